@@ -1,0 +1,9 @@
+"""The one error a user is meant to read."""
+
+
+class InputError(Exception):
+    """Something outside the program is wrong: a file, a setting, a disk.
+
+    The message says what, why and what to do next. The command line prints it without a traceback and ends with
+    exit code 1; every other exception is a bug and keeps its traceback.
+    """

@@ -1,0 +1,1 @@
+"""Everything that computes. Imports `formats`, never `msgs_cli`."""

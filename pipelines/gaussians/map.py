@@ -1,0 +1,45 @@
+"""The semantic map: isotropic 3D Gaussians with colour and class logits (method eq. 4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class GaussianMap:
+    """M isotropic Gaussians, raw parameters as they are optimised.
+
+    means (M, 3), log_radii (M,), opacity_logits (M,), colors (M, 3) RGB 0..1, class_logits (M, C), all float32;
+    anchor_frame_ids (M,) int64: the keyframe each Gaussian was seeded from and moves with.
+    """
+
+    means: Tensor
+    log_radii: Tensor
+    opacity_logits: Tensor
+    colors: Tensor
+    class_logits: Tensor
+    anchor_frame_ids: Tensor
+
+    def __post_init__(self) -> None:
+        m = self.means.shape[0]
+        shapes = {"means": (m, 3), "log_radii": (m,), "opacity_logits": (m,), "colors": (m, 3)}
+        shapes |= {"class_logits": (m, self.class_logits.shape[-1]), "anchor_frame_ids": (m,)}
+        for name, expected in shapes.items():
+            if (got := tuple(getattr(self, name).shape)) != expected:
+                raise ValueError(f"{name}: got shape {got}, expected {expected}")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def radii(self) -> Tensor:
+        """(M,) standard deviations, in the unit of the world."""
+        return torch.exp(self.log_radii)
+
+    @property
+    def opacities(self) -> Tensor:
+        """(M,) in 0..1."""
+        return torch.sigmoid(self.opacity_logits)

@@ -1,0 +1,212 @@
+"""What flows between stages, and the conventions, written once.
+
+Conventions
+- A transform is named target first: `cam_from_world @ points_in_world`. The inner names of a product cancel.
+- Camera axes: x right, y down, z forward. The centre of the top-left pixel is (0.5, 0.5).
+- `depth` is z along the optical axis, 0 where unknown; metres when the proxy is metric, else the unit of the run.
+- Images are RGB uint8 (H, W, 3). Labels are uint8 (H, W), indices into the run's class table, `VOID` where unknown.
+- Poses are float64 (4, 4); maps and renderings float32.
+- Shapes: N frames, M Gaussians, C classes, P points, H x W pixels; K is the intrinsics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+VOID = 255
+"""Label of a pixel whose class is unknown."""
+
+
+def require_shape(name: str, array: NDArray, expected: Sequence[int | None]) -> None:
+    """Raise ValueError unless `array` has the expected shape; None stands for any length."""
+    shape = array.shape
+    if len(shape) != len(expected) or any(e is not None and s != e for s, e in zip(shape, expected, strict=True)):
+        want = tuple("any" if e is None else e for e in expected)
+        raise ValueError(f"{name}: got shape {shape}, expected {want}")
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera without distortion; lengths in pixels, first pixel's centre at (0.5, 0.5)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"image size must be positive, got {self.width}x{self.height}")
+        if not (np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() and self.fx > 0 and self.fy > 0):
+            raise ValueError(f"focal lengths must be positive and finite, got {self}")
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """(3, 3) calibration matrix K."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
+
+    def resized(self, width: int, height: int) -> Intrinsics:
+        """The same camera after its image is resized to width x height."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picked frame: `id` counts picked frames from 0, `source_index` is its place in the source."""
+
+    id: int
+    name: str
+    timestamp: float
+    source_index: int
+    sharpness: float
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The camera of the (undistorted) frames and how it came to be known.
+
+    `origin` is "given", "exif" or "self-calibrated"; `focal_sd` its standard deviation in pixels (0 when given);
+    `distortion` the (k1, k2, p1, p2) that was removed from the frames.
+    """
+
+    intrinsics: Intrinsics
+    origin: str
+    focal_sd: float
+    distortion: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """Keyframe poses and triangulated points of structure from motion, in the run's world.
+
+    frame_ids (N,) int, cam_from_world (N, 4, 4) float64, points_in_world (P, 3) float64, colors (P, 3) uint8,
+    and the observations: obs_frame (O,) int index into frame_ids, obs_point (O,) int index into points,
+    obs_xy (O, 2) float64 pixels of the undistorted frame.
+    """
+
+    frame_ids: NDArray[np.int64]
+    cam_from_world: NDArray[np.float64]
+    points_in_world: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    obs_frame: NDArray[np.int64]
+    obs_point: NDArray[np.int64]
+    obs_xy: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        n, p, o = len(self.frame_ids), len(self.points_in_world), len(self.obs_frame)
+        require_shape("cam_from_world", self.cam_from_world, (n, 4, 4))
+        require_shape("points_in_world", self.points_in_world, (p, 3))
+        require_shape("colors", self.colors, (p, 3))
+        require_shape("obs_point", self.obs_point, (o,))
+        require_shape("obs_xy", self.obs_xy, (o, 2))
+
+
+@dataclass(frozen=True)
+class ProxyMaps:
+    """What the providers say of one frame, at their own resolution h x w (same field of view as the frame).
+
+    depth (h, w) float32, 0 = unknown; confidence (h, w) float32 in [0, 1]: the reliability U of eq. (2);
+    labels (h, w) uint8; label_confidence (h, w) float32 in [0, 1]: probability of that label.
+    """
+
+    depth: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    labels: NDArray[np.uint8]
+    label_confidence: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        require_shape("depth", self.depth, (None, None))
+        for name in ("confidence", "labels", "label_confidence"):
+            require_shape(name, getattr(self, name), self.depth.shape)
+
+
+@dataclass(frozen=True)
+class ClassTable:
+    """Names and display colours (RGB 0..255) of the classes; a label is an index into both."""
+
+    names: tuple[str, ...]
+    colors: tuple[tuple[int, int, int], ...]
+
+    def __post_init__(self) -> None:
+        if len(self.names) != len(self.colors) or len(self.names) > VOID:
+            raise ValueError(f"got {len(self.names)} names, {len(self.colors)} colours; at most {VOID} classes")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A pose for every picked frame, or the reason why there is none.
+
+    frame_ids (N,) int, timestamps (N,) seconds, cam_from_world (N, 4, 4) float64 (identity where lost),
+    is_keyframe (N,) bool, lost_reasons: N strings, "" where the frame is posed.
+    """
+
+    frame_ids: NDArray[np.int64]
+    timestamps: NDArray[np.float64]
+    cam_from_world: NDArray[np.float64]
+    is_keyframe: NDArray[np.bool_]
+    lost_reasons: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        n = len(self.frame_ids)
+        require_shape("timestamps", self.timestamps, (n,))
+        require_shape("cam_from_world", self.cam_from_world, (n, 4, 4))
+        require_shape("is_keyframe", self.is_keyframe, (n,))
+        if len(self.lost_reasons) != n:
+            raise ValueError(f"lost_reasons: got {len(self.lost_reasons)}, expected {n}")
+        if (self.is_keyframe & ~self.is_posed).any():
+            raise ValueError("a lost frame cannot be a keyframe")
+
+    @property
+    def is_posed(self) -> NDArray[np.bool_]:
+        """(N,) bool."""
+        return np.array([not reason for reason in self.lost_reasons], dtype=bool)
+
+    @property
+    def world_from_cam(self) -> NDArray[np.float64]:
+        """(N, 4, 4) inverse poses."""
+        return np.linalg.inv(self.cam_from_world)
+
+    @property
+    def centers(self) -> NDArray[np.float64]:
+        """(N, 3) camera centres in the world."""
+        return self.world_from_cam[:, :3, 3]
+
+
+@dataclass(frozen=True)
+class LoopEdge:
+    """A verified revisit: frame2_from_frame1 (4, 4) up to `scale`, with its inlier count."""
+
+    frame1_id: int
+    frame2_id: int
+    frame2_from_frame1: NDArray[np.float64]
+    scale: float
+    inliers: int
+
+
+@dataclass(frozen=True)
+class SemanticMesh:
+    """vertices (V, 3) float32, faces (F, 3) int32, colors (V, 3) uint8, labels (V,) uint8."""
+
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    colors: NDArray[np.uint8]
+    labels: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        v = len(self.vertices)
+        require_shape("vertices", self.vertices, (None, 3))
+        require_shape("faces", self.faces, (None, 3))
+        require_shape("colors", self.colors, (v, 3))
+        require_shape("labels", self.labels, (v,))
