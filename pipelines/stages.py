@@ -1,0 +1,187 @@
+"""Running the stages: what is up to date stays, what is not runs, what was interrupted goes on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import resource
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from formats.atomic import fsync_folder
+from formats.errors import InputError
+from pipelines.config import Config, config_to_dict
+from pipelines.progress import Progress, log
+from pipelines.run_folder import STAGES, RunFolder, read_json, write_json
+
+
+@dataclass(frozen=True)
+class StageContext:
+    """What a stage is given.
+
+    `folder` is the stage's own unfinished folder: it writes its result there, and may keep snapshots under
+    `folder / "snapshot"`, which is removed when the stage ends well. What an interrupted attempt with the same
+    settings and inputs has left in `folder` is still there when the stage starts again.
+    """
+
+    run: RunFolder
+    source: Path
+    config: Config
+    folder: Path
+    progress: Progress
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def snapshot(self) -> Path:
+        """Folder for snapshots; made on first use."""
+        path = self.folder / "snapshot"
+        path.mkdir(exist_ok=True)
+        return path
+
+    def warn(self, message: str) -> None:
+        """A degraded result: logged now, counted and kept for the report."""
+        log.warning(message)
+        self.warnings.append(message)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """`run` does the work and returns its key figures; raise `version` whenever its result changes."""
+
+    name: str
+    version: int
+    run: Callable[[StageContext], dict[str, Any]]
+    summary: str
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """One finished stage in the manifest. files: relative path → [bytes, sha256]."""
+
+    fingerprint: str
+    files: dict[str, tuple[int, str]]
+    seconds: float
+    peak_memory_mb: float
+    figures: dict[str, Any]
+    warnings: list[str]
+    content: str
+
+    @staticmethod
+    def from_json(value: dict[str, Any]) -> StageRecord:
+        """Inverse of `asdict` after JSON."""
+        return StageRecord(**{**value, "files": {k: (v[0], v[1]) for k, v in value["files"].items()}})
+
+
+def load_records(run: RunFolder) -> dict[str, StageRecord]:
+    """The finished stages by name."""
+    if not run.manifest_file.exists():
+        return {}
+    return {k: StageRecord.from_json(v) for k, v in read_json(run.manifest_file)["stages"].items()}
+
+
+def load_source(run: RunFolder) -> dict[str, Any]:
+    """What the run was made from: {"path", "digest"}."""
+    return read_json(run.manifest_file)["source"]
+
+
+def run_stages(
+    stages: list[Stage], run: RunFolder, source: Path, source_digest: str, config: Config, progress: Progress,
+    until: str = STAGES[-1],
+) -> dict[str, StageRecord]:
+    """Bring every stage up to `until` up to date; returns their records.
+
+    A stage is up to date when its fingerprint (version, own settings, seed, content of the stages before it) and
+    its files are unchanged. Raises InputError as the stages do.
+    """
+    records = load_records(run)
+    upstream = source_digest
+    for stage in stages[: STAGES.index(until) + 1]:
+        fingerprint = _fingerprint(stage, config, upstream)
+        record = records.get(stage.name)
+        if record is None or record.fingerprint != fingerprint or not _intact(run.stage(stage.name), record):
+            for later in STAGES[STAGES.index(stage.name) :]:
+                records.pop(later, None)
+            record = _run_one(stage, run, source, config, progress, fingerprint)
+            records[stage.name] = record
+            _save_manifest(run, source, source_digest, records)
+        else:
+            log.info("%s: up to date", stage.name)
+        upstream = hashlib.sha256((upstream + record.content).encode()).hexdigest()
+    return records
+
+
+def _run_one(
+    stage: Stage, run: RunFolder, source: Path, config: Config, progress: Progress, fingerprint: str
+) -> StageRecord:
+    folder = _open_partial(run.partial(stage.name), fingerprint)
+    context = StageContext(run, source, config, folder, progress)
+    started = time.monotonic()
+    try:
+        figures = stage.run(context)
+    except OSError as error:
+        if error.errno in (28, 122):  # ENOSPC, EDQUOT
+            raise InputError(
+                f"{run.root}: the disk is full. Free some space and type `msgs-slam resume {run.root}`"
+            ) from error
+        raise
+    shutil.rmtree(folder / "snapshot", ignore_errors=True)
+    (folder / "fingerprint.json").unlink()
+    files = _checksums(folder)
+    shutil.rmtree(run.stage(stage.name), ignore_errors=True)
+    os.replace(folder, run.stage(stage.name))
+    fsync_folder(run.root)
+    content = hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()
+    return StageRecord(
+        fingerprint, files, time.monotonic() - started, peak_memory_mb(), figures, context.warnings, content
+    )
+
+
+def _open_partial(folder: Path, fingerprint: str) -> Path:
+    """The unfinished folder, emptied unless it belongs to exactly this work."""
+    stamp = folder / "fingerprint.json"
+    if not (stamp.exists() and read_json(stamp) == fingerprint):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        write_json(stamp, fingerprint)
+    return folder
+
+
+def _fingerprint(stage: Stage, config: Config, upstream: str) -> str:
+    own = config_to_dict(getattr(config, stage.name))
+    text = json.dumps([stage.name, stage.version, own, config.run.seed, upstream], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _checksums(folder: Path) -> dict[str, tuple[int, str]]:
+    paths = sorted(p for p in folder.rglob("*") if p.is_file() and not p.is_symlink())
+    return {str(p.relative_to(folder)): (p.stat().st_size, file_digest(p)) for p in paths}
+
+
+def _intact(folder: Path, record: StageRecord) -> bool:
+    return all(
+        (path := folder / name).is_file() and path.stat().st_size == size and file_digest(path) == digest
+        for name, (size, digest) in record.files.items()
+    )
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file's bytes."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _save_manifest(run: RunFolder, source: Path, source_digest: str, records: dict[str, StageRecord]) -> None:
+    stages = {name: asdict(records[name]) for name in STAGES if name in records}
+    write_json(run.manifest_file, {"source": {"path": str(source), "digest": source_digest}, "stages": stages})
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process so far, in MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)
