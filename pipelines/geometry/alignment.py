@@ -1,0 +1,94 @@
+"""Least-squares alignment of point sets: rigid, or with a scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.types import require_shape
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """target = scale * rotation @ source + translation; rotation (3, 3) in SO(3), translation (3,)."""
+
+    scale: float
+    rotation: Array
+    translation: Array
+
+    def __post_init__(self) -> None:
+        require_shape("rotation", self.rotation, (3, 3))
+        require_shape("translation", self.translation, (3,))
+        if not self.scale > 0:
+            raise ValueError(f"scale must be positive, got {self.scale}")
+
+    def apply(self, points: NDArray) -> Array:
+        """(..., 3) source points in the target's frame."""
+        return self.scale * (points @ self.rotation.T) + self.translation
+
+    def apply_to_poses(self, cam_from_source: NDArray) -> Array:
+        """cam_from_target (N, 4, 4): the same cameras, rigid, after their world was mapped into the target's."""
+        cam_from_target = np.tile(np.eye(4), (len(cam_from_source), 1, 1))
+        rotations = cam_from_source[:, :3, :3] @ self.rotation.T
+        cam_from_target[:, :3, :3] = rotations
+        cam_from_target[:, :3, 3] = self.scale * cam_from_source[:, :3, 3] - rotations @ self.translation
+        return cam_from_target
+
+    def inverse(self) -> Similarity:
+        """source_from_target."""
+        rotation = self.rotation.T
+        return Similarity(1 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
+    def __matmul__(self, other: Similarity) -> Similarity:
+        """a_from_b @ b_from_c = a_from_c."""
+        translation = self.apply(other.translation)
+        return Similarity(self.scale * other.scale, self.rotation @ other.rotation, translation)
+
+
+def align_points(
+    source: NDArray, target: NDArray, with_scale: bool = True, weights: NDArray | None = None
+) -> Similarity:
+    """The similarity (or, without scale, the rigid motion) that takes source (N, 3) to target (N, 3).
+
+    Weighted least squares in closed form (Umeyama, PAMI 1991). Raises ValueError for fewer than three points, points
+    that are not finite, or points on one line, where the rotation is not determined.
+    """
+    require_shape("source", source, (None, 3))
+    require_shape("target", target, (len(source), 3))
+    if len(source) < 3 or not (np.isfinite(source).all() and np.isfinite(target).all()):
+        raise ValueError(f"alignment needs at least three finite points, got {len(source)}")
+    w = np.ones(len(source)) if weights is None else np.asarray(weights, dtype=np.float64)
+    w = w / w.sum()
+    source_mean, target_mean = w @ source, w @ target
+    source_centred, target_centred = source - source_mean, target - target_mean
+    u, d, vt = np.linalg.svd((w[:, None] * target_centred).T @ source_centred)
+    if d[1] <= 1e-12 * max(d[0], 1e-300):
+        raise ValueError("alignment is not determined: the points lie on one line")
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = (u * signs) @ vt
+    scale = float(d @ signs / (w @ (source_centred**2).sum(1))) if with_scale else 1.0
+    return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
+
+
+def align_points_robust(
+    source: NDArray, target: NDArray, with_scale: bool = True, iterations: int = 20
+) -> tuple[Similarity, NDArray[np.bool_]]:
+    """As `align_points`, with Tukey weights from the median residual; also which points (N,) bool were used.
+
+    Stands up to about a third of gross outliers. Raises ValueError as `align_points`.
+    """
+    weights = np.ones(len(source))
+    for _ in range(iterations):
+        similarity = align_points(source, target, with_scale, weights)
+        residuals = np.linalg.norm(similarity.apply(source) - target, axis=1)
+        # 4.685 sigma keeps 95 % efficiency; sigma of a 3-D residual's norm from its median is /1.538.
+        cut = 4.685 * max(float(np.median(residuals)) / 1.538, 1e-12)
+        updated = np.clip(1 - (residuals / cut) ** 2, 0, None) ** 2
+        if (updated > 0).sum() < 4 or np.allclose(updated, weights, atol=1e-6):
+            break
+        weights = updated
+    return similarity, weights > 0
