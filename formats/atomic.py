@@ -1,0 +1,78 @@
+"""Files that are either whole or not there."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from formats.errors import DiskFullError, InputError
+
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_NOT_ALLOWED = {errno.EACCES, errno.EPERM, errno.EROFS}
+_NEARLY_FULL_BYTES = 1 << 20
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`, of the same suffix; rename it to `path` when the block ends well.
+
+    The folder is made when missing. A block that raises leaves `path` as it was and no temporary file behind. The
+    temporary name depends on `path` alone, so what a killed process left is overwritten by the next attempt.
+
+    Raises DiskFullError when the disk is full, InputError when the folder cannot be written.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.unlink(missing_ok=True)
+        yield temporary
+        _flush_to_disk(temporary)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise _explained(error, path) from error
+    finally:
+        with suppress(NotADirectoryError):
+            temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, data: bytes | bytearray | memoryview) -> None:
+    """Write a whole file at once, atomically. Raises InputError as `atomic_path` does."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a UTF-8 text file atomically, line ends as they are. Raises InputError as `atomic_path` does."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def _flush_to_disk(path: Path) -> None:
+    with path.open("rb+") as file:
+        os.fsync(file.fileno())
+
+
+def _explained(error: OSError, path: Path) -> Exception:
+    """The same failure in the user's words, where the user can do something about it."""
+    # numpy's tofile reports a short write without an errno; the disk itself tells what happened.
+    full = error.errno in _NO_ROOM or (error.errno is None and _free_bytes(path.parent) < _NEARLY_FULL_BYTES)
+    if full:
+        return DiskFullError(
+            f"disk full while writing {path.name}, {_free_bytes(path.parent) / 1e6:.0f} MB are free in {path.parent}: "
+            "free some space (or point the output at another disk), then run the same command again"
+        )
+    if error.errno in _NOT_ALLOWED:
+        return InputError(f"cannot write {path}, {error.strerror}: choose another output folder or change its rights")
+    if error.errno in (errno.ENOTDIR, errno.EEXIST):
+        return InputError(f"cannot write {path}, a part of that path is a file: choose another output folder")
+    return error
+
+
+def _free_bytes(folder: Path) -> int:
+    while not folder.exists():
+        folder = folder.parent
+    return shutil.disk_usage(folder).free

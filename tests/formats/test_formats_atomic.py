@@ -1,0 +1,108 @@
+"""A written file is whole or not there, and failures speak to the user."""
+
+from __future__ import annotations
+
+import errno
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from formats.atomic import atomic_path, write_bytes, write_text
+from formats.errors import InputError
+
+REPO = Path(__file__).resolve().parents[2]
+
+
+def test_writes_and_replaces(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "folder" / "a.bin"
+    write_bytes(path, b"first")
+    write_bytes(path, b"second")
+    assert path.read_bytes() == b"second"
+    write_text(path.with_suffix(".txt"), "Grüße\n")
+    assert path.with_suffix(".txt").read_bytes() == "Grüße\n".encode()
+    assert sorted(p.name for p in path.parent.iterdir()) == ["a.bin", "a.txt"]
+
+
+def test_failed_block_keeps_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    write_text(path, "old")
+
+    def write_half(folder: Path) -> None:
+        with atomic_path(path) as temporary:
+            temporary.write_text("half of the n")
+            (folder / "not there").read_text()
+
+    with pytest.raises(FileNotFoundError):
+        write_half(tmp_path)
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_temporary_keeps_the_suffix_and_folder(tmp_path: Path) -> None:
+    with atomic_path(tmp_path / "mesh.glb") as temporary:
+        assert temporary.suffix == ".glb"
+        assert temporary.parent == tmp_path
+        temporary.write_bytes(b"x")
+
+
+def test_killed_writer_leaves_the_old_file_and_is_cleaned_by_the_next(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    write_text(path, "old")
+    program = (
+        "import os, signal, sys; from pathlib import Path; from formats.atomic import atomic_path\n"
+        "with atomic_path(Path(sys.argv[1])) as t:\n"
+        "    t.write_text('half'); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    done = subprocess.run([sys.executable, "-c", program, str(path)], cwd=REPO, check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert path.read_text() == "old"
+    assert len(list(tmp_path.iterdir())) == 2
+    write_text(path, "new")
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["new"]
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
+def test_full_disk_is_explained(tmp_path: Path, code: int) -> None:
+    with pytest.raises(InputError, match=r"disk full while writing a\.bin"), atomic_path(tmp_path / "a.bin"):
+        raise OSError(code, "no")
+    assert list(tmp_path.iterdir()) == []
+
+
+def _limit_file_size() -> None:
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+
+
+def test_a_write_that_really_stops_half_way(tmp_path: Path) -> None:
+    program = (
+        "import sys; from pathlib import Path; from formats.atomic import write_bytes; from formats.errors import *\n"
+        "try: write_bytes(Path(sys.argv[1]), b'x' * 5000)\n"
+        "except InputError as e: print(e); sys.exit(1)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "a.bin")],
+        cwd=REPO,
+        check=False,
+        capture_output=True,
+        text=True,
+        preexec_fn=_limit_file_size,
+    )
+    assert done.returncode == 1, done.stderr
+    assert "disk full" in done.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_in_place_of_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("I am a file")
+    with pytest.raises(InputError, match="choose another output folder"):
+        write_bytes(tmp_path / "out" / "a.bin", b"x")
+
+
+def test_other_errors_stay_what_they_are(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="weird") as caught, atomic_path(tmp_path / "a.bin"):
+        raise OSError(errno.EIO, "weird")
+    assert not isinstance(caught.value, InputError)

@@ -1,0 +1,201 @@
+"""Real, odd and broken videos; and the repair of time stamps against a known clock."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from formats.errors import InputError
+from formats.video import _Clock, iter_video, probe_video
+
+REPO = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def counted_video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """40 frames of 96x64 at 25/s; frame i is (red 6 i, green 0, blue 240 - 6 i) with a white top-left corner."""
+    path = tmp_path_factory.mktemp("video") / "counted.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25.0, (96, 64))
+    for i in range(40):
+        bgr = np.full((64, 96, 3), (240 - 6 * i, 0, 6 * i), np.uint8)
+        bgr[:16, :24] = 255
+        writer.write(bgr)
+    writer.release()
+    return path
+
+
+def test_frames_come_as_rgb_in_order_with_times(counted_video: Path) -> None:
+    frames = list(iter_video(counted_video))
+    assert [f.source_index for f in frames] == list(range(40))
+    np.testing.assert_allclose([f.timestamp for f in frames], np.arange(40) / 25, atol=1e-6)
+    assert frames[0].rgb.shape == (64, 96, 3)
+    assert frames[0].rgb.dtype == np.uint8
+    middle = np.array([f.rgb[40, 60] for f in frames], float)
+    np.testing.assert_allclose(middle[:, 0], 6.0 * np.arange(40), atol=12)
+    np.testing.assert_allclose(middle[:, 2], 240 - 6.0 * np.arange(40), atol=12)
+    assert all(f.rgb[4, 4].min() > 200 and f.rgb[60, 90].min() < 60 for f in frames)
+
+
+def test_probe_agrees_with_what_is_decoded(counted_video: Path) -> None:
+    info = probe_video(counted_video)
+    assert (info.width, info.height, info.frame_count_claimed) == (96, 64, 40)
+    assert info.fps == pytest.approx(25)
+    assert info.duration == pytest.approx(1.6)
+
+
+@pytest.mark.parametrize("wanted", [{3, 17, 39}, lambda i: i in (3, 17, 39), range(3, 40, 18)])
+def test_wanted_frames_are_the_same_pictures(counted_video: Path, wanted: object) -> None:
+    every = list(iter_video(counted_video))
+    reader = iter_video(counted_video, wanted)  # type: ignore[arg-type]
+    some = list(reader)
+    assert len(some) == len(range(3, 40, 18)) if isinstance(wanted, range) else 3
+    assert all(
+        (f.rgb == every[f.source_index].rgb).all() and f.timestamp == every[f.source_index].timestamp for f in some
+    )
+    assert len(reader.timestamps) == 40
+
+
+def test_frames_not_wanted_cost_less(shared_data: Path) -> None:
+    path = shared_data / "videos" / "bedroom_848x364_58fps.mp4"
+
+    def seconds(wanted: range) -> float:
+        start = time.process_time()
+        for _ in iter_video(path, wanted):
+            pass
+        return time.process_time() - start
+
+    skipped = min(seconds(range(0)) for _ in range(2))
+    every = min(seconds(range(10_000)) for _ in range(2))
+    assert 0.05 * every < skipped < 0.95 * every
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "decoded", "missing"),
+    [
+        ("d_odd_423x181_mjpeg.avi", (423, 181), 150, 30),
+        ("d_one_frame.mp4", (848, 364), 1, 0),
+        ("d_rotate90_metadata.mp4", (364, 848), 211, 0),
+        ("d_truncated_60pct.mp4", (848, 364), 625, 466),
+        ("d_vfr.mp4", (848, 364), 125, 0),
+        ("tc_bt709_full_range.mp4", (1280, 720), 30, 0),
+        ("tc_h264_10bits.mp4", (200, 200), 30, 0),
+        ("tc_h265_10bits.mp4", (200, 200), 30, 0),
+        ("tc_h265_video.mp4", (128, 128), 10, 0),
+    ],
+)
+def test_odd_videos(shared_data: Path, name: str, size: tuple[int, int], decoded: int, missing: int) -> None:
+    reader = iter_video(shared_data / "odd_videos" / name, lambda i: i % 50 == 0)
+    for frame in reader:
+        assert frame.rgb.shape == (size[1], size[0], 3)
+        assert frame.rgb.std() < 125
+    assert (reader.info.width, reader.info.height) == size
+    assert len(reader.timestamps) == decoded
+    assert (np.diff(reader.timestamps) > 0).all()
+    assert reader.missing_frames == missing
+
+
+def test_rotation_turns_the_picture(shared_data: Path) -> None:
+    turned = next(iter_video(shared_data / "odd_videos" / "d_rotate90_metadata.mp4")).rgb.astype(float)
+    upright = next(iter_video(shared_data / "videos" / "bedroom_848x364_58fps.mp4")).rgb.astype(float)
+    errors = [np.abs(turned - np.rot90(upright, k)).mean() for k in (1, 3)]
+    assert min(errors) < 15 < max(errors)
+
+
+def test_variable_rate_is_kept(shared_data: Path) -> None:
+    steps = np.diff(iter_video_times(shared_data / "odd_videos" / "d_vfr.mp4"))
+    assert steps.min() == pytest.approx(1 / 60, abs=1e-3)
+    assert steps.max() > 3 / 60
+
+
+def iter_video_times(path: Path) -> np.ndarray:
+    """Decode without converting anything."""
+    reader = iter_video(path, ())
+    assert list(reader) == []
+    return reader.timestamps
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("d_empty.mp4", "is empty"),
+        ("d_text.mp4", "is a text file"),
+        ("tc_audio_only.mp3", "no video stream"),
+        ("not_there.mp4", "no such file"),
+        (".", "is no file"),
+    ],
+)
+def test_bad_files_are_explained(shared_data: Path, name: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        probe_video(shared_data / "odd_videos" / name)
+
+
+def test_playlists_pointers_and_long_texts_are_refused(tmp_path: Path) -> None:
+    for name, text, message in [
+        ("a.m3u8", "#EXTM3U\n#EXTINF:1,\nfile:///etc/hostname\n", "text file"),
+        ("b.mp4", "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 3\n", "git lfs pull"),
+        ("c.mp4", "wörter über wörter " * 500, "text file"),
+    ]:
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        with pytest.raises(InputError, match=message):
+            probe_video(tmp_path / name)
+
+
+def test_an_image_is_not_taken_for_a_numbered_series(tmp_path: Path) -> None:
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / f"img_{i:02d}.jpg"), np.full((32, 32, 3), 80 * i, np.uint8))
+    assert len(iter_video_times(tmp_path / "img_00.jpg")) == 1
+
+
+def test_a_damaged_file_is_silent_on_stderr(tmp_path: Path) -> None:
+    (tmp_path / "broken.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(range(256)) * 20)
+    program = (
+        "import sys; from formats.video import probe_video; from formats.errors import InputError\n"
+        "try: probe_video(sys.argv[1])\n"
+        "except InputError: print('refused')"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path / "broken.mp4")]
+    done = subprocess.run(command, cwd=REPO, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("refused\n", "")
+
+
+def _run_clock(stored: list[float], fps: float = 10.0) -> tuple[list[float], int]:
+    clock = _Clock(fps)
+    for s in stored:
+        clock.next(s)
+    return clock.times, clock.repairs
+
+
+def test_good_times_pass_unchanged() -> None:
+    assert _run_clock([5.0, 5.1, 5.35, 5.4]) == (pytest.approx([0, 0.1, 0.35, 0.4]), 0)
+
+
+def test_one_wrong_time_does_not_shift_the_rest() -> None:
+    times, repairs = _run_clock([0.0, 0.1, 0.2, 0.05, 0.4, 0.5])
+    assert times == pytest.approx([0, 0.1, 0.2, 0.3, 0.4, 0.5])
+    assert repairs == 1
+
+
+def test_a_clock_set_back_keeps_its_steps() -> None:
+    times, _ = _run_clock([0.0, 0.1, 0.2, 0.0, 0.05, 0.15])
+    assert times == pytest.approx([0, 0.1, 0.2, 0.3, 0.35, 0.45])
+
+
+def test_missing_times_fall_back_to_the_rate() -> None:
+    assert _run_clock([0.0, 0.0, 0.0, 0.0])[0] == pytest.approx([0, 0.1, 0.2, 0.3])
+
+
+@given(st.lists(st.floats(allow_nan=True, allow_infinity=True, min_value=None) | st.floats(0, 10), min_size=1))
+def test_times_always_increase(stored: list[float]) -> None:
+    times, _ = _run_clock([s if abs(s) < 1e6 or s != s else float("inf") for s in stored])
+    assert times[0] == 0
+    assert all(b > a for a, b in itertools.pairwise(times))
+    assert np.isfinite(times).all()
