@@ -1,0 +1,93 @@
+"""Front-to-back compositing of projected isotropic Gaussians: MSGS-SLAM eq. (6)-(9), one autograd operation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+from pipelines.gaussians.render import reference
+
+
+@dataclass(frozen=True)
+class Composite:
+    """features (H, W, C); depth_sum, depth_silhouette, silhouette (H, W).
+
+    silhouette is 1 - T of the plain chain. depth_sum and depth_silhouette come from the chain of eq. (7), whose weights
+    may sum past 1 when κ > 0: the depth of a pixel is their ratio.
+    """
+
+    features: Tensor
+    depth_sum: Tensor
+    depth_silhouette: Tensor
+    silhouette: Tensor
+
+
+def composite(
+    u: Tensor,
+    v: Tensor,
+    sigma_px: Tensor,
+    z: Tensor,
+    opacity: Tensor,
+    features: Tensor,
+    width: int,
+    height: int,
+    proxy_depth: Tensor | None = None,
+    kappa: float = 0.0,
+    backend: str | None = None,
+    near: float = 0.0,
+) -> Composite:
+    """Blend M Gaussians into a width x height image; differentiable in the first six arguments.
+
+    u, v, sigma_px (M,) pixels, pixel centres at half integers; z (M,) depth, ignored where <= near; opacity (M,) 0..1;
+    features (M, C). proxy_depth (H, W), 0 = unknown, no gradient; kappa >= 0 in 1/depth². backend: "reference", "cpu",
+    "cuda" or None for the fastest that runs these tensors. Raises ValueError for wrong shapes, for NaN or infinity (by
+    the argument's name) and for an unknown backend.
+    """
+    arguments = {"u": u, "v": v, "sigma_px": sigma_px, "z": z, "opacity": opacity, "features": features}
+    check_arguments(arguments, width, height, proxy_depth, kappa)
+    module = choose_backend(backend, u)
+    return Composite(
+        *module.composite(u, v, sigma_px, z, opacity, features, width, height, proxy_depth, float(kappa), float(near))
+    )
+
+
+def check_arguments(
+    arguments: dict[str, Tensor], width: int, height: int, proxy_depth: Tensor | None, kappa: float
+) -> None:
+    """Raise ValueError, naming the argument, for wrong shapes and values that are not finite."""
+    if width < 1 or height < 1:
+        raise ValueError(f"image size must be positive, got {width}x{height}")
+    if not 0 <= kappa < float("inf"):
+        raise ValueError(f"kappa: got {kappa}, expected a finite number >= 0")
+    count = len(arguments["u"])
+    for name, tensor in arguments.items():
+        wanted = 2 if name == "features" else 1
+        if tensor.ndim != wanted or len(tensor) != count:
+            raise ValueError(
+                f"{name}: got shape {tuple(tensor.shape)}, expected {count} rows and {wanted} dimension(s)"
+            )
+        require_finite(name, tensor)
+    if proxy_depth is not None:
+        if tuple(proxy_depth.shape) != (height, width):
+            raise ValueError(f"proxy_depth: got shape {tuple(proxy_depth.shape)}, expected {(height, width)}")
+        require_finite("proxy_depth", proxy_depth)
+
+
+def require_finite(name: str, tensor: Tensor) -> None:
+    """Raise ValueError if any element is NaN or infinite."""
+    # A sum is finite unless an element is not (or it overflows, which the second look settles): one pass, no copy.
+    if not torch.isfinite(tensor.detach().sum()) and not (finite := torch.isfinite(tensor.detach())).all():
+        bad = int((~finite).sum())
+        raise ValueError(f"{name}: {bad} of {tensor.numel()} values are NaN or infinite")
+
+
+def choose_backend(backend: str | None, example: Tensor) -> ModuleType:
+    """The module that composites tensors like `example`; float64 and exotic devices go to the reference."""
+    if backend is None:
+        backend = "reference"
+    if backend == "reference":
+        return reference
+    raise ValueError(f"backend: got {backend!r}, expected 'reference', 'cpu', 'cuda' or None")

@@ -1,0 +1,77 @@
+"""World Gaussians seen by a camera: projection (MSGS-SLAM eq. 5) in torch around the compositing kernel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pipelines.gaussians.render.compositing import composite, require_finite
+from pipelines.geometry import se3
+from pipelines.geometry.camera import project_gaussians
+from pipelines.types import Intrinsics
+
+NEAR = 0.01
+"""Gaussians whose centre is nearer than this (or behind the camera) are not drawn; in the unit of the map."""
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """features (H, W, C); depth (H, W) = depth sum / depth silhouette, 0 where nothing is seen; silhouette (H, W)."""
+
+    features: Tensor
+    depth: Tensor
+    silhouette: Tensor
+
+
+def render(
+    means: Tensor,
+    radii: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    cam_from_world: Tensor,
+    intrinsics: Intrinsics,
+    proxy_depth: Tensor | None = None,
+    kappa: float = 0.0,
+    twist: Tensor | None = None,
+    near: float = NEAR,
+    backend: str | None = None,
+) -> Rendering:
+    """Draw M Gaussians from the pose exp(twist) @ cam_from_world; differentiable in everything but proxy_depth.
+
+    means (M, 3), radii (M,) world standard deviations, opacities (M,) 0..1, features (M, C), cam_from_world (4, 4),
+    proxy_depth (H, W) or None, twist (6,) translation first (see `pipelines.geometry.se3`). Raises ValueError for NaN,
+    infinity or wrong shapes.
+    """
+    u, v, sigma_px, z = project_map(means, radii, cam_from_world, intrinsics, twist, near)
+    image = composite(
+        u, v, sigma_px, z, opacities, features, intrinsics.width, intrinsics.height, proxy_depth, kappa, backend, near
+    )
+    depth = depth_ratio(image.depth_sum, image.depth_silhouette)
+    return Rendering(image.features, depth, image.silhouette)
+
+
+def project_map(
+    means: Tensor,
+    radii: Tensor,
+    cam_from_world: Tensor,
+    intrinsics: Intrinsics,
+    twist: Tensor | None = None,
+    near: float = NEAR,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """u, v, sigma_px, z (M,) of the Gaussians in the camera exp(twist) @ cam_from_world."""
+    for name, tensor in (("means", means), ("radii", radii), ("cam_from_world", cam_from_world)):
+        require_finite(name, tensor)
+    if twist is not None:
+        require_finite("twist", twist)
+        # The product in the pose's own precision (float64 in this project), only then down to the map's.
+        cam_from_world = se3.exp(twist.to(cam_from_world.dtype)) @ cam_from_world
+    points_in_cam = se3.transform(cam_from_world.to(means), means)
+    return project_gaussians(points_in_cam, radii, intrinsics, near)
+
+
+def depth_ratio(depth_sum: Tensor, depth_silhouette: Tensor) -> Tensor:
+    """Depth sum / depth silhouette with value and gradient 0 where no Gaussian is seen."""
+    seen = depth_silhouette > 1e-6
+    return torch.where(seen, depth_sum / torch.where(seen, depth_silhouette, 1.0), 0.0)
