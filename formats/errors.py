@@ -7,3 +7,7 @@ class InputError(Exception):
     The message says what, why and what to do next. The command line prints it without a traceback and ends with
     exit code 1; every other exception is a bug and keeps its traceback.
     """
+
+
+class DiskFullError(InputError):
+    """The disk is full: the work done so far is kept, and can go on once there is space."""

@@ -19,16 +19,14 @@ from typing import Any
 
 import cv2
 import numpy as np
+from formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
 from numpy.typing import NDArray
 
 from formats.atomic import atomic_path
 from formats.errors import InputError
 from formats.images import read_rgb
-from formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
 from pipelines.gaussians.map import GaussianMap
 from pipelines.types import Calibration, ClassTable, Frame, Intrinsics, LoopEdge, ProxyMaps, SparseModel, Trajectory
-
-STAGES = ("frames", "proxy", "tracking", "mapping", "global_ba", "export")
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -234,5 +232,3 @@ def resize_maps(maps: ProxyMaps, width: int, height: int) -> ProxyMaps:
 def iter_proxied(run: RunFolder, frames: list[Frame]) -> Iterator[Frame]:
     """The frames that have proxy maps, in order."""
     return (f for f in frames if run.has_proxy(f.id))
-
-

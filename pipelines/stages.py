@@ -14,11 +14,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from formats.atomic import fsync_folder
-from formats.errors import InputError
+from formats.errors import DiskFullError
 from pipelines.config import Config, config_to_dict
 from pipelines.progress import Progress, log
-from pipelines.run_folder import STAGES, RunFolder, read_json, write_json
+from pipelines.run_folder import RunFolder, read_json, write_json
+from pipelines.run_folder_names import STAGES
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,16 @@ class StageContext:
         path = self.folder / "snapshot"
         path.mkdir(exist_ok=True)
         return path
+
+    @property
+    def threads(self) -> int:
+        """How many CPU threads to use."""
+        return self.config.run.threads or os.cpu_count() or 1
+
+    @property
+    def device(self) -> str:
+        """ "cpu" or "cuda", as settled before the first stage."""
+        return self.config.run.device
 
     def warn(self, message: str) -> None:
         """A degraded result: logged now, counted and kept for the report."""
@@ -91,7 +101,12 @@ def load_source(run: RunFolder) -> dict[str, Any]:
 
 
 def run_stages(
-    stages: list[Stage], run: RunFolder, source: Path, source_digest: str, config: Config, progress: Progress,
+    stages: list[Stage],
+    run: RunFolder,
+    source: Path,
+    source_digest: str,
+    config: Config,
+    progress: Progress,
     until: str = STAGES[-1],
 ) -> dict[str, StageRecord]:
     """Bring every stage up to `until` up to date; returns their records.
@@ -126,7 +141,7 @@ def _run_one(
         figures = stage.run(context)
     except OSError as error:
         if error.errno in (28, 122):  # ENOSPC, EDQUOT
-            raise InputError(
+            raise DiskFullError(
                 f"{run.root}: the disk is full. Free some space and type `msgs-slam resume {run.root}`"
             ) from error
         raise
@@ -135,7 +150,7 @@ def _run_one(
     files = _checksums(folder)
     shutil.rmtree(run.stage(stage.name), ignore_errors=True)
     os.replace(folder, run.stage(stage.name))
-    fsync_folder(run.root)
+    _flush_folder(run.root)
     content = hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()
     return StageRecord(
         fingerprint, files, time.monotonic() - started, peak_memory_mb(), figures, context.warnings, content
@@ -149,7 +164,17 @@ def _open_partial(folder: Path, fingerprint: str) -> Path:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         write_json(stamp, fingerprint)
+    for torn in folder.rglob(".*.tmp*"):  # what a killed process was writing
+        torn.unlink()
     return folder
+
+
+def _flush_folder(folder: Path) -> None:
+    """Make a rename survive a power cut."""
+    if hasattr(os, "O_DIRECTORY"):
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        os.fsync(descriptor)
+        os.close(descriptor)
 
 
 def _fingerprint(stage: Stage, config: Config, upstream: str) -> str:

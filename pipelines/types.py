@@ -176,7 +176,7 @@ class Trajectory:
     @property
     def world_from_cam(self) -> NDArray[np.float64]:
         """(N, 4, 4) inverse poses."""
-        return np.linalg.inv(self.cam_from_world)
+        return np.asarray(np.linalg.inv(self.cam_from_world), dtype=np.float64)
 
     @property
     def centers(self) -> NDArray[np.float64]:

@@ -1,0 +1,240 @@
+"""`msgs-slam`: a plain video in; camera poses, a semantic Gaussian map and a labelled mesh out."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+# Spinning OpenMP threads of one library steal the cores of the next; must be set before torch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+from formats.errors import InputError
+from pipelines.run_folder_names import EXPORTS, STAGES
+
+FOLDER = click.Path(path_type=Path, file_okay=False)
+
+
+class FriendlyGroup(click.Group):
+    """Prints an InputError as one message with exit code 1; a bug keeps its traceback."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command inside the one error boundary."""
+        try:
+            return super().invoke(ctx)
+        except InputError as error:
+            raise click.ClickException(str(error)) from error
+
+
+@click.group(cls=FriendlyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(package_name="msgs-slam")
+def main() -> None:
+    """Turn a plain video into camera poses, a semantic Gaussian map and a labelled mesh.
+
+    \b
+    msgs-slam demo                      try it on a small synthetic room (under 3 minutes)
+    msgs-slam reconstruct video.mp4     the whole job; writes video.msgs/
+    msgs-slam resume video.msgs         go on after a stop
+    msgs-slam status video.msgs         what is done, what was found
+    msgs-slam export video.msgs         write the export files again, or elsewhere
+    msgs-slam config                    every setting with its default and meaning
+    """
+
+
+def verbosity_options(command: Callable[..., None]) -> Callable[..., None]:
+    """-q and -v."""
+    command = click.option("-v", "--verbose", is_flag=True, help="Log what is decided and why.")(command)
+    return click.option("-q", "--quiet", is_flag=True, help="No bars and no table; only errors.")(command)
+
+
+def settings_options(command: Callable[..., None]) -> Callable[..., None]:
+    """--config and --set."""
+    command = click.option(
+        "--set",
+        "overrides",
+        multiple=True,
+        metavar="SECTION.KEY=VALUE",
+        help="Change one setting, e.g. --set frames.rate=5; may be repeated.",
+    )(command)
+    return click.option(
+        "--config",
+        "config_file",
+        type=click.Path(path_type=Path, dir_okay=False),
+        metavar="FILE",
+        help="Settings in TOML; `msgs-slam config` prints one to start from.",
+    )(command)
+
+
+UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], help="Stop after this stage.")
+
+
+@main.command()
+@click.argument("source", type=click.Path(path_type=Path))
+@click.option("--out", type=FOLDER, metavar="RUN", help="The run folder. Default: the source's name + .msgs, here.")
+@settings_options
+@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), help="Where dense work runs. Default: auto.")
+@UNTIL
+@click.option(
+    "--depth",
+    metavar="PROVIDER",
+    help="Proxy depth: auto, multiview (needs no weights), files[:FOLDER] or onnx:CARD. Default: auto.",
+)
+@click.option(
+    "--semantics",
+    metavar="PROVIDER",
+    help="Semantics: auto, segments (needs no weights), files[:FOLDER] or onnx:CARD. Default: auto.",
+)
+@click.option(
+    "--intrinsics",
+    metavar="FX,FY,CX,CY[,K1,K2,P1,P2]|FILE",
+    help="The camera, in pixels of the source (first pixel's centre at 0.5, 0.5). Default: EXIF, else self-calibrated.",
+)
+@verbosity_options
+def reconstruct(
+    source: Path,
+    out: Path | None,
+    config_file: Path | None,
+    overrides: tuple[str, ...],
+    device: str | None,
+    until: str,
+    depth: str | None,
+    semantics: str | None,
+    intrinsics: str | None,
+    quiet: bool,
+    verbose: bool,
+) -> None:
+    """Reconstruct SOURCE, a video or a folder of images, into a run folder.
+
+    No option is needed. Stopped at any moment, the same command, or `msgs-slam resume RUN`, goes on where it was; with
+    a changed setting only the stages that depend on it run again.
+    """
+    _set_up_logging(quiet, verbose)
+    from pipelines.config import load_config
+    from pipelines.reconstruct import default_run_folder, existing_config
+    from pipelines.reconstruct import reconstruct as run_reconstruct
+    from pipelines.run_folder import RunFolder
+
+    run = RunFolder(out) if out else default_run_folder(source)
+    named = {"run.device": device, "proxy.depth": depth, "proxy.semantics": semantics, "frames.intrinsics": intrinsics}
+    texts = [f'{key}="{_toml_escape(value)}"' for key, value in named.items() if value is not None]
+    config = load_config(config_file, [*overrides, *texts], base=existing_config(run))
+    records = _interruptible(lambda: run_reconstruct(source, run, config, _progress(quiet), until), run.root)
+    if not quiet:
+        _print_summary(run.root, records)
+
+
+@main.command()
+@click.argument("run_path", metavar="RUN", type=FOLDER)
+@settings_options
+@UNTIL
+@verbosity_options
+def resume(
+    run_path: Path, config_file: Path | None, overrides: tuple[str, ...], until: str, quiet: bool, verbose: bool
+) -> None:
+    """Go on with RUN where it stopped. Finished stages are kept unless one of their settings is changed."""
+    _set_up_logging(quiet, verbose)
+    from pipelines.config import load_config
+    from pipelines.reconstruct import existing_config, require_run
+    from pipelines.reconstruct import resume as run_resume
+    from pipelines.run_folder import RunFolder
+
+    run = RunFolder(run_path)
+    require_run(run)
+    config = load_config(config_file, overrides, base=existing_config(run))
+    records = _interruptible(lambda: run_resume(run, _progress(quiet), config, until), run.root)
+    if not quiet:
+        _print_summary(run.root, records)
+
+
+@main.command()
+@click.argument("run_path", metavar="RUN", type=FOLDER)
+def status(run_path: Path) -> None:
+    """Say which stages of RUN are done, what they found, and what was degraded."""
+    from msgs_cli.tables import stage_table, warning_lines
+    from pipelines.reconstruct import require_run
+    from pipelines.run_folder import RunFolder
+    from pipelines.stages import load_records, load_source
+
+    run = RunFolder(run_path)
+    require_run(run)
+    records = load_records(run)
+    interrupted = [name for name in STAGES if run.partial(name).exists()]
+    click.echo(f"{run.root}: made from {load_source(run)['path']}\n")
+    click.echo(stage_table(records, STAGES, interrupted))
+    for line in warning_lines(records):
+        click.echo(line)
+
+
+@main.command()
+@click.argument("run_path", metavar="RUN", type=FOLDER)
+@click.option("--only", type=click.Choice(EXPORTS), help="Write one kind of file only. Default: all.")
+@click.option("--to", type=FOLDER, metavar="DIR", help="Where to write. Default: RUN/export.")
+@verbosity_options
+def export(run_path: Path, only: str | None, to: Path | None, quiet: bool, verbose: bool) -> None:
+    """Write the files for other programs: COLMAP model, Gaussian PLY, labelled mesh, TUM trajectory."""
+    _set_up_logging(quiet, verbose)
+    from pipelines.export.stage import export_run
+
+    from pipelines.reconstruct import require_run
+    from pipelines.run_folder import RunFolder
+
+    run = RunFolder(run_path)
+    require_run(run)
+    folder = to or run.stage("export")
+    for path in export_run(run, folder, only, _progress(quiet)):
+        if not quiet:
+            click.echo(path)
+
+
+@main.command("config")
+@settings_options
+def show_config(config_file: Path | None, overrides: tuple[str, ...]) -> None:
+    """Print every setting as commented TOML: save it, change it, pass it with --config."""
+    from pipelines.config import config_to_toml, load_config
+
+    click.echo(config_to_toml(load_config(config_file, overrides)), nl=False)
+
+
+def _toml_escape(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', '\\"')
+
+
+def _progress(quiet: bool) -> Any:
+    from msgs_cli.progress import BarProgress
+    from pipelines.progress import SilentProgress
+
+    return SilentProgress() if quiet else BarProgress()
+
+
+def _set_up_logging(quiet: bool, verbose: bool) -> None:
+    if quiet and verbose:
+        raise click.UsageError("-q and -v exclude each other")
+    level = logging.ERROR if quiet else logging.INFO if verbose else logging.WARNING
+    logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr, force=True)
+
+
+def _interruptible(work: Callable[[], Any], root: Path) -> Any:
+    try:
+        return work()
+    except KeyboardInterrupt:
+        click.echo(f"\nStopped. Go on with: msgs-slam resume {root}", err=True)
+        sys.exit(130)
+
+
+def _print_summary(root: Path, records: dict[str, Any]) -> None:
+    from msgs_cli.tables import stage_table, warning_lines
+
+    click.echo(stage_table(records, [name for name in STAGES if name in records]))
+    for line in warning_lines(records):
+        click.echo(line, err=True)
+    if "export" in records:
+        click.echo(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,43 @@
+"""Plain text tables of what a run did."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pipelines.stages import StageRecord
+
+
+def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Left-aligned columns under a rule."""
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    lines = [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in [header, *rows]
+    ]
+    return "\n".join([lines[0], "  ".join("-" * width for width in widths), *lines[1:]])
+
+
+def stage_table(records: dict[str, StageRecord], stages: Sequence[str], interrupted: Sequence[str] = ()) -> str:
+    """One row a stage: state, seconds, peak memory, key figures."""
+    rows = []
+    for name in stages:
+        if (record := records.get(name)) is None:
+            rows.append([name, "interrupted" if name in interrupted else "not yet", "", "", ""])
+            continue
+        figures = ", ".join(f"{key} {format_figure(value)}" for key, value in record.figures.items())
+        rows.append([name, "done", f"{record.seconds:.1f}", f"{record.peak_memory_mb:.0f}", figures])
+    return format_table(["stage", "state", "seconds", "peak MB", "figures"], rows)
+
+
+def format_figure(value: Any) -> str:
+    """Short text of a figure."""
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "-"}[value]
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def warning_lines(records: dict[str, StageRecord]) -> list[str]:
+    """Every degraded result, by stage."""
+    return [f"warning ({name}): {text}" for name, record in records.items() for text in record.warnings]

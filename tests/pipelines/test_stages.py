@@ -1,0 +1,130 @@
+"""The stage runner on small stages: what is up to date stays, what changed runs, what was interrupted goes on."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from formats.errors import DiskFullError
+from pipelines.config import Config, MappingConfig, load_config
+from pipelines.progress import SilentProgress
+from pipelines.run_folder import RunFolder
+from pipelines.run_folder_names import STAGES
+from pipelines.stages import Stage, StageContext, load_records, run_stages
+
+
+class Recorder:
+    """Six stages that note when they run; each writes a file made from its own setting and its predecessor's file."""
+
+    def __init__(self) -> None:
+        self.ran: list[str] = []
+        self.fail_in = ""
+        self.error: BaseException = KeyboardInterrupt()
+
+    def stages(self) -> list[Stage]:
+        return [Stage(name, 1, self.make(name), "") for name in STAGES]
+
+    def make(self, name: str) -> Any:
+        def run(context: StageContext) -> dict[str, Any]:
+            self.ran.append(name)
+            before = STAGES[STAGES.index(name) - 1] if name != STAGES[0] else None
+            text = (context.run.stage(before) / "result.txt").read_text() if before else "source"
+            (context.snapshot / "half.txt").write_text("half")
+            if name == self.fail_in:
+                raise self.error
+            (context.folder / "result.txt").write_text(f"{text} > {name} {getattr(context.config, name)}")
+            return {"length": len(text)}
+
+        return run
+
+
+@pytest.fixture
+def recorder() -> Recorder:
+    return Recorder()
+
+
+def bring_up_to_date(
+    recorder: Recorder, root: Path, config: Config | None = None, digest: str = "d", until: str = "export"
+) -> list[str]:
+    recorder.ran.clear()
+    root.mkdir(exist_ok=True)
+    run_stages(
+        recorder.stages(), RunFolder(root), Path("video.mp4"), digest, config or Config(), SilentProgress(), until
+    )
+    return list(recorder.ran)
+
+
+def test_second_run_does_nothing(recorder: Recorder, tmp_path: Path) -> None:
+    assert bring_up_to_date(recorder, tmp_path / "r") == list(STAGES)
+    assert bring_up_to_date(recorder, tmp_path / "r") == []
+    assert not list((tmp_path / "r").rglob("snapshot"))
+
+
+def test_changed_setting_reruns_its_stage_and_what_follows(recorder: Recorder, tmp_path: Path) -> None:
+    bring_up_to_date(recorder, tmp_path / "r")
+    key = next(iter(MappingConfig.__dataclass_fields__.values()))
+    config = load_config(overrides=[f"mapping.{key.name}={another_value(key.default)}"])
+    assert bring_up_to_date(recorder, tmp_path / "r", config) == ["mapping", "global_ba", "export"]
+
+
+def another_value(value: Any) -> Any:
+    if isinstance(value, bool):
+        return str(not value).lower()
+    return value + 1 if isinstance(value, int | float) else f'"{value}x"'
+
+
+def test_same_result_upstream_stops_the_wave(recorder: Recorder, tmp_path: Path) -> None:
+    """A stage that ran again but gave the same bytes leaves the later ones with the same fingerprint."""
+    bring_up_to_date(recorder, tmp_path / "r")
+    (tmp_path / "r" / "proxy" / "result.txt").unlink()
+    assert bring_up_to_date(recorder, tmp_path / "r", until="proxy") == ["proxy"]
+
+
+def test_damaged_file_is_made_again(recorder: Recorder, tmp_path: Path) -> None:
+    bring_up_to_date(recorder, tmp_path / "r")
+    damaged = tmp_path / "r" / "global_ba" / "result.txt"
+    damaged.write_text(damaged.read_text()[:-1] + "?")
+    assert bring_up_to_date(recorder, tmp_path / "r") == ["global_ba", "export"]
+
+
+def test_other_source_or_seed_reruns_all(recorder: Recorder, tmp_path: Path) -> None:
+    bring_up_to_date(recorder, tmp_path / "r")
+    assert bring_up_to_date(recorder, tmp_path / "r", digest="e") == list(STAGES)
+    config = Config()
+    assert bring_up_to_date(recorder, tmp_path / "r", replace(config, run=replace(config.run, seed=1)), "e") == list(
+        STAGES
+    )
+
+
+def test_interrupted_stage_keeps_its_snapshot(recorder: Recorder, tmp_path: Path) -> None:
+    recorder.fail_in = "mapping"
+    with pytest.raises(KeyboardInterrupt):
+        bring_up_to_date(recorder, tmp_path / "r")
+    run = RunFolder(tmp_path / "r")
+    assert list(load_records(run)) == ["frames", "proxy", "tracking"]
+    assert (run.partial("mapping") / "snapshot" / "half.txt").exists()
+    (run.partial("mapping") / ".torn.tmp.npz").write_bytes(b"x")
+    recorder.fail_in = ""
+    assert bring_up_to_date(recorder, tmp_path / "r") == ["mapping", "global_ba", "export"]
+    assert not list(run.root.glob("*.partial"))
+    assert not list(run.root.rglob(".torn*"))
+
+
+def test_snapshot_of_other_settings_is_dropped(recorder: Recorder, tmp_path: Path) -> None:
+    recorder.fail_in = "frames"
+    with pytest.raises(KeyboardInterrupt):
+        bring_up_to_date(recorder, tmp_path / "r")
+    stale = tmp_path / "r" / "frames.partial" / "stale.txt"
+    stale.write_text("of the first settings")
+    recorder.fail_in = ""
+    bring_up_to_date(recorder, tmp_path / "r", load_config(overrides=["frames.rate=1"]))
+    assert not (tmp_path / "r" / "frames" / "stale.txt").exists()
+
+
+def test_full_disk_is_said_and_can_be_resumed(recorder: Recorder, tmp_path: Path) -> None:
+    recorder.fail_in, recorder.error = "tracking", OSError(28, "No space left on device")
+    with pytest.raises(DiskFullError, match="msgs-slam resume"):
+        bring_up_to_date(recorder, tmp_path / "r")
+    recorder.fail_in = ""
+    assert bring_up_to_date(recorder, tmp_path / "r") == ["tracking", "mapping", "global_ba", "export"]

@@ -1,0 +1,65 @@
+"""The shape of the house: imports go one way, help is instant, nothing unsafe is loaded."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+FORBIDDEN = {
+    "formats": {"pipelines", "msgs_cli", "click", "tqdm"},
+    "pipelines": {"msgs_cli", "click", "tqdm"},
+    "msgs_cli": set(),
+}
+
+
+def imported_packages(path: Path) -> set[str]:
+    """Top-level packages that a file imports anywhere."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            found.add(node.module.split(".")[0])
+    return found
+
+
+@pytest.mark.parametrize("room", FORBIDDEN)
+def test_imports_go_one_way(room: str) -> None:
+    files = sorted((ROOT / room).rglob("*.py"))
+    assert files
+    wrong = {str(f.relative_to(ROOT)): imported_packages(f) & FORBIDDEN[room] for f in files}
+    assert not {name: bad for name, bad in wrong.items() if bad}
+
+
+def test_nothing_is_unpickled() -> None:
+    for room in FORBIDDEN:
+        for path in (ROOT / room).rglob("*.py"):
+            text = path.read_text(encoding="utf-8")
+            assert "pickle" not in imported_packages(path), path
+            assert "allow_pickle=True" not in text, path
+            assert "weights_only=False" not in text, path
+            for node in ast.walk(ast.parse(text)):
+                if isinstance(node, ast.Call) and ast.unparse(node.func) == "torch.load":
+                    assert any(k.arg == "weights_only" for k in node.keywords), f"{path}:{node.lineno}"
+                if isinstance(node, ast.Call) and ast.unparse(node.func) == "np.load":
+                    assert any(k.arg == "allow_pickle" for k in node.keywords), f"{path}:{node.lineno}"
+
+
+def test_help_does_not_load_torch() -> None:
+    code = "import sys, msgs_cli.main; print(sorted({'torch', 'cv2', 'numba', 'pycolmap', 'numpy'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("path", sorted(p for room in FORBIDDEN for p in (ROOT / room).rglob("*.py")), ids=str)
+def test_files_stay_readable(path: Path) -> None:
+    lines = path.read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 420, f"{len(lines)} lines: split it by noun"
+    for node in ast.walk(ast.parse("\n".join(lines))):
+        if isinstance(node, ast.FunctionDef):
+            assert (node.end_lineno or 0) - node.lineno < 90, (
+                f"{node.name} is {(node.end_lineno or 0) - node.lineno} lines"
+            )
