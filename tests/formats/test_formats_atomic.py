@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from formats.atomic import atomic_path, write_bytes, write_text
-from formats.errors import InputError
+from formats.errors import DiskFullError, InputError
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -67,7 +67,7 @@ def test_killed_writer_leaves_the_old_file_and_is_cleaned_by_the_next(tmp_path: 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
 def test_full_disk_is_explained(tmp_path: Path, code: int) -> None:
-    with pytest.raises(InputError, match=r"disk full while writing a\.bin"), atomic_path(tmp_path / "a.bin"):
+    with pytest.raises(DiskFullError, match=r"disk full while writing a\.bin"), atomic_path(tmp_path / "a.bin"):
         raise OSError(code, "no")
     assert list(tmp_path.iterdir()) == []
 

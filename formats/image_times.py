@@ -1,0 +1,74 @@
+"""When the images of a folder were taken: from a list beside them, else from EXIF."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.errors import InputError
+from formats.images import exif_time
+from formats.textfile import read_rows
+
+_LIST_NAMES = ("timestamps.txt", "times.txt", "rgb.txt")
+
+
+def read_image_times(images: list[Path]) -> NDArray[np.float64] | None:
+    """(N,) seconds at which the images were taken, strictly increasing; None where nothing tells.
+
+    Looks for timestamps.txt, times.txt or rgb.txt in the images' folder, then in the one above: a number a line for
+    each image in order, or for each frame number in the images' names; or lines of `seconds name`. Else EXIF.
+    Raises InputError for a list that matches the images in none of these ways.
+    """
+    if not images:
+        return None
+    for folder in (images[0].parent, images[0].parent.parent):
+        for name in _LIST_NAMES:
+            if (folder / name).is_file():
+                return _require_increasing(_from_list(folder / name, images), folder / name)
+    return _from_exif(images)
+
+
+def frame_number(path: Path) -> int | None:
+    """The last run of digits in a file name without its suffixes (frame-000012.color.jpg: 12), None without one."""
+    digits = re.findall(r"[0-9]+", path.name.split(".")[0])
+    return int(digits[-1]) if digits else None
+
+
+def _from_list(path: Path, images: list[Path]) -> NDArray[np.float64]:
+    rows = read_rows(path)
+    try:
+        if rows and all(len(row) >= 2 for row in rows):
+            by_name = {Path(row[1]).name: float(row[0]) for row in rows}
+            return np.array([by_name[p.name] for p in images], dtype=np.float64)
+        times = np.array([float(row[0]) for row in rows], dtype=np.float64)
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path}: no time for {error}: give one line of `seconds name` for each image") from error
+    if len(times) == len(images):
+        return times
+    numbers = [frame_number(p) for p in images]
+    if all(n is not None and n < len(times) for n in numbers):
+        return times[[n for n in numbers if n is not None]]
+    raise InputError(
+        f"{path} has {len(times)} times for {len(images)} images, and their names hold no row numbers: "
+        "give one line for each image, or remove the file"
+    )
+
+
+def _require_increasing(times: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
+    if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise InputError(f"{path}: times must be finite and increase from image to image: sort it, or remove the file")
+    return times
+
+
+def _from_exif(images: list[Path]) -> NDArray[np.float64] | None:
+    # Cameras often write whole seconds: equal neighbours tell nothing about the order, so such times are not used.
+    times: list[float] = []
+    for path in images:
+        time = exif_time(path)
+        if time is None or (times and time <= times[-1]):
+            return None
+        times.append(time)
+    return np.array(times, dtype=np.float64) - times[0]

@@ -1,0 +1,231 @@
+"""Image files to arrays and back: colour, depth, labels, and what the camera wrote beside the picture."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import ExifTags, Image, ImageOps
+
+from formats.atomic import atomic_path
+from formats.errors import InputError
+
+MAX_IMAGE_PIXELS = 120_000_000
+"""A larger picture is refused by its header, before memory is spent on it (phones go to 108 million)."""
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
+_UNREADABLE_SUFFIXES = frozenset({".heic", ".heif", ".dng", ".cr2", ".nef", ".arw", ".raw"})
+_FULL_FRAME_WIDTH_MM = 36.0
+_FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
+_MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}
+
+
+def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Sort key under which img2 comes before img10. Raises nothing; equal names have equal keys."""
+    parts = re.split(r"([0-9]+)", name)
+    return tuple((0, int(p), p) if p.isdecimal() and p.isascii() else (1, 0, p) for p in parts)
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The image files directly in `folder`, in natural order; hidden files are left out.
+
+    Raises InputError when there is no such folder or no image in it.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"no such folder: {folder}: check the spelling, and that the disk is mounted")
+    files = [p for p in folder.iterdir() if not p.name.startswith(".") and p.is_file()]
+    images = [p for p in files if p.suffix.lower() in IMAGE_SUFFIXES]
+    if not images:
+        raise InputError(_why_no_images(folder, files))
+    return sorted(images, key=lambda p: natural_key(p.name))
+
+
+def _why_no_images(folder: Path, files: list[Path]) -> str:
+    raw = sorted({p.suffix.lower() for p in files} & _UNREADABLE_SUFFIXES)
+    if raw:
+        return f"no readable image in {folder}: {', '.join(raw)} files are not supported, export them as JPEG first"
+    return (
+        f"no images in {folder} ({len(files)} other files): give the folder that directly holds the "
+        f"{', '.join(sorted(IMAGE_SUFFIXES))} files"
+    )
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) from the header, after the rotation stated in EXIF. Raises InputError as `read_rgb` does."""
+    with _opened(Path(path)) as image:
+        width, height = image.size
+        return (height, width) if image.getexif().get(ExifTags.Base.Orientation, 1) >= 5 else (width, height)
+
+
+def read_rgb(path: Path) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 RGB, turned upright as EXIF says; 16 bit is cut to 8, grey tripled, an alpha channel dropped.
+
+    Raises InputError for a missing, truncated, oversized or unreadable file.
+    """
+    with _opened(Path(path)) as image:
+        image.load()
+        upright = ImageOps.exif_transpose(image)
+        if upright.mode.startswith("I"):  # one channel of 16 bit; Pillow's own conversion saturates it
+            grey = (np.clip(np.asarray(upright), 0, 65535) >> 8).astype(np.uint8)
+            return np.repeat(grey[:, :, None], 3, axis=2)
+        return np.array(upright.convert("RGB"), dtype=np.uint8)
+
+
+def read_depth_png(path: Path) -> NDArray[np.uint16]:
+    """(H, W) uint16 depth in the file's own unit. Raises InputError unless the file holds one channel of 16 bits."""
+    values = _read_one_channel(Path(path), "depth")
+    if values.dtype == np.uint8:
+        raise InputError(f"{path} has 8 bits a pixel, depth needs 16: was it saved as a preview picture?")
+    return values.astype(np.uint16)
+
+
+def read_label_png(path: Path) -> NDArray[np.uint16]:
+    """(H, W) uint16 label ids as stored; of a palette image the indices. Raises InputError for a colour picture."""
+    return _read_one_channel(Path(path), "labels").astype(np.uint16)
+
+
+def read_grey_png(path: Path) -> NDArray[np.float32]:
+    """(H, W) float32 in [0, 1] of an 8 or 16 bit one-channel image, such as a confidence map."""
+    values = _read_one_channel(Path(path), "confidence")
+    return values.astype(np.float32) / np.float32(255 if values.dtype == np.uint8 else 65535)
+
+
+def write_rgb(path: Path, rgb: NDArray[np.uint8]) -> None:
+    """Write (H, W, 3) uint8 atomically; .jpg with quality 95 and full colour resolution, else lossless .png.
+
+    Raises ValueError for another array or suffix, InputError when the disk refuses.
+    """
+    path = Path(path)
+    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
+        raise ValueError(f"write_rgb: got {rgb.dtype} {rgb.shape}, expected uint8 (H, W, 3)")
+    image = Image.fromarray(np.ascontiguousarray(rgb))
+    with atomic_path(path) as temporary:
+        if path.suffix.lower() in (".jpg", ".jpeg"):
+            image.save(temporary, format="JPEG", quality=95, subsampling=0)
+        elif path.suffix.lower() == ".png":
+            image.save(temporary, format="PNG", compress_level=3)
+        else:
+            raise ValueError(f"write_rgb: {path.name} is neither .jpg nor .png")
+
+
+def write_grey_png(path: Path, values: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+    """Write (H, W) uint8 or uint16 (labels, depth) as a lossless PNG, atomically."""
+    if values.dtype not in (np.uint8, np.uint16) or values.ndim != 2:
+        raise ValueError(f"write_grey_png: got {values.dtype} {values.shape}, expected uint8 or uint16 (H, W)")
+    with atomic_path(Path(path)) as temporary:
+        Image.fromarray(np.ascontiguousarray(values)).save(temporary, format="PNG", compress_level=3)
+
+
+def decode_rgb(data: bytes, name: str) -> NDArray[np.uint8]:
+    """`read_rgb` for an image held in memory; `name` is what errors call it."""
+    with _explained(name), _quiet_open(io.BytesIO(data)) as image:
+        _require_sane_size(image, name)
+        return np.array(image.convert("RGB"), dtype=np.uint8)
+
+
+def exif_focal_px(path: Path, width: int, height: int) -> float | None:
+    """Focal length in pixels of an image of width x height, from EXIF; None when EXIF does not tell.
+
+    From the 35 mm equivalent (over the diagonal, as the makers define it for other aspect ratios than 3:2), else
+    from the focal length and the sensor's pixel pitch. The picture may have been resized since, but not cropped.
+    """
+    with _opened(Path(path)) as image:
+        tags = dict(image.getexif().get_ifd(ExifTags.IFD.Exif))
+        stored = image.size
+    equivalent = _positive(tags.get(ExifTags.Base.FocalLengthIn35mmFilm))
+    if equivalent is not None:
+        return equivalent / _FULL_FRAME_DIAGONAL_MM * math.hypot(width, height)
+    focal_mm = _positive(tags.get(ExifTags.Base.FocalLength))
+    pitch = _positive(tags.get(ExifTags.Base.FocalPlaneXResolution))
+    unit = _MM_PER_RESOLUTION_UNIT.get(tags.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
+    if focal_mm is None or pitch is None or unit is None:
+        return None
+    sensor_width = _positive(tags.get(ExifTags.Base.ExifImageWidth)) or max(stored)
+    sensor_mm = sensor_width * unit / pitch
+    if not 1.0 < sensor_mm < 2 * _FULL_FRAME_WIDTH_MM:
+        return None  # some cameras fill the pitch with the picture's print resolution
+    return focal_mm / sensor_mm * max(width, height)
+
+
+def exif_time(path: Path) -> float | None:
+    """Seconds (of the camera's own clock, since 1970) when the picture was taken, from EXIF; None when untold."""
+    with _opened(Path(path)) as image:
+        exif = image.getexif()
+        tags = exif.get_ifd(ExifTags.IFD.Exif)
+    text = tags.get(ExifTags.Base.DateTimeOriginal)
+    fraction = str(tags.get(ExifTags.Base.SubsecTimeOriginal, "")).strip("\0 ")
+    try:
+        moment = datetime.strptime(str(text).strip("\0 "), "%Y:%m:%d %H:%M:%S")
+    except ValueError:
+        return None
+    seconds = (moment - datetime(1970, 1, 1)).total_seconds()
+    return seconds + (float(f"0.{fraction}") if fraction.isdecimal() else 0.0)
+
+
+def _positive(value: object) -> float | None:
+    """An EXIF number (int or rational) when it is a usable one."""
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def _read_one_channel(path: Path, what: str) -> NDArray:
+    with _opened(path) as image:
+        image.load()
+        if image.mode not in ("L", "P", "I", "1") and not image.mode.startswith("I;16"):
+            raise InputError(f"{path} is a colour picture ({image.mode}), {what} need one channel: give the raw maps")
+        values = np.asarray(image)
+    if values.dtype == bool:
+        return values.astype(np.uint8)
+    if values.dtype.itemsize > 2 and values.size and not 0 <= values.min() <= values.max() <= 65535:
+        raise InputError(f"{path} holds values outside 0..65535: save the {what} as 16 bit integers")
+    return values.astype(np.uint8 if values.dtype == np.uint8 else np.uint16)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """An image whose header is read and checked; whatever goes wrong inside the block is explained."""
+    if not path.is_file():
+        raise InputError(f"no such image: {path}: check the spelling, and that the disk is mounted")
+    with _explained(str(path)):
+        if path.stat().st_size == 0:
+            raise InputError(f"{path} is empty (0 bytes): copy it again or remove it")
+        with _quiet_open(path) as image:
+            _require_sane_size(image, str(path))
+            yield image
+
+
+def _quiet_open(file: Path | io.BytesIO) -> Image.Image:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own limit follows
+        return Image.open(file)
+
+
+def _require_sane_size(image: Image.Image, name: str) -> None:
+    width, height = image.size
+    if width * height > MAX_IMAGE_PIXELS:
+        raise InputError(
+            f"{name} is {width}x{height}, over the limit of {MAX_IMAGE_PIXELS / 1e6:.0f} million pixels: scale it down"
+        )
+
+
+@contextmanager
+def _explained(name: str) -> Iterator[None]:
+    try:
+        yield
+    except Image.DecompressionBombError as error:
+        raise InputError(f"{name} is too large to decode safely ({error}): scale it down") from error
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
+        # Pillow reports damage under all of these names.
+        raise InputError(f"cannot read {name} as an image ({error}): copy it again or remove it") from error

@@ -1,0 +1,52 @@
+"""Small text files of numbers, read with a limit and with the line in the error."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.errors import InputError
+
+MAX_TEXT_BYTES = 512 * 1024 * 1024
+
+
+def read_text(path: Path) -> str:
+    """The text of a UTF-8 file. Raises InputError when it is missing, binary, or larger than `MAX_TEXT_BYTES`."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"no such file: {path}: check the spelling, or that the data set was unpacked completely")
+    size = path.stat().st_size
+    if size > MAX_TEXT_BYTES:
+        raise InputError(f"{path} has {size / 1e6:.0f} MB, too much for a text file: is it another file's name?")
+    text = path.read_bytes().decode("utf-8-sig", errors="replace")
+    if text.startswith("version https://git-lfs"):
+        raise InputError(f"{path} is a git-LFS pointer, not the file itself: run `git lfs pull` in its repository")
+    if "\0" in text[:4096]:
+        raise InputError(f"{path} is not a text file: check that it is the right one")
+    return text
+
+
+def read_rows(path: Path) -> list[list[str]]:
+    """The fields of each line, split at blanks and commas; empty lines and those that start with # are left out."""
+    lines = (line.strip() for line in read_text(path).splitlines())
+    return [line.replace(",", " ").split() for line in lines if line and not line.startswith("#")]
+
+
+def read_table(path: Path, columns: int | None = None) -> NDArray[np.float64]:
+    """(rows, columns) float64 of a text table; with `columns` None, as many as the first row has.
+
+    Raises InputError that names the first row of another length or with a field that is no number.
+    """
+    rows = read_rows(path)
+    if not rows:
+        raise InputError(f"{path} holds no numbers: check that it was written completely")
+    columns = columns or len(rows[0])
+    for i, row in enumerate(rows):
+        if len(row) < columns:
+            raise InputError(f"{path}: row {i + 1} has {len(row)} numbers, expected {columns}: is the file cut short?")
+    try:
+        return np.array([row[:columns] for row in rows], dtype=np.float64)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}: every field must be a number") from error

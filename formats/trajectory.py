@@ -1,0 +1,121 @@
+"""Trajectories as text: TUM lines and 4x4 matrices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from formats.atomic import write_text
+from formats.errors import InputError
+from formats.textfile import read_rows, read_table
+
+_ROTATION_TOLERANCE = 0.05
+"""Largest departure of R^T R from the identity that is taken for rounding or drift rather than for another format."""
+
+
+def nearest_rotation(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotations (..., 3, 3) closest to the given matrices in the Frobenius norm (orthogonal Procrustes).
+
+    Raises ValueError where a matrix is singular or not finite.
+    """
+    if not np.isfinite(matrices).all():
+        raise ValueError("nearest_rotation: got a matrix with a value that is not finite")
+    u, s, vt = np.linalg.svd(matrices)
+    if matrices.size and (s[..., -1] < 1e-9).any():
+        raise ValueError("nearest_rotation: got a singular matrix")
+    # The sign goes to the direction of least stretch, so that the result turns and does not mirror.
+    sign = np.sign(np.linalg.det(u @ vt))
+    u = u.copy()
+    u[..., -1] *= sign[..., None]
+    return u @ vt
+
+
+def write_tum(path: Path, timestamps: NDArray[np.float64], world_from_cam: NDArray[np.float64]) -> None:
+    """Write `timestamp tx ty tz qx qy qz qw` lines: camera centres and orientations in the world.
+
+    timestamps (N,) seconds, world_from_cam (N, 4, 4). Raises ValueError for other shapes, InputError when the disk
+    refuses. The sign of a quaternion is chosen so that qw >= 0.
+    """
+    n = len(timestamps)
+    if world_from_cam.shape != (n, 4, 4):
+        raise ValueError(f"write_tum: got {n} timestamps and poses of shape {world_from_cam.shape}")
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    if n:
+        quat_xyzw = Rotation.from_matrix(world_from_cam[:, :3, :3]).as_quat(canonical=True)
+        for time, t, q in zip(timestamps, world_from_cam[:, :3, 3], quat_xyzw, strict=True):
+            lines.append(f"{time:.9f} " + " ".join(f"{value:.9f}" for value in (*t, *q)))
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(N,) timestamps in file order and (N, 4, 4) world_from_cam of a TUM file.
+
+    Raises InputError for a row of other than 8 numbers, or a quaternion of length 0.
+    """
+    rows = read_rows(path)
+    for i, row in enumerate(rows):
+        if len(row) != 8:
+            raise InputError(f"{path}: row {i + 1} has {len(row)} numbers, a TUM trajectory has 8 (t, xyz, quat xyzw)")
+    table = read_table(path, 8)
+    quat_xyzw = table[:, 4:]
+    if not np.isfinite(table).all() or (np.linalg.norm(quat_xyzw, axis=1) < 1e-6).any():
+        raise InputError(f"{path}: a row holds a value that is not finite, or a quaternion of length 0: remove it")
+    world_from_cam = np.tile(np.eye(4), (len(table), 1, 1))
+    world_from_cam[:, :3, :3] = Rotation.from_quat(quat_xyzw).as_matrix()
+    world_from_cam[:, :3, 3] = table[:, 1:4]
+    return table[:, 0], world_from_cam
+
+
+def read_matrices(path: Path) -> NDArray[np.float64]:
+    """(N, 4, 4) world_from_cam of a file of row-major matrices: 16 or 12 numbers a line, or 4 lines for each matrix.
+
+    Rotations are projected to the nearest true ones. A matrix that is not finite (a frame without a pose, as ScanNet
+    writes it) comes back all NaN. Raises InputError for anything else that is no rigid transform.
+    """
+    rows = read_rows(path)
+    width = len(rows[0]) if rows else 0
+    if width == 4 and len(rows) % 4 == 0:
+        stacked = read_table(path, 4).reshape(-1, 4, 4)
+    elif width == 16:
+        stacked = read_table(path, 16).reshape(-1, 4, 4)
+    elif width == 12:
+        top = read_table(path, 12).reshape(-1, 3, 4)
+        stacked = np.concatenate([top, np.tile([[[0.0, 0, 0, 1]]], (len(top), 1, 1))], axis=1)
+    else:
+        raise InputError(f"{path}: {len(rows)} rows of {width} numbers are no 4x4 matrices: expected 16, 12 or 4 x 4")
+    return clean_poses(stacked, str(path))
+
+
+def clean_poses(matrices: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+    """Rigid transforms (N, 4, 4) with exact rotations; matrices that are not finite become all NaN.
+
+    Raises InputError, with `name` for the file, where the rotation part is no rotation within a few percent, so that
+    a scaled, mirrored or transposed-with-translation matrix is not taken for a pose.
+    """
+    result = np.full_like(matrices, np.nan)
+    known = np.isfinite(matrices).all(axis=(1, 2))
+    rotations = matrices[known, :3, :3]
+    off = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max(axis=(1, 2), initial=0)
+    bad = (off > _ROTATION_TOLERANCE) | (np.linalg.det(rotations) <= 0)
+    bad |= np.abs(matrices[known, 3] - [0, 0, 0, 1]).max(axis=1, initial=0) > 1e-4
+    if bad.any():
+        index = int(np.flatnonzero(known)[np.argmax(bad)])
+        raise InputError(
+            f"{name}: matrix {index + 1} is no rigid transform (rotation part off by {off[np.argmax(bad)]:.2g}): "
+            "expected camera-to-world, row by row, with a last row of 0 0 0 1"
+        )
+    result[known] = matrices[known]
+    result[known, :3, :3] = nearest_rotation(rotations)
+    result[known, 3] = [0, 0, 0, 1]
+    return result
+
+
+def write_matrices(path: Path, world_from_cam: NDArray[np.float64]) -> None:
+    """Write (N, 4, 4) as one row-major matrix of 16 numbers a line, with all digits of float64."""
+    if world_from_cam.ndim != 3 or world_from_cam.shape[1:] != (4, 4):
+        raise ValueError(f"write_matrices: got shape {world_from_cam.shape}, expected (N, 4, 4)")
+    lines = (" ".join(repr(float(value)) for value in matrix.ravel()) for matrix in world_from_cam)
+    write_text(path, "".join(line + "\n" for line in lines))

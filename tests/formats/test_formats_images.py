@@ -1,0 +1,254 @@
+"""Images of every kind a folder may hold, against OpenCV as the foreign reader and writer."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from formats.errors import InputError
+from formats.image_times import frame_number, read_image_times
+from formats.images import (
+    decode_rgb,
+    exif_focal_px,
+    exif_time,
+    image_size,
+    list_images,
+    natural_key,
+    read_depth_png,
+    read_grey_png,
+    read_label_png,
+    read_rgb,
+    write_grey_png,
+    write_rgb,
+)
+
+
+@pytest.fixture
+def picture() -> np.ndarray:
+    """(40, 60, 3) with smooth, different channels: no symmetry hides a flip or a channel swap."""
+    y, x = np.mgrid[0:40, 0:60]
+    return np.stack([4 * x, 6 * y, 120 + x - y], axis=2).clip(0, 255).astype(np.uint8)
+
+
+def test_natural_order() -> None:
+    names = ["img10.png", "img2.png", "img1b.png", "a", "img02.png", "7.png", "img2b10", "img2b9"]
+    assert sorted(names, key=natural_key) == [
+        "7.png", "a", "img1b.png", "img02.png", "img2.png", "img2b9", "img2b10", "img10.png",
+    ]  # fmt: skip
+
+
+def test_list_images_leaves_out_what_is_no_image(tmp_path: Path) -> None:
+    for name in ["f10.JPG", "f9.png", ".f1.png", "notes.txt", "f11.jpeg"]:
+        (tmp_path / name).touch()
+    (tmp_path / "folder.png").mkdir()
+    assert [p.name for p in list_images(tmp_path)] == ["f9.png", "f10.JPG", "f11.jpeg"]
+
+
+def test_folders_without_images_are_explained(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"):
+        list_images(tmp_path / "none")
+    with pytest.raises(InputError, match="no images in"):
+        list_images(tmp_path)
+    (tmp_path / "IMG_1.HEIC").touch()
+    with pytest.raises(InputError, match=r"\.heic files are not supported"):
+        list_images(tmp_path)
+
+
+def test_png_is_lossless_for_a_foreign_reader(tmp_path: Path, picture: np.ndarray) -> None:
+    write_rgb(tmp_path / "a.png", picture)
+    assert (read_rgb(tmp_path / "a.png") == picture).all()
+    assert (cv2.imread(str(tmp_path / "a.png"))[:, :, ::-1] == picture).all()
+    assert image_size(tmp_path / "a.png") == (60, 40)
+
+
+def test_jpeg_keeps_full_colour_resolution(tmp_path: Path) -> None:
+    stripes = np.zeros((64, 64, 3), np.uint8)
+    stripes[:, ::2] = (255, 0, 0)
+    stripes[:, 1::2] = (0, 0, 255)
+    write_rgb(tmp_path / "a.jpg", stripes)
+    error = np.abs(read_rgb(tmp_path / "a.jpg").astype(int) - stripes)
+    assert 0 < error.mean() < 6  # chroma subsampling would average neighbours: over 60
+
+
+def test_a_foreign_writer_is_read(tmp_path: Path, picture: np.ndarray) -> None:
+    cv2.imwrite(str(tmp_path / "a.bmp"), picture[:, :, ::-1])
+    cv2.imwrite(str(tmp_path / "a.tiff"), picture[:, :, ::-1])
+    cv2.imwrite(str(tmp_path / "grey.png"), picture[:, :, 0])
+    cv2.imwrite(str(tmp_path / "deep.png"), picture[:, :, ::-1].astype(np.uint16) * 257)
+    cv2.imwrite(str(tmp_path / "deep_grey.png"), picture[:, :, 0].astype(np.uint16) * 257)
+    alpha = np.dstack([picture[:, :, ::-1], np.full((40, 60), 128, np.uint8)])
+    cv2.imwrite(str(tmp_path / "alpha.png"), alpha)
+    for name in ("a.bmp", "a.tiff", "deep.png", "alpha.png"):
+        assert (read_rgb(tmp_path / name) == picture).all(), name
+    for name in ("grey.png", "deep_grey.png"):
+        assert (read_rgb(tmp_path / name) == picture[:, :, :1]).all(), name
+    assert (decode_rgb((tmp_path / "a.bmp").read_bytes(), "a") == picture).all()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_orientation_agrees_with_opencv(tmp_path: Path, picture: np.ndarray, orientation: int) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(picture).save(tmp_path / "a.jpg", quality=95, exif=exif)
+    ours = read_rgb(tmp_path / "a.jpg")
+    theirs = cv2.imread(str(tmp_path / "a.jpg"))[:, :, ::-1]
+    assert ours.shape == theirs.shape
+    assert np.abs(ours.astype(int) - theirs).max() <= 2
+    assert image_size(tmp_path / "a.jpg") == (ours.shape[1], ours.shape[0])
+
+
+def test_unreadable_images_are_explained(tmp_path: Path, picture: np.ndarray) -> None:
+    write_rgb(tmp_path / "good.jpg", picture)
+    write_rgb(tmp_path / "good.png", picture)
+    for name in ("good.jpg", "good.png"):
+        data = (tmp_path / name).read_bytes()
+        cut = tmp_path / f"cut_{name}"
+        cut.write_bytes(data[: len(data) * 6 // 10])
+        with pytest.raises(InputError, match="cannot read"):
+            read_rgb(cut)
+    (tmp_path / "empty.png").touch()
+    (tmp_path / "text.jpg").write_text("I am no picture")
+    with pytest.raises(InputError, match="is empty"):
+        read_rgb(tmp_path / "empty.png")
+    with pytest.raises(InputError, match="cannot read"):
+        read_rgb(tmp_path / "text.jpg")
+    with pytest.raises(InputError, match="no such image"):
+        read_rgb(tmp_path / "none.jpg")
+
+
+def _png_claiming(width: int, height: int) -> bytes:
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    idat = chunk(b"IDAT", zlib.compress(b"\0" * 1000))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + idat + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("side", [11_000, 12_000, 60_000])
+def test_bombs_are_refused_by_their_header(tmp_path: Path, side: int) -> None:
+    (tmp_path / "bomb.png").write_bytes(_png_claiming(side, side))
+    with pytest.raises(InputError, match=r"scale it down|too large|truncated"):
+        read_rgb(tmp_path / "bomb.png")
+
+
+def test_depth_round_trip(tmp_path: Path) -> None:
+    depth = np.arange(40 * 60, dtype=np.uint16).reshape(40, 60) * 27
+    depth[0, 0] = 65535
+    write_grey_png(tmp_path / "d.png", depth)
+    assert (read_depth_png(tmp_path / "d.png") == depth).all()
+    assert (cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED) == depth).all()
+    np.testing.assert_allclose(read_grey_png(tmp_path / "d.png"), depth / 65535, atol=1e-6)
+
+
+def test_labels_round_trip_and_palettes_give_indices(tmp_path: Path) -> None:
+    labels = (np.arange(40 * 60).reshape(40, 60) % 23).astype(np.uint8)
+    write_grey_png(tmp_path / "l.png", labels)
+    paletted = Image.fromarray(labels, mode="P")
+    paletted.putpalette(list(np.random.default_rng(0).integers(0, 256, 768)))
+    paletted.save(tmp_path / "p.png")
+    for name in ("l.png", "p.png"):
+        assert (read_label_png(tmp_path / name) == labels).all(), name
+
+
+def test_wrong_kinds_of_maps_are_refused(tmp_path: Path, picture: np.ndarray) -> None:
+    write_rgb(tmp_path / "colour.png", picture)
+    write_grey_png(tmp_path / "preview.png", picture[:, :, 0])
+    with pytest.raises(InputError, match="colour picture"):
+        read_label_png(tmp_path / "colour.png")
+    with pytest.raises(InputError, match="8 bits"):
+        read_depth_png(tmp_path / "preview.png")
+    with pytest.raises(ValueError, match="expected uint8"):
+        write_rgb(tmp_path / "x.png", picture.astype(np.float32))
+    with pytest.raises(ValueError, match="neither"):
+        write_rgb(tmp_path / "x.gif", picture)
+    assert not (tmp_path / "x.gif").exists()
+
+
+def _with_exif(path: Path, size: tuple[int, int], **tags: object) -> Path:
+    exif = Image.Exif()
+    names = {"equivalent": 0xA405, "focal": 0x920A, "pitch": 0xA20E, "unit": 0xA210, "width": 0xA002,
+             "taken": 0x9003, "subsec": 0x9291}  # fmt: skip
+    exif.get_ifd(0x8769).update({names[k]: v for k, v in tags.items()})
+    Image.new("RGB", size).save(path, exif=exif)
+    return path
+
+
+def test_exif_focal_from_the_35_mm_equivalent(tmp_path: Path) -> None:
+    path = _with_exif(tmp_path / "a.jpg", (400, 300), equivalent=26)
+    # a 4:3 picture whose diagonal of 500 px stands for 43.27 mm
+    assert exif_focal_px(path, 400, 300) == pytest.approx(26 / 43.2666 * 500, rel=1e-4)
+    assert exif_focal_px(path, 200, 150) == pytest.approx(26 / 43.2666 * 250, rel=1e-4)
+
+
+def test_exif_focal_from_the_pixel_pitch(tmp_path: Path) -> None:
+    # 4000 px over 20 mm = 200 px/mm = 5080 px/inch; 10 mm = 2000 px of the original, 1000 px at half size
+    path = _with_exif(tmp_path / "a.jpg", (400, 300), focal=10.0, pitch=5080.0, unit=2, width=4000)
+    assert exif_focal_px(path, 2000, 1500) == pytest.approx(1000)
+    nonsense = _with_exif(tmp_path / "b.jpg", (400, 300), focal=10.0, pitch=72.0, unit=2, width=4000)
+    assert exif_focal_px(nonsense, 2000, 1500) is None
+
+
+def test_exif_that_tells_nothing(tmp_path: Path) -> None:
+    assert exif_focal_px(_with_exif(tmp_path / "a.jpg", (40, 30)), 40, 30) is None
+    assert exif_focal_px(_with_exif(tmp_path / "b.jpg", (40, 30), equivalent=0), 40, 30) is None
+    assert exif_time(_with_exif(tmp_path / "c.jpg", (40, 30), taken="    :  :     :  :  ")) is None
+
+
+def test_exif_time_with_fractions(tmp_path: Path) -> None:
+    path = _with_exif(tmp_path / "a.jpg", (40, 30), taken="1970:01:02 00:00:01", subsec="25")
+    assert exif_time(path) == pytest.approx(86401.25)
+
+
+def test_real_phone_photos_agree_with_their_reconstruction(shared_data: Path) -> None:
+    for path in list_images(shared_data / "format_cases" / "colmap_table10" / "images")[:3]:
+        assert exif_focal_px(path, *image_size(path)) is None  # the messenger removed it
+    assert [p.name for p in list_images(shared_data / "format_cases" / "colmap_table10" / "images")][
+        -1
+    ] == "10table.jpeg"
+
+
+def _touch_images(folder: Path, names: list[str]) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        Image.new("RGB", (4, 4)).save(folder / name)
+    return [folder / name for name in names]
+
+
+def test_times_by_order_by_number_and_by_name(tmp_path: Path) -> None:
+    images = _touch_images(tmp_path / "rgb", ["000000.png", "000003.png", "000006.png"])
+    (tmp_path / "timestamps.txt").write_text("".join(f"{i / 10}\n" for i in range(9)))
+    assert read_image_times(images) == pytest.approx([0, 0.3, 0.6])
+    (tmp_path / "rgb" / "timestamps.txt").write_text("1.5\n2.5\n4\n")
+    assert read_image_times(images) == pytest.approx([1.5, 2.5, 4])
+    (tmp_path / "rgb" / "timestamps.txt").write_text("# time name\n5 rgb/000003.png\n4 rgb/000000.png\n6 000006.png")
+    assert read_image_times(images) == pytest.approx([4, 5, 6])
+
+
+def test_times_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    images = _touch_images(tmp_path, ["a.png", "b.png"])
+    assert read_image_times(images) is None
+    for text, message in [("1\n2\n3\n", "3 times for 2"), ("2\n1\n", "increase"), ("1 a.png\n2 c.png", "no time")]:
+        (tmp_path / "timestamps.txt").write_text(text)
+        with pytest.raises(InputError, match=message):
+            read_image_times(images)
+
+
+def test_times_from_exif_count_from_the_first(tmp_path: Path) -> None:
+    paths = [
+        _with_exif(tmp_path / f"{i}.jpg", (8, 8), taken="2020:01:01 10:00:0" + str(i), subsec=str(i)) for i in range(3)
+    ]
+    assert read_image_times(paths) == pytest.approx([0, 1.1, 2.2])
+    assert read_image_times([paths[0], paths[0]]) is None
+
+
+def test_frame_numbers() -> None:
+    assert frame_number(Path("x1/frame-000012.color.jpg")) == 12
+    assert frame_number(Path("rgb_7.png")) == 7
+    assert frame_number(Path("cover.png")) is None
