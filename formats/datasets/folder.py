@@ -1,0 +1,123 @@
+"""Plain folders: images, with whatever lies beside them under the usual names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.datasets.camera import Camera
+from formats.datasets.classes_json import read_classes_json
+from formats.datasets.intrinsics_json import read_intrinsics_json
+from formats.datasets.matching import classes_found, files_for_images, poses_for_images, times_or_frame_numbers
+from formats.datasets.sequence import LabelClass, Sequence
+from formats.errors import InputError
+from formats.images import IMAGE_SUFFIXES, list_images
+from formats.textfile import read_rows
+from formats.trajectory import read_matrices, read_tum
+
+_IMAGE_FOLDERS = ("rgb", "images", "color", "frames")
+_DEPTH_FOLDERS = ("depth", "depths")
+_LABEL_FOLDERS = ("labels", "label", "semantic")
+_POSE_FILES = ("traj.txt", "trajectory.txt", "poses.txt", "groundtruth.txt")
+_INTRINSICS_FILES = ("intrinsics.json", "cam_params.json", "camera.json")
+_SAME_INSTANT_SECONDS = 0.02
+
+
+def recognises(path: Path) -> bool:
+    """A folder of images, or one with a folder rgb/, images/, color/ or frames/."""
+    return _image_folder(path) is not None
+
+
+def open_folder(path: Path) -> Sequence:
+    """A plain folder: only the images must be there.
+
+    Beside or above them may lie depth/ (16 bit PNG, millimetres unless depth_scale in the intrinsics says otherwise),
+    labels/ (8 or 16 bit PNG of class ids) with classes.json, intrinsics.json (fx, fy, cx, cy, width, height,
+    distortion, depth_scale, pixel_centre), timestamps.txt, and traj.txt: world-from-camera, a 4x4 matrix or a TUM line
+    for each image or each frame number. Raises InputError where one of them contradicts the images.
+    """
+    folder = _image_folder(path)
+    if folder is None:
+        raise InputError(f"no images in {path}: give the folder that holds the images, or one above rgb/ or images/")
+    images = list_images(folder)
+    root = path if folder != path else _root_of(folder)
+    times = times_or_frame_numbers(images)
+    camera, depth_scale = _camera(root)
+    depth_paths = _first(images, root, _DEPTH_FOLDERS)
+    label_paths = _first(images, root, _LABEL_FOLDERS)
+    return Sequence(
+        format="folder",
+        root=root,
+        names=tuple(p.name for p in images),
+        timestamps=times,
+        image_paths=tuple(images),
+        camera=camera,
+        world_from_cam=_poses(images, times, root),
+        depth_paths=depth_paths,
+        depth_per_metre=depth_scale or 1000.0,
+        label_paths=label_paths,
+        classes=_classes(root, label_paths),
+    )
+
+
+def _image_folder(path: Path) -> Path | None:
+    for folder in (path, *(path / name for name in _IMAGE_FOLDERS)):
+        if folder.is_dir() and any(p.suffix.lower() in IMAGE_SUFFIXES for p in folder.iterdir() if p.is_file()):
+            return folder
+    return None
+
+
+def _root_of(images: Path) -> Path:
+    """Where to look for what belongs to a folder of images: above it, when it is the rgb/ of a larger folder."""
+    siblings = (*_DEPTH_FOLDERS, *_LABEL_FOLDERS, *_POSE_FILES, *_INTRINSICS_FILES)
+    belongs = images.name in _IMAGE_FOLDERS and any((images.parent / name).exists() for name in siblings)
+    return images.parent if belongs else images
+
+
+def _camera(root: Path) -> tuple[Camera | None, float | None]:
+    for name in _INTRINSICS_FILES:
+        if (root / name).is_file():
+            return read_intrinsics_json(root / name, integer_centres=False)
+    return None, None
+
+
+def _first(images: list[Path], root: Path, folders: tuple[str, ...]) -> tuple[Path | None, ...]:
+    existing = [root / name for name in folders if (root / name).is_dir() and root / name != images[0].parent]
+    return files_for_images(images, existing[0]) if existing else ()
+
+
+def _poses(images: list[Path], times: NDArray[np.float64], root: Path) -> NDArray[np.float64] | None:
+    path = next((root / name for name in _POSE_FILES if (root / name).is_file()), None)
+    if path is None:
+        return None
+    rows = read_rows(path)
+    if rows and len(rows[0]) == 8:
+        return poses_at(times, *read_tum(path))
+    return poses_for_images(images, read_matrices(path), path)
+
+
+def poses_at(
+    times: NDArray[np.float64],
+    pose_times: NDArray[np.float64],
+    world_from_cam: NDArray[np.float64],
+    tolerance: float = _SAME_INSTANT_SECONDS,
+) -> NDArray[np.float64]:
+    """(N, 4, 4) for each of `times` the pose nearest in time, NaN where none is within `tolerance` seconds."""
+    order = np.argsort(pose_times, kind="stable")
+    sorted_times = pose_times[order]
+    after = np.searchsorted(sorted_times, times).clip(1, max(1, len(order) - 1))
+    before = after - 1
+    after = after.clip(0, len(order) - 1)
+    nearest = np.where(np.abs(sorted_times[after] - times) < np.abs(sorted_times[before] - times), after, before)
+    result = world_from_cam[order[nearest]].copy()
+    result[np.abs(sorted_times[nearest] - times) > tolerance] = np.nan
+    return result
+
+
+def _classes(root: Path, label_paths: tuple[Path | None, ...]) -> tuple[LabelClass, ...]:
+    if not label_paths:
+        return ()
+    path = root / "classes.json"
+    return read_classes_json(path) if path.is_file() else classes_found(label_paths)

@@ -1,0 +1,46 @@
+"""Intrinsics in a JSON file, as several data sets spell them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from formats.datasets.camera import Camera
+from formats.errors import InputError
+from formats.jsonfile import number, optional_number, read_json_object
+
+_DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3")
+
+
+def read_intrinsics_json(path: Path, *, integer_centres: bool) -> tuple[Camera, float | None]:
+    """The camera, and raw depth units per metre where the file says so.
+
+    Understands w/width, h/height, fx, fy, cx, cy, distortion (a list, or k1, k2, p1, p2, k3) and depth_scale/scale,
+    at the top or under "camera". A key pixel_centre that begins with "integer" or "half" says which number the first
+    pixel's centre has; `integer_centres` is for files without that key.
+    """
+    top = read_json_object(path)
+    table = top["camera"] if isinstance(top.get("camera"), dict) else top
+    said = str(table.get("pixel_centre", "integer" if integer_centres else "half")).lower()
+    if not said.startswith(("integer", "half")):
+        raise InputError(f"{path}: pixel_centre is {said!r}, expected it to begin with 'integer' or 'half'")
+    shift = 0.5 if said.startswith("integer") else 0.0
+    camera = Camera(
+        int(number(table, path, "w", "width")),
+        int(number(table, path, "h", "height")),
+        number(table, path, "fx"),
+        number(table, path, "fy"),
+        number(table, path, "cx") + shift,
+        number(table, path, "cy") + shift,
+        _distortion(table, path),
+    )
+    return camera, optional_number(table, path, "depth_scale", "scale")
+
+
+def _distortion(table: dict, path: Path) -> tuple[float, ...]:
+    values = table.get("distortion")
+    if values is None:
+        named = tuple(optional_number(table, path, name) or 0.0 for name in _DISTORTION_NAMES)
+        return named if named[4] else named[:4]
+    if not isinstance(values, list) or not 0 < len(values) <= 5 or not all(isinstance(v, int | float) for v in values):
+        raise InputError(f"{path}: distortion is {values!r}, expected up to five numbers k1, k2, p1, p2, k3")
+    return tuple(float(v) for v in values) + (0.0,) * (4 - len(values))

@@ -1,0 +1,80 @@
+"""Which depth map, label image or pose row belongs to which colour image."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.datasets.sequence import LabelClass, used_label_ids
+from formats.errors import InputError
+from formats.image_times import frame_number, read_image_times
+from formats.images import IMAGE_SUFFIXES, natural_key
+
+ASSUMED_RATE = 30.0
+"""Frames per second where a data set does not say."""
+
+
+def files_for_images(images: list[Path], folder: Path, pattern: str = "*") -> tuple[Path | None, ...]:
+    """For each image the file in `folder` of the same name, else of the same frame number; () without such a folder.
+
+    Raises InputError when the folder has files and none of them belongs to an image.
+    """
+    if not folder.is_dir():
+        return ()
+    files = sorted((p for p in folder.glob(pattern) if p.suffix.lower() in IMAGE_SUFFIXES), key=_by_name)
+    files = [p for p in files if not p.name.startswith(".")]
+    by_stem = {_bare_name(p): p for p in files}
+    by_number = {frame_number(p): p for p in reversed(files)}
+    by_number.pop(None, None)
+    found = tuple(by_stem.get(_bare_name(image)) or by_number.get(frame_number(image)) for image in images)
+    if files and not any(found):
+        raise InputError(
+            f"none of the {len(files)} files in {folder} belongs to an image of {images[0].parent}: "
+            "give both the same file names or frame numbers"
+        )
+    return found if any(found) else ()
+
+
+def poses_for_images(images: list[Path], poses: NDArray[np.float64], source: Path) -> NDArray[np.float64]:
+    """(N, 4, 4) the rows of `poses` that belong to the images: one each, else the row of each frame number.
+
+    Raises InputError when neither fits.
+    """
+    if len(poses) == len(images):
+        return poses
+    numbers = [frame_number(p) for p in images]
+    rows = [n for n in numbers if n is not None and n < len(poses)]
+    if len(rows) == len(images):
+        return poses[rows]
+    raise InputError(
+        f"{source} has {len(poses)} poses for {len(images)} images, and the images' names are not row numbers: "
+        "give one pose for each image"
+    )
+
+
+def times_or_frame_numbers(images: list[Path], rate: float = ASSUMED_RATE) -> NDArray[np.float64]:
+    """(N,) seconds: the images' own times, else their frame numbers (or else their order) over `rate`."""
+    times = read_image_times(images)
+    if times is not None:
+        return times
+    numbers = [frame_number(p) for p in images]
+    usable = all(a is not None and b is not None and a < b for a, b in itertools.pairwise(numbers))
+    counts = numbers if usable and numbers[0] is not None else list(range(len(images)))
+    return np.array(counts, dtype=np.float64) / rate
+
+
+def classes_found(paths: tuple[Path | None, ...], void_ids: tuple[int, ...] = (0,)) -> tuple[LabelClass, ...]:
+    """A class for every id that occurs in the label images, named by its number: for sets that name none."""
+    used = used_label_ids(p for p in paths if p is not None)
+    return tuple(LabelClass(i, f"class {i}") for i in sorted(used - set(void_ids)))
+
+
+def _by_name(path: Path) -> tuple[tuple[int, int, str], ...]:
+    return natural_key(path.name)
+
+
+def _bare_name(path: Path) -> str:
+    return path.name.split(".")[0]

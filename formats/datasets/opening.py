@@ -1,0 +1,71 @@
+"""Which data set a folder or file is, and opening it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+
+from formats.datasets import folder, replica, seven_scenes
+from formats.datasets.sequence import Sequence
+from formats.errors import InputError
+
+
+@dataclass(frozen=True)
+class _Reader:
+    recognises: Callable[[Path], bool]
+    open: Callable[[Path], Sequence]
+
+
+# In the order of trying: a plain folder of images comes last, because most data sets are also that.
+_READERS = {
+    "7scenes": _Reader(seven_scenes.recognises, seven_scenes.open_seven_scenes),
+    "replica": _Reader(replica.recognises, replica.open_replica),
+    "folder": _Reader(folder.recognises, folder.open_folder),
+}
+
+_IMAGE_FOLDERS = frozenset({"rgb", "images", "color", "results"})
+
+FORMATS = ("auto", *_READERS)
+"""What `open_sequence` accepts as a format."""
+
+
+def recognise(path: Path) -> str | None:
+    """The format of a data set by what lies in it, "folder" for plain images, None for anything else."""
+    found = _recognise(Path(path))
+    return found[0] if found else None
+
+
+def _recognise(path: Path) -> tuple[str, Path] | None:
+    """The format and the place to open it at: of the images folder inside a data set, that data set."""
+    names = [name for name, reader in _READERS.items() if path.exists() and reader.recognises(path)]
+    if names == ["folder"] and path.name in _IMAGE_FOLDERS:
+        above = path.resolve().parent
+        names_above = [name for name, reader in _READERS.items() if name != "folder" and reader.recognises(above)]
+        if names_above:
+            return names_above[0], above
+    return (names[0], path) if names else None
+
+
+def open_sequence(path: Path, format: str = "auto") -> Sequence:
+    """Open a recorded sequence of a known data set, or a folder of images with what lies beside them.
+
+    Images are not read yet, text files are. Raises InputError for an unknown format, a missing path, a path that is
+    no such data set, or parts that contradict each other.
+    """
+    path = Path(path)
+    if format not in FORMATS:
+        nearest = get_close_matches(format, FORMATS, 1)
+        hint = f", did you mean {nearest[0]!r}?" if nearest else ""
+        raise InputError(f"no data set format {format!r}{hint} Known: {', '.join(FORMATS)}")
+    if not path.exists():
+        raise InputError(f"no such file or folder: {path}: check the spelling, and that the disk is mounted")
+    found = _recognise(path) if format == "auto" else (format, path)
+    if found is None:
+        raise InputError(
+            f"{path} is none of the known data sets ({', '.join(_READERS)}): give the folder of one sequence, "
+            "or name the format"
+        )
+    name, place = found
+    return _READERS[name].open(place)

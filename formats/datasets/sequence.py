@@ -1,0 +1,188 @@
+"""A recorded sequence with whatever truth its data set has, in one set of conventions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.datasets.camera import Camera, warp_nearest
+from formats.errors import InputError
+from formats.images import read_depth_png, read_label_png, read_rgb
+
+VOID_LABEL = 255
+"""Label of a pixel without a class."""
+
+
+@dataclass(frozen=True)
+class LabelClass:
+    """A class of the data set: its id in the label images, its name, its RGB colour where the set defines one."""
+
+    id: int
+    name: str
+    color: tuple[int, int, int] | None = None
+
+
+class FrameStore(Protocol):
+    """Frames that lie in one container file instead of a folder."""
+
+    def rgb(self, index: int) -> NDArray[np.uint8]:
+        """(H, W, 3) uint8."""
+
+    def raw_depth(self, index: int) -> NDArray[np.uint16]:
+        """(H, W) uint16 in the container's unit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """N frames of one camera.
+
+    names: N file names, unique. timestamps (N,) seconds, strictly increasing. image_paths: N paths, or none where
+    `store` holds the frames. camera: None where unknown. world_from_cam (N, 4, 4) float64 with exact rotations,
+    camera axes x right, y down, z forward; NaN for a frame without a pose; None without any. `metric` says whether
+    its lengths are metres. depth_paths, label_paths: N paths, None for a frame without; empty without any.
+    depth_camera: the camera of the depth images where that is another one than `camera`. Depth in metres is
+    raw / depth_per_metre, unknown where raw is one of depth_invalid. classes: what `labels` gives indices into.
+    notes: what a user should know about this recording, one sentence each.
+    """
+
+    format: str
+    root: Path
+    names: tuple[str, ...]
+    timestamps: NDArray[np.float64]
+    image_paths: tuple[Path, ...] = ()
+    camera: Camera | None = None
+    world_from_cam: NDArray[np.float64] | None = None
+    metric: bool = True
+    depth_paths: tuple[Path | None, ...] = ()
+    depth_camera: Camera | None = None
+    depth_per_metre: float = 1000.0
+    depth_invalid: tuple[int, ...] = (0, 65535)
+    label_paths: tuple[Path | None, ...] = ()
+    classes: tuple[LabelClass, ...] = ()
+    store: FrameStore | None = field(default=None, repr=False)
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        if n == 0:
+            raise InputError(f"no frames in {self.root}: check that the data set was unpacked completely")
+        if len(set(self.names)) != n:
+            raise InputError(f"{self.root}: two frames have the same file name: rename one")
+        if self.timestamps.shape != (n,) or not (np.diff(self.timestamps) > 0).all():
+            raise InputError(f"{self.root}: the frames' timestamps do not increase: sort the image list by time")
+        for what in ("image_paths", "depth_paths", "label_paths"):
+            if len(getattr(self, what)) not in (0, n):
+                raise ValueError(f"Sequence: {len(getattr(self, what))} {what} for {n} frames")
+        if self.world_from_cam is not None and self.world_from_cam.shape != (n, 4, 4):
+            raise ValueError(f"Sequence: {n} frames and poses of shape {self.world_from_cam.shape}")
+        if len(self.classes) >= VOID_LABEL:
+            raise InputError(f"{self.root} has {len(self.classes)} classes, at most {VOID_LABEL - 1} are supported")
+        if not self.image_paths and self.store is None:
+            raise ValueError("Sequence: neither image_paths nor a store")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether any frame has depth."""
+        return any(p is not None for p in self.depth_paths) or (self.store is not None)
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether any frame has labels."""
+        return any(p is not None for p in self.label_paths)
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names in the order of the indices that `labels` gives."""
+        return tuple(c.name for c in self.classes)
+
+    @property
+    def has_pose(self) -> NDArray[np.bool_]:
+        """(N,) whether the frame's pose is known."""
+        if self.world_from_cam is None:
+            return np.zeros(len(self), dtype=bool)
+        return np.asarray(np.isfinite(self.world_from_cam).all(axis=(1, 2)))
+
+    def rgb(self, index: int) -> NDArray[np.uint8]:
+        """(H, W, 3) uint8. Raises InputError for an unreadable image."""
+        return self.store.rgb(index) if self.store else read_rgb(self.image_paths[index])
+
+    def depth(self, index: int) -> NDArray[np.float32] | None:
+        """(h, w) float32 z-depth in metres with the field of view of the colour image, 0 = unknown; None without.
+
+        Depth of another camera is moved to the colour camera's pixels; the few centimetres between the two lenses
+        are left out, as these data sets do not tell them.
+        """
+        raw = self._raw_depth(index)
+        if raw is None:
+            return None
+        depth = raw.astype(np.float32) / np.float32(self.depth_per_metre)
+        depth[np.isin(raw, self.depth_invalid)] = 0
+        if self.depth_camera is None or self.camera is None:
+            return depth
+        return warp_nearest(depth, self.depth_camera, self.camera)
+
+    def labels(self, index: int) -> NDArray[np.uint8] | None:
+        """(h, w) uint8 indices into `classes`, VOID_LABEL where the pixel has none of them; None without labels."""
+        path = self.label_paths[index] if self.label_paths else None
+        if path is None:
+            return None
+        table = np.full(65536, VOID_LABEL, dtype=np.uint8)
+        table[[c.id for c in self.classes]] = np.arange(len(self.classes), dtype=np.uint8)
+        return table[read_label_png(path)]
+
+    def subset(self, indices: Iterable[int]) -> Sequence:
+        """The sequence of these frames only, in increasing order of time."""
+        keep = sorted(set(indices))
+        return replace(
+            self,
+            names=tuple(self.names[i] for i in keep),
+            timestamps=self.timestamps[keep],
+            image_paths=_pick(self.image_paths, keep),
+            depth_paths=_pick(self.depth_paths, keep),
+            label_paths=_pick(self.label_paths, keep),
+            world_from_cam=None if self.world_from_cam is None else self.world_from_cam[keep],
+            store=None if self.store is None else _PartOfStore(self.store, tuple(keep)),
+        )
+
+    def with_used_classes(self) -> Sequence:
+        """The same with only those classes that occur in the label images (reads all of them)."""
+        used = used_label_ids([p for p in self.label_paths if p is not None])
+        return replace(self, classes=tuple(c for c in self.classes if c.id in used))
+
+    def _raw_depth(self, index: int) -> NDArray[np.uint16] | None:
+        if self.store is not None:
+            return self.store.raw_depth(index)
+        path = self.depth_paths[index] if self.depth_paths else None
+        return None if path is None else read_depth_png(path)
+
+
+@dataclass(frozen=True)
+class _PartOfStore:
+    store: FrameStore
+    indices: tuple[int, ...]
+
+    def rgb(self, index: int) -> NDArray[np.uint8]:
+        return self.store.rgb(self.indices[index])
+
+    def raw_depth(self, index: int) -> NDArray[np.uint16]:
+        return self.store.raw_depth(self.indices[index])
+
+
+def used_label_ids(paths: Iterable[Path]) -> set[int]:
+    """All ids that occur in these label images."""
+    seen = np.zeros(65536, dtype=bool)
+    for path in paths:
+        seen[read_label_png(path).ravel()] = True
+    return {int(i) for i in np.flatnonzero(seen)}
+
+
+def _pick(paths: tuple, keep: list[int]) -> tuple:
+    return tuple(paths[i] for i in keep) if paths else ()
