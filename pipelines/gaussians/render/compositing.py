@@ -87,7 +87,11 @@ def require_finite(name: str, tensor: Tensor) -> None:
 def choose_backend(backend: str | None, example: Tensor) -> ModuleType:
     """The module that composites tensors like `example`; float64 and exotic devices go to the reference."""
     if backend is None:
-        backend = "reference"
+        backend = "cpu" if example.device.type == "cpu" and example.dtype == torch.float32 else "reference"
     if backend == "reference":
         return reference
+    if backend == "cpu":
+        from pipelines.gaussians.render import cpu
+
+        return cpu
     raise ValueError(f"backend: got {backend!r}, expected 'reference', 'cpu', 'cuda' or None")

@@ -134,15 +134,19 @@ class _Blend(torch.autograd.Function):
         ctx.save_for_backward(weights, features)
         ctx.pairs = pairs
         size = (len(pairs.pixel_ends) - 1, len(features))
-        return torch.sparse_csr_tensor(pairs.pixel_ends, pairs.gaussian, weights, size) @ features
+        return (
+            torch.sparse_csr_tensor(pairs.pixel_ends, pairs.gaussian, weights, size, check_invariants=False) @ features
+        )
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
         weights, features = ctx.saved_tensors
         pairs, gradient = ctx.pairs, gradients[0].contiguous()
         size = (len(gradient), len(features))
-        pattern = torch.sparse_csr_tensor(pairs.pixel_ends, pairs.gaussian, torch.zeros_like(weights), size)
+        pattern = torch.sparse_csr_tensor(
+            pairs.pixel_ends, pairs.gaussian, torch.zeros_like(weights), size, check_invariants=False
+        )
         d_weights = torch.sparse.sampled_addmm(pattern, gradient, features.t(), beta=0.0).values()
         pixel, listed = pairs.pixel[pairs.by_gaussian], weights[pairs.by_gaussian]
-        transposed = torch.sparse_csr_tensor(pairs.gaussian_ends, pixel, listed, size[::-1])
+        transposed = torch.sparse_csr_tensor(pairs.gaussian_ends, pixel, listed, size[::-1], check_invariants=False)
         return d_weights, transposed @ gradient, None

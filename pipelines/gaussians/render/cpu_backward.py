@@ -1,0 +1,301 @@
+"""Gradients of a band: the same walk front to back as the forward pass, with nothing stored per pair.
+
+What lies behind a Gaussian in a pixel is the pixel's total minus what has been blended so far. With q the product of a
+Gaussian's values with the gradient of the pixel and S the sum of weight * q of all Gaussians behind it,
+d loss / d alpha = light * q - S / (1 - alpha).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.gaussians.render import rules
+from pipelines.gaussians.render.cpu_bands import (
+    BAND_ROWS,
+    RECORD,
+    TILE,
+    first_pixel,
+    gather_band,
+    last_pixel,
+    list_tiles,
+)
+from pipelines.gaussians.render.cpu_forward import CHECK_EVERY, PIXELS, is_opaque
+from pipelines.gaussians.render.jit import kernel
+from pipelines.gaussians.render.lanes import (
+    at_most,
+    counting,
+    exp,
+    gradients_of_box,
+    load,
+    splat,
+    store,
+    total,
+    where,
+)
+
+F32 = np.float32
+LIGHT, DEPTH_LIGHT, BEHIND, DEPTH_BEHIND, PROXY, KAPPA = (PIXELS * i for i in range(6))
+D_DEPTH, D_DEPTH_SEEN, D_SEEN, ALPHA, WEIGHT, PRODUCT = (PIXELS * i for i in range(6, 12))
+"""Planes of a tile's state: light, proxy and κ as in the forward pass; what is still behind, in the plain and in the
+depth chain; the gradients of depth sum, depth silhouette and silhouette; and three that pass from one step of a Gaussian
+to the next. With κ = 0 the chains are one: the plain planes stand for both."""
+PLANES = 12
+
+_ALPHA_MAX, _LIGHT_MIN = F32(rules.ALPHA_MAX), F32(rules.TRANSMITTANCE_MIN)
+_HALF, _ZERO, _ONE, _TWO = F32(0.5), F32(0), F32(1), F32(2)
+_TINY = F32(1e-30)
+
+
+@kernel
+def open_tile(
+    state: NDArray[np.float32],
+    image: NDArray[np.float32],
+    channels: int,
+    left: int,
+    top: int,
+    columns: int,
+    rows: int,
+    proxy: NDArray[np.float32],
+    kappa: np.float32,
+    features: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    depth_silhouette: NDArray[np.float32],
+    silhouette: NDArray[np.float32],
+    d_features: NDArray[np.float32],
+    d_depth: NDArray[np.float32],
+    d_depth_silhouette: NDArray[np.float32],
+    d_silhouette: NDArray[np.float32],
+) -> None:
+    """Loads the gradients of the pixels of a tile and everything that will be blended into them."""
+    state[:] = _ZERO
+    used = features.shape[2]
+    for y in range(rows):
+        for x in range(columns):
+            pixel, row, column = TILE * y + x, top + y, left + x
+            behind = d_silhouette[row, column] * silhouette[row, column]
+            gradients, values = d_features[row, column], features[row, column]
+            for c in range(used):
+                image[pixel * channels + c] = gradients[c]
+                behind += gradients[c] * values[c]
+            state[LIGHT + pixel] = _ONE
+            state[D_DEPTH + pixel] = d_depth[row, column]
+            depth_behind = d_depth[row, column] * depth[row, column]
+            depth_behind += d_depth_silhouette[row, column] * depth_silhouette[row, column]
+            if kappa > _ZERO:
+                state[DEPTH_LIGHT + pixel] = _ONE
+                state[DEPTH_BEHIND + pixel] = depth_behind
+                state[BEHIND + pixel] = behind
+                state[D_DEPTH_SEEN + pixel] = d_depth_silhouette[row, column]
+                state[D_SEEN + pixel] = d_silhouette[row, column]
+                if proxy[row, column] > _ZERO:
+                    state[PROXY + pixel] = proxy[row, column]
+                    state[KAPPA + pixel] = kappa
+            else:
+                state[BEHIND + pixel] = behind + depth_behind
+                state[D_SEEN + pixel] = d_silhouette[row, column] + d_depth_silhouette[row, column]
+
+
+@kernel
+def weigh_rows(
+    state: NDArray[np.float32],
+    decisive: int,
+    falloff_y: NDArray[np.float32],
+    falloff_x: object,
+    dx2: object,
+    y_center: np.float32,
+    reach2: np.float32,
+    first: int,
+    last: int,
+) -> None:
+    """Opacity and weight of one Gaussian in rows first..last of a tile, as the forward pass had them."""
+    for y in range(first, last + 1):
+        row = TILE * y
+        dy = F32(y) + _HALF - y_center
+        alpha = at_most(falloff_x * falloff_y[y], _ALPHA_MAX)
+        inside = (dx2 <= splat(reach2 - dy * dy)) & (load(state, decisive + row) >= _LIGHT_MIN)
+        alpha = where(inside, alpha)
+        store(state, ALPHA + row, alpha)
+        store(state, WEIGHT + row, alpha * load(state, LIGHT + row))
+
+
+@kernel
+def pull_rows(
+    state: NDArray[np.float32], z: np.float32, y_center: np.float32, first: int, last: int
+) -> tuple[object, object, object, object]:
+    """Sums over rows first..last, column by column, of m, m dy, m dy² and d loss / d z, with
+    m = alpha * d loss / d alpha; light and what is behind go on behind the Gaussian."""
+    pull, pull_y, pull_y2, d_z = splat(_ZERO), splat(_ZERO), splat(_ZERO), splat(_ZERO)
+    for y in range(first, last + 1):
+        row = TILE * y
+        dy = F32(y) + _HALF - y_center
+        alpha, weight, light = load(state, ALPHA + row), load(state, WEIGHT + row), load(state, LIGHT + row)
+        d_depth = load(state, D_DEPTH + row)
+        q = load(state, PRODUCT + row) + d_depth * z + load(state, D_SEEN + row)
+        behind = load(state, BEHIND + row) - weight * q
+        store(state, BEHIND + row, behind)
+        store(state, LIGHT + row, light - weight)
+        d_alpha = light * q - behind / (_ONE - alpha)
+        m = where(alpha < splat(_ALPHA_MAX), d_alpha * alpha)
+        pull, pull_y, pull_y2 = pull + m, pull_y + m * dy, pull_y2 + m * (dy * dy)
+        d_z = d_z + weight * d_depth
+    return pull, pull_y, pull_y2, d_z
+
+
+@kernel
+def pull_rows_by_proxy(
+    state: NDArray[np.float32], z: np.float32, y_center: np.float32, first: int, last: int
+) -> tuple[object, object, object, object]:
+    """`pull_rows` with the depth chain of MSGS-SLAM eq. (7)."""
+    pull, pull_y, pull_y2, d_z = splat(_ZERO), splat(_ZERO), splat(_ZERO), splat(_ZERO)
+    for y in range(first, last + 1):
+        row = TILE * y
+        dy = F32(y) + _HALF - y_center
+        alpha, weight, light = load(state, ALPHA + row), load(state, WEIGHT + row), load(state, LIGHT + row)
+        q = load(state, PRODUCT + row) + load(state, D_SEEN + row)
+        behind = load(state, BEHIND + row) - weight * q
+        store(state, BEHIND + row, behind)
+        light_after = light - weight
+        store(state, LIGHT + row, where(light_after > splat(_TINY), light_after))
+        d_alpha = light * q - behind / (_ONE - alpha)
+
+        d_depth, depth_light = load(state, D_DEPTH + row), load(state, DEPTH_LIGHT + row)
+        error, kappa = splat(z) - load(state, PROXY + row), load(state, KAPPA + row)
+        agreement = exp(splat(_ZERO) - kappa * error * error)
+        value = d_depth * z + load(state, D_DEPTH_SEEN + row)
+        depth_weight = alpha * depth_light
+        depth_behind = load(state, DEPTH_BEHIND + row) - depth_weight * value
+        store(state, DEPTH_BEHIND + row, depth_behind)
+        store(state, DEPTH_LIGHT + row, depth_light - depth_weight * agreement)
+        d_occlusion = splat(_ZERO) - depth_behind / (_ONE - alpha * agreement)
+        d_alpha = d_alpha + depth_light * value + agreement * d_occlusion
+        m = where(alpha < splat(_ALPHA_MAX), d_alpha * alpha)
+        pull, pull_y, pull_y2 = pull + m, pull_y + m * dy, pull_y2 + m * (dy * dy)
+        d_z = d_z + depth_weight * d_depth - alpha * agreement * d_occlusion * (_TWO * kappa * error)
+    return pull, pull_y, pull_y2, d_z
+
+
+@kernel
+def backward_band(
+    vectors: tuple[int, ...],
+    band: int,
+    starts: NDArray[np.int64],
+    entries: NDArray[np.int32],
+    reach: NDArray[np.float32],
+    slots: NDArray[np.int64],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    sigma_px: NDArray[np.float32],
+    z: NDArray[np.float32],
+    opacity: NDArray[np.float32],
+    features: NDArray[np.float32],
+    proxy: NDArray[np.float32],
+    kappa: np.float32,
+    image_features: NDArray[np.float32],
+    image_depth: NDArray[np.float32],
+    image_depth_silhouette: NDArray[np.float32],
+    image_silhouette: NDArray[np.float32],
+    d_image_features: NDArray[np.float32],
+    d_image_depth: NDArray[np.float32],
+    d_image_depth_silhouette: NDArray[np.float32],
+    d_image_silhouette: NDArray[np.float32],
+    d_geometry: NDArray[np.float32],
+    d_features: NDArray[np.float32],
+    shared: NDArray[np.float32],
+) -> None:
+    """Gradients of the Gaussians seen in a band: of u, v, sigma_px, z, opacity to d_geometry (5, M) and of the features
+    to d_features (M, C), or, where other bands add to them too, to their row of `shared` (S, 5 + C)."""
+    height, width = image_depth.shape
+    channels, used = 16 * len(vectors), features.shape[1]
+    own = entries[starts[band] : starts[band + 1]]
+    records, padded = gather_band(own, u, v, sigma_px, z, opacity, reach, features, channels)
+    d_padded = np.zeros(len(padded), np.float32)
+    d_records = np.zeros((len(own), 5), np.float32)
+    band_top = band * BAND_ROWS
+    tile_starts, members = list_tiles(records, band_top, width, min(BAND_ROWS, height - band_top))
+    across = (width + TILE - 1) // TILE
+    image = np.zeros(PIXELS * channels, np.float32)
+    state = np.empty(PIXELS * PLANES, np.float32)
+    falloff_y = np.empty(TILE, np.float32)
+    decisive = DEPTH_LIGHT if kappa > _ZERO else LIGHT
+    for tile in range(len(tile_starts) - 1):
+        left, top = TILE * (tile % across), band_top + TILE * (tile // across)
+        columns, rows = min(TILE, width - left), min(TILE, height - top)
+        open_tile(
+            state, image, channels, left, top, columns, rows, proxy, kappa,
+            image_features, image_depth, image_depth_silhouette, image_silhouette,
+            d_image_features, d_image_depth, d_image_depth_silhouette, d_image_silhouette,
+        )  # fmt: skip
+        for k in range(tile_starts[tile], tile_starts[tile + 1]):
+            i = members[k]
+            at = RECORD * i
+            x, y, r = records[at] - F32(left), records[at + 1] - F32(top), records[at + 5]
+            x0, x1 = first_pixel(x - r), last_pixel(x + r, columns)
+            y0, y1 = first_pixel(y - r), last_pixel(y + r, rows)
+            if x1 < x0 or y1 < y0:
+                continue
+            precision = _ONE / (records[at + 2] * records[at + 2])
+            dx = counting(_HALF - x)
+            dy = counting(_HALF - y)
+            dx2 = dx * dx
+            falloff_x = exp(dx2 * (-_HALF * precision))
+            store(falloff_y, 0, exp(dy * dy * (-_HALF * precision)) * records[at + 4])
+            weigh_rows(state, decisive, falloff_y, falloff_x, dx2, y, r * r, y0, y1)
+            quads = (x1 - x0 + 4) // 4
+            corner = TILE * y0 + min(x0, TILE - 4 * quads)  # four at a time, without leaving the tile
+            gradients_of_box(
+                image, corner * channels, padded, i * channels, d_padded, i * channels,
+                state, WEIGHT + corner, state, PRODUCT + corner, y1 - y0 + 1, quads, vectors,
+            )  # fmt: skip
+            depth = records[at + 3]
+            if kappa > _ZERO:
+                pull, pull_y, pull_y2, d_z = pull_rows_by_proxy(state, depth, y, y0, y1)
+            else:
+                pull, pull_y, pull_y2, d_z = pull_rows(state, depth, y, y0, y1)
+            d_records[i, 0] += total(pull * dx) * precision
+            d_records[i, 1] += total(pull_y) * precision
+            d_records[i, 2] += total(pull * dx2 + pull_y2) * precision / records[at + 2]
+            d_records[i, 3] += total(d_z)
+            d_records[i, 4] += total(pull) / records[at + 4]
+            if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, decisive):
+                break
+    for k in range(len(own)):
+        i = own[k]
+        if slots[i + 1] > slots[i]:
+            # Its first band writes its first slot, and so on.
+            row = shared[slots[i] + band - first_pixel(v[i] - reach[i]) // BAND_ROWS]
+            for j in range(5):
+                row[j] = d_records[k, j]
+            for c in range(used):
+                row[5 + c] = d_padded[k * channels + c]
+        else:
+            for j in range(5):
+                d_geometry[j, i] = d_records[k, j]
+            for c in range(used):
+                d_features[i, c] = d_padded[k * channels + c]
+
+
+@kernel
+def merge_gradients(
+    chunk: int,
+    chunks: int,
+    reach: NDArray[np.float32],
+    slots: NDArray[np.int64],
+    d_geometry: NDArray[np.float32],
+    d_features: NDArray[np.float32],
+    shared: NDArray[np.float32],
+) -> None:
+    """For one chunk of the Gaussians: 0 where unseen, the sum over bands, top to bottom, where several saw it."""
+    count, used = d_features.shape
+    for i in range(count * chunk // chunks, count * (chunk + 1) // chunks):
+        if reach[i] > _ZERO and slots[i + 1] == slots[i]:
+            continue
+        for j in range(5):
+            d_geometry[j, i] = _ZERO
+        for c in range(used):
+            d_features[i, c] = _ZERO
+        for slot in range(slots[i], slots[i + 1]):
+            for j in range(5):
+                d_geometry[j, i] += shared[slot, j]
+            for c in range(used):
+                d_features[i, c] += shared[slot, 5 + c]

@@ -1,0 +1,172 @@
+"""Which Gaussian goes where: bands of rows, the unit of work of a thread, and the tiles of a band.
+
+Everything is sized by a first counting pass, so a Gaussian may cover any number of bands and tiles.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.gaussians.render import rules
+from pipelines.gaussians.render.jit import kernel
+from pipelines.gaussians.render.lanes import bits
+
+F32 = np.float32
+TILE = 16
+BAND_ROWS = 32  # two rows of tiles: more would leave threads idle at the end, fewer would split more Gaussians
+RECORD = 6
+"""Numbers kept per Gaussian of a band: u, v, sigma_px, z, opacity, reach."""
+
+_ALPHA_MIN, _CUT2 = F32(rules.ALPHA_MIN), F32(rules.CUT_SIGMAS**2)
+_HALF, _ZERO, _ONE, _TWO = F32(0.5), F32(0), F32(1), F32(2)
+_RADIX = 2048
+
+
+@kernel
+def first_pixel(low: np.float32) -> int:
+    """The first pixel whose centre is >= low, if low > -1/2; else 0."""
+    return math.ceil(low - _HALF) if low > _HALF else 0
+
+
+@kernel
+def last_pixel(high: np.float32, size: int) -> int:
+    """The last pixel below `size` whose centre is <= high; -1 if there is none."""
+    if high >= F32(size):
+        return size - 1
+    return math.floor(high - _HALF) if high >= _HALF else -1
+
+
+@kernel
+def bin_gaussians(
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    sigma_px: NDArray[np.float32],
+    z: NDArray[np.float32],
+    opacity: NDArray[np.float32],
+    width: int,
+    height: int,
+    near: np.float32,
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
+    """reach (M,) pixels, 0 where nothing is seen; the entries of band b: indices entries[starts[b]:starts[b + 1]];
+    and slots (M + 1,): Gaussians in several bands own the places slots[i]:slots[i + 1] for a gradient from each."""
+    count = len(u)
+    bands = (height + BAND_ROWS - 1) // BAND_ROWS
+    reach = np.empty(count, np.float32)
+    slots = np.zeros(count + 1, np.int64)
+    ends = np.zeros(bands + 2, np.int64)
+    for i in range(count):
+        reach[i] = _ZERO
+        slots[i + 1] = slots[i]
+        if not (z[i] > near and opacity[i] > _ALPHA_MIN and sigma_px[i] > _ZERO):
+            continue
+        r = sigma_px[i] * math.sqrt(min(_CUT2, _TWO * math.log(opacity[i] / _ALPHA_MIN)))
+        top, bottom = first_pixel(v[i] - r), last_pixel(v[i] + r, height)
+        if top > bottom or first_pixel(u[i] - r) > last_pixel(u[i] + r, width):
+            continue
+        reach[i] = r
+        first, last = top // BAND_ROWS, bottom // BAND_ROWS
+        for band in range(first, last + 1):
+            ends[band + 2] += 1
+        if last > first:
+            slots[i + 1] += last - first + 1
+    for band in range(bands):
+        ends[band + 2] += ends[band + 1]
+    entries = np.empty(ends[bands + 1], np.int32)
+    for i in range(count):
+        if reach[i] > _ZERO:
+            first = first_pixel(v[i] - reach[i]) // BAND_ROWS
+            for band in range(first, last_pixel(v[i] + reach[i], height) // BAND_ROWS + 1):
+                entries[ends[band + 1]] = i
+                ends[band + 1] += 1
+    return reach, ends[: bands + 1], entries, slots
+
+
+@kernel
+def sort_by_depth(entries: NDArray[np.int32], z: NDArray[np.float32]) -> None:
+    """Sorts indices by z > 0 in place; equal depths stay in order."""
+    count = len(entries)
+    keys, spare_keys = np.empty(count, np.uint32), np.empty(count, np.uint32)
+    spare = np.empty(count, np.int32)
+    places = np.zeros((3, _RADIX), np.int64)
+    for k in range(count):
+        keys[k] = bits(z[entries[k]])
+        for digit in range(3):
+            places[digit, (keys[k] >> np.uint32(11 * digit)) & np.uint32(_RADIX - 1)] += 1
+    source, target = entries, spare
+    for digit in range(3):
+        place, start = places[digit], 0
+        for j in range(_RADIX):
+            place[j], start = start, start + place[j]
+        for k in range(count):
+            j = (keys[k] >> np.uint32(11 * digit)) & np.uint32(_RADIX - 1)
+            spare_keys[place[j]] = keys[k]
+            target[place[j]] = source[k]
+            place[j] += 1
+        keys, spare_keys = spare_keys, keys
+        source, target = target, source
+    entries[:] = source  # an odd number of passes ends in `spare`
+
+
+@kernel
+def gather_band(
+    entries: NDArray[np.int32],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    sigma_px: NDArray[np.float32],
+    z: NDArray[np.float32],
+    opacity: NDArray[np.float32],
+    reach: NDArray[np.float32],
+    features: NDArray[np.float32],
+    channels: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The band's Gaussians side by side: records (n * RECORD,) and features padded with 0 to (n * channels,)."""
+    records = np.empty(len(entries) * RECORD, np.float32)
+    padded = np.empty(len(entries) * channels, np.float32)
+    used = features.shape[1]
+    for k in range(len(entries)):
+        i, at = entries[k], k * RECORD
+        records[at] = u[i]
+        records[at + 1] = v[i]
+        records[at + 2] = sigma_px[i]
+        records[at + 3] = z[i]
+        records[at + 4] = opacity[i]
+        records[at + 5] = reach[i]
+        row = padded[k * channels : (k + 1) * channels]
+        for c in range(used):
+            row[c] = features[i, c]
+        for c in range(used, channels):
+            row[c] = _ZERO
+    return records, padded
+
+
+@kernel
+def list_tiles(
+    records: NDArray[np.float32], top: int, width: int, rows: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Of a band from row `top`: the Gaussians that may touch tile t, near to far: members[starts[t]:starts[t + 1]]."""
+    count = len(records) // RECORD
+    across = (width + TILE - 1) // TILE
+    tiles = across * ((rows + TILE - 1) // TILE)
+    boxes = np.empty((count, 4), np.int32)
+    ends = np.zeros(tiles + 2, np.int64)
+    for k in range(count):
+        x, y, r = records[k * RECORD], records[k * RECORD + 1] - F32(top), records[k * RECORD + 5]
+        x0, x1 = first_pixel(x - r) // TILE, last_pixel(x + r, width) // TILE
+        y0, y1 = first_pixel(y - r) // TILE, last_pixel(y + r, rows) // TILE
+        boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3] = x0, x1, y0, y1
+        for y_tile in range(y0, y1 + 1):
+            for x_tile in range(x0, x1 + 1):
+                ends[y_tile * across + x_tile + 2] += 1
+    for tile in range(tiles):
+        ends[tile + 2] += ends[tile + 1]
+    members = np.empty(ends[tiles + 1], np.int32)
+    for k in range(count):
+        for y_tile in range(boxes[k, 2], boxes[k, 3] + 1):
+            for x_tile in range(boxes[k, 0], boxes[k, 1] + 1):
+                place = y_tile * across + x_tile + 1
+                members[ends[place]] = k
+                ends[place] += 1
+    return ends[: tiles + 1], members

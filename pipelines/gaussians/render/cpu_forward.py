@@ -1,0 +1,213 @@
+"""Blending a band: Gaussians outermost, then the rows of a tile, sixteen pixels of a row at once.
+
+An isotropic Gaussian is a product of a function of x and one of y: a tile needs two vectors of exponentials for it, not
+one per row. A tile's pixels keep their state in planes of one flat array, see the `PLANE` constants.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.gaussians.render import rules
+from pipelines.gaussians.render.cpu_bands import (
+    BAND_ROWS,
+    RECORD,
+    TILE,
+    first_pixel,
+    gather_band,
+    last_pixel,
+    list_tiles,
+    sort_by_depth,
+)
+from pipelines.gaussians.render.jit import kernel
+from pipelines.gaussians.render.lanes import (
+    add_to_box,
+    any_of,
+    at_most,
+    counting,
+    exp,
+    largest,
+    load,
+    splat,
+    store,
+    where,
+)
+
+F32 = np.float32
+PIXELS = TILE * TILE
+LIGHT, DEPTH_LIGHT, DEPTH_SUM, DEPTH_SILHOUETTE, PROXY, KAPPA = (PIXELS * i for i in range(6))
+"""Where the planes of the tile's state start: transmittance of the plain and of the depth chain, the two sums of the
+depth chain, the proxy depth and the κ of the pixel (0 where the proxy is unknown)."""
+PLANES = 6
+CHECK_EVERY = 32  # Gaussians between two looks at whether the whole tile is opaque
+
+_ALPHA_MAX, _LIGHT_MIN = F32(rules.ALPHA_MAX), F32(rules.TRANSMITTANCE_MIN)
+_HALF, _ZERO, _ONE = F32(0.5), F32(0), F32(1)
+_TINY = F32(1e-30)
+
+
+@kernel
+def open_tile(
+    state: NDArray[np.float32],
+    proxy: NDArray[np.float32],
+    kappa: np.float32,
+    left: int,
+    top: int,
+    columns: int,
+    rows: int,
+) -> None:
+    """Full light for the pixels of the image, none for the rest of the tile, so that nothing is blended there."""
+    state[:] = _ZERO
+    for y in range(rows):
+        for x in range(columns):
+            pixel = TILE * y + x
+            state[LIGHT + pixel] = _ONE
+            state[DEPTH_LIGHT + pixel] = _ONE
+            if kappa > _ZERO and proxy[top + y, left + x] > _ZERO:
+                state[PROXY + pixel] = proxy[top + y, left + x]
+                state[KAPPA + pixel] = kappa
+
+
+@kernel
+def is_opaque(state: NDArray[np.float32], plane: int) -> bool:
+    """Whether no pixel of the tile takes any more light."""
+    most = load(state, plane)
+    for y in range(1, TILE):
+        most = largest(most, load(state, plane + TILE * y))
+    return not any_of(most >= _LIGHT_MIN)
+
+
+@kernel
+def blend_rows(
+    state: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    falloff_y: NDArray[np.float32],
+    falloff_x: object,
+    dx2: object,
+    y_center: np.float32,
+    reach2: np.float32,
+    z: np.float32,
+    first: int,
+    last: int,
+) -> None:
+    """Weights of one Gaussian in rows first..last of a tile; light and depth sum go on behind it."""
+    for y in range(first, last + 1):
+        row = TILE * y
+        dy = F32(y) + _HALF - y_center
+        alpha = at_most(falloff_x * falloff_y[y], _ALPHA_MAX)
+        light = load(state, LIGHT + row)
+        alpha = where((dx2 <= splat(reach2 - dy * dy)) & (light >= _LIGHT_MIN), alpha)
+        weight = alpha * light
+        store(weights, row, weight)
+        store(state, LIGHT + row, light - weight)
+        store(state, DEPTH_SUM + row, load(state, DEPTH_SUM + row) + weight * z)
+
+
+@kernel
+def blend_rows_by_proxy(
+    state: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    falloff_y: NDArray[np.float32],
+    falloff_x: object,
+    dx2: object,
+    y_center: np.float32,
+    reach2: np.float32,
+    z: np.float32,
+    first: int,
+    last: int,
+) -> None:
+    """`blend_rows` with the depth chain of MSGS-SLAM eq. (7): who disagrees with the proxy occludes less there."""
+    for y in range(first, last + 1):
+        row = TILE * y
+        dy = F32(y) + _HALF - y_center
+        alpha = at_most(falloff_x * falloff_y[y], _ALPHA_MAX)
+        depth_light = load(state, DEPTH_LIGHT + row)
+        alpha = where((dx2 <= splat(reach2 - dy * dy)) & (depth_light >= _LIGHT_MIN), alpha)
+        light = load(state, LIGHT + row)
+        weight = alpha * light
+        store(weights, row, weight)
+        light = light - weight
+        store(state, LIGHT + row, where(light > splat(_TINY), light))  # denormal numbers are slow
+        depth_weight = alpha * depth_light
+        store(state, DEPTH_SUM + row, load(state, DEPTH_SUM + row) + depth_weight * z)
+        store(state, DEPTH_SILHOUETTE + row, load(state, DEPTH_SILHOUETTE + row) + depth_weight)
+        error = splat(z) - load(state, PROXY + row)
+        agreement = exp(splat(_ZERO) - load(state, KAPPA + row) * error * error)
+        store(state, DEPTH_LIGHT + row, depth_light - depth_weight * agreement)
+
+
+@kernel
+def forward_band(
+    vectors: tuple[int, ...],
+    band: int,
+    starts: NDArray[np.int64],
+    entries: NDArray[np.int32],
+    reach: NDArray[np.float32],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    sigma_px: NDArray[np.float32],
+    z: NDArray[np.float32],
+    opacity: NDArray[np.float32],
+    features: NDArray[np.float32],
+    proxy: NDArray[np.float32],
+    kappa: np.float32,
+    out_features: NDArray[np.float32],
+    out_depth: NDArray[np.float32],
+    out_depth_silhouette: NDArray[np.float32],
+    out_silhouette: NDArray[np.float32],
+) -> None:
+    """Sorts the band's entries by depth and fills its rows of the four images."""
+    height, width = out_depth.shape
+    channels, used = 16 * len(vectors), features.shape[1]
+    own = entries[starts[band] : starts[band + 1]]
+    sort_by_depth(own, z)
+    records, padded = gather_band(own, u, v, sigma_px, z, opacity, reach, features, channels)
+    band_top = band * BAND_ROWS
+    band_rows = min(BAND_ROWS, height - band_top)
+    tile_starts, members = list_tiles(records, band_top, width, band_rows)
+    across = (width + TILE - 1) // TILE
+    image = np.empty(PIXELS * channels, np.float32)
+    state = np.empty(PIXELS * PLANES, np.float32)
+    weights, falloff_y = np.zeros(PIXELS, np.float32), np.empty(TILE, np.float32)
+    decisive = DEPTH_LIGHT if kappa > _ZERO else LIGHT
+    for tile in range(len(tile_starts) - 1):
+        left, top = TILE * (tile % across), band_top + TILE * (tile // across)
+        columns, rows = min(TILE, width - left), min(TILE, height - top)
+        open_tile(state, proxy, kappa, left, top, columns, rows)
+        image[:] = _ZERO
+        for k in range(tile_starts[tile], tile_starts[tile + 1]):
+            i = members[k]
+            at = RECORD * i
+            x, y, r = records[at] - F32(left), records[at + 1] - F32(top), records[at + 5]
+            x0, x1 = first_pixel(x - r), last_pixel(x + r, columns)
+            y0, y1 = first_pixel(y - r), last_pixel(y + r, rows)
+            if x1 < x0 or y1 < y0:
+                continue
+            sharpness = -_HALF / (records[at + 2] * records[at + 2])
+            dx = counting(_HALF - x)
+            dy = counting(_HALF - y)
+            dx2 = dx * dx
+            falloff_x = exp(dx2 * sharpness)
+            store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
+            depth = records[at + 3]
+            if kappa > _ZERO:
+                blend_rows_by_proxy(state, weights, falloff_y, falloff_x, dx2, y, r * r, depth, y0, y1)
+            else:
+                blend_rows(state, weights, falloff_y, falloff_x, dx2, y, r * r, depth, y0, y1)
+            corner = TILE * y0 + x0
+            add_to_box(
+                image, corner * channels, padded, i * channels, weights, corner, y1 - y0 + 1, x1 - x0 + 1, vectors
+            )
+            if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, decisive):
+                break
+        for y in range(rows):
+            for x in range(columns):
+                pixel = TILE * y + x
+                row = out_features[top + y, left + x]
+                for c in range(used):
+                    row[c] = image[pixel * channels + c]
+                out_depth[top + y, left + x] = state[DEPTH_SUM + pixel]
+                seen = _ONE - state[LIGHT + pixel]
+                out_silhouette[top + y, left + x] = seen
+                out_depth_silhouette[top + y, left + x] = state[DEPTH_SILHOUETTE + pixel] if kappa > _ZERO else seen

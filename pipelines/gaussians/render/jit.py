@@ -1,0 +1,89 @@
+"""Compiling the CPU kernels: how, and where the machine code is kept between runs."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import stat
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+
+FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
+
+# No "nnan" or "ninf": comparisons with a NaN must stay what they are. "contract" lets a*b+c become one instruction.
+_FAST = {"contract", "nsz", "arcp"}
+
+
+def kernel(function: FunctionT) -> FunctionT:
+    """Compile to machine code that runs without the GIL, cached on disk between runs."""
+    directory = cache_directory()
+    with _numba_cache_in(directory):
+        # numba's decorators have no useful types.
+        return numba.njit(nogil=True, cache=directory is not None, fastmath=_FAST, error_model="numpy")(function)
+
+
+@functools.cache
+def cache_directory() -> Path | None:
+    """Where compiled kernels are kept: the first writable of NUMBA_CACHE_DIR, the user's cache folder and a private
+    folder in the system's temporary one; None, said once, if there is no such place.
+
+    The name ends in a hash of this package's sources: numba looks only at the file of the function it compiles, and
+    would go on using machine code into which an older version of another file is inlined.
+    """
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "msgs-slam"
+    name = f"renderer-{_source_hash()}"
+    if (directory := _private_directory(Path(given) if given else home, name)) is not None:
+        return directory
+    fallback = Path(tempfile.gettempdir()) / f"msgs-slam-{os.getuid() if hasattr(os, 'getuid') else 'user'}"
+    directory = _private_directory(fallback, name)
+    refused = given or home
+    if directory is None:
+        warnings.warn(f"cannot write to {refused} nor {fallback}: kernels are compiled at every start", stacklevel=3)
+    else:
+        warnings.warn(f"cannot write to {refused}: compiled kernels are kept in {directory}", stacklevel=3)
+    return directory
+
+
+def _private_directory(parent: Path, name: str) -> Path | None:
+    """parent/name, made if need be, if it is ours and nobody else may write there; else None.
+
+    The cache is executable code: in a shared temporary folder another user could have put it there first.
+    """
+    directory = parent / name
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for folder in (directory, parent) if parent.parent == Path(tempfile.gettempdir()) else (directory,):
+            status = folder.lstat()
+            foreign = hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & stat.S_IWOTH)
+            if foreign or not stat.S_ISDIR(status.st_mode):
+                return None
+        with tempfile.TemporaryFile(dir=directory):
+            return directory
+    except OSError:
+        return None
+
+
+def _source_hash() -> str:
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@contextmanager
+def _numba_cache_in(directory: Path | None) -> Iterator[None]:
+    """numba reads its cache setting when a function is decorated; other users of numba keep theirs."""
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(directory or "")
+    try:
+        yield
+    finally:
+        numba.config.CACHE_DIR = before
