@@ -1,0 +1,81 @@
+"""From pycolmap's reconstruction to the arrays that the other stages read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from pipelines.frames.lens import Lens
+from pipelines.types import SparseModel
+
+
+def to_sparse_model(
+    model: pycolmap.Reconstruction,
+    keyframe_ids: Sequence[int],
+    lens: Lens,
+    load_rgb: Callable[[int], NDArray[np.uint8]],
+) -> SparseModel:
+    """Keyframes, points and observations in undistorted pixels.
+
+    The world is the camera of the first registered keyframe, and its unit the median depth of all observations.
+    keyframe_ids[i] is the frame id of the image with id i + 1; load_rgb(frame_id) gives (H, W, 3) of the frame before
+    undistortion, one at a time.
+    """
+    image_ids = sorted(model.reg_image_ids())
+    poses = np.stack([_matrix(model.images[i]) for i in image_ids])
+    point_ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
+    points = np.stack([model.points3D[int(p)].xyz for p in point_ids])
+    row = {int(p): k for k, p in enumerate(point_ids)}
+    observed = [_observations(model.images[i], row) for i in image_ids]
+    frame_ids = np.array([keyframe_ids[i - 1] for i in image_ids], dtype=np.int64)
+    colors = _mean_colors(observed, len(points), (load_rgb(int(i)) for i in frame_ids))
+    obs_frame = np.concatenate([np.full(len(at), k, np.int64) for k, (at, _) in enumerate(observed)])
+    obs_point = np.concatenate([at for at, _ in observed])
+    obs_xy = np.concatenate([lens.undistort_points(xy) for _, xy in observed])
+    poses, points = _rebased(poses, points, obs_frame, obs_point)
+    return SparseModel(frame_ids, poses, points, colors, obs_frame, obs_point, obs_xy)
+
+
+def _matrix(image: pycolmap.Image) -> NDArray[np.float64]:
+    return np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
+
+
+def _observations(image: pycolmap.Image, row: dict[int, int]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Rows (O,) of the points that an image sees, and where (O, 2)."""
+    seen = [p for p in image.points2D if p.has_point3D()]
+    xy = np.array([p.xy for p in seen], dtype=np.float64).reshape(-1, 2)
+    return np.array([row[p.point3D_id] for p in seen], dtype=np.int64), xy
+
+
+def _mean_colors(
+    observed: Iterable[tuple[NDArray[np.int64], NDArray[np.float64]]], count: int, images: Iterable[NDArray[np.uint8]]
+) -> NDArray[np.uint8]:
+    total, seen = np.zeros((count, 3)), np.zeros(count)
+    for (point, xy), rgb in zip(observed, images, strict=True):
+        column = np.clip(xy[:, 0].astype(np.int64), 0, rgb.shape[1] - 1)
+        line = np.clip(xy[:, 1].astype(np.int64), 0, rgb.shape[0] - 1)
+        np.add.at(total, point, rgb[line, column])
+        np.add.at(seen, point, 1)
+    return np.round(total / np.maximum(seen, 1)[:, None]).astype(np.uint8)
+
+
+def _rebased(
+    cam_from_world: NDArray[np.float64],
+    points: NDArray[np.float64],
+    obs_frame: NDArray[np.int64],
+    obs_point: NDArray[np.int64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Poses and points with the first camera as the world, and the median depth as its unit."""
+    first = cam_from_world[0]
+    world_from_first = np.eye(4)
+    world_from_first[:3, :3], world_from_first[:3, 3] = first[:3, :3].T, -first[:3, :3].T @ first[:3, 3]
+    poses = cam_from_world @ world_from_first
+    moved = points @ first[:3, :3].T + first[:3, 3]
+    depth = (poses[obs_frame, 2, :3] * moved[obs_point]).sum(1) + poses[obs_frame, 2, 3]
+    unit = float(np.median(depth))
+    poses[:, :3, 3] /= unit
+    poses[0] = np.eye(4)
+    return poses, moved / unit

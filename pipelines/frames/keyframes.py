@@ -1,0 +1,102 @@
+"""Keyframes by parallax: how far points tracked from the last keyframe have moved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.frames.sharpness import reduce_image
+
+_TRACKED_SIDE = 480
+_MAX_CORNERS = 600
+_MIN_TRACKS = 30
+_BACKWARD_PX = 1.0
+_WINDOW = (21, 21)
+
+
+@dataclass(frozen=True)
+class KeyframeOptions:
+    """`parallax`: median displacement, as a fraction of the image width, that makes a new keyframe.
+
+    `min_survivors`: fraction of the tracks below which one is made in any case.
+    """
+
+    parallax: float = 0.05
+    min_survivors: float = 0.5
+
+
+@dataclass(frozen=True)
+class KeyframeChoice:
+    """keyframes: indices of the chosen frames; displacement (N,): median displacement of each frame from the keyframe
+    before it, as a fraction of the width, infinite where the tracks were lost."""
+
+    keyframes: list[int]
+    displacement: NDArray[np.float64]
+
+    @property
+    def largest_displacement(self) -> float:
+        """Largest displacement that was seen, as a fraction of the width."""
+        return float(self.displacement.max(initial=0.0))
+
+
+def choose_keyframes(frames: Iterable[NDArray[np.uint8]], options: KeyframeOptions) -> KeyframeChoice:
+    """Keyframes of grey frames (H, W) in order of time; the first is one, and the last where it adds a view."""
+    tracker = _Tracker()
+    keyframes: list[int] = []
+    displacement: list[float] = []
+    count = 0
+    for i, frame in enumerate(frames):
+        gray = reduce_image(frame, _TRACKED_SIDE)
+        moved, survivors = tracker.advance(gray)
+        displacement.append(moved)
+        if i == 0 or moved > options.parallax or survivors < options.min_survivors:
+            keyframes.append(i)
+            tracker.restart(gray)
+        count = i + 1
+    if keyframes and keyframes[-1] != count - 1 and displacement[-1] > options.parallax / 3:
+        keyframes.append(count - 1)
+    return KeyframeChoice(keyframes, np.array(displacement, dtype=np.float64))
+
+
+class _Tracker:
+    """Follows the last keyframe's corners from frame to frame, each step checked by tracking back."""
+
+    def __init__(self) -> None:
+        self._previous: NDArray[np.uint8] | None = None
+        self._origin = np.zeros((0, 2), np.float32)
+        self._points = np.zeros((0, 2), np.float32)
+        self._started = 0
+
+    def restart(self, gray: NDArray[np.uint8]) -> None:
+        """Take `gray`, the frame advanced to last, as the keyframe."""
+        corners = cv2.goodFeaturesToTrack(gray, _MAX_CORNERS, 0.005, 6)
+        self._origin = np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
+        self._points = self._origin
+        self._started = len(self._origin)
+
+    def advance(self, gray: NDArray[np.uint8]) -> tuple[float, float]:
+        """Median displacement since the keyframe (fraction of the width) and the share of its tracks that live."""
+        previous, self._previous = self._previous, gray
+        if previous is None or self._started == 0:
+            return 0.0, 1.0
+        if len(self._points):
+            moved, found = _track(previous, gray, self._points)
+            self._origin, self._points = self._origin[found], moved[found]
+        survivors = len(self._points) / self._started
+        if len(self._points) < min(_MIN_TRACKS, self._started):
+            return np.inf, survivors
+        distance = np.linalg.norm(self._points - self._origin, axis=1)
+        return float(np.median(distance)) / gray.shape[1], survivors
+
+
+def _track(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], points: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(first, second, points, None, winSize=_WINDOW, maxLevel=4)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, moved, None, winSize=_WINDOW, maxLevel=4)
+    close = np.linalg.norm(back - points, axis=1) < _BACKWARD_PX
+    return moved, (found.ravel() == 1) & (found_back.ravel() == 1) & close

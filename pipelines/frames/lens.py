@@ -1,0 +1,119 @@
+"""A calibrated lens, and the frames without its distortion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from formats.datasets.camera import Camera
+from pipelines.types import Intrinsics
+
+_BORDER_POINTS = 65
+
+
+def to_pycolmap(camera: Camera) -> pycolmap.Camera:
+    """A fixed camera with known intrinsics: OPENCV with distortion, PINHOLE without."""
+    params = [camera.fx, camera.fy, camera.cx, camera.cy]
+    model = "OPENCV" if any(camera.distortion) else "PINHOLE"
+    if model == "OPENCV":
+        params += list(camera.distortion[:4])
+    made = pycolmap.Camera.create_from_model_name(1, model, camera.fx, camera.width, camera.height)
+    made.params = np.array(params, dtype=np.float64)
+    made.has_prior_focal_length = True
+    return made
+
+
+def unknown_camera(width: int, height: int, focal: float, is_prior: bool) -> pycolmap.Camera:
+    """A camera to be calibrated: one focal length, the image centre, one radial coefficient."""
+    made = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, width, height)
+    made.has_prior_focal_length = is_prior
+    return made
+
+
+def distortion_of(camera: pycolmap.Camera) -> tuple[float, float, float, float]:
+    """(k1, k2, p1, p2); zeros for a pinhole."""
+    params = [float(p) for p in camera.params]
+    if camera.model == pycolmap.CameraModelId.SIMPLE_RADIAL:
+        return params[3], 0.0, 0.0, 0.0
+    if camera.model == pycolmap.CameraModelId.OPENCV:
+        return params[4], params[5], params[6], params[7]
+    return 0.0, 0.0, 0.0, 0.0
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A distorted camera and the pinhole of the same image size that takes its place.
+
+    The pinhole keeps the principal point, and the focal length too unless the frame's border would then look past the
+    source's: it is enlarged just enough that every pixel of the undistorted frame has a picture (what falls outside is
+    cropped). `shift_px` is the largest distance by which a pixel moves.
+    """
+
+    camera: pycolmap.Camera
+    pinhole: Intrinsics
+    shift_px: float
+
+    def undistort_points(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(M, 2) pixels of the source to pixels of the pinhole."""
+        rays = self.camera.cam_from_img(np.ascontiguousarray(xy, dtype=np.float64))
+        return rays * [self.pinhole.fx, self.pinhole.fy] + [self.pinhole.cx, self.pinhole.cy]
+
+    def undistort_image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(H, W, 3) of the source as the pinhole sees it."""
+        x, y = self._maps()
+        return cv2.remap(rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+    def _maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        columns, rows = np.meshgrid(np.arange(self.pinhole.width) + 0.5, np.arange(self.pinhole.height) + 0.5)
+        source = _distort(self.camera, self.pinhole, np.stack([columns.ravel(), rows.ravel()], axis=1))
+        # OpenCV counts pixel centres from (0, 0).
+        maps = (source - 0.5).reshape(self.pinhole.height, self.pinhole.width, 2).astype(np.float32)
+        return np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1])
+
+
+def make_lens(camera: pycolmap.Camera) -> Lens:
+    """The lens of a calibrated camera."""
+    same = Intrinsics(
+        camera.width, camera.height, camera.focal_length_x, camera.focal_length_y,
+        camera.principal_point_x, camera.principal_point_y,
+    )  # fmt: skip
+    border = _border(same.width, same.height)
+    shift = float(np.linalg.norm(_distort(camera, same, border) - border, axis=1).max())
+    return Lens(camera, _without_blank_border(camera, same, border), shift)
+
+
+def _without_blank_border(camera: pycolmap.Camera, same: Intrinsics, border: NDArray[np.float64]) -> Intrinsics:
+    low, high = 1.0, 2.0
+    if _inside(camera, same, border):
+        return same
+    for _ in range(30):
+        middle = (low + high) / 2
+        low, high = (low, middle) if _inside(camera, _zoomed(same, middle), border) else (middle, high)
+    return _zoomed(same, high)
+
+
+def _zoomed(camera: Intrinsics, factor: float) -> Intrinsics:
+    return Intrinsics(camera.width, camera.height, camera.fx * factor, camera.fy * factor, camera.cx, camera.cy)
+
+
+def _inside(camera: pycolmap.Camera, pinhole: Intrinsics, border: NDArray[np.float64]) -> bool:
+    # A hundredth of a pixel: a lens without distortion is inside although it is rounded.
+    source = _distort(camera, pinhole, border)
+    return bool((source > -0.01).all() and (source < [camera.width + 0.01, camera.height + 0.01]).all())
+
+
+def _distort(camera: pycolmap.Camera, pinhole: Intrinsics, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    rays = np.ones((len(xy), 3))
+    rays[:, :2] = (xy - [pinhole.cx, pinhole.cy]) / [pinhole.fx, pinhole.fy]
+    return camera.img_from_cam(rays)
+
+
+def _border(width: int, height: int) -> NDArray[np.float64]:
+    along = np.linspace(0.0, 1.0, _BORDER_POINTS)
+    zero, one = np.zeros_like(along), np.ones_like(along)
+    sides = [(along, zero), (along, one), (zero, along), (one, along)]
+    return np.concatenate([np.stack(side, axis=1) for side in sides]) * [width, height]

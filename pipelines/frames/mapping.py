@@ -1,0 +1,45 @@
+"""pycolmap's two mappers, one thread each so that the same database gives the same bytes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pycolmap
+
+
+def calibrate_focal(database: Path, seed: int) -> None:
+    """Estimate the focal length in `database` from the fundamental matrices, and make its pairs calibrated ones."""
+    options = pycolmap.ViewGraphCalibrationOptions()
+    options.random_seed = seed
+    pycolmap.calibrate_view_graph(database, options)
+
+
+def map_globally(database: Path, work: Path, refine_camera: bool, seed: int) -> pycolmap.Reconstruction | None:
+    """Poses of all images at once (Pan et al., Global Structure-from-Motion Revisited, ECCV 2024); None on failure."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    mapper = options.mapper
+    for part in (options, mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
+        part.random_seed = seed
+    mapper.global_positioning.use_gpu = mapper.bundle_adjustment.ceres.use_gpu = False
+    mapper.bundle_adjustment.refine_focal_length = refine_camera
+    mapper.bundle_adjustment.refine_extra_params = refine_camera
+    return _largest(pycolmap.global_mapping(database, work, work, options))
+
+
+def map_incrementally(database: Path, work: Path, refine_camera: bool, seed: int) -> pycolmap.Reconstruction | None:
+    """Poses image by image (Schönberger and Frahm, Structure-from-Motion Revisited, CVPR 2016); None on failure."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    for part in (options, options.mapper, options.triangulation):
+        part.random_seed = seed
+    options.extract_colors = False
+    options.min_model_size = 3
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = refine_camera
+    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = refine_camera
+    return _largest(pycolmap.incremental_mapping(database, work, work, options))
+
+
+def _largest(models: dict[int, pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:
+    usable = [m for m in models.values() if m.num_reg_images() >= 2 and m.num_points3D() > 0]
+    return max(usable, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)

@@ -1,0 +1,137 @@
+"""Feature matches of two keyframes, and their geometric verification."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from pipelines.frames.features import DESCRIPTOR_NORM, Features
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """Descriptor angles are in radians, `max_error` in pixels."""
+
+    max_ratio: float = 0.8
+    max_angle: float = 0.7
+    max_error: float = 2.0
+    min_inliers: int = 15
+
+
+@dataclass(frozen=True)
+class VerifiedPair:
+    """Two keyframes (indices into the keyframes, first < second) whose matches obey one geometry.
+
+    matches (M, 2) uint32 feature indices; `config` is pycolmap's TwoViewGeometryConfiguration as a number.
+    F, E, H (3, 3) float64, zero where the configuration has none.
+    """
+
+    first: int
+    second: int
+    matches: NDArray[np.uint32]
+    config: int
+    fundamental: NDArray[np.float64]
+    essential: NDArray[np.float64]
+    homography: NDArray[np.float64]
+    proposed: int
+
+
+def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8], options: MatchOptions) -> NDArray[np.uint32]:
+    """(M, 2) mutual nearest neighbours that pass Lowe's ratio test, sorted by the first index.
+
+    The products of byte descriptors are whole numbers below 2^24, so the float matrix product is exact and the
+    result does not depend on the order in which a BLAS adds.
+    """
+    if len(first) < 2 or len(second) < 2:
+        return np.zeros((0, 2), np.uint32)
+    similarity = first.astype(np.float32) @ second.astype(np.float32).T
+    best, score, runner_up, best_back = _two_nearest(similarity)
+    angle = np.arccos(np.clip(score / DESCRIPTOR_NORM**2, 0, 1))
+    next_angle = np.arccos(np.clip(runner_up / DESCRIPTOR_NORM**2, 0, 1))
+    index = np.arange(len(first))
+    good = (best_back[best] == index) & (angle < options.max_angle) & (angle < options.max_ratio * next_angle)
+    return np.stack([index[good], best[good]], axis=1).astype(np.uint32)
+
+
+@numba.njit(cache=True, nogil=True)
+def _two_nearest(similarity):  # type: ignore[no-untyped-def]
+    """Best column, its value and the second value of every row, and the best row of every column, in one pass."""
+    rows, columns = similarity.shape
+    best = np.zeros(rows, np.int64)
+    score = np.full(rows, np.float32(-1))
+    runner_up = np.full(rows, np.float32(-1))
+    column_score = np.full(columns, np.float32(-1))
+    column_best = np.zeros(columns, np.int64)
+    for i in range(rows):
+        top, second, at = np.float32(-1), np.float32(-1), 0
+        for j in range(columns):
+            value = similarity[i, j]
+            if value > top:
+                second, top, at = top, value, j
+            elif value > second:
+                second = value
+            if value > column_score[j]:
+                column_score[j], column_best[j] = value, i
+        best[i], score[i], runner_up[i] = at, top, second
+    return best, score, runner_up, column_best
+
+
+def match_pair(
+    pair: tuple[int, int],
+    features: tuple[Features, Features],
+    camera: pycolmap.Camera,
+    options: MatchOptions,
+    seed: int,
+) -> VerifiedPair | None:
+    """Match two keyframes and keep what one epipolar geometry or homography explains; None where nothing does.
+
+    The random choices depend on the seed and the pair alone, so pairs may be verified in any order on any thread.
+    """
+    matches = match_descriptors(features[0].descriptors, features[1].descriptors, options)
+    if len(matches) < options.min_inliers:
+        return None
+    return verify_matches(pair, matches, (features[0].xy, features[1].xy), camera, options, seed)
+
+
+def verify_matches(
+    pair: tuple[int, int],
+    matches: NDArray[np.uint32],
+    xy: tuple[NDArray[np.float64], NDArray[np.float64]],
+    camera: pycolmap.Camera,
+    options: MatchOptions,
+    seed: int,
+) -> VerifiedPair | None:
+    """Robust two-view geometry of proposed matches, or None. See `match_pair`."""
+    geometry = pycolmap.estimate_two_view_geometry(
+        camera, xy[0], camera, xy[1], matches, _verification_options(options, pair_seed(seed, pair))
+    )
+    inliers = np.asarray(geometry.inlier_matches, dtype=np.uint32).reshape(-1, 2)
+    if len(inliers) < options.min_inliers:
+        return None
+    return VerifiedPair(
+        *pair, inliers, int(geometry.config), *(_matrix(m) for m in (geometry.F, geometry.E, geometry.H)), len(matches)
+    )
+
+
+def pair_seed(seed: int, pair: tuple[int, int]) -> int:
+    """A seed below 2^31 for each pair."""
+    return int(np.random.SeedSequence([seed, *pair]).generate_state(1)[0] & 0x7FFFFFFF)
+
+
+def _matrix(value: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    return np.zeros((3, 3)) if value is None else np.array(value, dtype=np.float64)
+
+
+def _verification_options(options: MatchOptions, seed: int) -> pycolmap.TwoViewGeometryOptions:
+    chosen = pycolmap.TwoViewGeometryOptions()
+    chosen.min_num_inliers = options.min_inliers
+    chosen.detect_watermark = False
+    chosen.compute_relative_pose = True
+    chosen.ransac.max_error = options.max_error
+    chosen.ransac.random_seed = seed
+    chosen.ransac.num_threads = 1
+    return chosen

@@ -1,0 +1,75 @@
+"""Whether the camera moved, or only turned."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.errors import InputError
+from pipelines.frames.matching import VerifiedPair
+
+HOW_TO_FILM = (
+    "Film again while walking: move the camera sideways by a tenth of the distance to what it shows, rather than "
+    "turning on the spot"
+)
+_MOVING_FRACTION = 0.01
+_TURN_ONLY_PX = 1.5
+_MIN_DISPLACEMENT_PX = 10.0
+_FOCAL_FACTORS = np.geomspace(0.4, 4.0, 28)
+
+
+def require_motion(largest_displacement: float) -> None:
+    """Raise InputError for a camera that stands still; displacement as a fraction of the image width."""
+    if largest_displacement < _MOVING_FRACTION:
+        raise InputError(
+            f"there is no parallax: over the whole source the picture moves by at most {largest_displacement:.2%} of its "
+            f"width, the camera stands still, so no depth can be found. {HOW_TO_FILM}"
+        )
+
+
+def require_parallax(
+    pairs: Sequence[VerifiedPair],
+    xy: Sequence[NDArray[np.float64]],
+    size: tuple[int, int],
+    focal: float | None,
+) -> None:
+    """Raise InputError when turning on the spot explains all matches; size = (width, height).
+
+    `focal` in pixels where it is known; else every plausible one is tried, so that no wrong guess of it can hide a
+    pure rotation.
+    """
+    moved = [p for p in pairs if _displacement(p, xy) > _MIN_DISPLACEMENT_PX]
+    if not moved:
+        return
+    focals = [focal] if focal else [f * max(size) for f in _FOCAL_FACTORS]
+    residuals = [np.median([rotation_residual(p, xy, size, f) for p in moved]) for f in focals]
+    if min(residuals) < _TURN_ONLY_PX:
+        raise InputError(
+            f"there is no parallax: turning the camera on the spot explains all matches of {len(moved)} pairs of views "
+            f"to {min(residuals):.1f} px, so no depth can be found. {HOW_TO_FILM}"
+        )
+
+
+def rotation_residual(
+    pair: VerifiedPair, xy: Sequence[NDArray[np.float64]], size: tuple[int, int], focal: float
+) -> float:
+    """Pixels within which four fifths of a pair's matches obey the best rotation about the camera's centre."""
+    centre = np.array(size) / 2
+    first = _rays(xy[pair.first][pair.matches[:, 0]] - centre, focal)
+    second = _rays(xy[pair.second][pair.matches[:, 1]] - centre, focal)
+    u, _, vt = np.linalg.svd(second.T @ first)
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    angle = np.linalg.norm(first @ rotation.T - second, axis=1)
+    return float(np.percentile(angle, 80) * focal)
+
+
+def _displacement(pair: VerifiedPair, xy: Sequence[NDArray[np.float64]]) -> float:
+    moved = xy[pair.first][pair.matches[:, 0]] - xy[pair.second][pair.matches[:, 1]]
+    return float(np.median(np.linalg.norm(moved, axis=1)))
+
+
+def _rays(xy: NDArray[np.float64], focal: float) -> NDArray[np.float64]:
+    rays = np.concatenate([xy, np.full((len(xy), 1), focal)], axis=1)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)

@@ -1,0 +1,31 @@
+"""How sharp a picture is."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+_MEASURED_SIDE = 480
+"""Sharpness is measured at this long side: sensor noise is averaged away, and all sources are alike."""
+
+
+def sharpness(rgb: NDArray[np.uint8]) -> float:
+    """Variance of the Laplacian of the reduced grey image (H, W, 3) uint8; larger is sharper."""
+    gray = cv2.cvtColor(reduce_image(rgb, _MEASURED_SIDE), cv2.COLOR_RGB2GRAY)
+    return float(cv2.Laplacian(gray, cv2.CV_32F).var())
+
+
+def reduced_size(width: int, height: int, max_side: int) -> tuple[int, int]:
+    """(width, height) with the long side at most `max_side`, the shape kept; 0 = no limit."""
+    longest = max(width, height)
+    if max_side <= 0 or longest <= max_side:
+        return width, height
+    return max(1, round(width * max_side / longest)), max(1, round(height * max_side / longest))
+
+
+def reduce_image(image: NDArray[np.uint8], max_side: int) -> NDArray[np.uint8]:
+    """The image with its long side at most `max_side` pixels, averaged; itself when it is small enough."""
+    height, width = image.shape[:2]
+    size = reduced_size(width, height, max_side)
+    return image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)

@@ -1,0 +1,82 @@
+"""What the stage has found so far, so that a killed run goes on from it: features, matches, the model."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from formats.tensors import load_arrays, save_arrays
+from pipelines.frames.features import Features
+from pipelines.frames.matching import VerifiedPair
+
+
+@dataclass(frozen=True)
+class Snapshots:
+    """Files under one folder; each is whole or missing."""
+
+    folder: Path
+
+    def features(self, frame_id: int, compute: Callable[[], Features]) -> Features:
+        """Features of a frame, computed unless they are stored."""
+        path = self.folder / "features" / f"{frame_id:06d}.npz"
+        if not path.exists():
+            features = compute()
+            save_arrays(path, {"keypoints": features.keypoints, "descriptors": features.descriptors})
+            return features
+        return Features(**load_arrays(path))
+
+    def pairs(self, block: int, compute: Callable[[], list[VerifiedPair]]) -> list[VerifiedPair]:
+        """One block of verified pairs, computed unless they are stored."""
+        path = self.folder / "pairs" / f"{block:06d}.npz"
+        if not path.exists():
+            pairs = compute()
+            save_arrays(path, _pack(pairs))
+            return pairs
+        return _unpack(load_arrays(path))
+
+    def model(
+        self, name: str, compute: Callable[[Path], pycolmap.Reconstruction | None]
+    ) -> pycolmap.Reconstruction | None:
+        """A reconstruction, computed in a scratch folder unless it is stored; None where there is none.
+
+        It is always read back from disk: the order in memory of a fresh model and of one read differ, and with it the
+        order in which an adjustment adds.
+        """
+        path, scratch = self.folder / name, self.folder / f"{name}.tmp"
+        if not path.exists():
+            shutil.rmtree(scratch, ignore_errors=True)
+            (scratch / "work").mkdir(parents=True)
+            model = compute(scratch / "work")
+            shutil.rmtree(scratch / "work")
+            if model is not None:
+                model.write_binary(scratch)
+            os.replace(scratch, path)
+        return pycolmap.Reconstruction(path) if (path / "cameras.bin").exists() else None
+
+
+def _pack(pairs: Sequence[VerifiedPair]) -> dict[str, NDArray]:
+    return {
+        "index": np.array([(p.first, p.second, p.config, p.proposed, len(p.matches)) for p in pairs]).reshape(-1, 5),
+        "matches": _concatenated([p.matches for p in pairs]),
+        "matrices": np.array([(p.fundamental, p.essential, p.homography) for p in pairs]).reshape(-1, 3, 3, 3),
+    }
+
+
+def _unpack(arrays: dict[str, NDArray]) -> list[VerifiedPair]:
+    index = arrays["index"].astype(np.int64)
+    ends = np.cumsum(index[:, 4])
+    return [
+        VerifiedPair(int(i), int(j), arrays["matches"][end - count : end], int(config), *matrices, int(proposed))
+        for (i, j, config, proposed, count), end, matrices in zip(index, ends, arrays["matrices"], strict=True)
+    ]
+
+
+def _concatenated(parts: Iterable[NDArray[np.uint32]]) -> NDArray[np.uint32]:
+    return np.concatenate([np.zeros((0, 2), np.uint32), *parts])

@@ -1,0 +1,196 @@
+"""The two kinds of source, a video file and a folder of images, read alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import ExifTags, Image
+
+from formats.errors import InputError
+from formats.image_times import read_image_times
+from formats.images import exif_focal_px, image_size, list_images, read_rgb
+from formats.video import VideoFrame, VideoReader, probe_video
+
+Warn = Callable[[str], None]
+
+
+class Source(Protocol):
+    """Pictures in the order of time, all of one size.
+
+    `expected_frames` is an estimate before reading, 0 = unknown; `has_times` says whether the timestamps are real.
+    """
+
+    width: int
+    height: int
+    expected_frames: int
+    has_times: bool
+
+    def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
+        """Decode from start to end, and hand out the wanted frames (None = all) one at a time."""
+        ...
+
+    def name(self, frame_id: int, index: int) -> str:
+        """File name of picked frame `frame_id`, which is picture `index` of the source."""
+        ...
+
+    def original(self, index: int) -> Path | None:
+        """The file of picture `index` when it can serve as a frame as it is, else None."""
+        ...
+
+    def exif_focal(self) -> float | None:
+        """Focal length in pixels of the source that its metadata states, or None."""
+        ...
+
+
+@dataclass
+class VideoSource:
+    """A video file."""
+
+    path: Path
+    width: int = field(init=False)
+    height: int = field(init=False)
+    expected_frames: int = field(init=False)
+    has_times: bool = field(init=False, default=True)
+
+    def __post_init__(self) -> None:
+        info = probe_video(self.path)
+        self.width, self.height, self.expected_frames = info.width, info.height, info.frame_count_claimed
+
+    def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
+        """See `Source.read`; a truncated or damaged file is told to `warn` at the end."""
+        with VideoReader(self.path, wanted) as reader:
+            for frame in reader:
+                _require_size(frame.rgb, self.width, self.height, f"frame {frame.source_index} of {self.path}")
+                yield frame
+            if warn is not None:
+                _warn_of_damage(self.path, reader, warn)
+
+    def name(self, frame_id: int, index: int) -> str:
+        """000000.jpg, 000001.jpg, ..."""
+        return f"{frame_id:06d}.jpg"
+
+    def original(self, index: int) -> Path | None:
+        """A video has no files of single frames."""
+        return None
+
+    def exif_focal(self) -> float | None:
+        """Videos state none."""
+        return None
+
+
+@dataclass
+class FolderSource:
+    """The images directly in a folder, in natural order of their names."""
+
+    path: Path
+    width: int = field(init=False)
+    height: int = field(init=False)
+    expected_frames: int = field(init=False)
+    has_times: bool = field(init=False)
+    unreadable: list[str] = field(init=False, default_factory=list)
+    _images: list[Path] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._images = list_images(self.path)
+        sizes = self._sizes()
+        if not sizes:
+            raise InputError(
+                f"none of the {len(self._images)} images in {self.path} can be read: they are damaged, copy them again"
+            )
+        _require_one_size(self.path, sizes)
+        self.width, self.height = next(iter(sizes.values()))
+        times = read_image_times(self._images)
+        self.has_times = times is not None
+        self._times = np.arange(len(self._images), dtype=np.float64) if times is None else times
+        self.expected_frames = len(self._images)
+
+    def _sizes(self) -> dict[str, tuple[int, int]]:
+        sizes = {}
+        for path in self._images:
+            try:
+                sizes[path.name] = image_size(path)
+            except InputError:
+                self.unreadable.append(path.name)
+        return sizes
+
+    def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
+        """See `Source.read`; images that cannot be read are left out and told to `warn`."""
+        for index, path in enumerate(self._images):
+            if wanted is not None and index not in wanted:
+                continue
+            try:
+                rgb = read_rgb(path)
+            except InputError as error:
+                if warn is not None:
+                    warn(f"left out: {error}")
+                continue
+            _require_size(rgb, self.width, self.height, str(path))
+            yield VideoFrame(index, float(self._times[index]), rgb)
+
+    def name(self, frame_id: int, index: int) -> str:
+        """The image's own name; formats that are not written here become .png."""
+        path = self._images[index]
+        if path.suffix.lower() in (".jpg", ".jpeg", ".png"):
+            return path.name
+        return f"{path.name}.png"
+
+    def original(self, index: int) -> Path | None:
+        """The image's file, unless other programs would see it turned, transparent or not at all."""
+        path = self._images[index]
+        with Image.open(path) as image:
+            plain = image.mode in ("RGB", "L") and image.getexif().get(ExifTags.Base.Orientation, 1) == 1
+        return path if plain and path.name == self.name(0, index) else None
+
+    def exif_focal(self) -> float | None:
+        """That of the first readable image."""
+        for path in self._images:
+            if path.name not in self.unreadable:
+                return exif_focal_px(path, self.width, self.height)
+        return None
+
+
+def open_source(path: Path) -> VideoSource | FolderSource:
+    """A video file or a folder of images.
+
+    Raises InputError when there is no such file, it is no video, it holds no image, or images differ in size.
+    """
+    return FolderSource(path) if path.is_dir() else VideoSource(path)
+
+
+def _require_one_size(folder: Path, sizes: dict[str, tuple[int, int]]) -> None:
+    first_name, first = next(iter(sizes.items()))
+    others = [name for name, size in sizes.items() if size != first]
+    if others:
+        width, height = sizes[others[0]]
+        raise InputError(
+            f"the images of {folder} differ in size: {first_name} is {first[0]}x{first[1]}, {others[0]} is "
+            f"{width}x{height} ({len(others)} of {len(sizes)} differ from the first): keep the images of one camera and "
+            "one orientation in the folder"
+        )
+
+
+def _require_size(rgb: NDArray[np.uint8], width: int, height: int, what: str) -> None:
+    if rgb.shape[:2] != (height, width):
+        raise InputError(
+            f"{what} is {rgb.shape[1]}x{rgb.shape[0]}, the pictures before it are {width}x{height}: convert the source "
+            "to one size first"
+        )
+
+
+def _warn_of_damage(path: Path, reader: VideoReader, warn: Warn) -> None:
+    decoded = len(reader.timestamps)
+    # Containers count a frame or two too many in passing; that is no damage.
+    if reader.missing_frames > max(2, reader.info.frame_count_claimed // 50):
+        warn(
+            f"{path.name} is truncated: its header promises {reader.info.frame_count_claimed} frames, {decoded} decode; "
+            "going on with those"
+        )
+    if reader.unreadable_frames:
+        warn(f"{path.name}: {reader.unreadable_frames} damaged frames were left out")
+    if reader.repaired_timestamps:
+        warn(f"{path.name}: {reader.repaired_timestamps} of {decoded} timestamps were missing or went back; repaired")

@@ -1,0 +1,238 @@
+"""Stage 1: pictures of the source become frames with timestamps, a calibrated camera and a backbone of keyframes."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from formats.atomic import atomic_path
+from formats.errors import InputError
+from formats.images import read_rgb, write_rgb
+from formats.video import VideoFrame
+from pipelines.config import FramesConfig
+from pipelines.frames.backbone import to_sparse_model
+from pipelines.frames.calibration import read_intrinsics
+from pipelines.frames.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes
+from pipelines.frames.lens import Lens, distortion_of, make_lens, to_pycolmap, unknown_camera
+from pipelines.frames.parallax import require_motion
+from pipelines.frames.pick import sharpest_of_windows
+from pipelines.frames.sharpness import reduce_image, reduced_size
+from pipelines.frames.snapshots import Snapshots
+from pipelines.frames.source import FolderSource, VideoSource, open_source
+from pipelines.frames.structure import Structure, StructureFromMotion, parallel_map
+from pipelines.run_folder import read_json, save_calibration, save_frames, save_sparse_model, write_json
+from pipelines.stages import Stage, StageContext
+from pipelines.types import Calibration, Frame
+
+_SIGNIFICANT_SHIFT_PX = 0.3
+_FEW_KEYFRAMES = 12
+_FOCAL_GUESS = 1.2
+
+
+def run(context: StageContext) -> dict[str, Any]:
+    """See `StageContext`; raises InputError for a source that cannot be used."""
+    config = context.config.frames
+    source = open_source(context.source)
+    camera, origin = _known_camera(config, source)
+    _require_reasonable(config, source)
+    frames = _pick(context, source)
+    choice = _keyframes(context, frames)
+    structure = _structure(context, camera, origin == "given", frames, choice.keyframes)
+    lens = make_lens(structure.model.cameras[1])
+    calibration = _calibration(lens, origin, structure.focal_sd)
+    _write_backbone(context, structure, choice.keyframes, lens, frames)
+    _write_frames(context, source, frames, lens)
+    save_calibration(context.folder, calibration)
+    save_frames(context.folder, frames)
+    return _figures(context, frames, choice, structure, calibration)
+
+
+def _known_camera(config: FramesConfig, source: VideoSource | FolderSource) -> tuple[pycolmap.Camera, str]:
+    """The camera of the reduced frames as far as it is known before, and where from."""
+    width, height = reduced_size(source.width, source.height, config.max_side)
+    if config.intrinsics:
+        given = read_intrinsics(config.intrinsics, source.width, source.height)
+        return to_pycolmap(given.resized(width, height)), "given"
+    exif = source.exif_focal()
+    if exif is not None:
+        return unknown_camera(width, height, exif * width / source.width, is_prior=True), "exif"
+    return unknown_camera(width, height, _FOCAL_GUESS * max(width, height), is_prior=False), "self-calibrated"
+
+
+def _require_reasonable(config: FramesConfig, source: VideoSource | FolderSource) -> None:
+    if isinstance(source, FolderSource) and source.expected_frames - len(source.unreadable) < 2:
+        raise InputError(f"{source.path} holds one image only; a reconstruction needs several views of a scene")
+    if isinstance(source, FolderSource) and not source.has_times and source.expected_frames > config.max_frames:
+        raise InputError(
+            f"{source.path} holds {source.expected_frames} images, more than frames.max_frames = {config.max_frames}: "
+            f"remove some, or allow more with --set frames.max_frames={source.expected_frames}"
+        )
+
+
+# picking --------------------------------------------------------------------------------------------------------
+
+
+def _pick(context: StageContext, source: VideoSource | FolderSource) -> list[Frame]:
+    table = context.snapshot / "picked.json"
+    if table.exists():
+        return [Frame(**row) for row in read_json(table)]
+    config = context.config.frames
+    pictures = source.read(warn=context.warn)
+    pictures = context.progress.track(pictures, "picking", source.expected_frames or None)
+    rate = config.rate if source.has_times else 0.0
+    frames: list[Frame] = []
+    for picture, score in sharpest_of_windows(pictures, rate):
+        if len(frames) == config.max_frames:
+            raise InputError(
+                f"{source.path} gives more than frames.max_frames = {config.max_frames} frames at {config.rate:g} a "
+                "second: lower the rate (--set frames.rate=...), cut the video, or raise frames.max_frames"
+            )
+        frame_id = len(frames)
+        timestamp = picture.timestamp if source.has_times else _untimed(config, frame_id)
+        name = source.name(frame_id, picture.source_index)
+        frames.append(Frame(frame_id, name, timestamp, picture.source_index, score))
+        _save_picked(context, source, picture, name)
+    if len(frames) < 2:
+        raise InputError(f"{source.path} gives one frame only; a reconstruction needs several views of a scene")
+    write_json(table, [asdict(f) for f in frames])
+    return frames
+
+
+def _untimed(config: FramesConfig, frame_id: int) -> float:
+    return frame_id / (config.rate if config.rate > 0 else 1.0)
+
+
+def _save_picked(context: StageContext, source: VideoSource | FolderSource, picture: VideoFrame, name: str) -> None:
+    path = _picked(context, name)
+    reduced = reduce_image(picture.rgb, context.config.frames.max_side)
+    original = source.original(picture.source_index) if reduced is picture.rgb else None
+    if original is None:
+        write_rgb(path, reduced)
+    else:
+        _copy(original, path)
+
+
+def _picked(context: StageContext, name: str) -> Path:
+    return context.snapshot / "picked" / name
+
+
+def _copy(source: Path, target: Path) -> None:
+    with atomic_path(target) as temporary:
+        shutil.copyfile(source, temporary)
+
+
+# keyframes and structure ----------------------------------------------------------------------------------------
+
+
+def _keyframes(context: StageContext, frames: list[Frame]) -> KeyframeChoice:
+    """Keyframes by parallax; of a short walk closer ones, so that there are enough for a reconstruction."""
+    parallax = context.config.frames.parallax
+    while True:
+        grays = (_gray(context, f) for f in context.progress.track(frames, "keyframes", len(frames)))
+        choice = choose_keyframes(grays, KeyframeOptions(parallax=parallax))
+        require_motion(choice.largest_displacement)
+        if len(choice.keyframes) >= min(_FEW_KEYFRAMES, len(frames)) or parallax < context.config.frames.parallax / 3:
+            return choice
+        parallax /= 2
+
+
+def _gray(context: StageContext, frame: Frame) -> NDArray[np.uint8]:
+    return cv2.cvtColor(read_rgb(_picked(context, frame.name)), cv2.COLOR_RGB2GRAY)
+
+
+def _structure(
+    context: StageContext, camera: pycolmap.Camera, is_fixed: bool, frames: list[Frame], keyframes: list[int]
+) -> Structure:
+    structure = StructureFromMotion(
+        config=context.config.frames,
+        camera=camera,
+        is_fixed=is_fixed,
+        load_gray=lambda frame_id: _gray(context, frames[frame_id]),
+        snapshots=Snapshots(context.snapshot),
+        progress=context.progress,
+        threads=_threads(context),
+        seed=context.config.run.seed,
+    ).run(keyframes)
+    report = structure.report
+    if report.registered < report.total:
+        context.warn(
+            f"{report.total - report.registered} of {report.total} keyframes could not be placed by structure from motion"
+        )
+    if not report.is_sound:
+        context.warn(
+            f"the camera's path may be folded: {report.pairs_agreeing:.0%} of the matched pairs of views agree with it "
+            f"(mapper: {structure.mapper})"
+        )
+    return structure
+
+
+def _threads(context: StageContext) -> int:
+    return context.config.run.threads or os.cpu_count() or 1
+
+
+def _calibration(lens: Lens, origin: str, focal_sd: float) -> Calibration:
+    zoom = lens.pinhole.fx / lens.camera.focal_length_x
+    return Calibration(lens.pinhole, origin, focal_sd * zoom, distortion_of(lens.camera))
+
+
+# results --------------------------------------------------------------------------------------------------------
+
+
+def _write_backbone(
+    context: StageContext, structure: Structure, keyframes: list[int], lens: Lens, frames: list[Frame]
+) -> None:
+    model = to_sparse_model(
+        structure.model, keyframes, lens, lambda frame_id: read_rgb(_picked(context, frames[frame_id].name))
+    )
+    save_sparse_model(context.folder / "backbone" / "model.npz", model)
+
+
+def _write_frames(context: StageContext, source: VideoSource | FolderSource, frames: list[Frame], lens: Lens) -> None:
+    """The frames without distortion; those of a lens without any are the picked ones, byte for byte."""
+    missing = [f for f in frames if not (context.folder / f.name).exists()]
+    if lens.shift_px <= _SIGNIFICANT_SHIFT_PX:
+        for frame in context.progress.track(missing, "frames", len(missing)):
+            _copy(_picked(context, frame.name), context.folder / frame.name)
+        return
+    by_index = {f.source_index: f for f in missing}
+
+    def write(picture: VideoFrame) -> None:
+        reduced = reduce_image(picture.rgb, context.config.frames.max_side)
+        write_rgb(context.folder / by_index[picture.source_index].name, lens.undistort_image(reduced))
+
+    # Read again from the source: a picked JPEG would be compressed twice.
+    pictures: Iterator[VideoFrame] = source.read(by_index)
+    done = parallel_map(write, pictures, _threads(context))
+    for _ in context.progress.track(done, "undistorting", len(missing)):
+        pass
+
+
+def _figures(
+    context: StageContext, frames: list[Frame], choice: KeyframeChoice, structure: Structure, calibration: Calibration
+) -> dict[str, Any]:
+    report = structure.report
+    return {
+        "frames": len(frames),
+        "keyframes": len(choice.keyframes),
+        "keyframes_placed": report.registered,
+        "points": report.points,
+        "reprojection_px": round(report.reprojection_px, 4),
+        "pairs_agreeing": round(report.pairs_agreeing, 4),
+        "mapper": structure.mapper,
+        "calibration": calibration.origin,
+        "focal_px": round(calibration.intrinsics.fx, 3),
+        "focal_sd_px": round(calibration.focal_sd, 3),
+        "sharpness": round(float(np.median([f.sharpness for f in frames])), 2),
+    }
+
+
+STAGE = Stage("frames", 1, run, "pick frames, calibrate the camera, structure from motion over keyframes")

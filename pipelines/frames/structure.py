@@ -1,0 +1,147 @@
+"""Structure from motion over the keyframes: features, matches, poses and points, the camera."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from formats.errors import InputError
+from pipelines.config import FramesConfig
+from pipelines.frames.adjust import adjust
+from pipelines.frames.consistency import ModelReport, judge
+from pipelines.frames.database import write_database
+from pipelines.frames.features import FeatureExtractor, Features
+from pipelines.frames.mapping import calibrate_focal, map_globally, map_incrementally
+from pipelines.frames.matching import MatchOptions, VerifiedPair, match_pair
+from pipelines.frames.parallax import HOW_TO_FILM, require_parallax
+from pipelines.frames.retrieval import frame_descriptors, loop_pairs, sequential_pairs
+from pipelines.frames.snapshots import Snapshots
+from pipelines.progress import Progress
+
+_PAIRS_PER_BLOCK = 64
+_MIN_KEYFRAMES = 3
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Structure:
+    """An adjusted reconstruction (image i + 1 is keyframe i, camera 1 is the only one) and how good it is."""
+
+    model: pycolmap.Reconstruction
+    report: ModelReport
+    mapper: str
+    focal_sd: float
+
+
+@dataclass(frozen=True)
+class StructureFromMotion:
+    """`load_gray(frame_id)` gives an (H, W) uint8 frame; `camera` is what is known of the camera before, and
+    `is_fixed` says that it is known exactly."""
+
+    config: FramesConfig
+    camera: pycolmap.Camera
+    is_fixed: bool
+    load_gray: Callable[[int], NDArray[np.uint8]]
+    snapshots: Snapshots
+    progress: Progress
+    threads: int
+    seed: int
+
+    def run(self, keyframe_ids: Sequence[int]) -> Structure:
+        """Raises InputError when the keyframes have no parallax or too little in common."""
+        features = self._features(keyframe_ids)
+        pairs = self._pairs(features)
+        xy = [f.xy for f in features]
+        known_focal = self.camera.mean_focal_length() if self.camera.has_prior_focal_length else None
+        require_parallax(pairs, xy, (self.camera.width, self.camera.height), known_focal)
+        model, mapper, _ = self._map(features, pairs)
+        focal_sd = adjust(model, refine_camera=not self.is_fixed)
+        return Structure(model, judge(model, pairs, xy, len(features)), mapper, focal_sd)
+
+    def _features(self, keyframe_ids: Sequence[int]) -> list[Features]:
+        local = threading.local()
+
+        def extract(frame_id: int) -> Features:
+            if not hasattr(local, "extractor"):
+                local.extractor = FeatureExtractor(self.config.max_features, self.config.peak_threshold)
+            return local.extractor(self.load_gray(frame_id))
+
+        def stored(frame_id: int) -> Features:
+            return self.snapshots.features(frame_id, lambda: extract(frame_id))
+
+        found = parallel_map(stored, keyframe_ids, self.threads)
+        return list(self.progress.track(found, "features", len(keyframe_ids)))
+
+    def _pairs(self, features: Sequence[Features]) -> list[VerifiedPair]:
+        options = MatchOptions(max_error=self.config.max_match_error)
+        proposed = sorted({*sequential_pairs(len(features), self.config.overlap), *self._loops(features)})
+        blocks = [proposed[i : i + _PAIRS_PER_BLOCK] for i in range(0, len(proposed), _PAIRS_PER_BLOCK)]
+
+        def match(pair: tuple[int, int]) -> VerifiedPair | None:
+            return match_pair(pair, (features[pair[0]], features[pair[1]]), self.camera, options, self.seed)
+
+        def match_block(block: Sequence[tuple[int, int]]) -> list[VerifiedPair]:
+            return [p for p in parallel_map(match, block, self.threads) if p is not None]
+
+        numbered = self.progress.track(enumerate(blocks), "matches", len(blocks))
+        found = (self.snapshots.pairs(i, lambda b=block: match_block(b)) for i, block in numbered)  # type: ignore[misc]
+        return list(itertools.chain.from_iterable(found))
+
+    def _loops(self, features: Sequence[Features]) -> list[tuple[int, int]]:
+        if self.config.loop_candidates == 0:
+            return []
+        descriptors = frame_descriptors(features, self.seed)
+        return loop_pairs(descriptors, self.config.loop_candidates, self.config.overlap + 1)
+
+    def _map(
+        self, features: Sequence[Features], pairs: Sequence[VerifiedPair]
+    ) -> tuple[pycolmap.Reconstruction, str, ModelReport]:
+        """The better of the global and the incremental model; the second is only made when the first is doubtful."""
+        xy = [f.xy for f in features]
+        best: tuple[pycolmap.Reconstruction, str, ModelReport] | None = None
+        wanted = ("global", "incremental") if self.config.mapper == "auto" else (self.config.mapper,)
+        for name in self.progress.track(wanted, "mapping", len(wanted)):
+            if best is not None and best[2].is_sound:
+                break
+            model = self.snapshots.model(name, lambda work, n=name: self._run_mapper(n, work, features, pairs))  # type: ignore[misc]
+            if model is None:
+                continue
+            report = judge(model, pairs, xy, len(features))
+            if best is None or report.score > best[2].score:
+                best = model, name, report
+        if best is None or best[2].registered < min(_MIN_KEYFRAMES, len(features)):
+            raise InputError(
+                f"no structure could be found: {len(pairs)} pairs of {len(features)} views match. The views have too "
+                f"little texture, blur or overlap. {HOW_TO_FILM}, slowly and in good light"
+            )
+        return best
+
+    def _run_mapper(
+        self, name: str, work: Path, features: Sequence[Features], pairs: Sequence[VerifiedPair]
+    ) -> pycolmap.Reconstruction | None:
+        database = work / "database.db"
+        write_database(database, self.camera, [f"{i:06d}" for i in range(len(features))], features, pairs)
+        if not self.camera.has_prior_focal_length:
+            calibrate_focal(database, self.seed)
+        run = map_globally if name == "global" else map_incrementally
+        return run(database, work, not self.is_fixed, self.seed)
+
+
+def parallel_map(function: Callable[[T], R], items: Iterable[T], threads: int) -> Iterator[R]:
+    """`map` on threads, in order; at most a few results wait in memory."""
+    items = iter(items)
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        waiting = [pool.submit(function, item) for item in itertools.islice(items, 2 * max(1, threads))]
+        while waiting:
+            yield waiting.pop(0).result()
+            waiting.extend(pool.submit(function, item) for item in itertools.islice(items, 1))
