@@ -1,0 +1,200 @@
+"""The adjustment of everything tracked: poses, points and the scale fields of the proxy depths, in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import TrackingConfig
+from pipelines.tracking import depth_scales
+from pipelines.tracking.bundle import Bundle, adjust_bundle, adjust_pose
+from pipelines.tracking.depth_scales import WorldScale
+from pipelines.tracking.state import TrackState
+from pipelines.types import Intrinsics, ProxyMaps
+
+Array = NDArray[np.float64]
+
+LoadProxy = Callable[[int], ProxyMaps | None]
+OUTLIER_SD = 4.0
+ROUNDS = 3
+
+
+@dataclass
+class DepthTies:
+    """Proxy depths at the observations of a bundle, and the log scale fields (N, rows, columns) of its cameras.
+
+    depth (O,) as the provider gave it, 0 = none; reliability (O,); has_depth (N,) bool.
+    """
+
+    depth: Array
+    reliability: Array
+    has_depth: NDArray[np.bool_]
+    fields: Array
+    metric: bool
+    world: WorldScale | None = None
+
+
+@dataclass(frozen=True)
+class Report:
+    """What the adjustment did, for the stage's report."""
+
+    figures: dict[str, Any]
+    frame_ids: list[int]
+    ties: DepthTies
+
+
+def adjust_state(
+    state: TrackState, intrinsics: Intrinsics, load_proxy: LoadProxy, metric: bool, settings: TrackingConfig
+) -> Report:
+    """Adjust `state` in place: rounds of scale fields, bundle adjustment and removal of outliers.
+
+    With more frames than `settings.adjust_frames` only keyframes and points are adjusted together, and every other
+    frame follows by itself: the cost grows with the number of keyframes, not of frames.
+    """
+    frame_ids = sorted(state.poses) if len(state.poses) <= settings.adjust_frames else list(state.keyframes)
+    bundle = make_bundle(state, frame_ids)
+    ties = sample_depths(bundle, frame_ids, state, intrinsics, load_proxy, metric, settings)
+    initial = None
+    for round_number in range(ROUNDS):
+        bundle = set_scale(bundle, ties, intrinsics, settings)
+        tied = with_depths(bundle, ties, intrinsics, settings)
+        result = adjust_bundle(tied, intrinsics, settings.adjust_iterations)
+        initial = result.initial_cost if initial is None else initial
+        bundle = result.bundle
+        if round_number < ROUNDS - 1:
+            keep = consistent(bundle, intrinsics)
+            bundle, ties.depth, ties.reliability = bundle.select(keep), ties.depth[keep], ties.reliability[keep]
+    bundle = set_scale(bundle, ties, intrinsics, settings)
+    errors = bundle.reprojection_errors(intrinsics)
+    write_back(state, bundle, frame_ids)
+    follow_others(state, intrinsics, set(frame_ids))
+    figures = {
+        "adjusted_frames": len(frame_ids),
+        "points": len(np.unique(bundle.obs_point)),
+        "observations": len(bundle.obs_cam),
+        "reprojection_px": float(np.sqrt(np.mean(errors**2))),
+        "cost_before": initial,
+        "cost_after": result.cost,
+    }
+    return Report(figures, frame_ids, ties)
+
+
+def make_bundle(state: TrackState, frame_ids: list[int]) -> Bundle:
+    """All sightings of the given frames, in their order; points seen only once are left out."""
+    rows = [state.sightings[i] for i in frame_ids]
+    cam = np.repeat(np.arange(len(rows)), [len(r) for r in rows])
+    point = np.concatenate([r.point for r in rows])
+    keep = np.bincount(point, minlength=len(state.points))[point] >= 2
+    zeros = np.zeros(int(keep.sum()))
+    return Bundle(
+        np.array([state.poses[i] for i in frame_ids]),
+        state.points.copy(),
+        cam[keep],
+        point[keep],
+        np.concatenate([r.xy for r in rows])[keep],
+        np.concatenate([r.sd for r in rows])[keep],
+        zeros,
+        zeros + 1,
+    )
+
+
+def sample_depths(
+    bundle: Bundle,
+    frame_ids: list[int],
+    state: TrackState,
+    intrinsics: Intrinsics,
+    load_proxy: LoadProxy,
+    metric: bool,
+    settings: TrackingConfig,
+) -> DepthTies:
+    """Proxy depths of the keyframes at the bundle's observations."""
+    depth, reliability = np.zeros(len(bundle.obs_cam)), np.zeros(len(bundle.obs_cam))
+    has_depth = np.zeros(len(frame_ids), bool)
+    for c, frame_id in enumerate(frame_ids):
+        maps = load_proxy(frame_id) if frame_id in state.keyframes else None
+        if maps is None:
+            continue
+        mine = np.flatnonzero(bundle.obs_cam == c)
+        depth[mine], reliability[mine] = depth_scales.sample_proxy(maps, bundle.obs_xy[mine], intrinsics)
+        has_depth[c] = bool((depth[mine] > 0).sum() >= 5)
+    fields = np.zeros((len(frame_ids), settings.grid_rows, settings.grid_columns))
+    return DepthTies(depth, reliability, has_depth, fields, metric)
+
+
+def set_scale(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics, settings: TrackingConfig) -> Bundle:
+    """Fit the fields; when the proxies are metric, scale the world so that they are right on average."""
+    z = bundle.points_in_cam()[:, 2]
+    usable = (ties.depth > 0) & (z > 0)
+    log_ratio = np.where(usable, np.log(np.where(usable, z, 1) / np.where(usable, ties.depth, 1)), 0.0)
+    basis = depth_scales.bilinear_basis(bundle.obs_xy, intrinsics, settings.grid_rows, settings.grid_columns)
+    middles = np.zeros(len(ties.fields))
+    for c in np.flatnonzero(ties.has_depth):
+        mine = np.flatnonzero(usable & (bundle.obs_cam == c))
+        values, weights = log_ratio[mine], ties.reliability[mine]
+        middles[c] = depth_scales.keyframe_scale(values, weights)
+        ties.fields[c] = depth_scales.fit_field(
+            basis[mine], values, weights, settings.depth_sd, settings.grid_rows, settings.grid_columns
+        )
+    if not (ties.metric and ties.has_depth.any()):
+        return bundle
+    ties.world = depth_scales.world_scale(middles[ties.has_depth])
+    factor = ties.world.factor
+    ties.fields[ties.has_depth] += np.log(factor)
+    poses = bundle.cam_from_world.copy()
+    poses[:, :3, 3] *= factor
+    return replace(bundle, cam_from_world=poses, points=bundle.points * factor)
+
+
+def with_depths(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics, settings: TrackingConfig) -> Bundle:
+    """The bundle with the rescaled proxy depths as its depth observations.
+
+    Proxies that were made from the same pictures (not metric) say nothing new about the poses and are left out.
+    """
+    if not (settings.use_depth and ties.metric):
+        return bundle
+    basis = depth_scales.bilinear_basis(bundle.obs_xy, intrinsics, settings.grid_rows, settings.grid_columns)
+    log_scale = np.einsum("og,og->o", basis, ties.fields.reshape(len(ties.fields), -1)[bundle.obs_cam])
+    trusted = (ties.depth > 0) & ties.has_depth[bundle.obs_cam]
+    sd = settings.depth_sd / np.sqrt(np.maximum(ties.reliability, depth_scales.MIN_RELIABILITY))
+    return replace(bundle, obs_depth=np.where(trusted, ties.depth * np.exp(log_scale), 0.0), obs_depth_sd=sd)
+
+
+def consistent(bundle: Bundle, intrinsics: Intrinsics) -> NDArray[np.bool_]:
+    """(O,) observations to keep: no outliers, and of points that at least two cameras still see."""
+    errors = bundle.reprojection_errors(intrinsics) / bundle.obs_sd
+    # 1.1774: the median of a Rayleigh variable of sigma 1.
+    sigma = max(float(np.median(errors)) / 1.1774, 0.5)
+    keep = errors < OUTLIER_SD * sigma
+    keep &= np.bincount(bundle.obs_point[keep], minlength=len(bundle.points))[bundle.obs_point] >= 2
+    return keep
+
+
+def write_back(state: TrackState, bundle: Bundle, frame_ids: list[int]) -> None:
+    """Poses, points and the sightings that are left, into the state; points nobody sees stay unused."""
+    state.points = bundle.points
+    order = np.argsort(bundle.obs_cam, kind="stable")
+    bounds = np.searchsorted(bundle.obs_cam[order], np.arange(len(frame_ids) + 1))
+    for c, frame_id in enumerate(frame_ids):
+        mine = order[bounds[c] : bounds[c + 1]]
+        seen = state.sightings[frame_id]
+        state.poses[frame_id] = bundle.cam_from_world[c]
+        state.sightings[frame_id] = seen.select(np.isin(seen.point, bundle.obs_point[mine]))
+
+
+def follow_others(state: TrackState, intrinsics: Intrinsics, adjusted: set[int]) -> None:
+    """Frames outside the adjustment settle on the adjusted points they see."""
+    alive = np.zeros(len(state.points), bool)
+    for frame_id in adjusted:
+        alive[state.sightings[frame_id].point] = True
+    for frame_id in sorted(set(state.poses) - adjusted):
+        seen = state.sightings[frame_id]
+        seen = seen.select(alive[seen.point])
+        state.sightings[frame_id] = seen
+        if len(seen) >= 6:
+            state.poses[frame_id] = adjust_pose(
+                state.poses[frame_id], state.points[seen.point], seen.xy, seen.sd, intrinsics
+            )

@@ -1,0 +1,193 @@
+"""Bundle adjustment with proxy depths: camera poses and points, robustly, by Levenberg-Marquardt.
+
+An own solver, because pycolmap's Ceres interface has no residual for the depth of a point; without depths both reach
+the same minimum (the tests compare them). Points are eliminated (Schur complement), so the cost grows linearly with
+them; the reduced system over the cameras is solved densely.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from pipelines.geometry import se3
+from pipelines.tracking import bundle_kernels as kernels
+from pipelines.types import Intrinsics, require_shape
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Cameras, points and what ties them.
+
+    cam_from_world (N, 4, 4), points (P, 3) in the world; observations: obs_cam (O,), obs_point (O,) indices,
+    obs_xy (O, 2) pixels, obs_sd (O,) their standard deviation in pixels, obs_depth (O,) the proxy depth at that pixel
+    in the world's unit (0 = none) and obs_depth_sd (O,) its relative standard deviation.
+    """
+
+    cam_from_world: Array
+    points: Array
+    obs_cam: NDArray[np.int64]
+    obs_point: NDArray[np.int64]
+    obs_xy: Array
+    obs_sd: Array
+    obs_depth: Array
+    obs_depth_sd: Array
+
+    def __post_init__(self) -> None:
+        require_shape("cam_from_world", self.cam_from_world, (None, 4, 4))
+        require_shape("points", self.points, (None, 3))
+        require_shape("obs_xy", self.obs_xy, (len(self.obs_cam), 2))
+        for name in ("obs_point", "obs_sd", "obs_depth", "obs_depth_sd"):
+            require_shape(name, getattr(self, name), (len(self.obs_cam),))
+
+    def select(self, keep: NDArray) -> Bundle:
+        """Only the observations of a mask or of indices (O,); cameras and points stay."""
+        names = ("obs_cam", "obs_point", "obs_xy", "obs_sd", "obs_depth", "obs_depth_sd")
+        return replace(self, **{name: getattr(self, name)[keep] for name in names})
+
+    def points_in_cam(self) -> Array:
+        """(O, 3): every observed point in its camera."""
+        motions, points = self.cam_from_world[self.obs_cam], self.points[self.obs_point]
+        return np.einsum("oij,oj->oi", motions[:, :3, :3], points) + motions[:, :3, 3]
+
+    def reprojection_errors(self, intrinsics: Intrinsics) -> Array:
+        """(O,) pixels; infinite behind the camera."""
+        return reprojection_errors(self.points_in_cam(), self.obs_xy, intrinsics)
+
+
+def reprojection_errors(points_in_cam: Array, xy: Array, intrinsics: Intrinsics) -> Array:
+    """(O,) distances in pixels between projected points (O, 3) and pixels (O, 2); infinite behind the camera."""
+    z = np.where(points_in_cam[:, 2] > kernels.MIN_DEPTH, points_in_cam[:, 2], np.nan)
+    dx = intrinsics.fx * points_in_cam[:, 0] / z + intrinsics.cx - xy[:, 0]
+    dy = intrinsics.fy * points_in_cam[:, 1] / z + intrinsics.cy - xy[:, 1]
+    return np.nan_to_num(np.hypot(dx, dy), nan=np.inf)
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """The adjusted bundle, in the order it was given, with the robust costs before and after."""
+
+    bundle: Bundle
+    initial_cost: float
+    cost: float
+    iterations: int
+
+
+def adjust_bundle(
+    bundle: Bundle,
+    intrinsics: Intrinsics,
+    iterations: int = 20,
+    width: float = 2.0,
+    fixed: NDArray[np.bool_] | None = None,
+    tolerance: float = 1e-5,
+) -> Adjusted:
+    """Minimise reprojection and depth errors, each under Cauchy's loss of `width` standard deviations.
+
+    `fixed` (N,) bool: cameras that do not move. The free motion of the whole is left to the damping, so poses stay near
+    where they were. Stops when a step lowers the cost by less than `tolerance`, relatively.
+    """
+    problem = _Problem(bundle, intrinsics, width, fixed)
+    motions, points = bundle.cam_from_world.copy(), bundle.points.copy()
+    cost = initial = problem.cost(motions, points)
+    damping, done = 1e-4, 0
+    while done < iterations:
+        done += 1
+        normal = problem.linearise(motions, points)
+        accepted = False
+        while damping < 1e8:
+            step = problem.solve(normal, damping)
+            if step is not None:
+                moved, shifted = se3.exp(step[0]) @ motions, points + step[1]
+                tried = problem.cost(moved, shifted)
+                if tried < cost:
+                    accepted = True
+                    break
+            damping *= 8
+        if not accepted:
+            break
+        gain, cost, motions, points = (cost - tried) / cost, tried, moved, shifted
+        damping = max(damping / 5, 1e-8)
+        if gain < tolerance:
+            break
+    return Adjusted(replace(bundle, cam_from_world=motions, points=points), initial, cost, done)
+
+
+class _Problem:
+    """The arrays of a bundle in the order the kernels want: by point, then by camera."""
+
+    def __init__(self, bundle: Bundle, intrinsics: Intrinsics, width: float, fixed: NDArray[np.bool_] | None) -> None:
+        order = np.lexsort((bundle.obs_cam, bundle.obs_point))
+        b = bundle.select(order)
+        known = b.obs_depth > 0
+        log_depth = np.log(np.where(known, b.obs_depth, 1.0))
+        weight = np.where(known, 1 / np.where(known, b.obs_depth_sd, 1.0), 0.0)
+        camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
+        self.obs_cam, self.obs_point = b.obs_cam.astype(np.int64), b.obs_point.astype(np.int64)
+        self.data = (camera, self.obs_cam, self.obs_point, b.obs_xy, 1 / b.obs_sd, log_depth, weight, width)
+        self.starts = np.searchsorted(self.obs_point, np.arange(len(b.points) + 1))
+        self.free = np.ones(len(b.cam_from_world), bool) if fixed is None else ~fixed
+
+    def cost(self, motions: Array, points: Array) -> float:
+        return float(kernels.total_cost(motions, points, *self.data))
+
+    def linearise(self, motions: Array, points: Array) -> tuple[Array, ...]:
+        return kernels.linearise(motions, points, *self.data)
+
+    def solve(self, normal: tuple[Array, ...], damping: float) -> tuple[Array, Array] | None:
+        """Steps of cameras (N, 6) and points (P, 3); None where the system is not positive definite."""
+        cam_block, cam_right, point_block, point_right, mixed = normal
+        n = len(cam_block)
+        reduced, right = np.zeros((6 * n, 6 * n)), cam_right.ravel().copy()
+        diagonal = np.einsum("nii->ni", cam_block)
+        for c in range(n):
+            reduced[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] = cam_block[c] + np.diag(damping * diagonal[c] + 1e-9)
+        inverse = kernels.invert_points(point_block, damping)
+        kernels.eliminate_points(self.starts, self.obs_cam, mixed, inverse, point_right, reduced, right)
+        free = np.repeat(self.free, 6)
+        step = np.zeros(6 * n)
+        if free.any():
+            try:
+                factor = cho_factor(reduced if free.all() else reduced[np.ix_(free, free)], lower=False)
+            except LinAlgError:
+                return None
+            step[free] = cho_solve(factor, right[free])
+        cam_step = step.reshape(n, 6)
+        shift = kernels.point_steps(self.obs_cam, self.obs_point, mixed, inverse, point_right, cam_step)
+        return cam_step, shift
+
+
+def adjust_pose(
+    cam_from_world: Array,
+    points: Array,
+    xy: Array,
+    sd: Array,
+    intrinsics: Intrinsics,
+    iterations: int = 15,
+    width: float = 2.0,
+) -> Array:
+    """Motion-only adjustment: (4, 4) pose of one camera that sees known points (Q, 3) at pixels (Q, 2) of sd (Q,)."""
+    motion = np.ascontiguousarray(cam_from_world, dtype=np.float64)
+    index, none = np.zeros(len(points), np.int64), np.zeros(len(points))
+    camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
+    data = (camera, index, np.arange(len(points)), np.ascontiguousarray(xy), 1 / sd, none, none, width)
+    points = np.ascontiguousarray(points)
+    cost, damping = kernels.total_cost(motion[None], points, *data), 1e-4
+    for _ in range(iterations):
+        block, right, *_ = kernels.linearise(motion[None], points, *data)
+        step = np.linalg.solve(block[0] + np.diag(damping * np.diag(block[0]) + 1e-9), right[0])
+        moved = se3.exp(step) @ motion
+        tried = kernels.total_cost(moved[None], points, *data)
+        if tried < cost:
+            motion, gain, cost, damping = moved, (cost - tried) / cost, tried, damping / 5
+            if gain < 1e-6:
+                break
+        else:
+            damping *= 10
+            if damping > 1e6:
+                break
+    return motion

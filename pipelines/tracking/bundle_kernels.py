@@ -1,0 +1,163 @@
+"""Compiled loops of bundle adjustment: residuals, normal equations, elimination of the points.
+
+An observation has three residuals: x and y of its reprojection in units of its standard deviation, and, where the
+camera has a proxy depth there, log(z) - log(depth), likewise. A camera moves by a left twist (translation first).
+Loops run in the order of the observations, in one thread: the same input gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+MIN_DEPTH = 1e-6
+"""Relative to nothing: a point behind the camera is treated as an outlier of zero weight."""
+
+
+@njit(cache=True)
+def _residual(motion, point, camera, xy, inverse_sd, log_depth, depth_weight, residual, jac_cam, jac_point):  # type: ignore[no-untyped-def]
+    """Fill residual (3,), its derivatives by twist (3, 6) and point (3, 3); False if behind the camera."""
+    x = motion[0, 0] * point[0] + motion[0, 1] * point[1] + motion[0, 2] * point[2] + motion[0, 3]
+    y = motion[1, 0] * point[0] + motion[1, 1] * point[1] + motion[1, 2] * point[2] + motion[1, 3]
+    z = motion[2, 0] * point[0] + motion[2, 1] * point[1] + motion[2, 2] * point[2] + motion[2, 3]
+    if z <= MIN_DEPTH:
+        return False
+    iz = 1.0 / z
+    residual[0] = (camera[0] * x * iz + camera[2] - xy[0]) * inverse_sd
+    residual[1] = (camera[1] * y * iz + camera[3] - xy[1]) * inverse_sd
+    residual[2] = (np.log(z) - log_depth) * depth_weight
+    a, b = camera[0] * iz * inverse_sd, camera[1] * iz * inverse_sd
+    by_cam = np.zeros((3, 3))
+    by_cam[0, 0] = a
+    by_cam[0, 2] = -a * x * iz
+    by_cam[1, 1] = b
+    by_cam[1, 2] = -b * y * iz
+    by_cam[2, 2] = depth_weight * iz
+    for i in range(3):
+        d0, d1, d2 = by_cam[i, 0], by_cam[i, 1], by_cam[i, 2]
+        jac_cam[i, 0], jac_cam[i, 1], jac_cam[i, 2] = d0, d1, d2
+        jac_cam[i, 3] = d2 * y - d1 * z
+        jac_cam[i, 4] = d0 * z - d2 * x
+        jac_cam[i, 5] = d1 * x - d0 * y
+        for j in range(3):
+            jac_point[i, j] = d0 * motion[0, j] + d1 * motion[1, j] + d2 * motion[2, j]
+    return True
+
+
+@njit(cache=True)
+def _cauchy(squared, width):  # type: ignore[no-untyped-def]
+    """Cost and weight of Cauchy's loss of a squared residual."""
+    scaled = squared / (width * width)
+    return width * width * np.log1p(scaled), 1.0 / (1.0 + scaled)
+
+
+@njit(cache=True)
+def total_cost(motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_depth, depth_weight, width):  # type: ignore[no-untyped-def]
+    """Robust cost of all observations; one behind its camera costs what a residual of ten widths does."""
+    residual, jac_cam, jac_point = np.empty(3), np.empty((3, 6)), np.empty((3, 3))
+    cost = 0.0
+    for o in range(len(obs_cam)):
+        if not _residual(
+            motions[obs_cam[o]], points[obs_point[o]], camera, xy[o], inverse_sd[o], log_depth[o], depth_weight[o],
+            residual, jac_cam, jac_point,
+        ):  # fmt: skip
+            cost += _cauchy(100.0 * width * width, width)[0]
+            continue
+        cost += _cauchy(residual[0] ** 2 + residual[1] ** 2, width)[0] + _cauchy(residual[2] ** 2, width)[0]
+    return cost
+
+
+@njit(cache=True)
+def linearise(motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_depth, depth_weight, width):  # type: ignore[no-untyped-def]
+    """Normal equations: camera blocks (N, 6, 6), (N, 6), point blocks (P, 3, 3), (P, 3), mixed (O, 6, 3)."""
+    n, p, o_count = len(motions), len(points), len(obs_cam)
+    cam_block, cam_right = np.zeros((n, 6, 6)), np.zeros((n, 6))
+    point_block, point_right = np.zeros((p, 3, 3)), np.zeros((p, 3))
+    mixed = np.zeros((o_count, 6, 3))
+    residual, jac_cam, jac_point, weight = np.empty(3), np.empty((3, 6)), np.empty((3, 3)), np.empty(3)
+    for o in range(o_count):
+        c, q = obs_cam[o], obs_point[o]
+        if not _residual(
+            motions[c], points[q], camera, xy[o], inverse_sd[o], log_depth[o], depth_weight[o],
+            residual, jac_cam, jac_point,
+        ):  # fmt: skip
+            continue
+        weight[0] = _cauchy(residual[0] ** 2 + residual[1] ** 2, width)[1]
+        weight[1] = weight[0]
+        weight[2] = _cauchy(residual[2] ** 2, width)[1]
+        for k in range(3):
+            w, r = weight[k], residual[k]
+            if w == 0.0 or (k == 2 and depth_weight[o] == 0.0):
+                continue
+            for i in range(6):
+                wi = w * jac_cam[k, i]
+                cam_right[c, i] -= wi * r
+                for j in range(6):
+                    cam_block[c, i, j] += wi * jac_cam[k, j]
+                for j in range(3):
+                    mixed[o, i, j] += wi * jac_point[k, j]
+            for i in range(3):
+                wi = w * jac_point[k, i]
+                point_right[q, i] -= wi * r
+                for j in range(3):
+                    point_block[q, i, j] += wi * jac_point[k, j]
+    return cam_block, cam_right, point_block, point_right, mixed
+
+
+@njit(cache=True)
+def invert_points(point_block, damping):  # type: ignore[no-untyped-def]
+    """Inverses (P, 3, 3) of the damped point blocks."""
+    out = np.empty_like(point_block)
+    for q in range(len(point_block)):
+        m = point_block[q].copy()
+        floor = 1e-9 * (m[0, 0] + m[1, 1] + m[2, 2]) + 1e-12
+        for i in range(3):
+            m[i, i] += damping * m[i, i] + floor
+        out[q] = np.linalg.inv(m)
+    return out
+
+
+@njit(cache=True)
+def eliminate_points(starts, obs_cam, mixed, inverse_block, point_right, reduced, right):  # type: ignore[no-untyped-def]
+    """Subtract the points' share from the reduced camera system (6N, 6N; upper triangle) and its right side (6N,).
+
+    Observations are sorted by point, then camera; starts (P + 1,) are their ranges.
+    """
+    left = np.empty((6, 3))
+    for q in range(len(starts) - 1):
+        first, last = starts[q], starts[q + 1]
+        for a in range(first, last):
+            row = 6 * obs_cam[a]
+            for i in range(6):
+                total = 0.0
+                for j in range(3):
+                    value = 0.0
+                    for k in range(3):
+                        value += mixed[a, i, k] * inverse_block[q, k, j]
+                    left[i, j] = value
+                    total += value * point_right[q, j]
+                right[row + i] -= total
+            for b in range(a, last):
+                column = 6 * obs_cam[b]
+                for i in range(6):
+                    for j in range(6):
+                        reduced[row + i, column + j] -= (
+                            left[i, 0] * mixed[b, j, 0] + left[i, 1] * mixed[b, j, 1] + left[i, 2] * mixed[b, j, 2]
+                        )
+
+
+@njit(cache=True)
+def point_steps(obs_cam, obs_point, mixed, inverse_block, point_right, cam_step):  # type: ignore[no-untyped-def]
+    """Back substitution: steps (P, 3) of the points for the cameras' steps (N, 6)."""
+    rest = point_right.copy()
+    for o in range(len(obs_cam)):
+        c, q = obs_cam[o], obs_point[o]
+        for j in range(3):
+            for i in range(6):
+                rest[q, j] -= mixed[o, i, j] * cam_step[c, i]
+    out = np.zeros_like(rest)
+    for q in range(len(rest)):
+        for i in range(3):
+            for j in range(3):
+                out[q, i] += inverse_block[q, i, j] * rest[q, j]
+    return out

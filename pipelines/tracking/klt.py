@@ -1,0 +1,70 @@
+"""Subpixel correspondences by pyramidal Lucas-Kanade, checked forwards and backwards."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB -> (H, W) grey."""
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def follow(
+    grey_from: NDArray[np.uint8],
+    grey_to: NDArray[np.uint8],
+    xy: Array,
+    guess: Array,
+    window: int = 21,
+    levels: int = 3,
+    max_error: float = 0.7,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Where the points (Q, 2) of one picture lie in the other, searched from `guess` (Q, 2), and which were found (Q,).
+
+    A point is found when following it back ends within `max_error` pixels of where it began. Points whose guess is not
+    finite or far outside the picture are not found.
+    """
+    height, width = grey_to.shape
+    found: NDArray[np.bool_] = np.asarray(np.isfinite(guess).all(1))
+    found &= (np.where(np.isfinite(guess), guess, -1e9) > -window).all(1)
+    found &= (np.where(np.isfinite(guess), guess, 1e9) < np.array([width, height]) + window).all(1)
+    out = np.full_like(xy, np.nan)
+    if not found.any():
+        return out, found
+    # OpenCV puts the centre of the first pixel at (0, 0).
+    start = (xy[found] - 0.5).astype(np.float32)
+    there, ok = _flow(grey_from, grey_to, start, (guess[found] - 0.5).astype(np.float32), window, levels)
+    back, ok_back = _flow(grey_to, grey_from, there, start, window, levels)
+    inside = ((there >= 0) & (there <= [width - 1, height - 1])).all(1)
+    good = ok & ok_back & inside & (np.linalg.norm(back - start, axis=1) < max_error)
+    out[found] = there.astype(np.float64) + 0.5
+    found[found] = good
+    return out, found
+
+
+def _flow(
+    grey_from: NDArray[np.uint8], grey_to: NDArray[np.uint8], xy: NDArray, guess: NDArray, window: int, levels: int
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003)
+    there, status, _ = cv2.calcOpticalFlowPyrLK(
+        grey_from, grey_to, xy[:, None], guess[:, None].copy(), winSize=(window, window), maxLevel=levels,
+        criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
+    )  # fmt: skip
+    return there.reshape(-1, 2).astype(np.float32), status.reshape(-1).astype(bool)
+
+
+def corners(grey: NDArray[np.uint8], taken: Array, count: int, distance: float = 10.0) -> Array:
+    """Up to `count` new corners (Q, 2), subpixel, none within `distance` pixels of those taken (R, 2) or each other."""
+    mask = np.full(grey.shape, 255, np.uint8)
+    for x, y in np.asarray(taken).reshape(-1, 2):
+        cv2.circle(mask, (int(x), int(y)), int(distance), 0, -1)
+    found = cv2.goodFeaturesToTrack(grey, count, 0.005, distance, mask=mask, blockSize=5)
+    if found is None:
+        return np.zeros((0, 2))
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
+    found = cv2.cornerSubPix(grey, found, (3, 3), (-1, -1), criteria)
+    return found.reshape(-1, 2).astype(np.float64) + 0.5

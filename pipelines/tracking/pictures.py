@@ -1,0 +1,65 @@
+"""Grey pictures and features of frames, the last few kept in memory."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.run_folder import RunFolder
+from pipelines.tracking.features import Features, extract_features, frame_descriptor
+from pipelines.tracking.klt import to_grey
+from pipelines.types import Frame, ProxyMaps
+
+T = TypeVar("T")
+
+
+class _Recent(Generic[T]):
+    """The values of a function for the last `size` keys."""
+
+    def __init__(self, make: Callable[[int], T], size: int) -> None:
+        self.make, self.size = make, size
+        self.kept: OrderedDict[int, T] = OrderedDict()
+
+    def __call__(self, key: int) -> T:
+        if key not in self.kept:
+            self.kept[key] = self.make(key)
+            if len(self.kept) > self.size:
+                self.kept.popitem(last=False)
+        self.kept.move_to_end(key)
+        return self.kept[key]
+
+
+class Pictures:
+    """Everything tracking looks up by frame id; memory does not grow with the number of frames."""
+
+    def __init__(self, run: RunFolder, frames: Sequence[Frame], kept: int = 12) -> None:
+        self.run = run
+        self.frames = {f.id: f for f in frames}
+        self._grey = _Recent(lambda i: to_grey(self.color(i)), kept)
+        self._features = _Recent(lambda i: extract_features(self.grey(i)), 4 * kept)
+        # 32 x 24 x 3 numbers a frame: 9 MB for a thousand frames.
+        self._descriptor = _Recent(lambda i: frame_descriptor(self.color(i)), 20000)
+
+    def color(self, frame_id: int) -> NDArray[np.uint8]:
+        """(H, W, 3) RGB."""
+        return self.run.image(self.frames[frame_id])
+
+    def grey(self, frame_id: int) -> NDArray[np.uint8]:
+        """(H, W)."""
+        return self._grey(frame_id)
+
+    def features(self, frame_id: int) -> Features:
+        """SIFT features."""
+        return self._features(frame_id)
+
+    def descriptor(self, frame_id: int) -> NDArray[np.float32]:
+        """How the frame looks, for retrieval."""
+        return self._descriptor(frame_id)
+
+    def proxy(self, frame_id: int) -> ProxyMaps | None:
+        """Proxy maps where the frame has any."""
+        return self.run.load_proxy(frame_id) if self.run.has_proxy(frame_id) else None

@@ -1,0 +1,77 @@
+"""The pose of a frame from pixels and points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from pipelines.tracking.bundle import adjust_pose, reprojection_errors
+from pipelines.types import Intrinsics
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FramePose:
+    """cam_from_world (4, 4) and which correspondences (Q,) bool agree with it."""
+
+    cam_from_world: Array
+    inliers: NDArray[np.bool_]
+
+
+def colmap_camera(intrinsics: Intrinsics) -> pycolmap.Camera:
+    """The same pinhole camera for pycolmap, which also puts the first pixel's centre at (0.5, 0.5)."""
+    params = [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]
+    return pycolmap.Camera(model="PINHOLE", width=intrinsics.width, height=intrinsics.height, params=params)
+
+
+def solve_pose(
+    xy: Array,
+    points: Array,
+    intrinsics: Intrinsics,
+    seed: int,
+    start: Array | None = None,
+    max_error: float = 3.0,
+    sd: float = 0.5,
+) -> FramePose | None:
+    """RANSAC on minimal sets (pycolmap), then motion-only robust adjustment; None where no pose explains six points.
+
+    xy (Q, 2) pixels, points (Q, 3) in the world. A `start` (4, 4) is adjusted too and wins when it explains as many.
+    """
+    candidates = []
+    if start is not None and len(xy) >= 6:
+        candidates.append(start)
+    if len(xy) >= 6:
+        options = pycolmap.AbsolutePoseEstimationOptions()
+        options.ransac.max_error = max_error
+        options.ransac.random_seed = seed
+        options.ransac.min_num_trials, options.ransac.max_num_trials = 50, 2000
+        found = pycolmap.estimate_absolute_pose(xy, points, colmap_camera(intrinsics), options)
+        if found is not None:
+            candidates.append(np.vstack([found["cam_from_world"].matrix(), [0, 0, 0, 1]]))
+    best: FramePose | None = None
+    for motion in candidates:
+        adjusted = _settle(motion, xy, points, intrinsics, max_error, sd)
+        if adjusted is not None and (best is None or adjusted.inliers.sum() > best.inliers.sum()):
+            best = adjusted
+    return best
+
+
+def _settle(
+    motion: Array, xy: Array, points: Array, intrinsics: Intrinsics, max_error: float, sd: float
+) -> FramePose | None:
+    """Adjust with the inliers, look again which they are, adjust once more."""
+    for tolerance in (3 * max_error, max_error):
+        inliers = _errors(motion, xy, points, intrinsics) < tolerance
+        if inliers.sum() < 6:
+            return None
+        motion = adjust_pose(motion, points[inliers], xy[inliers], np.full(int(inliers.sum()), sd), intrinsics)
+    inliers = _errors(motion, xy, points, intrinsics) < max_error
+    return FramePose(motion, inliers) if inliers.sum() >= 6 else None
+
+
+def _errors(motion: Array, xy: Array, points: Array, intrinsics: Intrinsics) -> Array:
+    return reprojection_errors(points @ motion[:3, :3].T + motion[:3, 3], xy, intrinsics)

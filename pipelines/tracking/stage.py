@@ -1,0 +1,118 @@
+"""Stage 3: a pose for every frame, metric where the proxy depth is, and the sparse points that hold them together."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from formats.errors import InputError
+from formats.tensors import save_arrays
+from pipelines.config import TrackingConfig
+from pipelines.run_folder import save_sparse_model, save_trajectory, write_json
+from pipelines.stages import Stage, StageContext
+from pipelines.tracking.adjust import Report, adjust_state
+from pipelines.tracking.front_end import FrontEnd
+from pipelines.tracking.pictures import Pictures
+from pipelines.tracking.result import normalise, to_sparse_model, to_trajectory
+from pipelines.tracking.state import TrackState
+from pipelines.types import Frame
+
+
+def run(context: StageContext) -> dict[str, Any]:
+    """Keyframes from structure from motion, every other frame against them, then everything adjusted together."""
+    frames = context.run.load_frames()
+    intrinsics = context.run.load_calibration().intrinsics
+    settings = context.config.tracking
+    metric = bool(context.run.load_proxy_report().get("metric", False))
+    pictures = Pictures(context.run, frames)
+
+    state = track_frames(context, frames, pictures)
+    if len(state.poses) < 2:
+        raise InputError(
+            f"{context.source}: no camera motion could be recovered from {len(frames)} frames. A still camera, pure "
+            "rotation or pictures without texture give no parallax; film while walking, or choose another part"
+        )
+    report = adjust_state(state, intrinsics, pictures.proxy, metric, settings)
+    normalise(state)
+
+    trajectory = to_trajectory(state, frames)
+    save_trajectory(context.folder, trajectory)
+    save_sparse_model(context.folder / "sparse.npz", to_sparse_model(state))
+    save_depth_scales(context, state, report)
+    figures = describe(state, frames, report, metric)
+    write_json(context.folder / "tracking.json", figures)
+    warn_of_losses(context, state)
+    return figures
+
+
+def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures) -> TrackState:
+    """Every frame visited once; goes on from the last snapshot."""
+    settings = context.config.tracking
+    snapshot = context.snapshot / "state.npz"
+    state = TrackState.load(snapshot) if snapshot.exists() else start_state(context, settings)
+    intrinsics = context.run.load_calibration().intrinsics
+    times = {f.id: f.timestamp for f in frames}
+    front_end = FrontEnd(state, pictures, times, intrinsics, settings, context.config.run.seed)
+    for frame in context.progress.track(frames[state.done :], "tracking", len(frames) - state.done):
+        if frame.id not in state.poses:
+            front_end.track(frame.id)
+        state.done += 1
+        if state.done % settings.snapshot_every == 0:
+            state.save(snapshot)
+    return state
+
+
+def start_state(context: StageContext, settings: TrackingConfig) -> TrackState:
+    """The backbone, or nothing yet."""
+    backbone = context.run.load_backbone()
+    return TrackState() if backbone is None else TrackState.from_backbone(backbone, settings.feature_sd)
+
+
+def save_depth_scales(context: StageContext, state: TrackState, report: Report) -> None:
+    """depth in the world = scales * proxy depth of the keyframe; grids (N, rows, columns) is the same, field by field.
+
+    A grid's nodes span the picture from corner to corner; between them the *log* scale is bilinear.
+    """
+    keep = [c for c, i in enumerate(report.frame_ids) if report.ties.has_depth[c]]
+    grids = np.exp(report.ties.fields[keep])
+    scales = np.exp(np.median(report.ties.fields[keep].reshape(len(keep), -1), axis=1)) if keep else np.zeros(0)
+    frame_ids = np.array([report.frame_ids[c] for c in keep], np.int64)
+    save_arrays(context.folder / "depth_scales.npz", {"frame_ids": frame_ids, "scales": scales, "grids": grids})
+
+
+def describe(state: TrackState, frames: list[Frame], report: Report, metric: bool) -> dict[str, Any]:
+    """Key figures."""
+    world = report.ties.world
+    return {
+        "frames": len(frames),
+        "posed": len(state.poses),
+        "keyframes": len(state.keyframes),
+        "segments": len(set(state.segment.values())),
+        "lost": {str(i): reason for i, reason in sorted(state.lost.items())},
+        "scale": "metric" if metric and world else "free",
+        "scale_relative_sd": world.relative_sd if world else None,
+        **report.figures,
+    }
+
+
+def warn_of_losses(context: StageContext, state: TrackState) -> None:
+    """Name what is lost."""
+    if state.lost:
+        context.warn(f"{len(state.lost)} frames have no pose: {stretches(sorted(state.lost))}")
+    if len(set(state.segment.values())) > 1:
+        context.warn("the trajectory has parts that could not be joined; only the largest is kept")
+
+
+def stretches(ids: list[int]) -> str:
+    """[1, 2, 3, 7] -> "1-3, 7"."""
+    runs: list[list[int]] = []
+    for i in ids:
+        if runs and i == runs[-1][-1] + 1:
+            runs[-1].append(i)
+        else:
+            runs.append([i])
+    return ", ".join(f"{r[0]}-{r[-1]}" if len(r) > 1 else str(r[0]) for r in runs)
+
+
+STAGE = Stage("tracking", 1, run, "a pose for every frame, by correspondences and bundle adjustment")

@@ -1,0 +1,139 @@
+"""What tracking knows while it works: poses, points, and where each frame sees which point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.tensors import load_arrays, save_arrays
+from pipelines.types import SparseModel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Points seen by one frame: point (Q,) indices, xy (Q, 2) pixels, sd (Q,) their standard deviation in pixels."""
+
+    point: NDArray[np.int64]
+    xy: Array
+    sd: Array
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+    def select(self, keep: NDArray) -> Sightings:
+        """Those of a mask or of indices."""
+        return Sightings(self.point[keep], self.xy[keep], self.sd[keep])
+
+    def joined(self, other: Sightings) -> Sightings:
+        """Both, this one's first."""
+        return Sightings(
+            np.concatenate([self.point, other.point]),
+            np.concatenate([self.xy, other.xy]),
+            np.concatenate([self.sd, other.sd]),
+        )
+
+
+NO_SIGHTINGS = Sightings(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
+
+
+@dataclass
+class TrackState:
+    """points (P, 3) in the world, colors (P, 3); per frame id its pose cam_from_world, its sightings or why it is lost.
+
+    `segment` numbers connected stretches: poses of different segments cannot be compared. `done` counts the frames
+    that have been visited.
+    """
+
+    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    colors: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+    poses: dict[int, Array] = field(default_factory=dict)
+    sightings: dict[int, Sightings] = field(default_factory=dict)
+    keyframes: list[int] = field(default_factory=list)
+    lost: dict[int, str] = field(default_factory=dict)
+    segment: dict[int, int] = field(default_factory=dict)
+    done: int = 0
+
+    @staticmethod
+    def from_backbone(model: SparseModel, sd: float) -> TrackState:
+        """The keyframes and points of structure from motion as segment 0."""
+        state = TrackState(model.points_in_world.copy(), model.colors.copy())
+        order = np.argsort(model.obs_frame, kind="stable")
+        bounds = np.searchsorted(model.obs_frame[order], np.arange(len(model.frame_ids) + 1))
+        for k, frame_id in enumerate(int(i) for i in model.frame_ids):
+            mine = order[bounds[k] : bounds[k + 1]]
+            seen = Sightings(model.obs_point[mine].astype(np.int64), model.obs_xy[mine], np.full(len(mine), sd))
+            state.add_frame(frame_id, model.cam_from_world[k], seen, is_keyframe=True, segment=0)
+        return state
+
+    def add_frame(
+        self, frame_id: int, cam_from_world: Array, sightings: Sightings, is_keyframe: bool, segment: int
+    ) -> None:
+        """A posed frame; its sightings count each point once."""
+        _, first = np.unique(sightings.point, return_index=True)
+        self.poses[frame_id] = np.asarray(cam_from_world, dtype=np.float64)
+        self.sightings[frame_id] = sightings.select(np.sort(first))
+        self.segment[frame_id] = segment
+        self.lost.pop(frame_id, None)
+        if is_keyframe:
+            self.keyframes = sorted({*self.keyframes, frame_id})
+
+    def add_points(self, points: Array, colors: NDArray[np.uint8]) -> NDArray[np.int64]:
+        """Their indices (Q,)."""
+        first = len(self.points)
+        self.points = np.concatenate([self.points, points])
+        self.colors = np.concatenate([self.colors, colors])
+        return np.arange(first, len(self.points))
+
+    def nearest_keyframes(self, frame_id: int, count: int) -> list[int]:
+        """Up to `count` keyframes on each side in time, nearest first."""
+        before = [k for k in self.keyframes if k < frame_id][-count:]
+        after = [k for k in self.keyframes if k > frame_id][:count]
+        return sorted(before + after, key=lambda k: (abs(k - frame_id), k))
+
+    def save(self, path: Path) -> None:
+        """One npz, for going on after an interruption."""
+        ids = sorted(self.poses)
+        rows = [self.sightings[i] for i in ids]
+        lost = sorted(self.lost)
+        arrays: dict[str, NDArray] = {
+            "points": self.points,
+            "colors": self.colors,
+            "ids": np.array(ids, np.int64),
+            "poses": np.array([self.poses[i] for i in ids]).reshape(-1, 4, 4),
+            "segment": np.array([self.segment[i] for i in ids], np.int64),
+            "counts": np.array([len(s) for s in rows], np.int64),
+            "point": np.concatenate([s.point for s in rows] or [NO_SIGHTINGS.point]),
+            "xy": np.concatenate([s.xy for s in rows] or [NO_SIGHTINGS.xy]),
+            "sd": np.concatenate([s.sd for s in rows] or [NO_SIGHTINGS.sd]),
+            "keyframes": np.array(self.keyframes, np.int64),
+            "lost": np.array(lost, np.int64),
+            "reasons": np.array([self.lost[i] for i in lost], np.str_),
+            "done": np.array(self.done),
+        }
+        save_arrays(path, arrays)
+
+    @staticmethod
+    def load(path: Path) -> TrackState:
+        """Inverse of `save`."""
+        a = load_arrays(path)
+        ends = np.cumsum(a["counts"])
+        ids = [int(i) for i in a["ids"]]
+        sightings = {
+            i: Sightings(a["point"][e - c : e], a["xy"][e - c : e], a["sd"][e - c : e])
+            for i, e, c in zip(ids, ends, a["counts"], strict=True)
+        }
+        return TrackState(
+            a["points"],
+            a["colors"],
+            dict(zip(ids, a["poses"], strict=True)),
+            sightings,
+            [int(k) for k in a["keyframes"]],
+            {int(i): str(r) for i, r in zip(a["lost"], a["reasons"], strict=True)},
+            dict(zip(ids, (int(s) for s in a["segment"]), strict=True)),
+            int(a["done"]),
+        )
