@@ -1,0 +1,314 @@
+"""COLMAP models: written in the format every version and every splatting trainer reads, read by pycolmap."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from formats.atomic import write_bytes, write_text
+from formats.colmap_binary import require_whole_files
+from formats.errors import InputError
+from formats.trajectory import nearest_rotation
+
+_PINHOLE_MODEL_ID = 1
+_CAMERA_ID = 1
+_POINT2D = np.dtype([("xy", "<f8", 2), ("point3D_id", "<u8")])
+_TRACK_ELEMENT = np.dtype([("image_id", "<u4"), ("point2D_idx", "<u4")])
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """Images with poses, and points with their observations.
+
+    names: N image names. cam_from_world (N, 4, 4) float64. cameras: COLMAP's own (model name, width, height, params),
+    camera_index (N,) int which of them each image has. points (P, 3) float64, colors (P, 3) uint8. Observations:
+    obs_image (O,) and obs_point (O,) int indices into images and points, obs_xy (O, 2) float64 pixels, first pixel's
+    centre at (0.5, 0.5).
+    """
+
+    names: tuple[str, ...]
+    cam_from_world: NDArray[np.float64]
+    cameras: tuple[tuple[str, int, int, tuple[float, ...]], ...]
+    camera_index: NDArray[np.int64]
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    obs_image: NDArray[np.int64]
+    obs_point: NDArray[np.int64]
+    obs_xy: NDArray[np.float64]
+
+
+def write_colmap_model(
+    folder: Path,
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    names: tuple[str, ...] | list[str],
+    cam_from_world: NDArray[np.float64],
+    points: NDArray[np.float64],
+    colors: NDArray[np.uint8],
+    obs_image: NDArray[np.int64],
+    obs_point: NDArray[np.int64],
+    obs_xy: NDArray[np.float64],
+) -> None:
+    """Write cameras, images and points3D, binary and text, for one PINHOLE camera.
+
+    names: N; cam_from_world (N, 4, 4); points (P, 3); colors (P, 3) uint8; obs_image (O,) in 0..N-1, obs_point (O,)
+    in 0..P-1, obs_xy (O, 2) pixels with the first pixel's centre at (0.5, 0.5). Ids in the files count from 1, in the
+    order given. Each point's error is the mean reprojection error of its observations. COLMAP's text format has no
+    way to write blanks in a name: such names are whole in the binary files only.
+
+    Raises ValueError for shapes or indices that do not fit together, InputError when the disk refuses.
+    """
+    _require_consistent(names, cam_from_world, points, colors, obs_image, obs_point, obs_xy)
+    camera = (width, height, fx, fy, cx, cy)
+    errors = _point_errors(camera, cam_from_world, points, obs_image, obs_point, obs_xy)
+    images = _Images.from_arrays(names, cam_from_world, obs_image, obs_point, obs_xy)
+    tracks = _tracks(images, len(points))
+    folder = Path(folder)
+    # Binary last: readers look for it first, and must not find it before the rest is there.
+    write_text(folder / "cameras.txt", _cameras_text(camera))
+    write_text(folder / "images.txt", _images_text(images))
+    write_text(folder / "points3D.txt", _points_text(points, colors, errors, tracks))
+    write_bytes(folder / "cameras.bin", _cameras_binary(camera))
+    write_bytes(folder / "images.bin", _images_binary(images))
+    write_bytes(folder / "points3D.bin", _points_binary(points, colors, errors, tracks))
+
+
+def read_colmap_model(folder: Path) -> ColmapModel:
+    """The registered images, in order of their names, and the points of a binary or text model in `folder`.
+
+    Raises InputError when the folder holds no complete model or a file of it is damaged.
+    """
+    folder = Path(folder)
+    reconstruction = _load(folder)
+    images = sorted((reconstruction.images[i] for i in reconstruction.reg_image_ids()), key=lambda image: image.name)
+    camera_ids = sorted({image.camera_id for image in images})
+    point_ids = np.array(sorted(reconstruction.points3D), dtype=np.uint64)
+    points = [reconstruction.points3D[int(i)] for i in point_ids]
+    obs_image, obs_id, obs_xy = _observations(images)
+    return ColmapModel(
+        names=tuple(image.name for image in images),
+        cam_from_world=np.array([_matrix(image) for image in images], dtype=np.float64).reshape(-1, 4, 4),
+        cameras=tuple(_plain_camera(reconstruction.cameras[i]) for i in camera_ids),
+        camera_index=np.array([camera_ids.index(image.camera_id) for image in images], dtype=np.int64),
+        points=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
+        colors=np.array([p.color for p in points], dtype=np.uint8).reshape(-1, 3),
+        obs_image=obs_image,
+        obs_point=np.searchsorted(point_ids, obs_id).astype(np.int64),
+        obs_xy=obs_xy,
+    )
+
+
+def model_suffix(folder: Path) -> str | None:
+    """ ".bin" or ".txt" when the folder holds a complete model of that kind, else None."""
+    for suffix in (".bin", ".txt"):
+        if all((folder / f"{part}{suffix}").is_file() for part in ("cameras", "images", "points3D")):
+            return suffix
+    return None
+
+
+def _load(folder: Path) -> Any:
+    import pycolmap  # half a second: only for those who read a model
+
+    suffix = model_suffix(folder)
+    if suffix is None:
+        raise InputError(
+            f"no complete COLMAP model in {folder}: expected cameras, images and points3D as .bin or as .txt "
+            "(look in sparse/0)"
+        )
+    if suffix == ".bin":
+        require_whole_files(folder)
+    reconstruction = pycolmap.Reconstruction()
+    try:
+        (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(str(folder))
+    except (ValueError, RuntimeError, IndexError, KeyError, MemoryError) as error:
+        reason = str(error).splitlines()[-1] if str(error) else type(error).__name__
+        raise InputError(f"the COLMAP model in {folder} is damaged ({reason}): copy or export it again") from error
+    return reconstruction
+
+
+def _observations(images: list[Any]) -> tuple[NDArray[np.int64], NDArray[np.uint64], NDArray[np.float64]]:
+    seen = [[(p.point3D_id, *p.xy) for p in image.points2D if p.has_point3D()] for image in images]
+    counts = [len(points) for points in seen]
+    flat = [p for points in seen for p in points]
+    ids = np.array([p[0] for p in flat], dtype=np.uint64)
+    xy = np.array([p[1:] for p in flat], dtype=np.float64).reshape(-1, 2)
+    return np.repeat(np.arange(len(images)), counts).astype(np.int64), ids, xy
+
+
+def _matrix(image: Any) -> NDArray[np.float64]:
+    return np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
+
+
+def _plain_camera(camera: Any) -> tuple[str, int, int, tuple[float, ...]]:
+    return camera.model.name, int(camera.width), int(camera.height), tuple(float(p) for p in camera.params)
+
+
+@dataclass(frozen=True)
+class _Images:
+    """What images.* holds: per image a name, a pose, and the slice starts[i]:starts[i+1] of the observations."""
+
+    names: tuple[str, ...]
+    quat_wxyz: NDArray[np.float64]
+    translations: NDArray[np.float64]
+    starts: NDArray[np.int64]
+    obs_point: NDArray[np.int64]
+    obs_xy: NDArray[np.float64]
+
+    @classmethod
+    def from_arrays(
+        cls,
+        names: tuple[str, ...] | list[str],
+        cam_from_world: NDArray[np.float64],
+        obs_image: NDArray[np.int64],
+        obs_point: NDArray[np.int64],
+        obs_xy: NDArray[np.float64],
+    ) -> _Images:
+        order = np.argsort(obs_image, kind="stable")
+        starts = np.searchsorted(obs_image[order], np.arange(len(names) + 1)).astype(np.int64)
+        rotations = nearest_rotation(cam_from_world[:, :3, :3])
+        quat_xyzw = Rotation.from_matrix(rotations).as_quat(canonical=True) if len(names) else np.zeros((0, 4))
+        return cls(
+            tuple(names), quat_xyzw[:, [3, 0, 1, 2]], cam_from_world[:, :3, 3], starts, obs_point[order], obs_xy[order]
+        )
+
+
+@dataclass(frozen=True)
+class _Tracks:
+    """Per point the slice starts[p]:starts[p+1] of (image_id, point2D_idx)."""
+
+    starts: NDArray[np.int64]
+    elements: NDArray
+
+
+def _tracks(images: _Images, point_count: int) -> _Tracks:
+    counts = np.diff(images.starts)
+    elements = np.empty(len(images.obs_point), dtype=_TRACK_ELEMENT)
+    elements["image_id"] = np.repeat(np.arange(1, len(counts) + 1), counts)
+    elements["point2D_idx"] = np.arange(len(images.obs_point)) - np.repeat(images.starts[:-1], counts)
+    order = np.argsort(images.obs_point, kind="stable")
+    starts = np.searchsorted(images.obs_point[order], np.arange(point_count + 1)).astype(np.int64)
+    return _Tracks(starts, elements[order])
+
+
+def _point_errors(
+    camera: tuple[int, int, float, float, float, float],
+    cam_from_world: NDArray[np.float64],
+    points: NDArray[np.float64],
+    obs_image: NDArray[np.int64],
+    obs_point: NDArray[np.int64],
+    obs_xy: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """(P,) mean reprojection error in pixels, 0 for a point without observations."""
+    _, _, fx, fy, cx, cy = camera
+    transforms = cam_from_world[obs_image]
+    in_cam = np.einsum("oij,oj->oi", transforms[:, :3, :3], points[obs_point]) + transforms[:, :3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        projected = in_cam[:, :2] / in_cam[:, 2:] * [fx, fy] + [cx, cy]
+    distance = np.nan_to_num(np.linalg.norm(projected - obs_xy, axis=1), nan=0.0, posinf=0.0)
+    counts = np.bincount(obs_point, minlength=len(points))
+    return np.bincount(obs_point, distance, minlength=len(points)) / np.maximum(counts, 1)
+
+
+def _cameras_text(camera: tuple[int, int, float, float, float, float]) -> str:
+    width, height, *parameters = camera
+    head = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+    return f"{head}{_CAMERA_ID} PINHOLE {width} {height} {_numbers(parameters)}\n"
+
+
+def _images_text(images: _Images) -> str:
+    lines = [
+        "# Image list with two lines of data per image:",
+        "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
+        "#   POINTS2D[] as (X, Y, POINT3D_ID)",
+    ]
+    for i, name in enumerate(images.names):
+        here = slice(images.starts[i], images.starts[i + 1])
+        pose = _numbers([*images.quat_wxyz[i], *images.translations[i]])
+        lines.append(f"{i + 1} {pose} {_CAMERA_ID} {name}")
+        pairs = zip(images.obs_xy[here].tolist(), images.obs_point[here].tolist(), strict=True)
+        lines.append(" ".join(f"{x!r} {y!r} {point + 1}" for (x, y), point in pairs))
+    return "\n".join(lines) + "\n"
+
+
+def _points_text(
+    points: NDArray[np.float64], colors: NDArray[np.uint8], errors: NDArray[np.float64], tracks: _Tracks
+) -> str:
+    lines = [
+        "# 3D point list with one line of data per point:",
+        "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
+    ]
+    elements = tracks.elements.tolist()
+    for p, (xyz, rgb) in enumerate(zip(points.tolist(), colors.tolist(), strict=True)):
+        track = " ".join(f"{image} {index}" for image, index in elements[tracks.starts[p] : tracks.starts[p + 1]])
+        lines.append(f"{p + 1} {_numbers(xyz)} {rgb[0]} {rgb[1]} {rgb[2]} {float(errors[p])!r} {track}".rstrip())
+    return "\n".join(lines) + "\n"
+
+
+def _cameras_binary(camera: tuple[int, int, float, float, float, float]) -> bytes:
+    width, height, *parameters = camera
+    return struct.pack("<QIiQQ4d", 1, _CAMERA_ID, _PINHOLE_MODEL_ID, width, height, *parameters)
+
+
+def _images_binary(images: _Images) -> bytes:
+    points2d = np.empty(len(images.obs_point), dtype=_POINT2D)
+    points2d["xy"] = images.obs_xy
+    points2d["point3D_id"] = images.obs_point + 1
+    parts = [struct.pack("<Q", len(images.names))]
+    for i, name in enumerate(images.names):
+        here = points2d[images.starts[i] : images.starts[i + 1]]
+        parts.append(struct.pack("<I7dI", i + 1, *images.quat_wxyz[i], *images.translations[i], _CAMERA_ID))
+        parts.append(name.encode("utf-8") + b"\0" + struct.pack("<Q", len(here)) + here.tobytes())
+    return b"".join(parts)
+
+
+def _points_binary(
+    points: NDArray[np.float64], colors: NDArray[np.uint8], errors: NDArray[np.float64], tracks: _Tracks
+) -> bytes:
+    parts = [struct.pack("<Q", len(points))]
+    for p in range(len(points)):
+        track = tracks.elements[tracks.starts[p] : tracks.starts[p + 1]]
+        parts.append(struct.pack("<Q3d3BdQ", p + 1, *points[p], *colors[p].tolist(), errors[p], len(track)))
+        parts.append(track.tobytes())
+    return b"".join(parts)
+
+
+def _numbers(values: list[float]) -> str:
+    return " ".join(repr(float(v)) for v in values)
+
+
+def _require_consistent(
+    names: tuple[str, ...] | list[str],
+    cam_from_world: NDArray[np.float64],
+    points: NDArray[np.float64],
+    colors: NDArray[np.uint8],
+    obs_image: NDArray[np.int64],
+    obs_point: NDArray[np.int64],
+    obs_xy: NDArray[np.float64],
+) -> None:
+    n, p, o = len(names), len(points), len(obs_image)
+    shapes = {
+        "cam_from_world": (cam_from_world.shape, (n, 4, 4)),
+        "points": (points.shape, (p, 3)),
+        "colors": (colors.shape, (p, 3)),
+        "obs_point": (obs_point.shape, (o,)),
+        "obs_xy": (obs_xy.shape, (o, 2)),
+    }
+    for what, (got, expected) in shapes.items():
+        if got != expected:
+            raise ValueError(f"write_colmap_model: {what}: got shape {got}, expected {expected}")
+    if o and not (0 <= obs_image.min() <= obs_image.max() < n and 0 <= obs_point.min() <= obs_point.max() < p):
+        raise ValueError("write_colmap_model: an observation points outside the images or points")
+    if len(set(names)) != n or any(not name or "\n" in name or "\0" in name for name in names):
+        raise ValueError("write_colmap_model: image names must be unique, not empty, and without line breaks")
+    if not (np.isfinite(cam_from_world).all() and np.isfinite(points).all() and np.isfinite(obs_xy).all()):
+        raise ValueError("write_colmap_model: got a value that is not finite")

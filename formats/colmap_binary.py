@@ -1,0 +1,61 @@
+"""Whether COLMAP's binary files are whole, told before a reader trusts the counts in them."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+from formats.errors import InputError
+
+# Parameters of each of COLMAP's camera models, in the order of the models' ids (SIMPLE_PINHOLE first).
+_PARAMETER_COUNTS = dict(enumerate((3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)))
+_CAMERA_HEAD_BYTES = 4 + 4 + 8 + 8
+_IMAGE_HEAD_BYTES = 4 + 7 * 8 + 4
+_POINT_HEAD_BYTES = 8 + 3 * 8 + 3 + 8
+_POINT2D_BYTES = 8 + 8 + 8
+_TRACK_ELEMENT_BYTES = 4 + 4
+
+
+def require_whole_files(folder: Path) -> None:
+    """Walk through cameras.bin, images.bin and points3D.bin and check that each ends where its counts say.
+
+    pycolmap trusts the counts: it reads on past the end of a truncated file, into wrong cameras or into as much
+    memory as the machine has. Raises InputError naming the file.
+    """
+    for name, walk in (("cameras", _walk_cameras), ("images", _walk_images), ("points3D", _walk_points)):
+        path = folder / f"{name}.bin"
+        data = path.read_bytes()
+        try:
+            end = walk(data)
+        except (struct.error, ValueError, KeyError):
+            end = -1
+        if end != len(data):
+            raise InputError(f"{path} is damaged or was not copied completely: copy or export the model again")
+
+
+def _walk_cameras(data: bytes) -> int:
+    (count,) = struct.unpack_from("<Q", data, 0)
+    at = 8
+    for _ in range(count):
+        (model,) = struct.unpack_from("<i", data, at + 4)
+        at += _CAMERA_HEAD_BYTES + 8 * _PARAMETER_COUNTS[model]
+    return at
+
+
+def _walk_images(data: bytes) -> int:
+    (count,) = struct.unpack_from("<Q", data, 0)
+    at = 8
+    for _ in range(count):
+        at = data.index(b"\0", at + _IMAGE_HEAD_BYTES) + 1
+        (points,) = struct.unpack_from("<Q", data, at)
+        at += 8 + _POINT2D_BYTES * points
+    return at
+
+
+def _walk_points(data: bytes) -> int:
+    (count,) = struct.unpack_from("<Q", data, 0)
+    at = 8
+    for _ in range(count):
+        (track,) = struct.unpack_from("<Q", data, at + _POINT_HEAD_BYTES)
+        at += _POINT_HEAD_BYTES + 8 + _TRACK_ELEMENT_BYTES * track
+    return at

@@ -1,0 +1,150 @@
+"""COLMAP models: pycolmap reads what we write, and every digit of it comes back."""
+
+from __future__ import annotations
+
+import resource
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+
+from formats.colmap import ColmapModel, model_suffix, read_colmap_model, write_colmap_model
+from formats.errors import InputError
+
+WIDTH, HEIGHT, FX, FY, CX, CY = 640, 480, 525.0, 520.0, 321.0, 238.5
+
+
+def _scene(noise: float = 0.0) -> ColmapModel:
+    """6 cameras that look at 200 points, observations in random order, two points that nobody saw."""
+    rng = np.random.default_rng(0)
+    cam_from_world = np.tile(np.eye(4), (6, 1, 1))
+    cam_from_world[:, :3, :3] = Rotation.from_rotvec(rng.normal(0, 0.1, (6, 3))).as_matrix()
+    cam_from_world[:, :3, 3] = rng.normal(0, 0.3, (6, 3)) + np.array([0, 0, 5])
+    points = rng.uniform(-1, 1, (200, 3))
+    image, point = (a.ravel() for a in np.meshgrid(np.arange(6), np.arange(198), indexing="ij"))
+    keep = rng.permutation(len(image))[:800]
+    keep = np.concatenate([keep, np.setdiff1d(np.flatnonzero(image == 0), keep)])
+    image, point = image[keep], point[keep]
+    in_cam = np.einsum("oij,oj->oi", cam_from_world[image, :3, :3], points[point]) + cam_from_world[image, :3, 3]
+    xy = in_cam[:, :2] / in_cam[:, 2:] * [FX, FY] + [CX, CY] + noise * rng.choice([-1.0, 1.0], (len(image), 2))
+    return ColmapModel(
+        names=tuple(f"img_{i * 7 % 6}.jpg" for i in range(6)),
+        cam_from_world=cam_from_world,
+        cameras=(("PINHOLE", WIDTH, HEIGHT, (FX, FY, CX, CY)),),
+        camera_index=np.zeros(6, np.int64),
+        points=points,
+        colors=rng.integers(0, 256, (200, 3)).astype(np.uint8),
+        obs_image=image,
+        obs_point=point,
+        obs_xy=xy,
+    )
+
+
+def _write(folder: Path, m: ColmapModel) -> None:
+    write_colmap_model(
+        folder, WIDTH, HEIGHT, FX, FY, CX, CY, m.names, m.cam_from_world, m.points, m.colors, m.obs_image,
+        m.obs_point, m.obs_xy,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+def test_pycolmap_reads_both_kinds(tmp_path: Path, kind: str, noise: float) -> None:
+    scene = _scene(noise)
+    _write(tmp_path, scene)
+    for path in tmp_path.glob("*"):
+        if path.suffix != f".{kind}":
+            path.unlink()
+    model = pycolmap.Reconstruction(str(tmp_path))
+    assert (model.num_reg_images(), model.num_points3D(), len(model.cameras)) == (6, 200, 1)
+    stored = model.compute_mean_reprojection_error()
+    model.update_point_3d_errors()
+    recomputed = model.compute_mean_reprojection_error()
+    assert stored == pytest.approx(recomputed, abs=1e-9)
+    # every observation is off by (±0.5, ±0.5); the two unseen points count as 0
+    assert recomputed == pytest.approx(noise * np.sqrt(2) * 198 / 200, abs=1e-2 * noise + 1e-9)
+    back = read_colmap_model(tmp_path)
+    assert set(back.names) == set(scene.names)
+    order = np.argsort(scene.names)
+    np.testing.assert_allclose(back.cam_from_world, scene.cam_from_world[order], atol=1e-14)
+    assert (back.points == scene.points).all()
+    assert (back.colors == scene.colors).all()
+    assert back.cameras == scene.cameras
+    rank = np.argsort(order)
+    ours = sorted(zip(rank[scene.obs_image], scene.obs_point, *scene.obs_xy.T, strict=True))
+    assert sorted(zip(back.obs_image, back.obs_point, *back.obs_xy.T, strict=True)) == ours
+
+
+def test_written_files_are_the_same_every_time(tmp_path: Path) -> None:
+    _write(tmp_path / "a", _scene())
+    _write(tmp_path / "b", _scene())
+    names = sorted(p.name for p in (tmp_path / "a").iterdir())
+    assert names == [f"{n}{s}" for n in ("cameras", "images", "points3D") for s in (".bin", ".txt")]
+    assert all((tmp_path / "a" / n).read_bytes() == (tmp_path / "b" / n).read_bytes() for n in names)
+
+
+def test_a_model_without_points(tmp_path: Path) -> None:
+    write_colmap_model(
+        tmp_path, 8, 8, 5, 5, 4, 4, ["a.png"], np.eye(4)[None], np.zeros((0, 3)), np.zeros((0, 3), np.uint8),
+        np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)),
+    )  # fmt: skip
+    back = read_colmap_model(tmp_path)
+    assert back.names == ("a.png",)
+    assert back.points.shape == (0, 3)
+    assert back.obs_xy.shape == (0, 2)
+
+
+def test_names_with_blanks_survive_in_the_binary_files(tmp_path: Path) -> None:
+    scene = _scene()
+    _write(tmp_path, ColmapModel(**{**scene.__dict__, "names": tuple(f"my image {i}.jpg" for i in range(6))}))
+    assert read_colmap_model(tmp_path).names[2] == "my image 2.jpg"
+
+
+@pytest.mark.parametrize("spoil", ["shape", "index", "name", "nan"])
+def test_arrays_that_do_not_fit_are_refused(tmp_path: Path, spoil: str) -> None:
+    scene = _scene()
+    changed = {
+        "shape": {"obs_xy": scene.obs_xy[:-1]},
+        "index": {"obs_point": scene.obs_point + 10},
+        "name": {"names": ("same.jpg",) * 6},
+        "nan": {"points": scene.points * np.nan},
+    }[spoil]
+    with pytest.raises(ValueError, match="write_colmap_model"):
+        _write(tmp_path, ColmapModel(**{**scene.__dict__, **changed}))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_real_model_in_both_kinds(shared_data: Path) -> None:
+    binary = read_colmap_model(shared_data / "format_cases" / "colmap_table10" / "sparse" / "0")
+    text = read_colmap_model(shared_data / "format_cases" / "colmap_table10" / "text")
+    assert (len(binary.names), len(binary.points)) == (10, 2167)
+    assert binary.names == text.names
+    assert binary.cameras[0][0] == "SIMPLE_RADIAL"
+    for field in ("cam_from_world", "points", "colors", "obs_image", "obs_point", "obs_xy"):
+        np.testing.assert_allclose(
+            getattr(binary, field), getattr(text, field), atol=1e-3 if field == "obs_xy" else 1e-4
+        )
+
+
+def test_incomplete_models_are_explained(shared_data: Path, tmp_path: Path) -> None:
+    assert model_suffix(shared_data / "phone_desk" / "sparse" / "0") is None
+    with pytest.raises(InputError, match="no complete COLMAP model"):
+        read_colmap_model(shared_data / "phone_desk" / "sparse" / "0")
+    assert len(read_colmap_model(shared_data / "phone_desk" / "colmap_derived").names) == 70
+
+
+@pytest.mark.parametrize("part", ["cameras", "images", "points3D"])
+def test_truncated_files_are_refused_before_memory_is_spent(tmp_path: Path, part: str) -> None:
+    _write(tmp_path / "whole", _scene())
+    data = (tmp_path / "whole" / f"{part}.bin").read_bytes()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for keep in (0, 4, 9, len(data) // 3, len(data) - 1):
+        folder = tmp_path / str(keep)
+        shutil.copytree(tmp_path / "whole", folder)
+        (folder / f"{part}.bin").write_bytes(data[:keep])
+        with pytest.raises(InputError, match="not copied completely"):
+            read_colmap_model(folder)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
