@@ -1,6 +1,22 @@
-"""The differentiable renderer of isotropic semantic Gaussians."""
+"""The differentiable renderer of isotropic semantic Gaussians.
+
+`render` draws a map from a camera, `composite` blends already projected Gaussians; gradients flow through both.
+`median_depth` and `blending_weights` look at a map without gradients.
+"""
 
 from pipelines.gaussians.render.compositing import Composite, composite
+from pipelines.gaussians.render.inspection import BlendingWeights, blending_weights, median_depth
 from pipelines.gaussians.render.rendering import Rendering, render
+from pipelines.gaussians.render.threads import get_threads, set_threads
 
-__all__ = ["Composite", "Rendering", "composite", "render"]
+__all__ = [
+    "BlendingWeights",
+    "Composite",
+    "Rendering",
+    "blending_weights",
+    "composite",
+    "get_threads",
+    "median_depth",
+    "render",
+    "set_threads",
+]

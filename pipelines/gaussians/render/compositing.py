@@ -91,7 +91,7 @@ def choose_backend(backend: str | None, example: Tensor) -> ModuleType:
     if backend == "reference":
         return reference
     if backend == "cpu":
-        from pipelines.gaussians.render import cpu
+        from pipelines.gaussians.render import cpu  # importing numba takes a while: only where it is used
 
         return cpu
     raise ValueError(f"backend: got {backend!r}, expected 'reference', 'cpu', 'cuda' or None")

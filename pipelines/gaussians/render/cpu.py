@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,10 @@ from torch import Tensor
 from pipelines.gaussians.render.cpu_backward import backward_band, merge_gradients
 from pipelines.gaussians.render.cpu_bands import bin_gaussians
 from pipelines.gaussians.render.cpu_forward import forward_band
+from pipelines.gaussians.render.cpu_inspect import inspect
 from pipelines.gaussians.render.threads import for_each
+
+__all__ = ["composite", "inspect"]
 
 F32 = np.float32
 

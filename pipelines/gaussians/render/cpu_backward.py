@@ -229,18 +229,18 @@ def backward_band(
         for k in range(tile_starts[tile], tile_starts[tile + 1]):
             i = members[k]
             at = RECORD * i
-            x, y, r = records[at] - F32(left), records[at + 1] - F32(top), records[at + 5]
-            x0, x1 = first_pixel(x - r), last_pixel(x + r, columns)
-            y0, y1 = first_pixel(y - r), last_pixel(y + r, rows)
+            u_tile, v_tile, r = records[at] - F32(left), records[at + 1] - F32(top), records[at + 5]
+            x0, x1 = first_pixel(u_tile - r), last_pixel(u_tile + r, columns)
+            y0, y1 = first_pixel(v_tile - r), last_pixel(v_tile + r, rows)
             if x1 < x0 or y1 < y0:
                 continue
             precision = _ONE / (records[at + 2] * records[at + 2])
-            dx = counting(_HALF - x)
-            dy = counting(_HALF - y)
+            dx = counting(_HALF - u_tile)
+            dy = counting(_HALF - v_tile)
             dx2 = dx * dx
             falloff_x = exp(dx2 * (-_HALF * precision))
             store(falloff_y, 0, exp(dy * dy * (-_HALF * precision)) * records[at + 4])
-            weigh_rows(state, decisive, falloff_y, falloff_x, dx2, y, r * r, y0, y1)
+            weigh_rows(state, decisive, falloff_y, falloff_x, dx2, v_tile, r * r, y0, y1)
             quads = (x1 - x0 + 4) // 4
             corner = TILE * y0 + min(x0, TILE - 4 * quads)  # four at a time, without leaving the tile
             gradients_of_box(
@@ -249,9 +249,9 @@ def backward_band(
             )  # fmt: skip
             depth = records[at + 3]
             if kappa > _ZERO:
-                pull, pull_y, pull_y2, d_z = pull_rows_by_proxy(state, depth, y, y0, y1)
+                pull, pull_y, pull_y2, d_z = pull_rows_by_proxy(state, depth, v_tile, y0, y1)
             else:
-                pull, pull_y, pull_y2, d_z = pull_rows(state, depth, y, y0, y1)
+                pull, pull_y, pull_y2, d_z = pull_rows(state, depth, v_tile, y0, y1)
             d_records[i, 0] += total(pull * dx) * precision
             d_records[i, 1] += total(pull_y) * precision
             d_records[i, 2] += total(pull * dx2 + pull_y2) * precision / records[at + 2]

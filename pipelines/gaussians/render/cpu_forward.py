@@ -179,22 +179,22 @@ def forward_band(
         for k in range(tile_starts[tile], tile_starts[tile + 1]):
             i = members[k]
             at = RECORD * i
-            x, y, r = records[at] - F32(left), records[at + 1] - F32(top), records[at + 5]
-            x0, x1 = first_pixel(x - r), last_pixel(x + r, columns)
-            y0, y1 = first_pixel(y - r), last_pixel(y + r, rows)
+            u_tile, v_tile, r = records[at] - F32(left), records[at + 1] - F32(top), records[at + 5]
+            x0, x1 = first_pixel(u_tile - r), last_pixel(u_tile + r, columns)
+            y0, y1 = first_pixel(v_tile - r), last_pixel(v_tile + r, rows)
             if x1 < x0 or y1 < y0:
                 continue
             sharpness = -_HALF / (records[at + 2] * records[at + 2])
-            dx = counting(_HALF - x)
-            dy = counting(_HALF - y)
+            dx = counting(_HALF - u_tile)
+            dy = counting(_HALF - v_tile)
             dx2 = dx * dx
             falloff_x = exp(dx2 * sharpness)
             store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
             depth = records[at + 3]
             if kappa > _ZERO:
-                blend_rows_by_proxy(state, weights, falloff_y, falloff_x, dx2, y, r * r, depth, y0, y1)
+                blend_rows_by_proxy(state, weights, falloff_y, falloff_x, dx2, v_tile, r * r, depth, y0, y1)
             else:
-                blend_rows(state, weights, falloff_y, falloff_x, dx2, y, r * r, depth, y0, y1)
+                blend_rows(state, weights, falloff_y, falloff_x, dx2, v_tile, r * r, depth, y0, y1)
             corner = TILE * y0 + x0
             add_to_box(
                 image, corner * channels, padded, i * channels, weights, corner, y1 - y0 + 1, x1 - x0 + 1, vectors

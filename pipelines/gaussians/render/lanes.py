@@ -187,7 +187,17 @@ def total(typing_context: Any, value: Any) -> Any:
     """Sum of the lanes, always added in the same order."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return _sum(builder, args[0])
+        return _fold(builder, args[0], lambda x, y: builder.fadd(x, y, flags=_FLAGS))
+
+    return types.float32(lanes), emit
+
+
+@intrinsic
+def largest_of(typing_context: Any, value: Any) -> Any:
+    """The largest of the lanes."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        return _fold(builder, args[0], lambda x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y))
 
     return types.float32(lanes), emit
 
@@ -246,15 +256,12 @@ def bits(typing_context: Any, value: Any) -> Any:
     return types.uint32(types.float32), emit
 
 
-def _sum(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
+def _fold(builder: ir.IRBuilder, value: ir.Value, join: Callable[[ir.Value, ir.Value], ir.Value]) -> ir.Value:
     """Halves onto halves: a fixed order, four steps for sixteen lanes."""
-    undefined = ir.Constant(value.type, ir.Undefined)
-    length = value.type.count
-    step = length // 2
-    while step:
-        order = ir.Constant(_vector(length, _I32), [(i + step) % length for i in range(length)])
-        value = builder.fadd(value, builder.shuffle_vector(value, undefined, order), flags=_FLAGS)
-        step //= 2
+    undefined = ir.Constant(_vector(), ir.Undefined)
+    for step in (8, 4, 2, 1):
+        order = ir.Constant(_vector(element=_I32), [(i + step) % WIDTH for i in range(WIDTH)])
+        value = join(value, builder.shuffle_vector(value, undefined, order))
     return builder.extract_element(value, _I32(0))
 
 

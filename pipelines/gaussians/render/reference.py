@@ -69,6 +69,22 @@ def composite(
     )
 
 
+def inspect(
+    u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, width: int, height: int, near: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Median depth (H, W), and summed and largest blending weight of each Gaussian, (M,) each."""
+    u, v, sigma_px, z, opacity = (x.detach() for x in (u, v, sigma_px, z, opacity))
+    pairs = list_pairs(u, v, sigma_px, z, opacity, width, height, near)
+    alpha, depth = pair_opacities(pairs, u, v, sigma_px, z, opacity, width)
+    before = transmittance_before(alpha, pairs)
+    weights = torch.where(before >= TRANSMITTANCE_MIN, alpha * before, 0.0)
+    crossing = (before >= 0.5) & (before - weights < 0.5)
+    median = z.new_zeros(height * width).index_add(0, pairs.pixel[crossing], depth[crossing])
+    sums = torch.zeros_like(z).index_add(0, pairs.gaussian, weights)
+    most = torch.zeros_like(z).scatter_reduce(0, pairs.gaussian, weights, "amax")
+    return median.view(height, width), sums, most
+
+
 def list_pairs(
     u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, width: int, height: int, near: float
 ) -> Pairs:

@@ -1,0 +1,132 @@
+"""One forward walk that keeps what an image does not show: median depth, and how much each Gaussian was seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pipelines.gaussians.render.cpu_bands import (
+    BAND_ROWS,
+    RECORD,
+    TILE,
+    bin_gaussians,
+    first_pixel,
+    gather_band,
+    last_pixel,
+    list_tiles,
+    sort_by_depth,
+)
+from pipelines.gaussians.render.cpu_forward import (
+    CHECK_EVERY,
+    LIGHT,
+    PIXELS,
+    PLANES,
+    blend_rows,
+    is_opaque,
+    open_tile,
+)
+from pipelines.gaussians.render.jit import kernel
+from pipelines.gaussians.render.lanes import counting, exp, largest, largest_of, load, splat, store, total, where
+from pipelines.gaussians.render.threads import for_each
+
+F32 = np.float32
+_HALF, _ZERO = F32(0.5), F32(0)
+
+
+def inspect(
+    u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, width: int, height: int, near: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Median depth (H, W), and summed and largest blending weight of each Gaussian, (M,) each; float32 CPU tensors."""
+    inputs = [tensor.detach().contiguous().numpy() for tensor in (u, v, sigma_px, z, opacity)]
+    reach, starts, entries, slots = bin_gaussians(*inputs, width, height, F32(near))
+    median = np.empty((height, width), F32)
+    sums, most = np.zeros(len(reach), F32), np.zeros(len(reach), F32)
+    shared = np.zeros((int(slots[-1]), 2), F32)
+    no_features = np.zeros((len(reach), 0), F32)
+    job = (starts, entries, reach, slots, *inputs, no_features, median, sums, most, shared)
+    for_each(lambda band: inspect_band(band, *job), len(starts) - 1)
+    merge_statistics(slots, sums, most, shared)
+    return torch.from_numpy(median), torch.from_numpy(sums), torch.from_numpy(most)
+
+
+@kernel
+def inspect_band(
+    band: int,
+    starts: NDArray[np.int64],
+    entries: NDArray[np.int32],
+    reach: NDArray[np.float32],
+    slots: NDArray[np.int64],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    sigma_px: NDArray[np.float32],
+    z: NDArray[np.float32],
+    opacity: NDArray[np.float32],
+    no_features: NDArray[np.float32],
+    median: NDArray[np.float32],
+    sums: NDArray[np.float32],
+    most: NDArray[np.float32],
+    shared: NDArray[np.float32],
+) -> None:
+    """Fills the band's rows of `median`, and `sums` and `most` (or the row of `shared`) of the Gaussians seen in it."""
+    height, width = median.shape
+    own = entries[starts[band] : starts[band + 1]]
+    sort_by_depth(own, z)
+    records, _ = gather_band(own, u, v, sigma_px, z, opacity, reach, no_features, 0)
+    seen = np.zeros((len(own), 2), np.float32)
+    band_top = band * BAND_ROWS
+    tile_starts, members = list_tiles(records, band_top, width, min(BAND_ROWS, height - band_top))
+    across = (width + TILE - 1) // TILE
+    state, weights = np.empty(PIXELS * PLANES, np.float32), np.zeros(PIXELS, np.float32)
+    falloff_y, medians = np.empty(TILE, np.float32), np.empty(PIXELS, np.float32)
+    for tile in range(len(tile_starts) - 1):
+        left, top = TILE * (tile % across), band_top + TILE * (tile // across)
+        columns, rows = min(TILE, width - left), min(TILE, height - top)
+        open_tile(state, median, _ZERO, left, top, columns, rows)
+        medians[:] = _ZERO
+        for k in range(tile_starts[tile], tile_starts[tile + 1]):
+            i = members[k]
+            at = RECORD * i
+            u_tile, v_tile, r = records[at] - F32(left), records[at + 1] - F32(top), records[at + 5]
+            y0, y1 = first_pixel(v_tile - r), last_pixel(v_tile + r, rows)
+            if y1 < y0:
+                continue
+            sharpness = -_HALF / (records[at + 2] * records[at + 2])
+            dx, dy = counting(_HALF - u_tile), counting(_HALF - v_tile)
+            dx2 = dx * dx
+            store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
+            depth = records[at + 3]
+            blend_rows(state, weights, falloff_y, exp(dx2 * sharpness), dx2, v_tile, r * r, depth, y0, y1)
+            summed, top_weight = splat(_ZERO), splat(_ZERO)
+            for y in range(y0, y1 + 1):
+                weight, light = load(weights, TILE * y), load(state, LIGHT + TILE * y)
+                summed, top_weight = summed + weight, largest(top_weight, weight)
+                found = load(medians, TILE * y)
+                here = (light < splat(_HALF)) & (weight > splat(_ZERO)) & (found <= splat(_ZERO))
+                store(medians, TILE * y, found + where(here, splat(depth)))
+            seen[i, 0] += total(summed)
+            seen[i, 1] = max(seen[i, 1], largest_of(top_weight))
+            if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, LIGHT):
+                break
+        for y in range(rows):
+            for x in range(columns):
+                median[top + y, left + x] = medians[TILE * y + x]
+    for k in range(len(own)):
+        i = own[k]
+        if slots[i + 1] > slots[i]:
+            slot = slots[i] + band - first_pixel(v[i] - reach[i]) // BAND_ROWS
+            shared[slot, 0], shared[slot, 1] = seen[k, 0], seen[k, 1]
+        else:
+            sums[i], most[i] = seen[k, 0], seen[k, 1]
+
+
+@kernel
+def merge_statistics(
+    slots: NDArray[np.int64], sums: NDArray[np.float32], most: NDArray[np.float32], shared: NDArray[np.float32]
+) -> None:
+    """Over the bands of the Gaussians that several bands saw, top to bottom."""
+    for i in range(len(sums)):
+        for slot in range(slots[i], slots[i + 1]):
+            sums[i] += shared[slot, 0]
+            most[i] = max(most[i], shared[slot, 1])

@@ -1,0 +1,63 @@
+"""Forward-only views of the map: the depth of surfaces, and how much each Gaussian takes part in an image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from pipelines.gaussians.render.compositing import choose_backend, require_finite
+from pipelines.gaussians.render.rendering import NEAR, project_map
+from pipelines.types import Intrinsics
+
+
+@dataclass(frozen=True)
+class BlendingWeights:
+    """Of every Gaussian, over all pixels of an image: its summed and its largest blending weight, (M,) each."""
+
+    total: Tensor
+    largest: Tensor
+
+
+def median_depth(
+    means: Tensor,
+    radii: Tensor,
+    opacities: Tensor,
+    cam_from_world: Tensor,
+    intrinsics: Intrinsics,
+    near: float = NEAR,
+    backend: str | None = None,
+) -> Tensor:
+    """(H, W) depth of the Gaussian at which half the light is lost, 0 where it never is: one surface, never a mean of
+    two. No gradients; arguments as in `render`."""
+    return _inspect(means, radii, opacities, cam_from_world, intrinsics, near, backend)[0]
+
+
+def blending_weights(
+    means: Tensor,
+    radii: Tensor,
+    opacities: Tensor,
+    cam_from_world: Tensor,
+    intrinsics: Intrinsics,
+    near: float = NEAR,
+    backend: str | None = None,
+) -> BlendingWeights:
+    """What each of the M Gaussians contributes to the image of a camera: 0 where it is not seen at all. No gradients;
+    arguments as in `render`."""
+    return BlendingWeights(*_inspect(means, radii, opacities, cam_from_world, intrinsics, near, backend)[1:])
+
+
+def _inspect(
+    means: Tensor,
+    radii: Tensor,
+    opacities: Tensor,
+    cam_from_world: Tensor,
+    intrinsics: Intrinsics,
+    near: float,
+    backend: str | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    require_finite("opacities", opacities)
+    projected = project_map(means.detach(), radii.detach(), cam_from_world.detach(), intrinsics, near=near)
+    module = choose_backend(backend, means)
+    median, total, largest = module.inspect(*projected, opacities.detach(), intrinsics.width, intrinsics.height, near)
+    return median, total, largest
