@@ -53,6 +53,17 @@ class ProxyConfig:
 
     depth: str = setting("auto", "depth provider: auto, multiview, files:FOLDER, files, onnx:CARD")
     semantics: str = setting("auto", "semantics provider: auto, segments, files:FOLDER, files, onnx:CARD")
+    frames: str = setting("keyframes", "which frames get maps; all needs depth that needs no poses", ("keyframes", "all"))
+    max_side: int = setting(640, "the maps are at most this many pixels on the long side")
+    depth_scale: float = setting(0.001, "metres per unit of integer depth files")
+    alpha: float = setting(0.7, "eq. (2): how much depth edges lower the reliability")
+    beta: float = setting(0.8, "eq. (2): exponent of the depth's confidence")
+    gamma: float = setting(0.5, "eq. (2): exponent of the frame's semantic agreement")
+    theta_slope: float = setting(10.0, "eq. (3): lambda, steepness of the semantic agreement")
+    theta_middle: float = setting(0.3, "eq. (3): phi, agreement (mean IoU) that counts one half")
+    stereo_side: int = setting(320, "multiview matches images of this many pixels on the long side")
+    stereo_planes: int = setting(96, "multiview tries this many depths")
+    max_classes: int = setting(16, "segments makes at most this many classes")
 
 
 @dataclass(frozen=True)

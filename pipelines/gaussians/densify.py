@@ -1,0 +1,46 @@
+"""Where the map needs Gaussians (the three conditions of MSGS-SLAM 3.4, and plain error) and where it has useless ones."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussians.ssim import blur
+from pipelines.types import VOID
+
+
+def holes(silhouette: Tensor, least: float) -> Tensor:
+    """(H, W) bool: condition (a), the map does not cover the pixel."""
+    return silhouette < least
+
+
+def hidden_surfaces(rendered: Tensor, proxy: Tensor, trust: Tensor, tolerance: float) -> Tensor:
+    """(H, W) bool: condition (b), a trusted proxy is nearer than the map by more than `tolerance` of its depth.
+
+    The less the proxy is trusted, the farther it has to stand out.
+    """
+    allowed = tolerance * proxy / trust.clamp(min=0.1)
+    return (proxy > 0) & (rendered - proxy > allowed)
+
+
+def wrong_classes(logits: Tensor, channels: Tensor, weight: Tensor) -> Tensor:
+    """(H, W) bool: condition (c), the map shows another class than a confident label."""
+    if logits.shape[-1] == 0:
+        return torch.zeros_like(channels, dtype=torch.bool)
+    return (channels != VOID) & (weight > 0.5) & (logits.argmax(-1) != channels)
+
+
+def color_errors(rendered: Tensor, image: Tensor, quantile: float, least: float = 0.03) -> Tensor:
+    """(H, W) bool: the pixels whose smoothed colour error lies above the quantile, and above what the eye forgives."""
+    error = blur((rendered - image).abs().mean(-1, keepdim=True))[..., 0]
+    # kthvalue: torch.quantile refuses images of more than 16 million pixels.
+    k = max(int(quantile * error.numel()), 1)
+    return (error > error.reshape(-1).kthvalue(k).values) & (error > least)
+
+
+def useless(gaussian_map: GaussianMap, least_opacity: float, largest_radius: float) -> Tensor:
+    """(M,) bool: too transparent, too large or not finite."""
+    finite = torch.isfinite(gaussian_map.means).all(1) & torch.isfinite(gaussian_map.log_radii)
+    finite &= torch.isfinite(gaussian_map.colors).all(1) & torch.isfinite(gaussian_map.opacity_logits)
+    return ~finite | (gaussian_map.opacities < least_opacity) | (gaussian_map.radii > largest_radius)

@@ -1,0 +1,102 @@
+"""Which view is visited when: a pure function of the iteration, so that a resumed run goes on as an unbroken one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import MappingConfig
+from pipelines.mapping.covisibility import keyframe_weights, overlaps
+from pipelines.mapping.views import View
+
+
+@dataclass(frozen=True)
+class Step:
+    """One visit: view index, loss weight, learning rate factor, and what happens around it."""
+
+    iteration: int
+    view: int
+    weight: float
+    rate: float
+    coarse: bool
+    seed: bool
+    grow: bool
+    prune: bool
+    refine_pose: bool
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Seeding steps first (`window_steps` for each view in order), then `visits` over all views, shuffled each pass."""
+
+    settings: MappingConfig
+    seed: int
+    views: int
+    seeding: int
+    visits: int
+    overlap: NDArray[np.float64]
+    reliability: NDArray[np.float64]
+
+    @staticmethod
+    def plan(
+        views: Sequence[View], settings: MappingConfig, seed: int, seeding: bool, passes: float | None
+    ) -> Schedule:
+        """The schedule for these views; `passes` overrides that of the settings, which also have a least count."""
+        visits = round(passes * len(views)) if passes is not None else round(settings.passes * len(views))
+        if passes is None:
+            visits = max(visits, settings.min_iterations)
+        steps = max(settings.window_steps, 1) * len(views) if seeding else 0
+        reliability = np.array([float(v.trust.mean()) for v in views])
+        return Schedule(settings, seed, len(views), steps, visits, overlaps(views), reliability)
+
+    @property
+    def total(self) -> int:
+        """Number of steps."""
+        return self.seeding + self.visits
+
+    def step(self, iteration: int) -> Step:
+        """What happens at this iteration."""
+        return self._seeding_step(iteration) if iteration < self.seeding else self._visit(iteration)
+
+    def _seeding_step(self, iteration: int) -> Step:
+        """The new keyframe first, then in turn one that sees the same and one of all past ones."""
+        per_view = max(self.settings.window_steps, 1)
+        now, nth = divmod(iteration, per_view)
+        rng = np.random.default_rng([self.seed, 1, iteration])
+        view = now
+        if nth > 0 and now > 0:
+            view = self._covisible(now, rng) if nth % 2 else int(rng.integers(now))
+        weights = keyframe_weights(now, self.reliability, self.settings.time_decay, self.settings.reliability_decay)
+        return Step(iteration, view, float(weights[view]), 1.0, True, nth == 0, False, False, False)
+
+    def _covisible(self, now: int, rng: np.random.Generator) -> int:
+        overlap = self.overlap[now, :now]
+        # η > 0.08 of the article; where nobody sees the same, anybody will do.
+        chances = np.where(overlap > 0.08, overlap, 0.0)
+        if chances.sum() == 0:
+            return int(rng.integers(now))
+        return int(rng.choice(now, p=chances / chances.sum()))
+
+    def _visit(self, iteration: int) -> Step:
+        s = self.settings
+        visit = iteration - self.seeding
+        number, place = divmod(visit, self.views)
+        view = int(np.random.default_rng([self.seed, 2, number]).permutation(self.views)[place])
+        share = visit / max(self.visits, 1)
+        coarse = self.seeding > 0 and share < s.coarse_share
+        grows = s.densify_every > 0 and not coarse and share < s.densify_until and number % s.densify_every == 0
+        weights = keyframe_weights(0, self.reliability, 0.0, s.reliability_decay)
+        return Step(
+            iteration=iteration,
+            view=view,
+            weight=float(weights[view] / weights.mean()),
+            rate=s.rate_decay**share,
+            coarse=coarse,
+            seed=False,
+            grow=grows,
+            prune=grows and place == self.views - 1,
+            refine_pose=view != 0,
+        )

@@ -1,0 +1,155 @@
+"""New Gaussians from the pixels of a view, at the proxy depth or, where that is weak, at what its region says (eq. 17)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pipelines.gaussians.map import GaussianMap
+from pipelines.types import VOID, Intrinsics
+
+SEED_OPACITY = 0.73
+SEED_RADIUS = 0.7
+"""Radius of a seed in units of the distance between seeds on the image: neighbours then overlap without blurring."""
+SEED_LOGIT = 3.0
+"""Logit of a seed's own class against 0 for the others."""
+_MIN_REGION = 64
+_REGION_SAMPLES = 4000
+
+
+@dataclass(frozen=True)
+class SeedDepth:
+    """depth (H, W) float32, 0 = nowhere known; trust (H, W) 0..1."""
+
+    depth: NDArray[np.float32]
+    trust: NDArray[np.float32]
+
+
+def complete_depth(
+    depth: NDArray[np.float32],
+    reliability: NDArray[np.float32],
+    channels: NDArray[np.uint8],
+    low: float,
+    prior: bool,
+) -> SeedDepth:
+    """A depth for every pixel: reliable proxy, else proxy and region prior weighed, else filled from around.
+
+    depth, reliability U (H, W), channels (H, W). Pixels with U above `low` keep their depth (MSGS-SLAM eq. 17 gives the
+    others the prior of their class and connected region). What only the fill knows has trust 0.
+    """
+    known = depth > 0
+    inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=known)
+    trust = np.where(known, reliability, 0).astype(np.float32)
+    if prior:
+        inverse, trust = _apply_region_priors(inverse, trust, channels, low)
+    if not (inverse > 0).any():
+        return SeedDepth(np.zeros_like(depth), np.zeros_like(depth))
+    filled = np.where(inverse > 0, inverse, fill_smoothly(inverse, trust))
+    return SeedDepth((1.0 / np.maximum(filled, 1e-9)).astype(np.float32), trust)
+
+
+def _apply_region_priors(
+    inverse: NDArray[np.float32], trust: NDArray[np.float32], channels: NDArray[np.uint8], low: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Eq. (17) with μ_k a plane in inverse depth over the region, so that slanted walls keep their slant."""
+    out, out_trust = inverse.copy(), trust.copy()
+    for channel in np.unique(channels[channels != VOID]):
+        count, regions = cv2.connectedComponents((channels == channel).astype(np.uint8), connectivity=4)
+        for region in range(1, count):
+            rows, columns = np.nonzero(regions == region)
+            weak = trust[rows, columns] <= low
+            reliable = ~weak & (inverse[rows, columns] > 0)
+            if not weak.any() or reliable.sum() < _MIN_REGION:
+                continue
+            mean, spread = _fit_plane(columns, rows, inverse[rows, columns], reliable)
+            rows, columns, mean = rows[weak], columns[weak], mean[weak]
+            seen, weight = inverse[rows, columns], trust[rows, columns]
+            # The proxy's own precision at reliability U is taken as U² / 5 %²; the prior's is its residual spread.
+            proxy_precision = np.where(seen > 0, (weight / (0.05 * np.maximum(seen, 1e-9))) ** 2, 0)
+            prior_precision = 1 / max(spread, 1e-9) ** 2
+            fused = (proxy_precision * seen + prior_precision * mean) / (proxy_precision + prior_precision)
+            good = (mean > 0) & (spread < 0.1 * mean)
+            out[rows[good], columns[good]] = fused[good]
+            out_trust[rows[good], columns[good]] = np.maximum(weight[good], low / 2)
+    return out, out_trust
+
+
+def _fit_plane(
+    columns: NDArray, rows: NDArray, values: NDArray[np.float32], use: NDArray[np.bool_]
+) -> tuple[NDArray[np.float32], float]:
+    """Robust plane a x + b y + c through the used values, at all places, and the spread of its residuals."""
+    picked = np.flatnonzero(use)
+    picked = picked[:: max(len(picked) // _REGION_SAMPLES, 1)]
+    design = np.stack([columns, rows, np.ones(len(rows))], 1) / [1000, 1000, 1]
+    target, weights = values[picked].astype(np.float64), np.ones(len(picked))
+    for _ in range(5):
+        a = design[picked] * weights[:, None]
+        plane = np.linalg.lstsq(a, target * weights, rcond=None)[0]
+        residual = np.abs(design[picked] @ plane - target)
+        spread = 1.4826 * float(np.median(residual))
+        weights = np.sqrt(1 / np.maximum(residual / max(spread, 1e-9), 1))
+    return (design @ plane).astype(np.float32), spread
+
+
+def fill_smoothly(values: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H, W) a smooth continuation of the values > 0: coarser and coarser weighted means until everything is covered."""
+    known = np.where(values > 0, np.maximum(weights, 1e-3), 0).astype(np.float32)
+    levels = [(values * known, known)]
+    while min(levels[-1][0].shape) > 2:
+        levels.append((cv2.pyrDown(levels[-1][0]), cv2.pyrDown(levels[-1][1])))
+    filled = np.full_like(levels[-1][0], float(levels[-1][0].sum() / max(levels[-1][1].sum(), 1e-12)))
+    for total, weight in reversed(levels):
+        coarse = cv2.resize(filled, total.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        share = np.clip(weight / 0.05, 0, 1)
+        mean = np.divide(total, weight, out=coarse.copy(), where=weight > 1e-6)
+        filled = share * mean + (1 - share) * coarse
+    return filled
+
+
+def seed_gaussians(
+    pixels: Tensor,
+    depth: Tensor,
+    colors: Tensor,
+    channels: Tensor,
+    spacing: float,
+    classes: int,
+    cam_from_world: Tensor,
+    intrinsics: Intrinsics,
+    frame_id: int,
+) -> GaussianMap:
+    """One Gaussian for each marked pixel with a depth.
+
+    pixels (H, W) bool, depth (H, W), colors (H, W, 3) 0..1, channels (H, W) uint8, spacing: pixels between neighbours.
+    """
+    rows, columns = torch.nonzero(pixels & (depth > 0), as_tuple=True)
+    z = depth[rows, columns]
+    x = (columns + 0.5 - intrinsics.cx) / intrinsics.fx * z
+    y = (rows + 0.5 - intrinsics.cy) / intrinsics.fy * z
+    world_from_cam = torch.linalg.inv(cam_from_world)
+    in_world = torch.stack([x, y, z], 1).double() @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+    focal = math.sqrt(intrinsics.fx * intrinsics.fy)
+    channel = channels[rows, columns].long()
+    logits = torch.zeros(len(z), classes + 1, device=z.device)
+    # Void pixels write into a column of their own, which is cut off.
+    logits[torch.arange(len(z), device=z.device), channel.clamp(max=classes)] = SEED_LOGIT
+    return GaussianMap(
+        means=in_world.float(),
+        log_radii=torch.log(z / focal * (spacing * SEED_RADIUS)),
+        opacity_logits=torch.full_like(z, math.log(SEED_OPACITY / (1 - SEED_OPACITY))),
+        colors=colors[rows, columns].float(),
+        class_logits=logits[:, :classes].contiguous(),
+        anchor_frame_ids=torch.full((len(z),), frame_id, dtype=torch.int64, device=z.device),
+    )
+
+
+def seed_grid(height: int, width: int, stride: int) -> NDArray[np.bool_]:
+    """(H, W) every stride-th pixel of every stride-th row, centred in its cell."""
+    grid = np.zeros((height, width), bool)
+    grid[stride // 2 :: stride, stride // 2 :: stride] = True
+    return grid

@@ -1,0 +1,127 @@
+"""What mapping knows of one keyframe: its picture and proxies as tensors, full size and halved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pipelines.run_folder import resize_maps
+from pipelines.types import VOID, Intrinsics, ProxyMaps
+
+
+@dataclass(frozen=True)
+class View:
+    """A posed picture with its proxies.
+
+    cam_from_world (4, 4) float64; image (H, W, 3) uint8; depth (H, W) float32 in the world's unit, 0 = unknown;
+    reliability U (H, W) uint8 0..255; channels (H, W) uint8: the class *channel* of each pixel, VOID where unknown;
+    channel_confidence (H, W) uint8. Kept in bytes: a run has hundreds of views.
+    """
+
+    frame_id: int
+    intrinsics: Intrinsics
+    cam_from_world: Tensor
+    image: Tensor
+    depth: Tensor
+    reliability: Tensor
+    channels: Tensor
+    channel_confidence: Tensor
+
+    @property
+    def colors(self) -> Tensor:
+        """(H, W, 3) float32 in 0..1."""
+        return self.image.float() / 255
+
+    @property
+    def trust(self) -> Tensor:
+        """(H, W) float32 reliability U in 0..1, 0 where there is no depth."""
+        return self.reliability.float() / 255 * (self.depth > 0)
+
+    @property
+    def label_weight(self) -> Tensor:
+        """(H, W) float32 in 0..1."""
+        return self.channel_confidence.float() / 255
+
+    def with_depth(self, depth: Tensor, reliability: Tensor) -> View:
+        """The same view with another depth and reliability."""
+        return replace(self, depth=depth, reliability=reliability)
+
+
+def make_view(
+    frame_id: int,
+    intrinsics: Intrinsics,
+    cam_from_world: NDArray[np.float64],
+    image: NDArray[np.uint8],
+    maps: ProxyMaps | None,
+    depth_scale: float,
+    class_ids: tuple[int, ...],
+    device: torch.device | str = "cpu",
+) -> View:
+    """A view of the size of `intrinsics`; `maps` None stands for a frame of which no provider said anything."""
+    width, height = intrinsics.width, intrinsics.height
+    if image.shape[:2] != (height, width):
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    if maps is None:
+        nothing = np.zeros((height, width), np.float32)
+        maps = ProxyMaps(nothing, nothing, np.full((height, width), VOID, np.uint8), nothing)
+    elif maps.depth.shape != (height, width):
+        maps = resize_maps(maps, width, height)
+    tensors = (
+        image,
+        (maps.depth * depth_scale).astype(np.float32),
+        np.round(maps.confidence * 255).astype(np.uint8),
+        channel_table(class_ids)[maps.labels],
+        np.round(maps.label_confidence * 255).astype(np.uint8),
+    )
+    pose = torch.as_tensor(cam_from_world, dtype=torch.float64, device=device)
+    return View(frame_id, intrinsics, pose, *(torch.from_numpy(np.ascontiguousarray(t)).to(device) for t in tensors))
+
+
+def channel_table(class_ids: tuple[int, ...]) -> NDArray[np.uint8]:
+    """(256,) label → class channel; labels that have no channel become VOID."""
+    table = np.full(256, VOID, np.uint8)
+    table[list(class_ids)] = np.arange(len(class_ids), dtype=np.uint8)
+    return table
+
+
+def halved(view: View) -> View:
+    """The view at half the size: colours averaged, depth and classes sampled so that no edge is averaged across."""
+    size = (max(view.intrinsics.width // 2, 1), max(view.intrinsics.height // 2, 1))
+    image = cv2.resize(view.image.cpu().numpy(), size, interpolation=cv2.INTER_AREA)
+
+    def sampled(tensor: Tensor) -> Tensor:
+        return tensor[1::2, 1::2][: size[1], : size[0]].contiguous()
+
+    return replace(
+        view,
+        intrinsics=view.intrinsics.resized(*size),
+        image=torch.from_numpy(image).to(view.image.device),
+        depth=sampled(view.depth),
+        reliability=sampled(view.reliability),
+        channels=sampled(view.channels),
+        channel_confidence=sampled(view.channel_confidence),
+    )
+
+
+def working_size(intrinsics: Intrinsics, max_side: int) -> Intrinsics:
+    """The camera of images whose long side is at most `max_side`; 0 leaves it as it is."""
+    side = max(intrinsics.width, intrinsics.height)
+    if max_side <= 0 or side <= max_side:
+        return intrinsics
+    return intrinsics.resized(
+        max(round(intrinsics.width * max_side / side), 1), max(round(intrinsics.height * max_side / side), 1)
+    )
+
+
+def occurring_classes(all_labels: list[NDArray[np.uint8]], least_share: float = 1e-5) -> tuple[int, ...]:
+    """The classes that make up at least `least_share` of the labelled pixels, in order."""
+    counts = np.zeros(256, np.int64)
+    for labels in all_labels:
+        counts += np.bincount(labels.reshape(-1), minlength=256)
+    counts[VOID] = 0
+    return tuple(int(i) for i in np.flatnonzero(counts > least_share * max(counts.sum(), 1)))
