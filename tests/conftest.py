@@ -13,3 +13,15 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"needs the real recordings in {SHARED_DATA}")
     return SHARED_DATA
+
+
+@pytest.fixture(scope="session")
+def world_sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short walk in the synthetic room with exact truth: 32 frames of 240x180, half a lap, 10 frames a second.
+
+    rgb/, depth/, labels/, traj.txt, intrinsics.json, classes.json, timestamps.txt.
+    """
+    from pipelines.world import ClipOptions, make_world, write_sequence
+
+    options = ClipOptions(frames=32, width=240, height=180, laps=0.5)
+    return write_sequence(tmp_path_factory.mktemp("world"), make_world(texel=0.01), options)
