@@ -1,0 +1,169 @@
+"""Depth from the video itself: multi-view stereo between the backbone's keyframes. Needs no learned weights.
+
+First every keyframe gets a depth map of its own (plane sweep, semi-global smoothing, refinement); then each is
+compared with those of its neighbours, which gives the fused depth and its confidence. Both passes go over the disk
+and hold only a few frames at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.errors import InputError
+from formats.tensors import load_arrays, save_arrays
+from pipelines.progress import Progress
+from pipelines.proxy.providers import DepthEstimate
+from pipelines.proxy.sequence import Sequence, map_intrinsics
+from pipelines.proxy.stereo.bands import Bands
+from pipelines.proxy.stereo.consistency import fuse_depths
+from pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
+from pipelines.proxy.stereo.refine import refine_inverse_depth
+from pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
+from pipelines.proxy.stereo.sweep import sweep_cost, warps_to
+from pipelines.proxy.stereo.upsample import upsample_depth
+from pipelines.types import Frame, Intrinsics, SparseModel
+
+_CACHED_FRAMES = 48
+
+
+@dataclass(frozen=True)
+class StereoSettings:
+    """Numbers of the stereo; lengths in pixels of the sweep's image."""
+
+    side: int = 320
+    planes: int = 96
+    views: int = 6
+    best: int = 3
+    fuse_views: int = 8
+    best_angle: float = 8.0
+    small_step: float = 0.05
+    jump: float = 0.4
+    edge: float = 0.05
+    stiffness: float = 0.01
+    tolerance: float = 0.01
+
+
+class MultiviewDepth:
+    """Depth of the backbone's keyframes in the backbone's unit."""
+
+    metric = False
+    name = "multiview"
+
+    def __init__(
+        self, sequence: Sequence, settings: StereoSettings, folder: Callable[[], Path], threads: int, progress: Progress
+    ) -> None:
+        """`folder` gives a place for the maps between the passes. InputError without a backbone of two keyframes."""
+        if sequence.backbone is None or len(sequence.backbone.frame_ids) < 2:
+            raise InputError(
+                "depth from several views needs parallax, and structure from motion found none: the camera stands still "
+                "or only turns. Move the camera sideways, or give depth with --depth files:FOLDER or --depth onnx:CARD"
+            )
+        self._sequence, self._settings, self._folder, self._progress = sequence, settings, folder, progress
+        self._model: SparseModel = sequence.backbone
+        self._index = {int(f): i for i, f in enumerate(self._model.frame_ids)}
+        self._frame = {f.id: f for f in sequence.frames}
+        self._bands = Bands(threads)
+        self._camera: Intrinsics = map_intrinsics(sequence.calibration.intrinsics, settings.side)
+        self._grey = lru_cache(_CACHED_FRAMES)(self._read_grey)
+        self._raw = lru_cache(_CACHED_FRAMES)(self._load_raw)
+        self._kept: list[float] = []
+
+    def missing(self, frames: list[Frame]) -> list[Frame]:
+        """The frames that are no keyframes of the backbone."""
+        return [f for f in frames if f.id not in self._index]
+
+    # first pass -------------------------------------------------------------------------------------------------
+
+    def prepare(self, frames: list[Frame]) -> None:
+        """A raw depth map of every keyframe, on disk."""
+        for frame in self._progress.track([f for f in frames if f.id in self._index], "stereo"):
+            path = self._path(frame.id)
+            if not path.exists():
+                save_arrays(path, {"inverse_depth": self._sweep(self._index[frame.id])})
+
+    def _sweep(self, index: int) -> NDArray[np.float32]:
+        """(H, W) inverse depth of one keyframe from its neighbours alone; 0 where it has none to match with."""
+        s, camera = self._settings, self._camera
+        companions = self._neighbours(index, s.views)
+        limits = depth_range(self._model, index, companions)
+        if len(companions) == 0 or limits is None:
+            return np.zeros((camera.height, camera.width), np.float32)
+        image = self._grey(int(self._model.frame_ids[index]))
+        others = np.stack([self._grey(int(self._model.frame_ids[j])) for j in companions])
+        warps = self._warps(index, companions)
+        planes = np.linspace(1 / limits[1], 1 / limits[0], s.planes)
+        step = planes[1] - planes[0]
+        cost = sweep_cost(image, others, warps, planes, s.best, self._bands)
+        total = smooth_cost(cost, image, s.small_step, s.jump, s.edge, self._bands)
+        picked, _ = pick_planes(total)
+        inverse = (planes[0] + picked * step).astype(np.float32)
+        inverse = cv2.bilateralFilter(inverse, 7, step, 2.0)
+        inverse, _ = refine_inverse_depth(image, others, warps, inverse, step / 3, 2, s.stiffness, s.best, self._bands)
+        inverse = cv2.bilateralFilter(inverse, 7, 0.7 * step, 2.0)
+        return np.clip(inverse, planes[0], planes[-1]).astype(np.float32)
+
+    # second pass ------------------------------------------------------------------------------------------------
+
+    def estimate(self, frame: Frame) -> DepthEstimate:
+        """Fused depth and its confidence; unknown everywhere for a frame that is no keyframe."""
+        target = self._sequence.intrinsics
+        if frame.id not in self._index:
+            empty = np.zeros((target.height, target.width), np.float32)
+            return DepthEstimate(empty, empty)
+        index = self._index[frame.id]
+        depth, confidence = self._fuse(index)
+        self._kept.append(float((confidence > 0.27).mean()))
+        return upsample_depth(depth, confidence, self._sequence.image(frame))
+
+    def _fuse(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        companions = self._neighbours(index, self._settings.fuse_views)
+        companions = np.array([j for j in companions if self._path(int(self._model.frame_ids[j])).exists()], np.int64)
+        depth = self._raw(index)
+        if len(companions) == 0:
+            return depth, np.where(depth > 0, 0.2, 0).astype(np.float32)
+        others = np.stack([self._raw(int(j)) for j in companions])
+        back = np.array([self._warps(int(j), np.array([index]))[0][2] for j in companions])
+        fused, support, conflict = fuse_depths(
+            depth, others, self._warps(index, companions), back, self._settings.tolerance, self._bands
+        )
+        return fused, agreement(support, conflict)
+
+    def figures(self) -> dict[str, Any]:
+        """Mean fraction of pixels on which the views agree."""
+        return {"stereo_agreeing": round(float(np.mean(self._kept)), 4)} if self._kept else {}
+
+    # what both use ----------------------------------------------------------------------------------------------
+
+    def _path(self, frame_id: int) -> Path:
+        return self._folder() / f"{frame_id:06d}.npz"
+
+    def _neighbours(self, index: int, count: int) -> NDArray[np.int64]:
+        camera = self._sequence.calibration.intrinsics
+        return choose_neighbours(self._model, camera, index, count, self._settings.best_angle)
+
+    def _warps(self, index: int, others: NDArray[np.int64]) -> NDArray[np.float64]:
+        matrix, poses = self._camera.matrix, self._model.cam_from_world
+        return warps_to(matrix, poses[index], [matrix] * len(others), [poses[j] for j in others])
+
+    def _read_grey(self, frame_id: int) -> NDArray[np.float32]:
+        rgb = self._sequence.read_image(self._frame[frame_id])
+        grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        small = cv2.resize(grey, (self._camera.width, self._camera.height), interpolation=cv2.INTER_AREA)
+        return small.astype(np.float32) / 255
+
+    def _load_raw(self, index: int) -> NDArray[np.float32]:
+        inverse = load_arrays(self._path(int(self._model.frame_ids[index])))["inverse_depth"]
+        return np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse > 0)
+
+
+def agreement(support: NDArray[np.float32], conflict: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Confidence in [0, 1]: one agreeing view gives about a half, five give 0.8; views that look through count against."""
+    return (support / (support + 1.0 + conflict)).astype(np.float32)

@@ -1,0 +1,77 @@
+"""What a provider of proxy depth or proxy semantics is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.types import ClassTable, Frame, require_shape
+
+
+@dataclass(frozen=True)
+class DepthEstimate:
+    """depth (h, w) float32, 0 = unknown; confidence (h, w) float32 in [0, 1], 0 where the depth is unknown."""
+
+    depth: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        require_shape("depth", self.depth, (None, None))
+        require_shape("confidence", self.confidence, self.depth.shape)
+
+
+@dataclass(frozen=True)
+class LabelEstimate:
+    """labels (h, w) uint8 indices into the provider's class table or VOID; confidence (h, w) float32 in [0, 1]."""
+
+    labels: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        require_shape("labels", self.labels, (None, None))
+        require_shape("confidence", self.confidence, self.labels.shape)
+
+
+class DepthProvider(Protocol):
+    """Depth of every frame. What can be refused without slow work is refused when the provider is made."""
+
+    name: str
+    metric: bool
+    """Whether depths are metres; else they are in the unit of the run's backbone."""
+
+    def missing(self, frames: list[Frame]) -> list[Frame]:
+        """The frames it will know nothing of."""
+
+    def prepare(self, frames: list[Frame]) -> None:
+        """Slow passes over all frames that `estimate` builds on; goes on where it was interrupted."""
+
+    def estimate(self, frame: Frame) -> DepthEstimate:
+        """Depth at the size of the proxy maps."""
+
+    def figures(self) -> dict[str, Any]:
+        """What the report says of the pass, as plain values."""
+
+
+class SemanticsProvider(Protocol):
+    """Class of every pixel of every frame."""
+
+    name: str
+
+    def missing(self, frames: list[Frame]) -> list[Frame]:
+        """The frames it will know nothing of."""
+
+    def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
+        """Slow passes over all frames that `estimate` and `classes` build on."""
+
+    def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
+        """Labels at the size of the proxy maps."""
+
+    def classes(self) -> ClassTable:
+        """Known after `prepare`."""
+
+    def figures(self) -> dict[str, Any]:
+        """What the report says of the pass, as plain values."""

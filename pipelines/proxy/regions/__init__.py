@@ -1,0 +1,1 @@
+"""Unsupervised regions of the whole video: voxels of all frames, named by geometry where that is sure."""

@@ -1,0 +1,123 @@
+"""What all frames saw, gathered in small cubes of the world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.camera import unproject_depth
+from pipelines.types import Intrinsics
+
+_BITS = 21
+_HALF = 1 << (_BITS - 1)
+_OFFSETS = np.array([(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], np.int64)
+
+
+@dataclass(frozen=True)
+class Voxels:
+    """keys (V,) int64 sorted; weight (V,); position, normal (unit) and color (CIE Lab) each (V, 3), means over points."""
+
+    size: float
+    keys: NDArray[np.int64]
+    weight: NDArray[np.float64]
+    position: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    color: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+
+def voxel_keys(points: NDArray[np.float64], size: float) -> NDArray[np.int64]:
+    """(..., 3) points → (...,) keys; equal for points in the same cube. -1 for points too far out to have one."""
+    cell = np.floor(points / size)
+    inside = (np.abs(cell) < _HALF - 2).all(-1)
+    cell = np.where(inside[..., None], cell, 0).astype(np.int64) + _HALF
+    return np.where(inside, (cell[..., 0] << 2 * _BITS) | (cell[..., 1] << _BITS) | cell[..., 2], -1)
+
+
+def neighbour_keys(keys: NDArray[np.int64], reach: NDArray[np.int64] = _OFFSETS) -> NDArray[np.int64]:
+    """(V,) → (V, R) keys of the cubes around each, in a fixed order."""
+    return keys[:, None] + ((reach[:, 0] << 2 * _BITS) + (reach[:, 1] << _BITS) + reach[:, 2])[None]
+
+
+def find(sorted_keys: NDArray[np.int64], keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Index of every key in the sorted keys, -1 where it is not there."""
+    if len(sorted_keys) == 0:
+        return np.full(keys.shape, -1, np.int64)
+    at = np.minimum(np.searchsorted(sorted_keys, keys), len(sorted_keys) - 1)
+    return np.where(sorted_keys[at] == keys, at, -1)
+
+
+def normals_in_cam(depth: NDArray[np.float32], intrinsics: Intrinsics) -> NDArray[np.float64]:
+    """(h, w, 3) unit normals that face the camera, from central differences; 0 beside unknown depth and at edges."""
+    points = unproject_depth(depth, intrinsics)
+    along_x = np.zeros_like(points)
+    along_y = np.zeros_like(points)
+    along_x[:, 1:-1] = points[:, 2:] - points[:, :-2]
+    along_y[1:-1] = points[2:] - points[:-2]
+    normal = np.cross(along_y, along_x)
+    length = np.linalg.norm(normal, axis=-1)
+    # Over an occlusion edge the difference spans a gap, not a surface.
+    smooth = (np.abs(along_x[..., 2]) < 0.15 * depth) & (np.abs(along_y[..., 2]) < 0.15 * depth)
+    known = cv2.erode((depth > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    good = smooth & known & (length > 0)
+    normal = np.where(good[..., None], normal / np.maximum(length, 1e-12)[..., None], 0)
+    facing = (normal * points).sum(-1, keepdims=True) > 0
+    return np.where(facing, -normal, normal)
+
+
+def gather_frame(
+    depth: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    image: NDArray[np.uint8],
+    intrinsics: Intrinsics,
+    world_from_cam: NDArray[np.float64],
+    size: float,
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """One frame's voxels: keys (V,), and (V, 10) weight and weighted sums of position, normal and Lab colour.
+
+    All images have the size of `intrinsics`.
+    """
+    points = unproject_depth(depth, intrinsics) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+    normals = normals_in_cam(depth, intrinsics) @ world_from_cam[:3, :3].T
+    lab = cv2.cvtColor((image / np.float32(255)).astype(np.float32), cv2.COLOR_RGB2LAB)
+    use = (depth > 0) & (weight > 0) & (np.abs(normals).sum(-1) > 0)
+    keys = voxel_keys(points, size)
+    use &= keys >= 0
+    w = weight[use].astype(np.float64)
+    values = np.concatenate([np.ones((len(w), 1)), points[use], normals[use], lab[use]], axis=1) * w[:, None]
+    return _sum_by_key(keys[use], values)
+
+
+def merge(size: float, frames: list[tuple[NDArray[np.int64], NDArray[np.float64]]]) -> Voxels:
+    """All frames' voxels together."""
+    keys, total = _sum_by_key(
+        np.concatenate([np.empty(0, np.int64), *(f[0] for f in frames)]),
+        np.concatenate([np.empty((0, 10)), *(f[1] for f in frames)]),
+    )
+    weight = np.maximum(total[:, :1], 1e-12)
+    normal = total[:, 4:7]
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return Voxels(size, keys, total[:, 0], total[:, 1:4] / weight, normal, total[:, 7:10] / weight)
+
+
+def select(voxels: Voxels, keep: NDArray[np.bool_]) -> Voxels:
+    """The voxels where `keep` (V,) is true."""
+    return Voxels(
+        voxels.size,
+        voxels.keys[keep],
+        voxels.weight[keep],
+        voxels.position[keep],
+        voxels.normal[keep],
+        voxels.color[keep],
+    )
+
+
+def _sum_by_key(keys: NDArray[np.int64], values: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    unique, place = np.unique(keys, return_inverse=True)
+    columns = [np.bincount(place, weights=values[:, c], minlength=len(unique)) for c in range(values.shape[1])]
+    return unique, np.stack(columns, axis=1)

@@ -1,0 +1,151 @@
+"""Classes without any learned model: regions of the reconstructed scene, named by geometry where that is sure.
+
+All frames' depths are gathered in one grid of voxels, the grid is cut into floor, ceiling, walls, surfaces and parts,
+and every frame reads its labels from the grid. So a class means the same in the whole video.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.errors import InputError
+from pipelines.geometry.camera import unproject_depth
+from pipelines.progress import Progress
+from pipelines.proxy.palette import class_colors
+from pipelines.proxy.providers import DepthEstimate, LabelEstimate
+from pipelines.proxy.regions.parts import cut_parts
+from pipelines.proxy.regions.spread import spread_votes
+from pipelines.proxy.regions.structure import NAMES, OTHER, find_gravity, name_structure
+from pipelines.proxy.regions.voxels import find, gather_frame, merge, neighbour_keys, select, voxel_keys
+from pipelines.proxy.sequence import Sequence, resample_nearest
+from pipelines.types import VOID, ClassTable, Frame
+
+_VOXELS_PER_DEPTH = 60
+"""A voxel is this fraction of the scene's median depth: 5 cm at 3 m."""
+_GATHER_SIDE = 200
+_LEAST_CONFIDENCE = 0.3
+_REACH = 24.0
+_COLOR_SD = 40.0
+_LEAST_WEIGHT = 1.5
+
+
+class SegmentLabels:
+    """Unsupervised regions; needs poses (a backbone), because they make the regions consistent over the video."""
+
+    name = "segments"
+
+    def __init__(self, sequence: Sequence, most: int, progress: Progress) -> None:
+        """`most` classes at the most. Raises InputError without a backbone."""
+        if not sequence.cam_from_world:
+            raise InputError(
+                "regions of the scene need camera poses, and structure from motion found none: the camera stands still "
+                "or only turns. Move it sideways, or give classes with --semantics files:FOLDER or onnx:CARD"
+            )
+        self._sequence, self._most, self._progress = sequence, most, progress
+        self._size = 1.0
+        self._keys = np.empty(0, np.int64)
+        self._label = np.empty(0, np.uint8)
+        self._classes = ClassTable((), ())
+        self._gravity: list[float] = []
+        self._world_from_cam = {k: np.linalg.inv(v) for k, v in sequence.cam_from_world.items()}
+
+    def missing(self, frames: list[Frame]) -> list[Frame]:
+        """The frames without a pose."""
+        return [f for f in frames if f.id not in self._world_from_cam]
+
+    def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
+        """Gather all frames and cut the scene."""
+        posed = [f for f in frames if f.id in self._world_from_cam]
+        self._size = _scene_depth([depth_of(f) for f in posed[:: max(1, len(posed) // 12)]]) / _VOXELS_PER_DEPTH
+        rows = [self._gather(f, depth_of(f)) for f in self._progress.track(posed, "regions", len(posed))]
+        voxels = merge(self._size, rows)
+        voxels = select(voxels, voxels.weight > _LEAST_WEIGHT)
+        cameras = np.array([self._world_from_cam[f.id] for f in posed])
+        gravity = find_gravity(voxels, -cameras[:, :3, 1].mean(0))
+        kind = name_structure(voxels, gravity, cameras[:, :3, 3])
+        self._name(kind, cut_parts(select(voxels, kind == OTHER), self._most - len(NAMES) - 1))
+        self._keys = voxels.keys
+        self._gravity = [round(float(v), 4) for v in gravity.up] if gravity.is_sure else []
+
+    def _gather(self, frame: Frame, estimate: DepthEstimate) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        camera = self._sequence.intrinsics
+        scale = min(1.0, _GATHER_SIDE / max(camera.width, camera.height))
+        small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+        confidence = resample_nearest(estimate.confidence, small.height, small.width)
+        return gather_frame(
+            resample_nearest(estimate.depth, small.height, small.width),
+            np.where(confidence >= _LEAST_CONFIDENCE, confidence, 0).astype(np.float32),
+            resample_nearest(self._sequence.image(frame), small.height, small.width),
+            small,
+            self._world_from_cam[frame.id],
+            self._size,
+        )
+
+    def _name(self, kind: NDArray[np.int64], parts: NDArray[np.int64]) -> None:
+        """Number the kinds that occur, then the parts, largest first; what is left over is the class "other"."""
+        label = np.full(len(kind), VOID, np.uint8)
+        names = []
+        for k, name in NAMES.items():
+            if (kind == k).any():
+                label[kind == k] = len(names)
+                names.append(name)
+        own = np.full(len(parts), VOID, np.uint8)
+        for part in range(int(parts.max(initial=-1)) + 1):
+            own[parts == part] = len(names)
+            names.append(f"object {part + 1}")
+        if (own == VOID).any():
+            own[own == VOID] = len(names)
+            names.append("other")
+        label[kind == OTHER] = own
+        self._label = label
+        self._classes = ClassTable(tuple(names), class_colors(len(names)))
+
+    def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
+        """Votes of the voxels under the pixels, spread along like colours to where the depth is unsure."""
+        camera = self._sequence.intrinsics
+        if frame.id not in self._world_from_cam or len(self._keys) == 0:
+            return LabelEstimate(np.full(depth.depth.shape, VOID, np.uint8), np.zeros(depth.depth.shape, np.float32))
+        world_from_cam = self._world_from_cam[frame.id]
+        points = unproject_depth(depth.depth, camera) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+        label = self._lookup(voxel_keys(points, self._size))
+        known = (label != VOID) & (depth.depth > 0)
+        votes = np.zeros((*label.shape, len(self._classes)), np.float32)
+        rows, columns = np.nonzero(known)
+        votes[rows, columns, label[known]] = 0.02 + depth.confidence[known]
+        votes = spread_votes(votes, self._sequence.image(frame), _REACH, _COLOR_SD)
+        total = votes.sum(-1)
+        best = votes.argmax(-1).astype(np.uint8)
+        share = votes.max(-1) / np.maximum(total, 1e-9)
+        best[total < 1e-4] = VOID
+        return LabelEstimate(best, np.where(best == VOID, 0, share * np.minimum(1, 2 * total)).astype(np.float32))
+
+    def _lookup(self, keys: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Label of the voxel of every key, else of a neighbouring voxel, else VOID."""
+        at = find(self._keys, keys)
+        lost = np.flatnonzero((at < 0) & (keys >= 0))
+        around = find(self._keys, neighbour_keys(keys.ravel()[lost]))
+        first = (around >= 0).argmax(1)
+        flat = at.ravel()
+        flat[lost] = around[np.arange(len(lost)), first]
+        at = flat.reshape(keys.shape)
+        return np.where(at >= 0, self._label[at], VOID).astype(np.uint8)
+
+    def classes(self) -> ClassTable:
+        """Named structure first, then the objects by size."""
+        return self._classes
+
+    def figures(self) -> dict[str, Any]:
+        """The up direction in the world, when a dominant plane made it sure."""
+        return {"up": self._gravity} if self._gravity else {}
+
+
+def _scene_depth(estimates: list[DepthEstimate]) -> float:
+    """Median of the known depths. Raises InputError when there is none."""
+    known = [e.depth[(e.depth > 0) & (e.confidence >= _LEAST_CONFIDENCE)][::7] for e in estimates]
+    if not sum(map(len, known)):
+        raise InputError("no reliable depth in any frame, so there are no regions; give another --depth provider")
+    return float(np.median(np.concatenate(known)))

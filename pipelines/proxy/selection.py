@@ -1,0 +1,56 @@
+"""From the settings' text to a provider."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from formats.errors import InputError
+from pipelines.config import ProxyConfig
+from pipelines.progress import Progress
+from pipelines.proxy.files_depth import FilesDepth
+from pipelines.proxy.files_labels import FilesLabels
+from pipelines.proxy.multiview import MultiviewDepth, StereoSettings
+from pipelines.proxy.providers import DepthProvider, SemanticsProvider
+from pipelines.proxy.segments import SegmentLabels
+from pipelines.proxy.sequence import Sequence
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What providers are made from. `scratch(name)` is a folder that lives as long as the stage is unfinished."""
+
+    source: Path
+    sequence: Sequence
+    config: ProxyConfig
+    scratch: Callable[[str], Path]
+    threads: int
+    progress: Progress
+
+
+def split_choice(text: str, setting: str, kinds: tuple[str, ...]) -> tuple[str, str]:
+    """`files:FOLDER` → ("files", "FOLDER"). Raises InputError for a kind that does not exist or lacks its part."""
+    kind, _, rest = text.strip().partition(":")
+    if kind not in kinds:
+        raise InputError(f"{setting}: there is no provider {text!r}; choose one of {', '.join(kinds)}")
+    if kind == "onnx" and not rest:
+        raise InputError(f"{setting}: onnx needs the card of a network: onnx:CARD.toml")
+    return kind, rest
+
+
+def open_depth(around: Surroundings) -> DepthProvider:
+    """Raises InputError when the provider cannot work on this video."""
+    kind, rest = split_choice(around.config.depth, "proxy.depth", ("auto", "multiview", "files", "onnx"))
+    if kind == "files":
+        return FilesDepth(rest, around.source, around.sequence, around.config.depth_scale)
+    settings = StereoSettings(side=around.config.stereo_side, planes=around.config.stereo_planes)
+    return MultiviewDepth(around.sequence, settings, lambda: around.scratch("stereo"), around.threads, around.progress)
+
+
+def open_semantics(around: Surroundings) -> SemanticsProvider:
+    """Raises InputError when the provider cannot work on this video."""
+    kind, rest = split_choice(around.config.semantics, "proxy.semantics", ("auto", "segments", "files", "onnx"))
+    if kind == "files":
+        return FilesLabels(rest, around.source, around.sequence, around.progress)
+    return SegmentLabels(around.sequence, around.config.max_classes, around.progress)

@@ -1,0 +1,50 @@
+"""The frames a provider looks at, at the size of the proxy maps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.types import Calibration, Frame, Intrinsics, SparseModel
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """All picked frames with their camera at map size, and what structure from motion knows of them."""
+
+    frames: list[Frame]
+    calibration: Calibration
+    intrinsics: Intrinsics
+    backbone: SparseModel | None
+    read_image: Callable[[Frame], NDArray[np.uint8]]
+
+    @cached_property
+    def cam_from_world(self) -> dict[int, NDArray[np.float64]]:
+        """Frame id → (4, 4) of the backbone's keyframes."""
+        if self.backbone is None:
+            return {}
+        return dict(zip(self.backbone.frame_ids.tolist(), self.backbone.cam_from_world, strict=True))
+
+    def image(self, frame: Frame) -> NDArray[np.uint8]:
+        """(h, w, 3) RGB at map size."""
+        rgb = self.read_image(frame)
+        size = (self.intrinsics.width, self.intrinsics.height)
+        return rgb if rgb.shape[1::-1] == size else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+
+
+def map_intrinsics(frame_camera: Intrinsics, max_side: int) -> Intrinsics:
+    """The frames' camera with its long side reduced to at most `max_side` pixels."""
+    scale = min(1.0, max_side / max(frame_camera.width, frame_camera.height))
+    return frame_camera.resized(max(1, round(frame_camera.width * scale)), max(1, round(frame_camera.height * scale)))
+
+
+def resample_nearest(array: NDArray, height: int, width: int) -> NDArray:
+    """(H, W, ...) → (height, width, ...): each pixel takes the value under its centre (depth must not be averaged)."""
+    rows = ((np.arange(height) + 0.5) * array.shape[0] / height).astype(np.int64)
+    columns = ((np.arange(width) + 0.5) * array.shape[1] / width).astype(np.int64)
+    return np.ascontiguousarray(array[rows[:, None], columns[None, :]])

@@ -1,0 +1,165 @@
+"""Stage 2: depth, its reliability, and classes of the keyframes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from formats.errors import InputError
+from formats.tensors import load_arrays, save_arrays
+from pipelines.config import ProxyConfig
+from pipelines.progress import log
+from pipelines.proxy.providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider
+from pipelines.proxy.reliability import reliability, semantic_agreement, theta, warp_labels
+from pipelines.proxy.selection import Surroundings, open_depth, open_semantics
+from pipelines.proxy.sequence import Sequence, map_intrinsics
+from pipelines.run_folder import load_proxy_maps, proxy_path, save_classes, save_proxy_maps, write_json
+from pipelines.stages import Stage, StageContext
+from pipelines.types import VOID, Frame, ProxyMaps
+
+
+def run(context: StageContext) -> dict[str, Any]:
+    """Provide maps of every keyframe (every frame without a backbone, or on request)."""
+    config = context.config.proxy
+    sequence = _load_sequence(context)
+    around = Surroundings(
+        context.source, sequence, config, lambda name: context.snapshot / name, _threads(context), context.progress
+    )
+    depths = open_depth(around)
+    semantics = open_semantics(around)
+    log.info("proxy: depth by %s, classes by %s", depths.name, semantics.name)
+    frames = _frames_to_do(context, sequence, config, depths)
+    _warn_of_missing(context, frames, depths, semantics)
+    _depth_pass(context, frames, depths)
+    semantics.prepare(frames, lambda frame: _load_depth(context.snapshot, frame))
+    save_classes(context.folder, semantics.classes())
+    agreements = _maps_pass(context, sequence, frames, semantics)
+    report = _report(context.folder, frames, depths, semantics, agreements)
+    write_json(context.folder / "proxy.json", report)
+    return report
+
+
+def _load_sequence(context: StageContext) -> Sequence:
+    calibration = context.run.load_calibration()
+    camera = map_intrinsics(calibration.intrinsics, context.config.proxy.max_side)
+    return Sequence(context.run.load_frames(), calibration, camera, context.run.load_backbone(), context.run.image)
+
+
+def _threads(context: StageContext) -> int:
+    return context.config.run.threads or os.cpu_count() or 1
+
+
+def _frames_to_do(context: StageContext, sequence: Sequence, config: ProxyConfig, depths: DepthProvider) -> list[Frame]:
+    if config.frames == "all" and depths.metric or sequence.backbone is None:
+        return sequence.frames
+    if config.frames == "all":
+        context.warn(f"proxy.frames=all: {depths.name} knows only keyframes, the other frames get no maps")
+    return [f for f in sequence.frames if f.id in sequence.cam_from_world]
+
+
+def _warn_of_missing(
+    context: StageContext, frames: list[Frame], depths: DepthProvider, semantics: SemanticsProvider
+) -> None:
+    for kind, provider in (("depth", depths), ("label", semantics)):
+        missing = provider.missing(frames)
+        if len(missing) == len(frames):
+            raise InputError(f"{provider.name}: no {kind} map belongs to any keyframe. Check the names of the files")
+        if missing:
+            context.warn(f"{len(missing)} of {len(frames)} frames have no {kind} map, the first is {missing[0].name}")
+
+
+# depth ----------------------------------------------------------------------------------------------------------
+
+
+def _depth_pass(context: StageContext, frames: list[Frame], depths: DepthProvider) -> None:
+    """Depth of every frame to the snapshot; what is there stays."""
+    depths.prepare(frames)
+    for frame in context.progress.track(frames, "depth", len(frames)):
+        path = _depth_path(context.snapshot, frame)
+        if not path.exists():
+            save_arrays(path, dict(vars(depths.estimate(frame))))
+
+
+def _depth_path(snapshot: Path, frame: Frame) -> Path:
+    return snapshot / "depth" / f"{frame.id:06d}.npz"
+
+
+def _load_depth(snapshot: Path, frame: Frame) -> DepthEstimate:
+    return DepthEstimate(**load_arrays(_depth_path(snapshot, frame)))
+
+
+# maps -----------------------------------------------------------------------------------------------------------
+
+
+def _maps_pass(
+    context: StageContext, sequence: Sequence, frames: list[Frame], semantics: SemanticsProvider
+) -> list[float]:
+    """Labels and reliability of every frame; returns the semantic agreement m_t of each with the one before it."""
+    config = context.config.proxy
+    agreements: list[float] = []
+    previous: Frame | None = None
+    for frame in context.progress.track(frames, "classes", len(frames)):
+        path = proxy_path(context.folder, frame.id)
+        depth = _load_depth(context.snapshot, frame)
+        labels = semantics.estimate(frame, depth)
+        m = _agreement(context, sequence, frame, previous, depth, labels)
+        agreements.append(m)
+        if not path.exists():
+            trust = theta(m, config.theta_slope, config.theta_middle)
+            u = reliability(depth.depth, depth.confidence, trust, config.alpha, config.beta, config.gamma)
+            save_proxy_maps(path, ProxyMaps(depth.depth, u, labels.labels, labels.confidence))
+        previous = frame
+    return agreements
+
+
+def _agreement(
+    context: StageContext,
+    sequence: Sequence,
+    frame: Frame,
+    previous: Frame | None,
+    depth: DepthEstimate,
+    labels: LabelEstimate,
+) -> float:
+    """m_t of eq. (3): against the labels of the frame before, warped through depth and poses; 1 where unknown."""
+    poses = sequence.cam_from_world
+    if previous is None or frame.id not in poses or previous.id not in poses:
+        return 1.0
+    before = load_proxy_maps(proxy_path(context.folder, previous.id)).labels
+    previous_from_cam = poses[previous.id] @ np.linalg.inv(poses[frame.id])
+    sure = np.where(depth.confidence > 0.3, depth.depth, 0).astype(np.float32)
+    m = semantic_agreement(labels.labels, warp_labels(before, previous_from_cam, sure, sequence.intrinsics))
+    return 1.0 if m is None else m
+
+
+# report ---------------------------------------------------------------------------------------------------------
+
+
+def _report(
+    folder: Path, frames: list[Frame], depths: DepthProvider, semantics: SemanticsProvider, agreements: list[float]
+) -> dict[str, Any]:
+    sizes, reliable, void = [], [], []
+    for frame in frames:
+        path = proxy_path(folder, frame.id)
+        maps = load_proxy_maps(path)
+        sizes.append(path.stat().st_size)
+        reliable.append(float((maps.confidence > 0.35).mean()))
+        void.append(float((maps.labels == VOID).mean()))
+    return {
+        "depth": depths.name,
+        "semantics": semantics.name,
+        "metric": depths.metric,
+        "frames": len(frames),
+        "classes": len(semantics.classes()),
+        "reliable_pixels": round(float(np.mean(reliable)), 4),
+        "void_pixels": round(float(np.mean(void)), 4),
+        "label_agreement": round(float(np.mean(agreements)), 4),
+        "kilobytes_a_frame": round(float(np.mean(sizes)) / 1000, 1),
+        **depths.figures(),
+        **semantics.figures(),
+    }
+
+
+STAGE = Stage("proxy", 1, run, "depth, reliability and classes of the keyframes")

@@ -1,0 +1,1 @@
+"""Dense depth from several posed views: plane sweep, semi-global smoothing, refinement, cross-view consistency."""

@@ -1,0 +1,111 @@
+"""Semi-global smoothing of a cost volume (Hirschmueller, PAMI 2008), eight directions."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pipelines.proxy.stereo.bands import Bands
+
+_DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
+
+
+def smooth_cost(
+    cost: NDArray[np.float32], image: NDArray[np.float32], small: float, large: float, edge: float, bands: Bands
+) -> NDArray[np.float32]:
+    """(H, W, D) sum of the path costs, from the matching cost (H, W, D) and the reference image (H, W) in 0..1.
+
+    A step of one plane costs `small`; a jump costs `large`, less where the intensity steps by about `edge` or more,
+    and never less than `small`.
+    """
+    height, width, _ = cost.shape
+    total = np.zeros_like(cost)
+    for dy, dx in _DIRECTIONS:
+        starts = _path_starts(height, width, dy, dx)
+
+        def work(first: int, last: int, dy: int = dy, dx: int = dx, starts: NDArray[np.int64] = starts) -> None:
+            _scan_paths(cost, image, starts[first:last], dy, dx, small, large, edge, total)
+
+        bands.run(len(starts), work, 64)
+    return total
+
+
+def _path_starts(height: int, width: int, dy: int, dx: int) -> NDArray[np.int64]:
+    """(S, 2) row and column of the first pixel of every path of a direction; each pixel lies on exactly one path."""
+    y, x = np.mgrid[:height, :width]
+    before_y, before_x = y - dy, x - dx
+    first = (before_y < 0) | (before_y >= height) | (before_x < 0) | (before_x >= width)
+    return np.argwhere(first)
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def _scan_paths(
+    cost: NDArray[np.float32],
+    image: NDArray[np.float32],
+    starts: NDArray[np.int64],
+    dy: int,
+    dx: int,
+    small: float,
+    large: float,
+    edge: float,
+    total: NDArray[np.float32],
+) -> None:
+    height, width, planes = cost.shape
+    step = np.float32(small)
+    far = np.float32(1e9)
+    # One cell of padding on both sides stands for "no such plane".
+    before = np.empty(planes + 2, np.float32)
+    now = np.empty(planes + 2, np.float32)
+    before[0] = before[planes + 1] = now[0] = now[planes + 1] = far
+    for s in range(len(starts)):
+        y, x = starts[s, 0], starts[s, 1]
+        lowest = np.float32(0)
+        for d in range(planes + 2):
+            before[d] = far
+        for d in range(planes):
+            before[d + 1] = 0
+        intensity = image[y, x]
+        while 0 <= y < height and 0 <= x < width:
+            change = abs(image[y, x] - intensity)
+            intensity = image[y, x]
+            jump = lowest + np.float32(max(large / (1 + change / edge), small))
+            minimum = far
+            for d in range(planes):
+                way = min(min(before[d + 1], jump), min(before[d], before[d + 2]) + step)
+                value = cost[y, x, d] + way - lowest
+                now[d + 1] = value
+                total[y, x, d] += value
+                minimum = min(minimum, value)
+            lowest = minimum
+            before, now = now, before
+            y += dy
+            x += dx
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def pick_planes(total: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(H, W) best plane as a fractional index (a parabola through the lowest sum and its two neighbours), and
+    (H, W) margin: by how much the second best, non-adjacent plane is worse, relative to the best."""
+    height, width, planes = total.shape
+    index = np.empty((height, width), np.float32)
+    margin = np.empty((height, width), np.float32)
+    for y in range(height):
+        for x in range(width):
+            k = 0
+            for d in range(1, planes):
+                if total[y, x, d] < total[y, x, k]:
+                    k = d
+            second = np.float32(1e9)
+            for d in range(planes):
+                if abs(d - k) > 2:
+                    second = min(second, total[y, x, d])
+            offset = np.float32(0)
+            if 0 < k < planes - 1:
+                a, b, c = total[y, x, k - 1], total[y, x, k], total[y, x, k + 1]
+                bend = a + c - 2 * b
+                if bend > 0:
+                    offset = min(max((a - c) / (2 * bend), np.float32(-0.5)), np.float32(0.5))
+            index[y, x] = np.float32(k) + offset
+            margin[y, x] = (second - total[y, x, k]) / max(total[y, x, k], np.float32(1e-3))
+    return index, margin

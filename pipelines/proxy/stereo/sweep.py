@@ -1,0 +1,225 @@
+"""Plane sweep: how well each inverse depth of a pixel agrees with the neighbouring views.
+
+The score of a hypothesis is the zero-mean normalised cross-correlation of a square window, averaged over the best few
+neighbours, so that an occlusion in the others does not count (Kang, Szeliski, Chai, CVPR 2001).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pipelines.proxy.stereo.bands import BAND_ROWS, Bands
+
+RADIUS = 3
+"""Half the window: 7 x 7 pixels."""
+VARIANCE_FLOOR = 2e-5
+"""Added to both variances (intensities 0..1): below about one grey level there is no texture, only noise."""
+OUTSIDE = -2.0
+"""Marks the score of a view that does not see the pixel."""
+
+
+def warps_to(
+    matrix: NDArray[np.float64],
+    cam_from_world: NDArray[np.float64],
+    matrices: list[NDArray[np.float64]],
+    cams_from_world: list[NDArray[np.float64]],
+) -> NDArray[np.float64]:
+    """(N, 3, 4): pixel (x, y) at inverse depth w of the reference lies at `warp @ (x, y, 1, w)` of view n, homogeneous."""
+    inverse = np.linalg.inv(matrix)
+    warps = []
+    for other, other_from_world in zip(matrices, cams_from_world, strict=True):
+        other_from_cam = other_from_world @ np.linalg.inv(cam_from_world)
+        warps.append(np.column_stack([other @ other_from_cam[:3, :3] @ inverse, other @ other_from_cam[:3, 3]]))
+    return np.array(warps)
+
+
+def sweep_cost(
+    image: NDArray[np.float32],
+    others: NDArray[np.float32],
+    warps: NDArray[np.float64],
+    inverse_depths: NDArray[np.float64],
+    best: int,
+    bands: Bands,
+) -> NDArray[np.float32]:
+    """(H, W, D) cost 1 - score in [0, 2] of every inverse depth; `others` (N, H, W) lie as the warps say.
+
+    Intensities are 0..1. Where no view sees the point the cost is 1, as for a surface without texture.
+    """
+    height, width = image.shape
+    mean, variance = window_moments(image)
+    cost = np.empty((height, width, len(inverse_depths)), np.float32)
+
+    def work(first: int, last: int) -> None:
+        _sweep_band(image, mean, variance, others, warps, inverse_depths, best, first, last, cost)
+
+    bands.run(height, work)
+    return cost
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def window_moments(image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Mean and variance of every window; the border is repeated outwards."""
+    height, width = image.shape
+    mean = np.empty((height, width), np.float32)
+    variance = np.empty((height, width), np.float32)
+    for y in range(height):
+        for x in range(width):
+            s = np.float32(0)
+            q = np.float32(0)
+            for j in range(-RADIUS, RADIUS + 1):
+                for i in range(-RADIUS, RADIUS + 1):
+                    v = image[min(max(y + j, 0), height - 1), min(max(x + i, 0), width - 1)]
+                    s += v
+                    q += v * v
+            n = np.float32((2 * RADIUS + 1) ** 2)
+            mean[y, x] = s / n
+            variance[y, x] = max(q / n - (s / n) * (s / n), np.float32(0))
+    return mean, variance
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def _warp_row(
+    other: NDArray[np.float32],
+    warp: NDArray[np.float64],
+    inverse_depth: float,
+    y: int,
+    width: int,
+    row: NDArray[np.float32],
+    seen: NDArray[np.uint8],
+) -> None:
+    """Samples of `other` for one row of the reference on a plane of constant inverse depth; the border is repeated."""
+    rows, columns = other.shape
+    v = y + 0.5
+    bx = np.float32(warp[0, 1] * v + warp[0, 2] + warp[0, 3] * inverse_depth)
+    by = np.float32(warp[1, 1] * v + warp[1, 2] + warp[1, 3] * inverse_depth)
+    bz = np.float32(warp[2, 1] * v + warp[2, 2] + warp[2, 3] * inverse_depth)
+    ax = np.float32(warp[0, 0])
+    ay = np.float32(warp[1, 0])
+    az = np.float32(warp[2, 0])
+    right = np.float32(columns - 1.001)
+    bottom = np.float32(rows - 1.001)
+    half = np.float32(0.5)
+    for x in range(width):
+        u = np.float32(x) + half
+        z = az * u + bz
+        scale = np.float32(1) / max(z, np.float32(1e-6))
+        px = (ax * u + bx) * scale - half
+        py = (ay * u + by) * scale - half
+        seen[x] = (z > np.float32(1e-6)) & (px >= -half) & (py >= -half) & (px <= right + half) & (py <= bottom + half)
+        px = min(max(px, np.float32(0)), right)
+        py = min(max(py, np.float32(0)), bottom)
+        ix = np.int32(px)
+        iy = np.int32(py)
+        fx = px - np.float32(ix)
+        fy = py - np.float32(iy)
+        top = other[iy, ix] + fx * (other[iy, ix + 1] - other[iy, ix])
+        low = other[iy + 1, ix] + fx * (other[iy + 1, ix + 1] - other[iy + 1, ix])
+        row[x + RADIUS] = top + fy * (low - top)
+    for i in range(RADIUS):
+        row[i] = row[RADIUS]
+        row[width + RADIUS + i] = row[width + RADIUS - 1]
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def correlate_row(
+    warped: NDArray[np.float32],
+    image: NDArray[np.float32],
+    k: int,
+    y: int,
+    mean: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    seen: NDArray[np.uint8],
+    columns: NDArray[np.float32],
+    score: NDArray[np.float32],
+) -> None:
+    """Score of the windows centred on row `y`; `warped` rows k..k+2R are rows y-R..y+R, padded by R on both sides."""
+    height, width = image.shape
+    padded = width + 2 * RADIUS
+    for x in range(padded):
+        columns[0, x] = 0
+        columns[1, x] = 0
+        columns[2, x] = 0
+    for j in range(2 * RADIUS + 1):
+        source = min(max(y + j - RADIUS, 0), height - 1)
+        for x in range(width):
+            w = warped[k + j, x + RADIUS]
+            columns[0, x + RADIUS] += w
+            columns[1, x + RADIUS] += w * w
+            columns[2, x + RADIUS] += w * image[source, x]
+    for c in range(3):
+        for i in range(RADIUS):
+            columns[c, i] = columns[c, RADIUS]
+            columns[c, width + RADIUS + i] = columns[c, width + RADIUS - 1]
+    inverse_count = np.float32(1.0 / (2 * RADIUS + 1) ** 2)
+    floor = np.float32(VARIANCE_FLOOR)
+    for x in range(width):
+        s = np.float32(0)
+        q = np.float32(0)
+        p = np.float32(0)
+        for i in range(2 * RADIUS + 1):
+            s += columns[0, x + i]
+            q += columns[1, x + i]
+            p += columns[2, x + i]
+        m = s * inverse_count
+        v = max(q * inverse_count - m * m, np.float32(0))
+        covariance = p * inverse_count - m * mean[y, x]
+        value = covariance / np.sqrt((v + floor) * (variance[y, x] + floor))
+        score[x] = value if seen[x] else np.float32(OUTSIDE)
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def best_mean(scores: NDArray[np.float32], x: int, best: int) -> float:
+    """Mean of the `best` largest scores of column x among the views that see it; 0 when none does. Alters `scores`."""
+    total = np.float32(0)
+    used = 0
+    for _ in range(best):
+        at = 0
+        for n in range(1, scores.shape[0]):
+            if scores[n, x] > scores[at, x]:
+                at = n
+        if scores[at, x] <= np.float32(OUTSIDE):
+            break
+        total += scores[at, x]
+        scores[at, x] = np.float32(OUTSIDE)
+        used += 1
+    return total / np.float32(max(used, 1))
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def _sweep_band(
+    image: NDArray[np.float32],
+    mean: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    others: NDArray[np.float32],
+    warps: NDArray[np.float64],
+    inverse_depths: NDArray[np.float64],
+    best: int,
+    first: int,
+    last: int,
+    cost: NDArray[np.float32],
+) -> None:
+    height, width = image.shape
+    views = others.shape[0]
+    padded = width + 2 * RADIUS
+    warped = np.empty((BAND_ROWS + 2 * RADIUS, padded), np.float32)
+    seen = np.empty((BAND_ROWS + 2 * RADIUS, width), np.uint8)
+    columns = np.empty((3, padded), np.float32)
+    scores = np.empty((BAND_ROWS, views, width), np.float32)
+    block = np.empty((len(inverse_depths), last - first, width), np.float32)
+    for d in range(len(inverse_depths)):
+        for n in range(views):
+            for k in range(last - first + 2 * RADIUS):
+                y = min(max(first + k - RADIUS, 0), height - 1)
+                _warp_row(others[n], warps[n], inverse_depths[d], y, width, warped[k], seen[k])
+            for k in range(last - first):
+                correlate_row(warped, image, k, first + k, mean, variance, seen[k + RADIUS], columns, scores[k, n])
+        for k in range(last - first):
+            for x in range(width):
+                block[d, k, x] = np.float32(1) - best_mean(scores[k], x, best)
+    # Turned round in one go: writing plane by plane into (H, W, D) would miss the cache at every pixel.
+    for k in range(last - first):
+        for x in range(width):
+            for d in range(len(inverse_depths)):
+                cost[first + k, x, d] = block[d, k, x]
