@@ -1,0 +1,85 @@
+"""How well a mesh covers the true surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+Points = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SurfaceError:
+    """accuracy: mean distance from the mesh to the truth; completeness: from the truth to the mesh, both in metres.
+    precision, recall: shares of these distances below `threshold`; f_score their harmonic mean."""
+
+    accuracy: float
+    completeness: float
+    precision: float
+    recall: float
+    f_score: float
+    threshold: float
+
+
+def sample_surface(vertices: NDArray, faces: NDArray, count: int, seed: int = 0) -> Points:
+    """(count, 3) points spread evenly by area over a triangle mesh. Raises ValueError for a mesh without area."""
+    corners = vertices[faces].astype(np.float64)
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    if not areas.sum() > 0:
+        raise ValueError("the mesh has no area")
+    rng = np.random.default_rng(seed)
+    # Stratified: one draw in each of `count` equal shares of the area.
+    at = (np.arange(count) + rng.random(count)) / count * areas.sum()
+    chosen = np.clip(np.searchsorted(np.cumsum(areas), at), 0, len(areas) - 1)
+    a, b = rng.random((2, count))
+    over = a + b > 1
+    a, b = np.where(over, 1 - a, a), np.where(over, 1 - b, b)
+    first, second, third = corners[chosen].transpose(1, 0, 2)
+    return first + a[:, None] * (second - first) + b[:, None] * (third - first)
+
+
+def surface_error(points: Points, true_points: Points, threshold: float = 0.05) -> SurfaceError:
+    """Errors between two sampled surfaces (N, 3) and (M, 3) in metres. Raises ValueError where one is empty."""
+    if len(points) == 0 or len(true_points) == 0:
+        raise ValueError(f"nothing to compare: {len(points)} points against {len(true_points)}")
+    to_truth = cKDTree(true_points).query(points)[0]
+    to_mesh = cKDTree(points).query(true_points)[0]
+    precision, recall = float((to_truth < threshold).mean()), float((to_mesh < threshold).mean())
+    f_score = 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0
+    return SurfaceError(float(to_truth.mean()), float(to_mesh.mean()), precision, recall, f_score, threshold)
+
+
+def thinned(points: Points, cell: float) -> Points:
+    """One point of every cell of a grid of `cell` metres: the first in the order of the cells."""
+    cells = np.floor(points / cell).astype(np.int64)
+    return points[np.unique(cells, axis=0, return_index=True)[1]]
+
+
+def depth_points(
+    depth: NDArray, matrix: NDArray[np.float64], world_from_cam: NDArray[np.float64], stride: int = 1
+) -> Points:
+    """(P, 3) world points of every `stride`-th pixel with a depth; `matrix` (3, 3) has pixel centres at +0.5."""
+    v, u = np.mgrid[0 : depth.shape[0] : stride, 0 : depth.shape[1] : stride]
+    z = depth[::stride, ::stride].astype(np.float64)
+    pixels = np.stack([u + 0.5, v + 0.5, np.ones_like(z)], axis=-1)
+    points = (pixels @ np.linalg.inv(matrix).T * z[..., None])[z > 0]
+    return points @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+
+
+def seen_in_depth(
+    points: Points, depth: NDArray, matrix: NDArray[np.float64], cam_from_world: NDArray[np.float64], slack: float
+) -> NDArray[np.bool_]:
+    """(N,) whether a point lies in the picture and no further than `slack` metres behind the depth seen there."""
+    in_cam = points @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
+    z = in_cam[:, 2]
+    pixels = in_cam @ matrix.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = np.floor(pixels[:, 0] / z), np.floor(pixels[:, 1] / z)
+    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < depth.shape[1]) & (v < depth.shape[0])
+    seen = np.zeros(len(points), dtype=bool)
+    there = depth[v[inside].astype(np.int64), u[inside].astype(np.int64)]
+    seen[inside] = (there > 0) & (z[inside] < there + slack)
+    return seen
