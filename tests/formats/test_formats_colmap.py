@@ -125,7 +125,7 @@ def test_a_real_model_in_both_kinds(shared_data: Path) -> None:
     assert binary.cameras[0][0] == "SIMPLE_RADIAL"
     for field in ("cam_from_world", "points", "colors", "obs_image", "obs_point", "obs_xy"):
         np.testing.assert_allclose(
-            getattr(binary, field), getattr(text, field), atol=1e-3 if field == "obs_xy" else 1e-4
+            getattr(binary, field), getattr(text, field), atol=6e-3 if field == "obs_xy" else 1e-4
         )
 
 

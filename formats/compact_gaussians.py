@@ -1,0 +1,103 @@
+"""A small file for a Gaussian map: about 25 bytes a Gaussian, whatever the number of classes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.errors import InputError
+from formats.gaussians import GaussianCloud
+from formats.tensors import load_arrays, save_arrays
+
+KEPT_CLASSES = 4
+"""The most probable classes of each Gaussian that are kept; the rest shares what is left equally."""
+
+_FORMAT = "gaussians-compact-1"
+_STEPS = 65535
+
+
+def write_compact(path: Path, cloud: GaussianCloud, class_names: tuple[str, ...] = ()) -> None:
+    """Write isotropic or general Gaussians into a .safetensors file of quantised arrays.
+
+    Means: 16 bits over the bounding box, an error of at most its side / 131070. Scales and opacity: half precision.
+    Colours: 8 bits, clipped to 0..1. Classes: the `KEPT_CLASSES` most probable, with 8 bit probabilities.
+    Rotations are left out where all three scales are equal. Raises InputError when the disk refuses.
+    """
+    low, side = _bounds(cloud.means)
+    isotropic = bool((cloud.log_scales == cloud.log_scales[:, :1]).all())
+    arrays: dict[str, NDArray] = {
+        "means": np.round((cloud.means.astype(np.float64) - low) / side * _STEPS).astype(np.uint16),
+        "box": np.stack([low, side]),
+        "log_scales": cloud.log_scales[:, :1].astype(np.float16) if isotropic else cloud.log_scales.astype(np.float16),
+        "opacity_logits": cloud.opacity_logits.astype(np.float16),
+        "colors": np.round(cloud.colors.clip(0, 1) * 255).astype(np.uint8),
+    }
+    if not isotropic:
+        arrays["quat_wxyz"] = cloud.quat_wxyz.astype(np.float16)
+    if cloud.class_probs is not None:
+        arrays["top_classes"], arrays["top_probs"] = _top_classes(cloud.class_probs)
+    count = 0 if cloud.class_probs is None else cloud.class_probs.shape[1]
+    meta = {"format": _FORMAT, "class_count": str(count), "class_names": "\n".join(class_names)}
+    save_arrays(path, arrays, meta)
+
+
+def read_compact(path: Path) -> tuple[GaussianCloud, tuple[str, ...]]:
+    """The cloud, to the precision `write_compact` states, and the class names. Raises InputError for another file."""
+    arrays, meta = load_arrays(path)
+    if meta.get("format") != _FORMAT:
+        raise InputError(f"{path} is no compact Gaussian file: expected one written with the map's compact export")
+    try:
+        cloud = _unpacked(arrays, int(meta["class_count"]))
+    except (KeyError, ValueError, IndexError) as error:
+        raise InputError(f"{path} is damaged ({error}): export it again") from error
+    names = meta.get("class_names", "")
+    return cloud, tuple(names.split("\n")) if names else ()
+
+
+def _unpacked(arrays: dict[str, NDArray], class_count: int) -> GaussianCloud:
+    low, side = arrays["box"]
+    m = len(arrays["means"])
+    scales = arrays["log_scales"].astype(np.float32)
+    identity = np.tile(np.array([1, 0, 0, 0], dtype=np.float32), (m, 1))
+    probs = None
+    if class_count:
+        probs = _spread_classes(arrays["top_classes"], arrays["top_probs"], class_count)
+    return GaussianCloud(
+        means=(arrays["means"] / _STEPS * side + low).astype(np.float32),
+        log_scales=np.repeat(scales, 3, axis=1) if scales.shape[1] == 1 else scales,
+        quat_wxyz=arrays["quat_wxyz"].astype(np.float32) if "quat_wxyz" in arrays else identity,
+        opacity_logits=arrays["opacity_logits"].astype(np.float32),
+        colors=arrays["colors"].astype(np.float32) / np.float32(255),
+        class_ids=arrays["top_classes"][:, 0] if probs is not None else None,
+        class_probs=probs,
+    )
+
+
+def _bounds(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lowest corner and side lengths, a side of 0 replaced by 1."""
+    if not len(means):
+        return np.zeros(3), np.ones(3)
+    low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
+    return low, np.where(high > low, high - low, 1.0)
+
+
+def _top_classes(probs: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """(M, k) ids and 8 bit probabilities, most probable first; equal ones by id."""
+    kept = min(KEPT_CLASSES, probs.shape[1])
+    ids = np.argsort(-probs, axis=1, kind="stable")[:, :kept]
+    values = np.take_along_axis(probs, ids, axis=1)
+    return ids.astype(np.uint8), np.floor(values.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def _spread_classes(ids: NDArray[np.uint8], values: NDArray[np.uint8], count: int) -> NDArray[np.float32]:
+    """(M, C) probabilities that sum to 1: the kept ones, and equal shares of what they leave for the others."""
+    kept = values.astype(np.float32) / np.float32(255)
+    others = count - ids.shape[1]
+    total = kept.sum(axis=1, keepdims=True)
+    kept = kept / np.maximum(total, 1) if others else kept / np.maximum(total, np.float32(1e-6))
+    rest = np.maximum(0, 1 - kept.sum(axis=1, keepdims=True)) / max(others, 1)
+    probs = np.repeat(rest.astype(np.float32), count, axis=1)
+    np.put_along_axis(probs, ids.astype(np.int64), kept.astype(np.float32), axis=1)
+    return probs

@@ -1,0 +1,115 @@
+"""Gaussian splat PLY in the layout of the original 3D Gaussian splatting (Kerbl et al. 2023)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.errors import InputError
+from formats.gaussians import GaussianCloud
+from formats.ply_table import columns, read_ply, write_ply
+
+SH_C0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * f_dc."""
+
+_REST_COUNTS = {0: 0, 1: 9, 2: 24, 3: 45}
+_MEANS, _NORMALS, _DC = ["x", "y", "z"], ["nx", "ny", "nz"], ["f_dc_0", "f_dc_1", "f_dc_2"]
+_SCALES, _ROTATION = ["scale_0", "scale_1", "scale_2"], ["rot_0", "rot_1", "rot_2", "rot_3"]
+
+
+def write_gaussian_ply(
+    path: Path, cloud: GaussianCloud, class_names: tuple[str, ...] = (), *, sh_degree: int = 0
+) -> None:
+    """Write a cloud so that splat viewers and trainers take it as their own.
+
+    The properties are those of the original code in its order: x y z, nx ny nz (0), f_dc_0..2, f_rest_* (as many as
+    `sh_degree` has, all 0), opacity (logit), scale_0..2 (log), rot_0..3 (w x y z); after them class_id (uchar) and
+    class_prob_0.. (float) where the cloud has classes. Degree 0, the default, is what the original writes when it
+    trains without view-dependent colour; 3 is for readers that insist on 45 of them. Class names go to comments.
+
+    Raises ValueError for another degree or a value that is not finite, InputError when the disk refuses.
+    """
+    if sh_degree not in _REST_COUNTS:
+        raise ValueError(f"write_gaussian_ply: sh_degree must be 0 to 3, got {sh_degree}")
+    fields = [*_MEANS, *_NORMALS, *_DC, *(f"f_rest_{i}" for i in range(_REST_COUNTS[sh_degree]))]
+    fields += ["opacity", *_SCALES, *_ROTATION]
+    dtype: list[tuple[str, str]] = [(name, "<f4") for name in fields]
+    if cloud.class_ids is not None:
+        dtype.append(("class_id", "u1"))
+    if cloud.class_probs is not None:
+        dtype += [(f"class_prob_{i}", "<f4") for i in range(cloud.class_probs.shape[1])]
+    vertex = np.zeros(len(cloud), dtype=dtype)
+    _fill(vertex, _MEANS, cloud.means)
+    _fill(vertex, _DC, (cloud.colors - np.float32(0.5)) / np.float32(SH_C0))
+    _fill(vertex, ["opacity"], cloud.opacity_logits[:, None])
+    _fill(vertex, _SCALES, cloud.log_scales)
+    _fill(vertex, _ROTATION, cloud.quat_wxyz)
+    if cloud.class_ids is not None:
+        vertex["class_id"] = cloud.class_ids
+    if cloud.class_probs is not None:
+        _fill(vertex, [f"class_prob_{i}" for i in range(cloud.class_probs.shape[1])], cloud.class_probs)
+    write_ply(path, {"vertex": vertex}, [f"class {i} {name}" for i, name in enumerate(class_names)])
+
+
+def read_gaussian_ply(path: Path) -> GaussianCloud:
+    """The Gaussians of a PLY by this or another program, of any spherical-harmonic degree.
+
+    Raises InputError when the file is missing, damaged, a git-LFS pointer, or a PLY of another kind.
+    """
+    path = Path(path)
+    ply = read_ply(path)
+    if "vertex" not in ply:
+        raise InputError(f"{path} has no vertices: it is no Gaussian splat PLY")
+    vertex = ply["vertex"].data
+    names = vertex.dtype.names or ()
+    if not set(_SCALES[:1] + _DC) <= set(names):
+        kind = "a mesh" if "face" in ply else "a point cloud"
+        raise InputError(f"{path} is {kind}, not a Gaussian splat PLY: it lacks f_dc_0..2 and scale_0..2")
+    return GaussianCloud(
+        means=columns(vertex, _MEANS, path),
+        log_scales=_log_scales(vertex, path),
+        quat_wxyz=_unit(columns(vertex, _ROTATION, path)),
+        opacity_logits=columns(vertex, ["opacity"], path)[:, 0],
+        colors=columns(vertex, _DC, path) * np.float32(SH_C0) + np.float32(0.5),
+        class_ids=vertex["class_id"].astype(np.uint8) if "class_id" in names else None,
+        class_probs=_class_probs(vertex, path),
+        dropped_sh_degree=_rest_degree(names),
+    )
+
+
+def _fill(vertex: NDArray[Any], names: list[str], values: NDArray[np.float32]) -> None:
+    if not np.isfinite(values).all():
+        raise ValueError(f"write_gaussian_ply: {names[0]} holds a value that is not finite")
+    for i, name in enumerate(names):
+        vertex[name] = values[:, i]
+
+
+def _log_scales(vertex: NDArray[Any], path: Path) -> NDArray[np.float32]:
+    """Flat splats (2D Gaussian splatting) have two scales only: the third is made thin."""
+    names = [name for name in _SCALES if name in (vertex.dtype.names or ())]
+    scales = columns(vertex, names if len(names) == 2 else _SCALES, path)
+    thin = (
+        scales.min(axis=1, keepdims=True, initial=0) - np.float32(math.log(100)) if len(names) == 2 else scales[:, :0]
+    )
+    return np.concatenate([scales, thin], axis=1)
+
+
+def _unit(quat_wxyz: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The original stores quaternions as the optimiser left them."""
+    length = np.linalg.norm(quat_wxyz, axis=1, keepdims=True)
+    identity = np.array([1, 0, 0, 0], dtype=np.float32)
+    return np.where(length > 1e-12, quat_wxyz / np.maximum(length, np.float32(1e-12)), identity).astype(np.float32)
+
+
+def _class_probs(vertex: NDArray[Any], path: Path) -> NDArray[np.float32] | None:
+    count = sum(name.startswith("class_prob_") for name in vertex.dtype.names or ())
+    return columns(vertex, [f"class_prob_{i}" for i in range(count)], path) if count else None
+
+
+def _rest_degree(names: tuple[str, ...]) -> int:
+    count = sum(name.startswith("f_rest_") for name in names)
+    return max(degree for degree, needed in _REST_COUNTS.items() if needed <= count)

@@ -1,0 +1,159 @@
+"""Labelled triangle meshes in PLY and GLB."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.atomic import write_bytes
+from formats.errors import InputError
+from formats.ply_table import columns, read_ply, write_ply
+
+_LABEL_ATTRIBUTE = "_LABEL"
+_MAX_GLB_BYTES = 4 * 1024**3
+
+
+@dataclass(frozen=True, eq=False)
+class MeshArrays:
+    """vertices (V, 3) float32, faces (F, 3) int32, colors (V, 3) uint8, labels (V,) uint8 (255 = no class)."""
+
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    colors: NDArray[np.uint8]
+    labels: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        v = len(self.vertices)
+        expected = {"vertices": (v, 3), "faces": (len(self.faces), 3), "colors": (v, 3), "labels": (v,)}
+        for name, shape in expected.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"MeshArrays: {name}: got shape {getattr(self, name).shape}, expected {shape}")
+        if len(self.faces) and not 0 <= self.faces.min() <= self.faces.max() < v:
+            raise ValueError(f"MeshArrays: a face points outside the {v} vertices")
+
+
+def write_mesh_ply(
+    path: Path,
+    vertices: NDArray[np.float32],
+    faces: NDArray[np.int32],
+    colors: NDArray[np.uint8],
+    labels: NDArray[np.uint8],
+    class_names: tuple[str, ...] = (),
+) -> None:
+    """Write a binary PLY with x y z, red green blue and the extra property label (uchar) at each vertex.
+
+    vertices (V, 3), faces (F, 3), colors (V, 3) uint8, labels (V,) uint8; class names go to comments. Raises
+    ValueError for other shapes, InputError when the disk refuses.
+    """
+    mesh = MeshArrays(vertices, faces, colors, labels)
+    fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("label", "u1")]
+    vertex = np.empty(len(vertices), dtype=fields)
+    for i, name in enumerate(("x", "y", "z")):
+        vertex[name] = mesh.vertices[:, i]
+    for i, name in enumerate(("red", "green", "blue")):
+        vertex[name] = mesh.colors[:, i]
+    vertex["label"] = mesh.labels
+    face = np.empty(len(faces), dtype=[("vertex_indices", "<i4", (3,))])
+    face["vertex_indices"] = mesh.faces
+    comments = [f"class {i} {name}" for i, name in enumerate(class_names)]
+    write_ply(path, {"vertex": vertex, "face": face}, comments)
+
+
+def read_mesh_ply(path: Path) -> MeshArrays:
+    """A triangle mesh from a PLY by this or another program; polygons are cut into triangle fans.
+
+    Vertices without colours are grey, without labels 255. Raises InputError for a file that is no mesh.
+    """
+    path = Path(path)
+    ply = read_ply(path)
+    if "vertex" not in ply or "face" not in ply:
+        raise InputError(f"{path} has no faces: it is a point cloud or a splat file, not a mesh")
+    vertex, face = ply["vertex"].data, ply["face"].data
+    indices = next((n for n in ("vertex_indices", "vertex_index") if n in (face.dtype.names or ())), None)
+    if indices is None:
+        raise InputError(f"{path}: its faces have no vertex_indices: it is no mesh this program can read")
+    names = vertex.dtype.names or ()
+    count = len(vertex)
+    has_colors = {"red", "green", "blue"} <= set(names)
+    colors = columns(vertex, ["red", "green", "blue"], path) if has_colors else np.full((count, 3), 128, np.float32)
+    labels = vertex["label"] if "label" in names else np.full(count, 255)
+    try:
+        return MeshArrays(
+            columns(vertex, ["x", "y", "z"], path), _triangles(face[indices]), colors.astype(np.uint8),
+            labels.astype(np.uint8),
+        )  # fmt: skip
+    except ValueError as error:
+        raise InputError(f"{path} is a damaged mesh ({error}): export it again") from error
+
+
+def write_mesh_glb(
+    path: Path,
+    vertices: NDArray[np.float32],
+    faces: NDArray[np.int32],
+    colors: NDArray[np.uint8],
+    labels: NDArray[np.uint8],
+    class_names: tuple[str, ...] = (),
+) -> None:
+    """Write a GLB with vertex colours, the labels as vertex attribute _LABEL, class names in the mesh's extras.
+
+    Arguments and errors as `write_mesh_ply`. The coordinates stay those of the world: y need not be up.
+    """
+    import trimesh  # slow to import, and only the export needs it
+
+    mesh = MeshArrays(vertices, faces, colors, labels)
+    if not len(mesh.faces):
+        raise ValueError("write_mesh_glb: glTF has no way to store a mesh without faces")
+    opaque = np.column_stack([mesh.colors, np.full(len(mesh.colors), 255, dtype=np.uint8)])
+    scene = trimesh.Scene()
+    scene.add_geometry(
+        trimesh.Trimesh(
+            mesh.vertices,
+            mesh.faces,
+            vertex_colors=opaque,
+            # glTF wants every vertex at a multiple of 4 bytes: a float per label instead of a byte
+            vertex_attributes={_LABEL_ATTRIBUTE: mesh.labels.astype(np.float32)},
+            metadata={"classes": list(class_names)},
+            process=False,
+        ),
+        geom_name="mesh",
+        node_name="mesh",
+    )
+    write_bytes(path, scene.export(file_type="glb"))
+
+
+def read_mesh_glb(path: Path) -> MeshArrays:
+    """A mesh as `write_mesh_glb` wrote it. Raises InputError for a damaged file or one without triangles."""
+    import trimesh
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"no such file: {path}: check the spelling, or run the export")
+    if path.stat().st_size > _MAX_GLB_BYTES:
+        raise InputError(f"{path} is larger than {_MAX_GLB_BYTES / 1e9:.0f} GB: it is not a mesh of this program")
+    try:
+        scene = trimesh.load_scene(str(path), file_type="glb", process=False)
+        mesh: Any = next(m for m in scene.geometry.values() if isinstance(m, trimesh.Trimesh))
+        labels = mesh.vertex_attributes.get(_LABEL_ATTRIBUTE, np.full(len(mesh.vertices), 255))
+        return MeshArrays(
+            np.asarray(mesh.vertices, dtype=np.float32),
+            np.asarray(mesh.faces, dtype=np.int32),
+            np.asarray(mesh.visual.vertex_colors[:, :3], dtype=np.uint8),
+            np.asarray(labels).reshape(-1).astype(np.uint8),
+        )
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, StopIteration) as error:
+        raise InputError(f"{path} is damaged or holds no triangle mesh ({error}): export it again") from error
+
+
+def _triangles(polygons: NDArray) -> NDArray[np.int32]:
+    """(F, 3) of faces given as an (F, n) array, or as n indices each in an array of objects."""
+    if polygons.dtype != object:
+        listed = polygons.astype(np.int64)
+        fans = [listed[:, [0, i, i + 1]] for i in range(1, listed.shape[1] - 1)] if listed.ndim == 2 else []
+        return np.concatenate(fans).astype(np.int32) if fans else np.zeros((0, 3), dtype=np.int32)
+    counts = np.array([len(p) for p in polygons])
+    parts = [_triangles(np.stack(list(polygons[counts == n]))) for n in np.unique(counts) if n >= 3]
+    return np.concatenate(parts).astype(np.int32) if parts else np.zeros((0, 3), dtype=np.int32)

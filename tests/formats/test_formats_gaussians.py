@@ -1,0 +1,169 @@
+"""Gaussian splat files: the reference layout to the byte, foreign files, and the compact file's error bounds."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pytest
+
+from formats.compact_gaussians import read_compact, write_compact
+from formats.errors import InputError
+from formats.gaussian_ply import SH_C0, read_gaussian_ply, write_gaussian_ply
+from formats.gaussians import GaussianCloud, isotropic_cloud
+
+
+def _cloud(m: int = 300, classes: int = 7) -> GaussianCloud:
+    rng = np.random.default_rng(0)
+    logits = rng.normal(0, 3, (m, classes))
+    probs = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
+    return isotropic_cloud(
+        rng.normal(0, 3, (m, 3)).astype(np.float32),
+        rng.normal(-4, 1, m).astype(np.float32),
+        rng.normal(0, 3, m).astype(np.float32),
+        rng.uniform(0, 1, (m, 3)).astype(np.float32),
+        probs.astype(np.float32),
+    )
+
+
+def test_the_property_order_is_that_of_the_original(tmp_path: Path, shared_data: Path) -> None:
+    reference = plyfile.PlyData.read(
+        str(shared_data / "format_cases" / "ply_other_writers" / "test-splat.3-points-from-train.ply")
+    )["vertex"].data.dtype
+    write_gaussian_ply(tmp_path / "3.ply", _cloud(), sh_degree=3)
+    write_gaussian_ply(tmp_path / "0.ply", _cloud())
+    full = plyfile.PlyData.read(str(tmp_path / "3.ply"))["vertex"].data.dtype
+    lean = plyfile.PlyData.read(str(tmp_path / "0.ply"))["vertex"].data.dtype
+    extra = ("class_id", *(f"class_prob_{i}" for i in range(7)))
+    assert full.names == reference.names + extra
+    assert all(full[name] == reference[name] for name in reference.names)
+    assert lean.names == tuple(n for n in reference.names if not n.startswith("f_rest")) + extra
+    assert lean["class_id"] == np.uint8
+
+
+def test_values_are_stored_as_a_viewer_expects(tmp_path: Path) -> None:
+    cloud = isotropic_cloud(
+        np.array([[1, 2, 3]], np.float32),
+        np.log(np.array([0.05], np.float32)),
+        np.array([2.0], np.float32),
+        np.array([[1.0, 0.5, 0.0]], np.float32),
+        np.array([[0.2, 0.7, 0.1]], np.float32),
+    )
+    write_gaussian_ply(tmp_path / "g.ply", cloud, ("wall", "floor", "sofa"))
+    ply = plyfile.PlyData.read(str(tmp_path / "g.ply"))
+    row = ply["vertex"][0]
+    assert (row["x"], row["y"], row["z"]) == (1, 2, 3)
+    assert [row[f"f_dc_{i}"] * SH_C0 + 0.5 for i in range(3)] == pytest.approx([1, 0.5, 0])
+    assert [np.exp(row[f"scale_{i}"]) for i in range(3)] == pytest.approx([0.05] * 3)
+    assert [row[f"rot_{i}"] for i in range(4)] == [1, 0, 0, 0]
+    assert 1 / (1 + np.exp(-row["opacity"])) == pytest.approx(0.8808, abs=1e-4)
+    assert row["class_id"] == 1
+    assert ply.comments == ["class 0 wall", "class 1 floor", "class 2 sofa"]
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
+def test_round_trip(tmp_path: Path, sh_degree: int) -> None:
+    cloud = _cloud()
+    write_gaussian_ply(tmp_path / "g.ply", cloud, sh_degree=sh_degree)
+    back = read_gaussian_ply(tmp_path / "g.ply")
+    for field in ("means", "log_scales", "quat_wxyz", "opacity_logits", "class_ids", "class_probs"):
+        assert (getattr(back, field) == getattr(cloud, field)).all(), field
+    np.testing.assert_allclose(back.colors, cloud.colors, atol=3e-7)
+    assert back.dropped_sh_degree == sh_degree
+
+
+def test_a_file_by_the_original_program(shared_data: Path) -> None:
+    path = shared_data / "format_cases" / "ply_other_writers" / "test-splat.3-points-from-train.ply"
+    cloud, raw = read_gaussian_ply(path), plyfile.PlyData.read(str(path))["vertex"]
+    assert (len(cloud), cloud.dropped_sh_degree, cloud.class_ids, cloud.class_probs) == (3, 3, None, None)
+    np.testing.assert_allclose(np.linalg.norm(cloud.quat_wxyz, axis=1), 1, atol=1e-6)
+    np.testing.assert_array_equal(cloud.log_scales[:, 1], raw["scale_1"])
+    np.testing.assert_allclose(cloud.colors[:, 2], 0.5 + 0.28209479 * raw["f_dc_2"], atol=1e-6)
+
+
+def test_other_files_are_explained(shared_data: Path, tmp_path: Path) -> None:
+    cases = shared_data / "format_cases"
+    for path, message in [
+        (cases / "lfs_pointer" / "point_cloud.ply", "git lfs pull"),
+        (cases / "ply_other_writers" / "beetle.binary.ply", "a mesh, not"),
+        (cases / "ply_other_writers" / "inria_3dgs_output" / "input.ply", "a point cloud, not"),
+        (cases / "ply_other_writers" / "test-splat.3-points-from-train.spz", "no PLY file"),
+        (cases / "none.ply", "no such file"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            read_gaussian_ply(path)
+    write_gaussian_ply(tmp_path / "whole.ply", _cloud())
+    data = (tmp_path / "whole.ply").read_bytes()
+    for keep in (1, 100, len(data) // 2, len(data) - 1):
+        (tmp_path / "cut.ply").write_bytes(data[:keep])
+        with pytest.raises(InputError):
+            read_gaussian_ply(tmp_path / "cut.ply")
+    (tmp_path / "huge.ply").write_bytes(data.replace(b"vertex 300", b"vertex 99999999999"))
+    with pytest.raises(InputError, match="not copied completely"):
+        read_gaussian_ply(tmp_path / "huge.ply")
+
+
+def test_values_that_are_not_finite_are_not_written(tmp_path: Path) -> None:
+    cloud = _cloud(5)
+    cloud.means[2, 1] = np.nan
+    with pytest.raises(ValueError, match="not finite"):
+        write_gaussian_ply(tmp_path / "g.ply", cloud)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_half_a_million_are_fast(tmp_path: Path) -> None:
+    cloud = _cloud(500_000, 20)
+    start = time.process_time()
+    write_gaussian_ply(tmp_path / "g.ply", cloud)
+    back = read_gaussian_ply(tmp_path / "g.ply")
+    assert time.process_time() - start < 15
+    assert (back.means == cloud.means).all()
+
+
+@pytest.mark.parametrize("classes", [2, 4, 7, 101])
+def test_compact_file_keeps_its_error_bounds(tmp_path: Path, classes: int) -> None:
+    cloud = _cloud(2000, classes)
+    names = tuple(f"class {i}" for i in range(classes))
+    write_compact(tmp_path / "c.safetensors", cloud, names)
+    back, names_back = read_compact(tmp_path / "c.safetensors")
+    assert names_back == names
+    side = np.ptp(cloud.means, axis=0)
+    error = np.abs(back.means - cloud.means).max(axis=0)
+    assert (error <= side / 131070 * 1.01 + 1e-6).all()
+    assert (error > side / 131070 * 0.5).all()
+    assert 0 < np.abs(back.colors - cloud.colors).max() <= 0.5 / 255 + 1e-6
+    np.testing.assert_allclose(back.log_scales, cloud.log_scales, rtol=1e-3)
+    np.testing.assert_allclose(back.opacity_logits, cloud.opacity_logits, rtol=1e-3, atol=1e-4)
+    assert cloud.class_probs is not None
+    assert back.class_probs is not None
+    assert (back.class_ids == cloud.class_ids).all()
+    np.testing.assert_allclose(back.class_probs.sum(axis=1), 1, atol=1e-5)
+    largest = np.take_along_axis(back.class_probs, cloud.class_probs.argmax(axis=1)[:, None], axis=1)[:, 0]
+    np.testing.assert_allclose(largest, cloud.class_probs.max(axis=1), atol=0.012)
+    # what is not kept: at most the fifth largest probability, which is under a fifth
+    assert np.abs(back.class_probs - cloud.class_probs).max() < 0.2
+
+
+def test_compact_file_is_small_and_the_same_every_time(tmp_path: Path) -> None:
+    cloud = _cloud(300_000, 20)
+    write_compact(tmp_path / "a.safetensors", cloud)
+    write_compact(tmp_path / "b.safetensors", cloud)
+    size = (tmp_path / "a.safetensors").stat().st_size
+    assert 5e6 < size < 15e6
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
+
+
+def test_compact_file_of_turned_ellipsoids_and_of_nothing(tmp_path: Path, shared_data: Path) -> None:
+    cloud = read_gaussian_ply(shared_data / "format_cases" / "ply_other_writers" / "test-splat.3-points-from-train.ply")
+    write_compact(tmp_path / "c.safetensors", cloud)
+    back, names = read_compact(tmp_path / "c.safetensors")
+    assert names == ()
+    np.testing.assert_allclose(back.quat_wxyz, cloud.quat_wxyz, atol=1e-3)
+    np.testing.assert_allclose(back.log_scales, cloud.log_scales, rtol=1e-3)
+    assert back.class_probs is None
+    empty = _cloud(0)
+    write_compact(tmp_path / "e.safetensors", empty)
+    write_gaussian_ply(tmp_path / "e.ply", empty)
+    assert len(read_compact(tmp_path / "e.safetensors")[0]) == len(read_gaussian_ply(tmp_path / "e.ply")) == 0

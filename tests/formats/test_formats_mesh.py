@@ -1,0 +1,129 @@
+"""Meshes: trimesh and plyfile read what we write, with colours and labels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pytest
+import trimesh
+
+from formats.errors import InputError
+from formats.mesh import read_mesh_glb, read_mesh_ply, write_mesh_glb, write_mesh_ply
+
+
+@pytest.fixture
+def sphere() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """An icosphere with random colours, and labels by octant."""
+    mesh = trimesh.creation.icosphere(subdivisions=3)
+    rng = np.random.default_rng(0)
+    labels = ((mesh.vertices > 0) @ [1, 2, 4]).astype(np.uint8)
+    labels[0] = 255
+    colors = rng.integers(0, 256, (len(mesh.vertices), 3)).astype(np.uint8)
+    return mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32), colors, labels
+
+
+def test_ply_round_trip_and_foreign_readers(tmp_path: Path, sphere: tuple) -> None:
+    vertices, faces, colors, labels = sphere
+    path = tmp_path / "mesh.ply"
+    write_mesh_ply(path, *sphere, class_names=("wall", "two words"))
+    ours = read_mesh_ply(path)
+    for got, expected in zip((ours.vertices, ours.faces, ours.colors, ours.labels), sphere, strict=True):
+        assert (got == expected).all()
+    ply = plyfile.PlyData.read(str(path))
+    assert ply["vertex"].data.dtype.names == ("x", "y", "z", "red", "green", "blue", "label")
+    assert (ply["vertex"]["label"] == labels).all()
+    assert ply.comments == ["class 0 wall", "class 1 two words"]
+    loaded = trimesh.load_mesh(str(path), process=False)
+    assert loaded.is_watertight
+    assert (loaded.faces == faces).all()
+    assert (loaded.visual.vertex_colors[:, :3] == colors).all()
+    np.testing.assert_array_equal(loaded.vertices, vertices)
+
+
+def test_glb_round_trip_and_foreign_reader(tmp_path: Path, sphere: tuple) -> None:
+    vertices, faces, colors, labels = sphere
+    path = tmp_path / "mesh.glb"
+    write_mesh_glb(path, *sphere, class_names=("wall", "floor"))
+    scene = trimesh.load_scene(str(path), process=False)
+    (mesh,) = scene.geometry.values()
+    assert (mesh.faces == faces).all()
+    np.testing.assert_array_equal(np.asarray(mesh.vertices, np.float32), vertices)
+    assert (mesh.visual.vertex_colors[:, :3] == colors).all()
+    assert (mesh.vertex_attributes["_LABEL"].ravel() == labels).all()
+    assert mesh.metadata["classes"] == ["wall", "floor"]
+    ours = read_mesh_glb(path)
+    for got, expected in zip((ours.vertices, ours.faces, ours.colors, ours.labels), sphere, strict=True):
+        assert (got == expected).all()
+
+
+def test_the_same_mesh_gives_the_same_bytes(tmp_path: Path, sphere: tuple) -> None:
+    for write, name in ((write_mesh_ply, "m.ply"), (write_mesh_glb, "m.glb")):
+        write(tmp_path / "a" / name, *sphere)
+        write(tmp_path / "b" / name, *sphere)
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary"])
+def test_meshes_by_other_programs(shared_data: Path, kind: str) -> None:
+    mesh = read_mesh_ply(shared_data / "format_cases" / "ply_other_writers" / f"beetle.{kind}.ply")
+    assert mesh.vertices.shape == (1148, 3)
+    # the faces of both files are triangles and some larger polygons that fall into fans
+    foreign = trimesh.load_mesh(
+        str(shared_data / "format_cases" / "ply_other_writers" / f"beetle.{kind}.ply"), process=False
+    )
+    assert len(mesh.faces) == len(foreign.faces)
+    area = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).area
+    assert area == pytest.approx(foreign.area, rel=1e-5)
+    assert (mesh.labels == 255).all()
+
+
+def test_polygons_become_triangles(tmp_path: Path) -> None:
+    (tmp_path / "quad.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 2\nproperty list uchar int vertex_index\nend_header\n"
+        "0 0 0\n1 0 0\n1 1 0\n0 1 0\n0 2 0\n4 0 1 2 3\n3 2 4 3\n"
+    )
+    mesh = read_mesh_ply(tmp_path / "quad.ply")
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).area == pytest.approx(1.5)
+
+
+def test_bad_meshes_are_explained(tmp_path: Path, shared_data: Path, sphere: tuple) -> None:
+    with pytest.raises(InputError, match="no faces"):
+        read_mesh_ply(shared_data / "format_cases" / "ply_other_writers" / "inria_3dgs_output" / "input.ply")
+    with pytest.raises(InputError, match="git lfs pull"):
+        read_mesh_ply(shared_data / "format_cases" / "lfs_pointer" / "point_cloud.ply")
+    write_mesh_ply(tmp_path / "whole.ply", *sphere)
+    data = (tmp_path / "whole.ply").read_bytes()
+    for keep in (2, 40, 300, len(data) - 1):
+        (tmp_path / "cut.ply").write_bytes(data[:keep])
+        with pytest.raises(InputError):
+            read_mesh_ply(tmp_path / "cut.ply")
+    write_mesh_glb(tmp_path / "whole.glb", *sphere)
+    data = (tmp_path / "whole.glb").read_bytes()
+    for keep in (0, 10, len(data) // 2):
+        (tmp_path / "cut.glb").write_bytes(data[:keep])
+        with pytest.raises(InputError):
+            read_mesh_glb(tmp_path / "cut.glb")
+    (tmp_path / "bad.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n3 0 1 2\n"
+    )
+    with pytest.raises(InputError, match="outside"):
+        read_mesh_ply(tmp_path / "bad.ply")
+
+
+def test_arrays_that_do_not_fit_are_refused(tmp_path: Path, sphere: tuple) -> None:
+    vertices, faces, colors, labels = sphere
+    for arguments in [
+        (vertices, faces, colors[:-1], labels),
+        (vertices, faces + 1, colors, labels),
+        (vertices, faces, colors, labels[:, None]),
+    ]:
+        with pytest.raises(ValueError, match="MeshArrays"):
+            write_mesh_ply(tmp_path / "m.ply", *arguments)
+    with pytest.raises(ValueError, match="without faces"):
+        write_mesh_glb(tmp_path / "m.glb", vertices, faces[:0], colors, labels)
+    write_mesh_ply(tmp_path / "empty.ply", vertices[:0], faces[:0], colors[:0], labels[:0])
+    assert len(read_mesh_ply(tmp_path / "empty.ply").faces) == 0

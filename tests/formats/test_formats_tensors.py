@@ -1,0 +1,114 @@
+"""Array files: nothing lost, nothing executed, the same bytes every time."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.numpy
+
+import formats.tensors
+from formats.errors import InputError
+from formats.tensors import load_arrays, load_npz, save_arrays, save_npz
+
+REPO = Path(__file__).resolve().parents[2]
+ARRAYS = {
+    "b": np.arange(12, dtype=np.float32).reshape(3, 4),
+    "a": np.array([1, 2, 255], np.uint8),
+    "empty": np.zeros((0, 3), np.float64),
+    "strided": np.arange(20, dtype=np.int64).reshape(4, 5)[::2, ::-2],
+    "flag": np.array([True, False]),
+    "half": np.array([0.5, -2], np.float16),
+}
+
+
+def test_safetensors_round_trip(tmp_path: Path) -> None:
+    save_arrays(tmp_path / "t.safetensors", ARRAYS, {"kind": "test", "ü": "x\ny"})
+    back, meta = load_arrays(tmp_path / "t.safetensors")
+    foreign = safetensors.numpy.load_file(str(tmp_path / "t.safetensors"))
+    assert meta == {"kind": "test", "ü": "x\ny"}
+    for name, array in ARRAYS.items():
+        assert back[name].dtype == foreign[name].dtype == array.dtype
+        np.testing.assert_array_equal(back[name], array)
+        np.testing.assert_array_equal(foreign[name], array)
+
+
+def test_npz_round_trip(tmp_path: Path) -> None:
+    for compress in (True, False):
+        save_npz(tmp_path / "t.npz", ARRAYS, compress=compress)
+        back = load_npz(tmp_path / "t.npz")
+        assert set(back) == set(ARRAYS)
+        for name, array in ARRAYS.items():
+            assert back[name].dtype == array.dtype
+            np.testing.assert_array_equal(back[name], array)
+
+
+def test_bytes_do_not_depend_on_process_or_order(tmp_path: Path) -> None:
+    program = (
+        "import sys; import numpy as np; from pathlib import Path; from formats.tensors import save_arrays, save_npz\n"
+        "names = sys.argv[2].split(',')\n"
+        "arrays = {n: np.arange(ord(n)) for n in names}\n"
+        "save_arrays(Path(sys.argv[1] + '.safetensors'), arrays, {n: n for n in names})\n"
+        "save_npz(Path(sys.argv[1] + '.npz'), arrays)"
+    )
+    for name, order, seed in (("one", "a,b,c,d,e,f", "1"), ("two", "f,c,e,a,d,b", "2")):
+        command = [sys.executable, "-c", program, str(tmp_path / name), order]
+        subprocess.run(command, cwd=REPO, check=True, env={**os.environ, "PYTHONHASHSEED": seed})
+    for suffix in (".safetensors", ".npz"):
+        assert (tmp_path / f"one{suffix}").read_bytes() == (tmp_path / f"two{suffix}").read_bytes()
+
+
+def test_nothing_in_a_file_is_executed(tmp_path: Path) -> None:
+    class Trap:
+        def __reduce__(self) -> tuple:
+            return (Path.touch, (tmp_path / "sprung",))
+
+    np.savez(tmp_path / "trap.npz", a=np.array([Trap()], dtype=object))
+    (tmp_path / "trap.safetensors").write_bytes(pickle.dumps(Trap()))
+    with pytest.raises(InputError, match=r"no \.npz file of plain arrays"):
+        load_npz(tmp_path / "trap.npz")
+    with pytest.raises(InputError, match="damaged"):
+        load_arrays(tmp_path / "trap.safetensors")
+    assert not (tmp_path / "sprung").exists()
+    with pytest.raises(ValueError, match=r"[Oo]bject"):
+        save_npz(tmp_path / "o.npz", {"a": np.array([Trap()], dtype=object)})
+    assert not (tmp_path / "o.npz").exists()
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
+def test_damaged_files_are_explained(tmp_path: Path, suffix: str) -> None:
+    path, load = tmp_path / f"t{suffix}", load_npz if suffix == ".npz" else load_arrays
+    with pytest.raises(InputError, match="no such file"):
+        load(path)
+    (save_npz if suffix == ".npz" else save_arrays)(path, ARRAYS)
+    data = path.read_bytes()
+    for keep in (0, 5, 100, len(data) // 2, len(data) - 1):
+        path.write_bytes(data[:keep])
+        with pytest.raises(InputError, match="damaged"):
+            load(path)
+
+
+def test_arrays_larger_than_the_limit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(formats.tensors, "MAX_ARRAY_BYTES", 100_000)
+    np.savez_compressed(tmp_path / "bomb.npz", a=np.zeros(1_000_000, np.uint8))
+    assert (tmp_path / "bomb.npz").stat().st_size < 10_000
+    with pytest.raises(InputError, match="unpack"):
+        load_npz(tmp_path / "bomb.npz")
+    save_arrays(tmp_path / "big.safetensors", {"a": np.zeros(200_000, np.uint8)})
+    with pytest.raises(InputError, match="larger"):
+        load_arrays(tmp_path / "big.safetensors")
+
+
+def test_a_header_that_claims_more_than_the_entry(tmp_path: Path) -> None:
+    header = b"\x93NUMPY\x01\x00" + (118).to_bytes(2, "little")
+    header += b"{'descr': '|u1', 'fortran_order': False, 'shape': (99999999999999,), }".ljust(117) + b"\n"
+    with zipfile.ZipFile(tmp_path / "liar.npz", "w") as archive:
+        archive.writestr("a.npy", header + b"few")
+    with pytest.raises(InputError, match="damaged"):
+        load_npz(tmp_path / "liar.npz")
