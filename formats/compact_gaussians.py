@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from formats.errors import InputError
 from formats.gaussians import GaussianCloud
-from formats.tensors import load_arrays, save_arrays
+from formats.tensors import load_safetensors, save_safetensors
 
 KEPT_CLASSES = 4
 """The most probable classes of each Gaussian that are kept; the rest shares what is left equally."""
@@ -40,12 +40,12 @@ def write_compact(path: Path, cloud: GaussianCloud, class_names: tuple[str, ...]
         arrays["top_classes"], arrays["top_probs"] = _top_classes(cloud.class_probs)
     count = 0 if cloud.class_probs is None else cloud.class_probs.shape[1]
     meta = {"format": _FORMAT, "class_count": str(count), "class_names": "\n".join(class_names)}
-    save_arrays(path, arrays, meta)
+    save_safetensors(path, arrays, meta)
 
 
 def read_compact(path: Path) -> tuple[GaussianCloud, tuple[str, ...]]:
     """The cloud, to the precision `write_compact` states, and the class names. Raises InputError for another file."""
-    arrays, meta = load_arrays(path)
+    arrays, meta = load_safetensors(path)
     if meta.get("format") != _FORMAT:
         raise InputError(f"{path} is no compact Gaussian file: expected one written with the map's compact export")
     try:

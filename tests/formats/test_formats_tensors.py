@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import safetensors.numpy
+import torch
 
 import formats.tensors
 from formats.errors import InputError
-from formats.tensors import load_arrays, load_npz, save_arrays, save_npz
+from formats.tensors import load_arrays, load_safetensors, load_tensors, save_arrays, save_safetensors, save_tensors
 
 REPO = Path(__file__).resolve().parents[2]
 ARRAYS = {
@@ -29,8 +30,8 @@ ARRAYS = {
 
 
 def test_safetensors_round_trip(tmp_path: Path) -> None:
-    save_arrays(tmp_path / "t.safetensors", ARRAYS, {"kind": "test", "ü": "x\ny"})
-    back, meta = load_arrays(tmp_path / "t.safetensors")
+    save_safetensors(tmp_path / "t.safetensors", ARRAYS, {"kind": "test", "ü": "x\ny"})
+    back, meta = load_safetensors(tmp_path / "t.safetensors")
     foreign = safetensors.numpy.load_file(str(tmp_path / "t.safetensors"))
     assert meta == {"kind": "test", "ü": "x\ny"}
     for name, array in ARRAYS.items():
@@ -39,10 +40,21 @@ def test_safetensors_round_trip(tmp_path: Path) -> None:
         np.testing.assert_array_equal(foreign[name], array)
 
 
+def test_tensors_round_trip_with_their_layout_undone(tmp_path: Path) -> None:
+    tensors = {"t": torch.arange(12.0).reshape(3, 4).T, "i": torch.tensor(7), "g": torch.ones(2, requires_grad=True)}
+    save_tensors(tmp_path / "t.safetensors", tensors)
+    back = load_tensors(tmp_path / "t.safetensors")
+    assert all(torch.equal(back[name], tensor) for name, tensor in tensors.items())
+    assert (load_safetensors(tmp_path / "t.safetensors")[0]["t"] == tensors["t"].numpy()).all()
+    (tmp_path / "t.safetensors").write_bytes(b"no")
+    with pytest.raises(InputError, match="damaged"):
+        load_tensors(tmp_path / "t.safetensors")
+
+
 def test_npz_round_trip(tmp_path: Path) -> None:
     for compress in (True, False):
-        save_npz(tmp_path / "t.npz", ARRAYS, compress=compress)
-        back = load_npz(tmp_path / "t.npz")
+        save_arrays(tmp_path / "t.npz", ARRAYS, compress=compress)
+        back = load_arrays(tmp_path / "t.npz")
         assert set(back) == set(ARRAYS)
         for name, array in ARRAYS.items():
             assert back[name].dtype == array.dtype
@@ -51,11 +63,11 @@ def test_npz_round_trip(tmp_path: Path) -> None:
 
 def test_bytes_do_not_depend_on_process_or_order(tmp_path: Path) -> None:
     program = (
-        "import sys; import numpy as np; from pathlib import Path; from formats.tensors import save_arrays, save_npz\n"
+        "import sys; import numpy as np; from pathlib import Path; from formats.tensors import *\n"
         "names = sys.argv[2].split(',')\n"
         "arrays = {n: np.arange(ord(n)) for n in names}\n"
-        "save_arrays(Path(sys.argv[1] + '.safetensors'), arrays, {n: n for n in names})\n"
-        "save_npz(Path(sys.argv[1] + '.npz'), arrays)"
+        "save_safetensors(Path(sys.argv[1] + '.safetensors'), arrays, {n: n for n in names})\n"
+        "save_arrays(Path(sys.argv[1] + '.npz'), arrays)"
     )
     for name, order, seed in (("one", "a,b,c,d,e,f", "1"), ("two", "f,c,e,a,d,b", "2")):
         command = [sys.executable, "-c", program, str(tmp_path / name), order]
@@ -72,21 +84,21 @@ def test_nothing_in_a_file_is_executed(tmp_path: Path) -> None:
     np.savez(tmp_path / "trap.npz", a=np.array([Trap()], dtype=object))
     (tmp_path / "trap.safetensors").write_bytes(pickle.dumps(Trap()))
     with pytest.raises(InputError, match=r"no \.npz file of plain arrays"):
-        load_npz(tmp_path / "trap.npz")
+        load_arrays(tmp_path / "trap.npz")
     with pytest.raises(InputError, match="damaged"):
-        load_arrays(tmp_path / "trap.safetensors")
+        load_safetensors(tmp_path / "trap.safetensors")
     assert not (tmp_path / "sprung").exists()
     with pytest.raises(ValueError, match=r"[Oo]bject"):
-        save_npz(tmp_path / "o.npz", {"a": np.array([Trap()], dtype=object)})
+        save_arrays(tmp_path / "o.npz", {"a": np.array([Trap()], dtype=object)})
     assert not (tmp_path / "o.npz").exists()
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
 def test_damaged_files_are_explained(tmp_path: Path, suffix: str) -> None:
-    path, load = tmp_path / f"t{suffix}", load_npz if suffix == ".npz" else load_arrays
+    path, load = tmp_path / f"t{suffix}", load_arrays if suffix == ".npz" else load_safetensors
     with pytest.raises(InputError, match="no such file"):
         load(path)
-    (save_npz if suffix == ".npz" else save_arrays)(path, ARRAYS)
+    (save_arrays if suffix == ".npz" else save_safetensors)(path, ARRAYS)
     data = path.read_bytes()
     for keep in (0, 5, 100, len(data) // 2, len(data) - 1):
         path.write_bytes(data[:keep])
@@ -99,10 +111,10 @@ def test_arrays_larger_than_the_limit_are_refused(tmp_path: Path, monkeypatch: p
     np.savez_compressed(tmp_path / "bomb.npz", a=np.zeros(1_000_000, np.uint8))
     assert (tmp_path / "bomb.npz").stat().st_size < 10_000
     with pytest.raises(InputError, match="unpack"):
-        load_npz(tmp_path / "bomb.npz")
-    save_arrays(tmp_path / "big.safetensors", {"a": np.zeros(200_000, np.uint8)})
+        load_arrays(tmp_path / "bomb.npz")
+    save_safetensors(tmp_path / "big.safetensors", {"a": np.zeros(200_000, np.uint8)})
     with pytest.raises(InputError, match="larger"):
-        load_arrays(tmp_path / "big.safetensors")
+        load_safetensors(tmp_path / "big.safetensors")
 
 
 def test_a_header_that_claims_more_than_the_entry(tmp_path: Path) -> None:
@@ -111,4 +123,4 @@ def test_a_header_that_claims_more_than_the_entry(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "liar.npz", "w") as archive:
         archive.writestr("a.npy", header + b"few")
     with pytest.raises(InputError, match="damaged"):
-        load_npz(tmp_path / "liar.npz")
+        load_arrays(tmp_path / "liar.npz")
