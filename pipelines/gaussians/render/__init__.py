@@ -1,17 +1,19 @@
 """The differentiable renderer of isotropic semantic Gaussians.
 
 `render` draws a map from a camera, `composite` blends already projected Gaussians; gradients flow through both.
-`median_depth` and `blending_weights` look at a map without gradients.
+`track_gn` fits a pose to an image, `median_depth` and `blending_weights` look at a map without gradients.
 """
 
 from pipelines.gaussians.render.compositing import Composite, composite
 from pipelines.gaussians.render.inspection import BlendingWeights, blending_weights, median_depth
 from pipelines.gaussians.render.rendering import Rendering, render
 from pipelines.gaussians.render.threads import get_threads, set_threads
+from pipelines.gaussians.render.tracking import PoseFit, track_gn
 
 __all__ = [
     "BlendingWeights",
     "Composite",
+    "PoseFit",
     "Rendering",
     "blending_weights",
     "composite",
@@ -19,4 +21,5 @@ __all__ = [
     "median_depth",
     "render",
     "set_threads",
+    "track_gn",
 ]

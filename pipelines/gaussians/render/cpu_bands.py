@@ -22,7 +22,7 @@ RECORD = 6
 
 _ALPHA_MIN, _CUT2 = F32(rules.ALPHA_MIN), F32(rules.CUT_SIGMAS**2)
 _HALF, _ZERO, _ONE, _TWO = F32(0.5), F32(0), F32(1), F32(2)
-_RADIX = 2048
+DIGIT = 11  # bits sorted in one pass; three passes cover a float32
 
 
 @kernel
@@ -90,24 +90,35 @@ def sort_by_depth(entries: NDArray[np.int32], z: NDArray[np.float32]) -> None:
     count = len(entries)
     keys, spare_keys = np.empty(count, np.uint32), np.empty(count, np.uint32)
     spare = np.empty(count, np.int32)
-    places = np.zeros((3, _RADIX), np.int64)
     for k in range(count):
         keys[k] = bits(z[entries[k]])
-        for digit in range(3):
-            places[digit, (keys[k] >> np.uint32(11 * digit)) & np.uint32(_RADIX - 1)] += 1
-    source, target = entries, spare
-    for digit in range(3):
-        place, start = places[digit], 0
-        for j in range(_RADIX):
-            place[j], start = start, start + place[j]
-        for k in range(count):
-            j = (keys[k] >> np.uint32(11 * digit)) & np.uint32(_RADIX - 1)
-            spare_keys[place[j]] = keys[k]
-            target[place[j]] = source[k]
-            place[j] += 1
-        keys, spare_keys = spare_keys, keys
-        source, target = target, source
-    entries[:] = source  # an odd number of passes ends in `spare`
+    sort_by_digit(keys, entries, spare_keys, spare, 0)
+    sort_by_digit(spare_keys, spare, keys, entries, DIGIT)
+    sort_by_digit(keys, entries, spare_keys, spare, 2 * DIGIT)
+    for k in range(count):
+        entries[k] = spare[k]
+
+
+@kernel
+def sort_by_digit(
+    keys: NDArray[np.uint32],
+    values: NDArray[np.int32],
+    keys_out: NDArray[np.uint32],
+    values_out: NDArray[np.int32],
+    shift: int,
+) -> None:
+    """One pass of a radix sort: by the DIGIT bits of the keys from bit `shift` on, equal ones in their old order."""
+    places = np.zeros((1 << DIGIT) + 1, np.int64)
+    digits = np.uint32((1 << DIGIT) - 1)
+    for k in range(len(keys)):
+        places[np.intp((keys[k] >> np.uint32(shift)) & digits) + 1] += 1
+    for j in range(1 << DIGIT):
+        places[j + 1] += places[j]
+    for k in range(len(keys)):
+        j = np.intp((keys[k] >> np.uint32(shift)) & digits)
+        keys_out[places[j]] = keys[k]
+        values_out[places[j]] = values[k]
+        places[j] += 1
 
 
 @kernel

@@ -1,0 +1,245 @@
+"""Normal equations of a camera pose, by carrying six derivatives through the blending next to every value.
+
+A dual number is eight lanes: the derivatives by the six numbers of a left twist (translation first), the value, and one
+lane unused. Two dual numbers share a vector: red and green, blue and depth sum; the light is kept twice.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.gaussians.render import rules
+from pipelines.gaussians.render.cpu_backward import ALPHA, PLANES, weigh_rows
+from pipelines.gaussians.render.cpu_bands import (
+    BAND_ROWS,
+    RECORD,
+    TILE,
+    bin_gaussians,
+    first_pixel,
+    gather_band,
+    last_pixel,
+    list_tiles,
+    sort_by_depth,
+)
+from pipelines.gaussians.render.cpu_forward import CHECK_EVERY, LIGHT, PIXELS, is_opaque
+from pipelines.gaussians.render.jit import kernel
+from pipelines.gaussians.render.lanes import add_products, counting, exp, halves, load, load_twice, store
+from pipelines.gaussians.render.threads import for_each
+
+F32 = np.float32
+VALUE = 6
+"""The lane of a dual number that holds its value."""
+_ALPHA_MAX = F32(rules.ALPHA_MAX)
+_HALF, _ZERO, _ONE = F32(0.5), F32(0), F32(1)
+_DUAL = 48  # floats per pixel: red and green, blue and depth, light and light
+_JACOBIAN = 32  # floats per Gaussian: derivatives of u/s², v/s², of the exponent by distance², and of z
+
+
+def normal_equations(
+    projected: tuple[NDArray[np.float32], ...],
+    points_in_cam: NDArray[np.float32],
+    colors: NDArray[np.float32],
+    image: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    depth_weights: NDArray[np.float32],
+    focal: tuple[float, float],
+    color_weight: float,
+    floor: float,
+    min_silhouette: float,
+    near: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float, int]:
+    """JᵀWJ (6, 6), JᵀWr (6,), Σ weight |r| and the number of pixels of color_weight |C - I| + depth_weights |D - D̂|.
+
+    W makes the absolute values quadratic about the present residuals, `floor` being the least residual divided by.
+    projected: u, v, sigma_px, z, opacity (M,); D is the normalised depth; depth (H, W) is 0 where unknown; pixels with a
+    silhouette below `min_silhouette` do not count. The same bytes for any number of threads.
+    """
+    height, width = depth.shape
+    reach, starts, entries, _ = bin_gaussians(*projected, width, height, F32(near))
+    sums = np.zeros((len(starts) - 1, 6, 8))
+    costs = np.zeros((len(starts) - 1, 2))
+    job = (starts, entries, reach, *projected, points_in_cam, colors, image, depth, depth_weights)
+    settings = (F32(focal[0]), F32(focal[1]), F32(color_weight), F32(floor), F32(min_silhouette))
+    for_each(lambda band: normal_equations_of_band(band, *job, *settings, sums, costs), len(starts) - 1)
+    total, (cost, pixels) = sums.sum(axis=0), costs.sum(axis=0)
+    return total[:, :6], total[:, VALUE], float(cost), int(pixels)
+
+
+@kernel
+def fill_jacobian(
+    jacobian: NDArray[np.float32],
+    point: NDArray[np.float32],
+    fx: np.float32,
+    fy: np.float32,
+    sigma_px: np.float32,
+) -> None:
+    """d exponent = dx * jacobian[0:8] + dy * jacobian[8:16] + distance² * jacobian[16:24]; dz = jacobian[24:32].
+
+    A left twist (ρ, φ) moves a point P of the camera by ρ + φ x P.
+    """
+    jacobian[:] = _ZERO
+    x, y, z = point[0], point[1], point[2]
+    scale = _ONE / (z * sigma_px * sigma_px)
+    du, dv, ds, dz = jacobian[0:8], jacobian[8:16], jacobian[16:24], jacobian[24:32]
+    dz[2], dz[3], dz[4] = _ONE, y, -x
+    du[0], du[4], du[5] = fx * scale, fx * scale * z, -fx * scale * y
+    dv[1], dv[3], dv[5] = fy * scale, -fy * scale * z, fy * scale * x
+    for p in range(2, 5):
+        du[p] -= fx * scale * x / z * dz[p]
+        dv[p] -= fy * scale * y / z * dz[p]
+        ds[p] = -scale * dz[p]
+
+
+@kernel
+def blend_duals(
+    duals: NDArray[np.float32],
+    state: NDArray[np.float32],
+    jacobian: NDArray[np.float32],
+    color: NDArray[np.float32],
+    u_tile: np.float32,
+    v_tile: np.float32,
+    z: np.float32,
+    y0: int,
+    y1: int,
+    x0: int,
+    x1: int,
+) -> None:
+    """Blends one Gaussian, whose opacities stand in the plane ALPHA, into a box of a tile's dual numbers."""
+    du, dv, ds = load_twice(jacobian, 0), load_twice(jacobian, 8), load_twice(jacobian, 16)
+    dz = load_twice(jacobian, 24) * halves(_ZERO, _ONE)
+    red_green, blue_depth = halves(color[0], color[1]), halves(color[2], z)
+    for y in range(y0, y1 + 1):
+        dy = F32(y) + _HALF - v_tile
+        for x in range(x0, x1 + 1):
+            pixel = TILE * y + x
+            alpha, light = state[ALPHA + pixel], state[LIGHT + pixel]
+            if alpha == _ZERO:
+                continue
+            dx = F32(x) + _HALF - u_tile
+            slope = alpha if alpha < _ALPHA_MAX else _ZERO
+            d_alpha = (du * dx + dv * dy + ds * (dx * dx + dy * dy)) * slope
+            at = _DUAL * pixel
+            lights = load(duals, at + 32)
+            weight = lights * alpha + d_alpha * light
+            store(duals, at, load(duals, at) + weight * red_green)
+            store(duals, at + 16, load(duals, at + 16) + weight * blue_depth + dz * (alpha * light))
+            store(duals, at + 32, lights - weight)
+            state[LIGHT + pixel] = light - alpha * light
+
+
+@kernel
+def add_pixel(
+    normal: NDArray[np.float32],
+    duals: NDArray[np.float32],
+    seen: np.float32,
+    color: NDArray[np.float32],
+    depth: np.float32,
+    depth_weight: np.float32,
+    color_weight: np.float32,
+    floor: np.float32,
+) -> np.float32:
+    """Turns a pixel's dual numbers into residuals, adds their products, gives back Σ weight |residual|."""
+    rendered = duals[16 + 8 + VALUE] / seen
+    # (D / S)' = (D' - D / S S') / S, and S' is minus the derivative of the light.
+    corrected = load(duals, 16) + load(duals, 32) * halves(_ZERO, rendered)
+    store(duals, 16, corrected * halves(_ONE, _ONE / seen))
+    duals[VALUE] -= color[0]
+    duals[8 + VALUE] -= color[1]
+    duals[16 + VALUE] -= color[2]
+    duals[16 + 8 + VALUE] = rendered - depth
+    red, green, blue = abs(duals[VALUE]), abs(duals[8 + VALUE]), abs(duals[16 + VALUE])
+    away = abs(rendered - depth)
+    of_depth = depth_weight if depth > _ZERO else _ZERO
+    add_products(normal, load(duals, 0), halves(color_weight / max(red, floor), color_weight / max(green, floor)))
+    add_products(normal, load(duals, 16), halves(color_weight / max(blue, floor), of_depth / max(away, floor)))
+    return color_weight * (red + green + blue) + of_depth * away
+
+
+@kernel
+def normal_equations_of_band(
+    band: int,
+    starts: NDArray[np.int64],
+    entries: NDArray[np.int32],
+    reach: NDArray[np.float32],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    sigma_px: NDArray[np.float32],
+    z: NDArray[np.float32],
+    opacity: NDArray[np.float32],
+    points_in_cam: NDArray[np.float32],
+    colors: NDArray[np.float32],
+    target: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    depth_weights: NDArray[np.float32],
+    fx: np.float32,
+    fy: np.float32,
+    color_weight: np.float32,
+    floor: np.float32,
+    min_silhouette: np.float32,
+    sums: NDArray[np.float64],
+    costs: NDArray[np.float64],
+) -> None:
+    """Adds the pixels of one band to sums[band] (6, 8) and costs[band] (2,)."""
+    height, width = depth.shape
+    own = entries[starts[band] : starts[band + 1]]
+    sort_by_depth(own, z)
+    records, padded = gather_band(own, u, v, sigma_px, z, opacity, reach, colors, 3)
+    jacobians = np.empty(len(own) * _JACOBIAN, np.float32)
+    for k in range(len(own)):
+        jacobian = jacobians[k * _JACOBIAN : (k + 1) * _JACOBIAN]
+        fill_jacobian(jacobian, points_in_cam[own[k]], fx, fy, sigma_px[own[k]])
+    band_top = band * BAND_ROWS
+    tile_starts, members = list_tiles(records, band_top, width, min(BAND_ROWS, height - band_top))
+    across = (width + TILE - 1) // TILE
+    state, falloff_y = np.empty(PIXELS * PLANES, np.float32), np.empty(TILE, np.float32)
+    duals, normal = np.empty(PIXELS * _DUAL, np.float32), np.empty(6 * 16, np.float32)
+    for tile in range(len(tile_starts) - 1):
+        left, top = TILE * (tile % across), band_top + TILE * (tile // across)
+        columns, rows = min(TILE, width - left), min(TILE, height - top)
+        open_tile(state, duals, columns, rows)
+        for k in range(tile_starts[tile], tile_starts[tile + 1]):
+            i = members[k]
+            at = RECORD * i
+            u_tile, v_tile, r = records[at] - F32(left), records[at + 1] - F32(top), records[at + 5]
+            x0, x1 = first_pixel(u_tile - r), last_pixel(u_tile + r, columns)
+            y0, y1 = first_pixel(v_tile - r), last_pixel(v_tile + r, rows)
+            if x1 < x0 or y1 < y0:
+                continue
+            sharpness = -_HALF / (records[at + 2] * records[at + 2])
+            dx, dy = counting(_HALF - u_tile), counting(_HALF - v_tile)
+            dx2 = dx * dx
+            store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
+            weigh_rows(state, LIGHT, falloff_y, exp(dx2 * sharpness), dx2, v_tile, r * r, y0, y1)
+            jacobian, color = jacobians[i * _JACOBIAN : (i + 1) * _JACOBIAN], padded[3 * i : 3 * i + 3]
+            blend_duals(duals, state, jacobian, color, u_tile, v_tile, records[at + 3], y0, y1, x0, x1)
+            if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, LIGHT):
+                break
+        normal[:] = _ZERO
+        for y in range(rows):
+            for x in range(columns):
+                pixel, row, column = TILE * y + x, top + y, left + x
+                seen = _ONE - state[LIGHT + pixel]
+                if seen >= min_silhouette and seen > _ZERO:
+                    own_duals = duals[pixel * _DUAL : (pixel + 1) * _DUAL]
+                    costs[band, 0] += add_pixel(
+                        normal, own_duals, seen, target[row, column], depth[row, column],
+                        depth_weights[row, column], color_weight, floor,
+                    )  # fmt: skip
+                    costs[band, 1] += 1
+        for p in range(6):
+            for q in range(8):
+                sums[band, p, q] += normal[16 * p + q] + normal[16 * p + 8 + q]
+
+
+@kernel
+def open_tile(state: NDArray[np.float32], duals: NDArray[np.float32], columns: int, rows: int) -> None:
+    """Full light without derivatives for the pixels of the image, none for the rest of the tile."""
+    state[:] = _ZERO
+    duals[:] = _ZERO
+    for y in range(rows):
+        for x in range(columns):
+            pixel = TILE * y + x
+            state[LIGHT + pixel] = _ONE
+            duals[pixel * _DUAL + 32 + VALUE] = _ONE
+            duals[pixel * _DUAL + 40 + VALUE] = _ONE

@@ -1,0 +1,153 @@
+"""Finding the pose of a camera from a nearby one: Gauss-Newton through the renderer, MSGS-SLAM eq. (16) without labels.
+
+One evaluation, which yields the cost, its gradient and its curvature, costs less than one reverse-mode gradient. It
+needs a start within about 3 cm and 1 degree (some ten pixels); from farther away it refuses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pipelines.gaussians.render.compositing import require_finite
+from pipelines.gaussians.render.rendering import NEAR
+from pipelines.geometry import se3
+from pipelines.geometry.camera import project_gaussians
+from pipelines.types import Intrinsics
+
+FIRST_FLOOR, FLOOR_FACTOR, LAST_FLOOR = 0.3, 0.6, 0.02
+"""Residuals below the floor count quadratically, above it absolutely; the floor falls with every evaluation."""
+
+
+@dataclass(frozen=True)
+class PoseFit:
+    """cam_from_world (4, 4) float64: the fitted pose, or the start where `converged` is False and `reason` says why.
+
+    evaluations: how often the map was rendered; cost: mean weighted |residual| per pixel seen, at the last evaluation;
+    information (6, 6) float64: JᵀWJ there, for a left twist (translation first).
+    """
+
+    cam_from_world: Tensor
+    converged: bool
+    reason: str
+    evaluations: int
+    cost: float
+    information: NDArray[np.float64]
+
+
+def track_gn(
+    means: Tensor,
+    radii: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    cam_from_world: Tensor,
+    intrinsics: Intrinsics,
+    image: Tensor,
+    depth: Tensor | None = None,
+    depth_weights: Tensor | None = None,
+    color_weight: float = 1.0,
+    depth_weight: float = 0.8,
+    min_silhouette: float = 0.95,
+    min_overlap: float = 0.2,
+    max_evaluations: int = 10,
+    tolerance_px: float = 0.05,
+    near: float = NEAR,
+) -> PoseFit:
+    """Fit cam_from_world (4, 4) so that the map looks like image (H, W, 3) in 0..1 and depth (H, W), 0 = unknown.
+
+    Minimises Σ color_weight |C - I| + depth_weight depth_weights |D - depth| over the pixels with silhouette >=
+    min_silhouette, depth_weights (H, W) being the reliability of the depth (1 where not given). Ends when a step moves
+    the image by less than tolerance_px; refuses, with `converged` False, if less than min_overlap of the image shows
+    the map, if the cost grows or if max_evaluations do not suffice. Computes in float32 on the CPU wherever the tensors
+    are. Raises ValueError for NaN, infinity or wrong shapes.
+    """
+    problem = _Problem(means, radii, opacities, colors, intrinsics, image, depth, depth_weights, near)
+    weights = (color_weight, depth_weight, min_silhouette)
+    start = cam_from_world.detach().cpu().double()
+    require_finite("cam_from_world", start)
+    pose, floor, first_cost, cost = start, FIRST_FLOOR, np.inf, np.inf
+    information, reason = np.zeros((6, 6)), f"no convergence within {max_evaluations} evaluations"
+    step_px, evaluation = np.inf, 0
+    for evaluation in range(1, max_evaluations + 1):
+        information, gradient, total, pixels, z = problem.normal_equations(pose, floor, *weights)
+        if pixels < min_overlap * intrinsics.width * intrinsics.height:
+            reason = f"only {pixels} pixels show the map, fewer than {min_overlap:.0%} of the image"
+            break
+        cost = total / pixels
+        first_cost = min(first_cost, cost) if evaluation == 1 else first_cost
+        if np.linalg.cond(information) > 1e12:
+            reason = "the image does not determine the pose"
+            break
+        step = -np.linalg.solve(information, gradient)
+        pose = torch.from_numpy(se3.exp(step)) @ pose
+        step_px = max(intrinsics.fx, intrinsics.fy) * (np.linalg.norm(step[:3]) / z + np.linalg.norm(step[3:]))
+        if step_px < tolerance_px:
+            reason = "" if cost <= first_cost else "the cost grew"
+            break
+        floor = max(floor * FLOOR_FACTOR, LAST_FLOOR)
+    return PoseFit(start if reason else pose, not reason, reason, evaluation, float(cost), information)
+
+
+class _Problem:
+    """The arguments of `track_gn` as checked arrays, and how to evaluate them at a pose."""
+
+    def __init__(
+        self,
+        means: Tensor,
+        radii: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        intrinsics: Intrinsics,
+        image: Tensor,
+        depth: Tensor | None,
+        depth_weights: Tensor | None,
+        near: float,
+    ) -> None:
+        size, count = (intrinsics.height, intrinsics.width), len(means)
+        depth = torch.zeros(size) if depth is None else depth
+        depth_weights = torch.ones(size) if depth_weights is None else depth_weights
+        self.intrinsics, self.near = intrinsics, near
+        self.means = _checked("means", means, (count, 3))
+        self.radii = _checked("radii", radii, (count,))
+        self.opacities = _checked("opacities", opacities, (count,)).numpy()
+        self.colors = _checked("colors", colors, (count, 3)).numpy()
+        self.image = _checked("image", image, (*size, 3)).numpy()
+        self.depth = _checked("depth", depth, size).numpy()
+        self.depth_weights = _checked("depth_weights", depth_weights, size).numpy()
+
+    def normal_equations(
+        self, pose: Tensor, floor: float, color_weight: float, depth_weight: float, min_silhouette: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, int, float]:
+        """JᵀWJ, JᵀWr, cost, pixels, and the median depth of the Gaussians in front of the camera."""
+        from pipelines.gaussians.render.cpu_tracking import normal_equations  # imports numba
+
+        points_in_cam = se3.transform(pose.float(), self.means)
+        u, v, sigma_px, z = project_gaussians(points_in_cam, self.radii, self.intrinsics, self.near)
+        front = z[z > self.near]
+        projected = (u.numpy(), v.numpy(), sigma_px.numpy(), z.contiguous().numpy(), self.opacities)
+        result = normal_equations(
+            projected,
+            points_in_cam.numpy(),
+            self.colors,
+            self.image,
+            self.depth,
+            self.depth_weights * np.float32(depth_weight),
+            (self.intrinsics.fx, self.intrinsics.fy),
+            color_weight,
+            floor,
+            min_silhouette,
+            self.near,
+        )
+        return (*result, float(front.median()) if len(front) else 1.0)
+
+
+def _checked(name: str, tensor: Tensor, shape: tuple[int, ...]) -> Tensor:
+    tensor = tensor.detach().to("cpu", torch.float32).contiguous()
+    if tuple(tensor.shape) != shape:
+        raise ValueError(f"{name}: got shape {tuple(tensor.shape)}, expected {shape}")
+    require_finite(name, tensor)
+    return tensor
