@@ -117,6 +117,15 @@ class RunFolder:
         """Keyframe poses and points as `stage` left them."""
         return load_sparse_model(self.stage(stage) / "sparse.npz")
 
+    def load_depth_scales(self) -> dict[str, NDArray] | None:
+        """frame_ids, scales, grids: depth in the world over proxy depth; None where tracking left none."""
+        path = self.stage("tracking") / "depth_scales.npz"
+        return load_arrays(path) if path.exists() else None
+
+    def load_exposure(self) -> dict[str, NDArray]:
+        """frame_ids (N,), log_gains (N, 3), offsets (N, 3) of the mapped keyframes."""
+        return load_arrays(self.stage("mapping") / "exposure.npz")
+
     def load_map(self, stage: str) -> GaussianMap:
         """The Gaussian map as `stage` left it."""
         return GaussianMap(**load_tensors(self.stage(stage) / "map.safetensors"))
@@ -212,6 +221,13 @@ def save_trajectory(folder: Path, trajectory: Trajectory) -> None:
 def save_map(folder: Path, gaussian_map: GaussianMap) -> None:
     """One safetensors file."""
     save_tensors(folder / "map.safetensors", {k: v.detach().cpu().contiguous() for k, v in vars(gaussian_map).items()})
+
+
+def save_exposure(
+    folder: Path, frame_ids: NDArray[np.int64], log_gains: NDArray[np.float32], offsets: NDArray[np.float32]
+) -> None:
+    """picture = colours of the map * exp(log gain) + offset, a keyframe and channel."""
+    save_arrays(folder / "exposure.npz", {"frame_ids": frame_ids, "log_gains": log_gains, "offsets": offsets})
 
 
 def save_loops(folder: Path, loops: list[LoopEdge]) -> None:

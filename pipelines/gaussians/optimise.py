@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,13 +19,16 @@ from pipelines.gaussians.map import GaussianMap
 from pipelines.gaussians.parameters import AdamTable, MapParameters, empty_map
 from pipelines.gaussians.render import Rendering, render
 from pipelines.gaussians.schedule import Schedule, Step
-from pipelines.gaussians.seeding import complete_depth, seed_gaussians, seed_grid
+from pipelines.gaussians.seeding import SEED_OPACITY, complete_depth, seed_gaussians, seed_grid
 from pipelines.geometry import se3
 from pipelines.mapping.views import View, halved
 from pipelines.progress import Progress, SilentProgress
 
 VIEW_KEYS = ("twist", "log_gain", "offset")
+GROWN_OPACITY, ERROR_OPACITY = 0.3, 0.1
+"""Of Gaussians added to a map that is already there: opaque ones would hide what has been learnt."""
 _LOW_RELIABILITY = 0.35
+_HIGH_RELIABILITY = 0.85
 
 
 @dataclass(frozen=True)
@@ -227,8 +231,8 @@ class MapOptimiser:
         coarse = needed & grid
         colors = expose(rendering.features[..., :3], self.state.view_tables[index])
         fine = densify.color_errors(colors, view.colors, 1 - s.error_share) & ~grid
-        self._append(index, coarse, s.seed_stride, rendering)
-        self._append(index, fine, 1.0, rendering)
+        self._append(index, coarse, s.seed_stride, rendering, GROWN_OPACITY)
+        self._append(index, fine, 1.0, rendering, ERROR_OPACITY)
 
     def _needed(self, view: View, rendering: Rendering) -> Tensor:
         """Conditions (a) and (b)."""
@@ -238,7 +242,7 @@ class MapOptimiser:
             needed = needed | densify.hidden_surfaces(rendering.depth, view.depth, view.trust, tolerance)
         return needed
 
-    def _append(self, index: int, pixels: Tensor, spacing: float, rendering: Rendering | None) -> None:
+    def _append(self, index: int, pixels: Tensor, spacing: float, rendering: Rendering | None, opacity: float = SEED_OPACITY) -> None:
         parameters, view = self.state.parameters, self.views[index]
         if not pixels.any() or len(parameters) >= self.settings.max_gaussians:
             return
@@ -247,6 +251,7 @@ class MapOptimiser:
         seeds = seed_gaussians(
             pixels, depth, view.colors, view.channels, spacing, self.classes, pose, view.intrinsics, view.frame_id
         )
+        seeds.opacity_logits.fill_(math.log(opacity / (1 - opacity)))
         parameters.append(seeds, trust[pixels & (depth > 0)])
 
     def _seed_depth(self, view: View, rendering: Rendering | None) -> tuple[Tensor, Tensor]:
@@ -258,8 +263,9 @@ class MapOptimiser:
         depth, trust = (torch.from_numpy(x).to(view.image.device) for x in (completed.depth, completed.trust))
         if rendering is None:
             return depth, trust
+        # A trusted proxy is sharp at depth edges, where the map's blended depth lies between the surfaces.
         nearer = densify.hidden_surfaces(rendering.depth, view.depth, view.trust, self.settings.depth_tolerance)
-        use_map = (rendering.silhouette > 0.8) & ~nearer
+        use_map = (rendering.silhouette > 0.8) & ~nearer & (trust < _HIGH_RELIABILITY)
         return torch.where(use_map, rendering.depth, depth), trust
 
     @torch.no_grad()
