@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 from formats.datasets.camera import Camera
 from formats.datasets.classes_json import read_classes_json
 from formats.datasets.intrinsics_json import read_intrinsics_json
-from formats.datasets.matching import classes_found, files_for_images, poses_for_images, times_or_frame_numbers
+from formats.datasets.matching import (
+    classes_found,
+    files_for_images,
+    poses_at,
+    poses_for_images,
+    times_or_frame_numbers,
+)
 from formats.datasets.sequence import LabelClass, Sequence
 from formats.errors import InputError
 from formats.images import IMAGE_SUFFIXES, list_images
@@ -22,7 +28,6 @@ _DEPTH_FOLDERS = ("depth", "depths")
 _LABEL_FOLDERS = ("labels", "label", "semantic")
 _POSE_FILES = ("traj.txt", "trajectory.txt", "poses.txt", "groundtruth.txt")
 _INTRINSICS_FILES = ("intrinsics.json", "cam_params.json", "camera.json")
-_SAME_INSTANT_SECONDS = 0.02
 
 
 def recognises(path: Path) -> bool:
@@ -96,24 +101,6 @@ def _poses(images: list[Path], times: NDArray[np.float64], root: Path) -> NDArra
     if rows and len(rows[0]) == 8:
         return poses_at(times, *read_tum(path))
     return poses_for_images(images, read_matrices(path), path)
-
-
-def poses_at(
-    times: NDArray[np.float64],
-    pose_times: NDArray[np.float64],
-    world_from_cam: NDArray[np.float64],
-    tolerance: float = _SAME_INSTANT_SECONDS,
-) -> NDArray[np.float64]:
-    """(N, 4, 4) for each of `times` the pose nearest in time, NaN where none is within `tolerance` seconds."""
-    order = np.argsort(pose_times, kind="stable")
-    sorted_times = pose_times[order]
-    after = np.searchsorted(sorted_times, times).clip(1, max(1, len(order) - 1))
-    before = after - 1
-    after = after.clip(0, len(order) - 1)
-    nearest = np.where(np.abs(sorted_times[after] - times) < np.abs(sorted_times[before] - times), after, before)
-    result = world_from_cam[order[nearest]].copy()
-    result[np.abs(sorted_times[nearest] - times) > tolerance] = np.nan
-    return result
 
 
 def _classes(root: Path, label_paths: tuple[Path | None, ...]) -> tuple[LabelClass, ...]:

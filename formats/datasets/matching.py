@@ -16,6 +16,11 @@ from formats.images import IMAGE_SUFFIXES, natural_key
 ASSUMED_RATE = 30.0
 """Frames per second where a data set does not say."""
 
+SAME_INSTANT_SECONDS = 0.02
+"""Two sensors' measurements at most this far apart belong together: half a frame at 25 a second."""
+
+_MOST_IMAGES_SEARCHED = 300
+
 
 def files_for_images(images: list[Path], folder: Path, pattern: str = "*") -> tuple[Path | None, ...]:
     """For each image the file in `folder` of the same name, else of the same frame number; () without such a folder.
@@ -55,6 +60,28 @@ def poses_for_images(images: list[Path], poses: NDArray[np.float64], source: Pat
     )
 
 
+def poses_at(
+    times: NDArray[np.float64],
+    pose_times: NDArray[np.float64],
+    world_from_cam: NDArray[np.float64],
+    tolerance: float = SAME_INSTANT_SECONDS,
+) -> NDArray[np.float64]:
+    """(N, 4, 4) for each of `times` the pose nearest in time, NaN where none is within `tolerance` seconds."""
+    order = np.argsort(pose_times, kind="stable")
+    index = order[nearest_index(pose_times[order], times)]
+    result = world_from_cam[index].copy()
+    result[np.abs(pose_times[index] - times) > tolerance] = np.nan
+    return result
+
+
+def nearest_index(sorted_times: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(N,) for each of `times` the index of the nearest of `sorted_times`, the earlier of two equally near."""
+    after = np.searchsorted(sorted_times, times).clip(0, len(sorted_times) - 1)
+    before = (after - 1).clip(0)
+    closer = np.abs(sorted_times[before] - times) <= np.abs(sorted_times[after] - times)
+    return np.where(closer, before, after).astype(np.int64)
+
+
 def times_or_frame_numbers(images: list[Path], rate: float = ASSUMED_RATE) -> NDArray[np.float64]:
     """(N,) seconds: the images' own times, else their frame numbers (or else their order) over `rate`."""
     times = read_image_times(images)
@@ -67,8 +94,12 @@ def times_or_frame_numbers(images: list[Path], rate: float = ASSUMED_RATE) -> ND
 
 
 def classes_found(paths: tuple[Path | None, ...], void_ids: tuple[int, ...] = (0,)) -> tuple[LabelClass, ...]:
-    """A class for every id that occurs in the label images, named by its number: for sets that name none."""
-    used = used_label_ids(p for p in paths if p is not None)
+    """A class for every id that occurs in the label images, named by its number: for sets that name none.
+
+    Of long sequences some `_MOST_IMAGES_SEARCHED` evenly spread images are looked at.
+    """
+    existing = [p for p in paths if p is not None]
+    used = used_label_ids(existing[:: max(1, len(existing) // _MOST_IMAGES_SEARCHED)])
     return tuple(LabelClass(i, f"class {i}") for i in sorted(used - set(void_ids)))
 
 

@@ -7,7 +7,17 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 
-from formats.datasets import folder, replica, seven_scenes
+from formats.datasets import (
+    colmap,
+    euroc,
+    folder,
+    nerfstudio,
+    replica,
+    scannet,
+    scannet_sens,
+    seven_scenes,
+    tum_rgbd,
+)
 from formats.datasets.sequence import Sequence
 from formats.errors import InputError
 
@@ -22,10 +32,18 @@ class _Reader:
 _READERS = {
     "7scenes": _Reader(seven_scenes.recognises, seven_scenes.open_seven_scenes),
     "replica": _Reader(replica.recognises, replica.open_replica),
+    "tum": _Reader(tum_rgbd.recognises, tum_rgbd.open_tum_rgbd),
+    "euroc": _Reader(euroc.recognises, euroc.open_euroc),
+    "scannet": _Reader(scannet.recognises, scannet.open_scannet),
+    "sens": _Reader(scannet_sens.recognises, scannet_sens.open_sens),
+    "nerfstudio": _Reader(nerfstudio.recognises, nerfstudio.open_nerfstudio),
+    "colmap": _Reader(colmap.recognises, colmap.open_colmap),
     "folder": _Reader(folder.recognises, folder.open_folder),
 }
 
 _IMAGE_FOLDERS = frozenset({"rgb", "images", "color", "results"})
+# An earlier reconstruction that lies beside images is no part of their recording.
+_NOT_FROM_INSIDE = frozenset({"folder", "colmap"})
 
 FORMATS = ("auto", *_READERS)
 """What `open_sequence` accepts as a format."""
@@ -42,7 +60,7 @@ def _recognise(path: Path) -> tuple[str, Path] | None:
     names = [name for name, reader in _READERS.items() if path.exists() and reader.recognises(path)]
     if names == ["folder"] and path.name in _IMAGE_FOLDERS:
         above = path.resolve().parent
-        names_above = [name for name, reader in _READERS.items() if name != "folder" and reader.recognises(above)]
+        names_above = [name for name in _READERS if name not in _NOT_FROM_INSIDE and _READERS[name].recognises(above)]
         if names_above:
             return names_above[0], above
     return (names[0], path) if names else None

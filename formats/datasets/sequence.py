@@ -20,11 +20,15 @@ VOID_LABEL = 255
 
 @dataclass(frozen=True)
 class LabelClass:
-    """A class of the data set: its id in the label images, its name, its RGB colour where the set defines one."""
+    """A class of the data set: its id in the label images, its name, its RGB colour where the set defines one.
+
+    `other_ids` mean the same class: sets with fine labels are commonly read through a table that joins them.
+    """
 
     id: int
     name: str
     color: tuple[int, int, int] | None = None
+    other_ids: tuple[int, ...] = ()
 
 
 class FrameStore(Protocol):
@@ -135,7 +139,8 @@ class Sequence:
         if path is None:
             return None
         table = np.full(65536, VOID_LABEL, dtype=np.uint8)
-        table[[c.id for c in self.classes]] = np.arange(len(self.classes), dtype=np.uint8)
+        for index, label_class in enumerate(self.classes):
+            table[[label_class.id, *label_class.other_ids]] = index
         return table[read_label_png(path)]
 
     def subset(self, indices: Iterable[int]) -> Sequence:
@@ -155,7 +160,7 @@ class Sequence:
     def with_used_classes(self) -> Sequence:
         """The same with only those classes that occur in the label images (reads all of them)."""
         used = used_label_ids([p for p in self.label_paths if p is not None])
-        return replace(self, classes=tuple(c for c in self.classes if c.id in used))
+        return replace(self, classes=tuple(c for c in self.classes if not used.isdisjoint((c.id, *c.other_ids))))
 
     def _raw_depth(self, index: int) -> NDArray[np.uint16] | None:
         if self.store is not None:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from formats.datasets import VOID_LABEL, Camera, Sequence, open_sequence, recognise
 from formats.datasets.camera import warp_nearest
-from formats.datasets.folder import poses_at
+from formats.datasets.matching import poses_at
 from formats.errors import InputError
 from formats.images import write_grey_png, write_rgb
 from formats.trajectory import write_matrices, write_tum

@@ -1,0 +1,90 @@
+"""EuRoC MAV, left camera: mav0/cam0 with data.csv and sensor.yaml."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from formats.datasets.camera import Camera
+from formats.datasets.matching import poses_at
+from formats.datasets.sequence import Sequence
+from formats.errors import InputError
+from formats.safe_path import inside
+from formats.textfile import read_rows, read_table, read_text
+from formats.trajectory import clean_poses
+
+_NANOSECONDS = 1e-9
+
+
+def recognises(path: Path) -> bool:
+    """A folder with mav0/cam0/data.csv, or mav0 itself."""
+    return any((root / "cam0" / "data.csv").is_file() for root in (path / "mav0", path))
+
+
+def open_euroc(path: Path) -> Sequence:
+    """The left camera of a EuRoC sequence: metric poses, grey images with lens distortion, no depth.
+
+    Poses are those of the body, moved to the camera by the extrinsics in sensor.yaml. Raises InputError where a table
+    or the calibration cannot be read.
+    """
+    root = path / "mav0" if (path / "mav0" / "cam0").is_dir() else path
+    times, images = _images(root / "cam0")
+    camera, body_from_cam = _calibration(root / "cam0" / "sensor.yaml")
+    return Sequence(
+        format="euroc",
+        root=path,
+        names=tuple(p.name for p in images),
+        timestamps=times,
+        image_paths=tuple(images),
+        camera=camera,
+        world_from_cam=_poses(root / "state_groundtruth_estimate0" / "data.csv", times, body_from_cam),
+    )
+
+
+def _images(cam: Path) -> tuple[NDArray[np.float64], list[Path]]:
+    rows = read_rows(cam / "data.csv")
+    try:
+        entries = sorted({int(row[0]): row[1] for row in rows}.items())
+    except (IndexError, ValueError) as error:
+        raise InputError(f"{cam / 'data.csv'}: a line is not `nanoseconds,file` ({error}): unpack it again") from error
+    if not entries:
+        raise InputError(f"{cam / 'data.csv'} lists no images: unpack the data set again")
+    files = [inside(cam / "data", name, cam / "data.csv") for _, name in entries]
+    return np.array([time for time, _ in entries], dtype=np.float64) * _NANOSECONDS, files
+
+
+def _poses(path: Path, times: NDArray[np.float64], body_from_cam: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Rows of time, position, quaternion w x y z of the body in the world."""
+    if not path.is_file():
+        return None
+    table = read_table(path, 8)
+    world_from_body = np.tile(np.eye(4), (len(table), 1, 1))
+    world_from_body[:, :3, :3] = Rotation.from_quat(table[:, [5, 6, 7, 4]]).as_matrix()
+    world_from_body[:, :3, 3] = table[:, 1:4]
+    return poses_at(times, table[:, 0] * _NANOSECONDS, world_from_body @ body_from_cam)
+
+
+def _calibration(path: Path) -> tuple[Camera, NDArray[np.float64]]:
+    text = read_text(path)
+    fx, fy, cx, cy = _numbers(text, path, "intrinsics", 4)
+    width, height = _numbers(text, path, "resolution", 2)
+    distortion = _numbers(text, path, "distortion_coefficients", 4)
+    transform = np.array(_numbers(text, path, "data", 16)).reshape(1, 4, 4)
+    camera = Camera.from_integer_centres(int(width), int(height), fx, fy, cx, cy, tuple(distortion))
+    return camera, clean_poses(transform, str(path))[0]
+
+
+def _numbers(text: str, path: Path, key: str, count: int) -> list[float]:
+    """The list under a key of the YAML file, which may go over several lines."""
+    found = re.search(rf"^\s*{key}\s*:\s*\[([^\]]*)\]", text, flags=re.MULTILINE)
+    try:
+        values = [float(part) for part in found[1].split(",")] if found else []
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise InputError(f"{path}: {key!r} is missing or not a list of {count} numbers: unpack the data set again")
+    return values
