@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
-from formats.tensors import load_arrays, save_arrays
 from pipelines.progress import Progress
 from pipelines.proxy.providers import DepthEstimate
+from pipelines.proxy.scratch import load_scratch, save_scratch
 from pipelines.proxy.sequence import Sequence, map_intrinsics
 from pipelines.proxy.stereo.bands import Bands
 from pipelines.proxy.stereo.consistency import fuse_depths
+from pipelines.proxy.stereo.fill import SURE, fill_unsure
 from pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
 from pipelines.proxy.stereo.refine import refine_inverse_depth
 from pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
@@ -63,8 +64,8 @@ class MultiviewDepth:
         """`folder` gives a place for the maps between the passes. InputError without a backbone of two keyframes."""
         if sequence.backbone is None or len(sequence.backbone.frame_ids) < 2:
             raise InputError(
-                "depth from several views needs parallax, and structure from motion found none: the camera stands still "
-                "or only turns. Move the camera sideways, or give depth with --depth files:FOLDER or --depth onnx:CARD"
+                "depth from several views needs parallax, and structure from motion found none: the camera stands "
+                "still or only turns. Move it sideways, or give depth with --depth files:FOLDER or --depth onnx:CARD"
             )
         self._sequence, self._settings, self._folder, self._progress = sequence, settings, folder, progress
         self._model: SparseModel = sequence.backbone
@@ -87,7 +88,7 @@ class MultiviewDepth:
         for frame in self._progress.track([f for f in frames if f.id in self._index], "stereo"):
             path = self._path(frame.id)
             if not path.exists():
-                save_arrays(path, {"inverse_depth": self._sweep(self._index[frame.id])})
+                save_scratch(path, inverse_depth=self._sweep(self._index[frame.id]))
 
     def _sweep(self, index: int) -> NDArray[np.float32]:
         """(H, W) inverse depth of one keyframe from its neighbours alone; 0 where it has none to match with."""
@@ -120,8 +121,11 @@ class MultiviewDepth:
             return DepthEstimate(empty, empty)
         index = self._index[frame.id]
         depth, confidence = self._fuse(index)
-        self._kept.append(float((confidence > 0.27).mean()))
-        return upsample_depth(depth, confidence, self._sequence.image(frame))
+        self._kept.append(float((confidence >= SURE).mean()))
+        image = self._sequence.image(frame)
+        size = (self._camera.width, self._camera.height)
+        depth, confidence = fill_unsure(depth, confidence, cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+        return upsample_depth(depth, confidence, image)
 
     def _fuse(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         companions = self._neighbours(index, self._settings.fuse_views)
@@ -160,10 +164,10 @@ class MultiviewDepth:
         return small.astype(np.float32) / 255
 
     def _load_raw(self, index: int) -> NDArray[np.float32]:
-        inverse = load_arrays(self._path(int(self._model.frame_ids[index])))["inverse_depth"]
+        inverse = load_scratch(self._path(int(self._model.frame_ids[index])))["inverse_depth"]
         return np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse > 0)
 
 
 def agreement(support: NDArray[np.float32], conflict: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Confidence in [0, 1]: one agreeing view gives about a half, five give 0.8; views that look through count against."""
+    """Confidence in [0, 1]: one agreeing view gives a half, four 0.8; views that look through count against."""
     return (support / (support + 1.0 + conflict)).astype(np.float32)

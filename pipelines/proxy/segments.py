@@ -51,7 +51,7 @@ class SegmentLabels:
         self._label = np.empty(0, np.uint8)
         self._classes = ClassTable((), ())
         self._gravity: list[float] = []
-        self._world_from_cam = {k: np.linalg.inv(v) for k, v in sequence.cam_from_world.items()}
+        self._world_from_cam = {k: np.linalg.inv(v).astype(np.float64) for k, v in sequence.cam_from_world.items()}
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames without a pose."""
@@ -88,7 +88,7 @@ class SegmentLabels:
     def _name(self, kind: NDArray[np.int64], parts: NDArray[np.int64]) -> None:
         """Number the kinds that occur, then the parts, largest first; what is left over is the class "other"."""
         label = np.full(len(kind), VOID, np.uint8)
-        names = []
+        names: list[str] = []
         for k, name in NAMES.items():
             if (kind == k).any():
                 label[kind == k] = len(names)

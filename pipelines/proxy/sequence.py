@@ -34,7 +34,11 @@ class Sequence:
         """(h, w, 3) RGB at map size."""
         rgb = self.read_image(frame)
         size = (self.intrinsics.width, self.intrinsics.height)
-        return rgb if rgb.shape[1::-1] == size else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+        return (
+            rgb
+            if rgb.shape[1::-1] == size
+            else np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+        )
 
 
 def map_intrinsics(frame_camera: Intrinsics, max_side: int) -> Intrinsics:

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from formats.errors import InputError
-from formats.tensors import load_arrays, save_arrays
 from pipelines.config import ProxyConfig
 from pipelines.progress import log
 from pipelines.proxy.providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider
 from pipelines.proxy.reliability import reliability, semantic_agreement, theta, warp_labels
+from pipelines.proxy.scratch import load_scratch, save_scratch
 from pipelines.proxy.selection import Surroundings, open_depth, open_semantics
 from pipelines.proxy.sequence import Sequence, map_intrinsics
 from pipelines.run_folder import load_proxy_maps, proxy_path, save_classes, save_proxy_maps, write_json
@@ -53,7 +53,7 @@ def _threads(context: StageContext) -> int:
 
 
 def _frames_to_do(context: StageContext, sequence: Sequence, config: ProxyConfig, depths: DepthProvider) -> list[Frame]:
-    if config.frames == "all" and depths.metric or sequence.backbone is None:
+    if (config.frames == "all" and depths.metric) or sequence.backbone is None:
         return sequence.frames
     if config.frames == "all":
         context.warn(f"proxy.frames=all: {depths.name} knows only keyframes, the other frames get no maps")
@@ -80,7 +80,7 @@ def _depth_pass(context: StageContext, frames: list[Frame], depths: DepthProvide
     for frame in context.progress.track(frames, "depth", len(frames)):
         path = _depth_path(context.snapshot, frame)
         if not path.exists():
-            save_arrays(path, dict(vars(depths.estimate(frame))))
+            save_scratch(path, **vars(depths.estimate(frame)))
 
 
 def _depth_path(snapshot: Path, frame: Frame) -> Path:
@@ -88,7 +88,7 @@ def _depth_path(snapshot: Path, frame: Frame) -> Path:
 
 
 def _load_depth(snapshot: Path, frame: Frame) -> DepthEstimate:
-    return DepthEstimate(**load_arrays(_depth_path(snapshot, frame)))
+    return DepthEstimate(**load_scratch(_depth_path(snapshot, frame)))
 
 
 # maps -----------------------------------------------------------------------------------------------------------

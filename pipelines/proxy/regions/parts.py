@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pipelines.proxy.graph_cut import cut_graph
 from pipelines.proxy.regions.voxels import Voxels, find, neighbour_keys
 
 _COLOR_UNIT = 12.0
@@ -16,15 +16,13 @@ _SCALE = 60.0
 def cut_parts(voxels: Voxels, largest: int) -> NDArray[np.int64]:
     """(V,) part of every voxel, 0 the largest by weight; parts beyond the `largest` join a neighbour or are -1.
 
-    Efficient graph-based segmentation (Felzenszwalb and Huttenlocher, IJCV 2004) on the grid of voxels. A step of
-    the surface that bends towards the viewer's side (concave) separates objects more than a convex one.
+    The graph joins neighbouring voxels. A step of the surface that bends towards the viewer's side (concave) separates objects more than a convex one.
     """
     if len(voxels) == 0:
         return np.empty(0, np.int64)
     a, b, cost = _edges(voxels)
-    order = np.lexsort((b, a, cost))
-    root = _felzenszwalb(a[order], b[order], cost[order], voxels.weight / np.median(voxels.weight), _SCALE)
-    return _absorb_small(root, a, b, cost, voxels.weight, largest)
+    part = cut_graph(a, b, cost, voxels.weight / np.median(voxels.weight), _SCALE)
+    return _absorb_small(part, a, b, cost, voxels.weight, largest)
 
 
 def _edges(voxels: Voxels) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
@@ -39,34 +37,8 @@ def _edges(voxels: Voxels) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArra
     return a, b, color + np.where(concave, 1.0, 0.3) * bend
 
 
-@njit(cache=True)
-def _root(parent: NDArray[np.int64], i: int) -> int:
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
-
-
-@njit(cache=True)
-def _felzenszwalb(
-    a: NDArray[np.int64], b: NDArray[np.int64], cost: NDArray[np.float64], weight: NDArray[np.float64], scale: float
-) -> NDArray[np.int64]:
-    parent = np.arange(len(weight))
-    mass = weight.copy()
-    inner = np.zeros(len(weight))
-    for e in range(len(cost)):
-        i, j = _root(parent, a[e]), _root(parent, b[e])
-        if i != j and cost[e] <= min(inner[i] + scale / mass[i], inner[j] + scale / mass[j]):
-            parent[j] = i
-            mass[i] += mass[j]
-            inner[i] = cost[e]
-    for i in range(len(parent)):
-        parent[i] = _root(parent, i)
-    return parent
-
-
 def _absorb_small(
-    root: NDArray[np.int64],
+    part: NDArray[np.int64],
     a: NDArray[np.int64],
     b: NDArray[np.int64],
     cost: NDArray[np.float64],
@@ -74,11 +46,10 @@ def _absorb_small(
     largest: int,
 ) -> NDArray[np.int64]:
     """Number the largest parts; the others join the numbered part they are bound to most cheaply, ring by ring."""
-    ids, part = np.unique(root, return_inverse=True)
     mass = np.bincount(part, weights=weight)
-    by_mass = np.lexsort((np.arange(len(ids)), -mass))
-    rank = np.full(len(ids), -1, np.int64)
-    rank[by_mass[:largest]] = np.arange(min(largest, len(ids)))
+    by_mass = np.lexsort((np.arange(len(mass)), -mass))
+    rank = np.full(len(mass), -1, np.int64)
+    rank[by_mass[:largest]] = np.arange(min(largest, len(mass)))
     order = np.lexsort((b, a, cost))
     pa, pb = part[a[order]], part[b[order]]
     while True:

@@ -15,10 +15,10 @@ def spread_votes(
     out = votes.astype(np.float32).copy()
     for iteration in range(2):
         sigma = reach * 0.5**iteration
-        _pass_rows(out, image, np.float32(np.exp(-np.sqrt(2.0) / sigma)), np.float32(reach / color_sd))
+        _pass_rows(out, image, float(np.exp(-np.sqrt(2.0) / sigma)), reach / color_sd)
         turned = np.ascontiguousarray(out.transpose(1, 0, 2))
         side = np.ascontiguousarray(image.transpose(1, 0, 2))
-        _pass_rows(turned, side, np.float32(np.exp(-np.sqrt(2.0) / sigma)), np.float32(reach / color_sd))
+        _pass_rows(turned, side, float(np.exp(-np.sqrt(2.0) / sigma)), reach / color_sd)
         out = np.ascontiguousarray(turned.transpose(1, 0, 2))
     return out
 
@@ -29,7 +29,7 @@ def _pass_rows(votes: NDArray[np.float32], image: NDArray[np.uint8], fade: float
     feedback = np.empty(width, np.float32)
     for y in range(height):
         for x in range(1, width):
-            change = 0.0
+            change = np.float64(0)
             for c in range(3):
                 change += abs(np.float32(image[y, x, c]) - np.float32(image[y, x - 1, c]))
             feedback[x] = fade ** (1 + stretch * change)

@@ -18,7 +18,7 @@ _OFFSETS = np.array([(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in 
 
 @dataclass(frozen=True)
 class Voxels:
-    """keys (V,) int64 sorted; weight (V,); position, normal (unit) and color (CIE Lab) each (V, 3), means over points."""
+    """keys (V,) int64 sorted; weight (V,); position, normal (unit) and color (CIE Lab) (V, 3), means over points."""
 
     size: float
     keys: NDArray[np.int64]
@@ -34,7 +34,7 @@ class Voxels:
 def voxel_keys(points: NDArray[np.float64], size: float) -> NDArray[np.int64]:
     """(..., 3) points → (...,) keys; equal for points in the same cube. -1 for points too far out to have one."""
     cell = np.floor(points / size)
-    inside = (np.abs(cell) < _HALF - 2).all(-1)
+    inside = np.asarray((np.abs(cell) < _HALF - 2).all(-1))
     cell = np.where(inside[..., None], cell, 0).astype(np.int64) + _HALF
     return np.where(inside, (cell[..., 0] << 2 * _BITS) | (cell[..., 1] << _BITS) | cell[..., 2], -1)
 

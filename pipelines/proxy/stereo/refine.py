@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pipelines.proxy.stereo.bands import BAND_ROWS, Bands
-from pipelines.proxy.stereo.sweep import RADIUS, window_moments, best_mean, correlate_row
+from pipelines.proxy.stereo.sweep import RADIUS, best_mean, correlate_row, window_moments
 
 
 def refine_inverse_depth(

@@ -26,7 +26,7 @@ def warps_to(
     matrices: list[NDArray[np.float64]],
     cams_from_world: list[NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """(N, 3, 4): pixel (x, y) at inverse depth w of the reference lies at `warp @ (x, y, 1, w)` of view n, homogeneous."""
+    """(N, 3, 4): pixel (x, y) of inverse depth w lies at `warp @ (x, y, 1, w)` of the other view, homogeneous."""
     inverse = np.linalg.inv(matrix)
     warps = []
     for other, other_from_world in zip(matrices, cams_from_world, strict=True):
@@ -170,7 +170,7 @@ def correlate_row(
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def best_mean(scores: NDArray[np.float32], x: int, best: int) -> float:
+def best_mean(scores: NDArray[np.float32], x: int, best: int) -> np.floating:
     """Mean of the `best` largest scores of column x among the views that see it; 0 when none does. Alters `scores`."""
     total = np.float32(0)
     used = 0
