@@ -48,6 +48,6 @@ def match_features(first: Features, second: Features, ratio: float = 0.85) -> ND
 def frame_descriptor(image: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(D,) unit vector that says how a frame looks: a small blurred picture, brightness and contrast taken out."""
     small = cv2.resize(image, (32, 24), interpolation=cv2.INTER_AREA).astype(np.float32)
-    small = cv2.GaussianBlur(small, (0, 0), 1.0)
-    centred = (small - small.mean((0, 1))).ravel()
-    return centred / max(float(np.linalg.norm(centred)), 1e-6)
+    blurred = np.asarray(cv2.GaussianBlur(small, (0, 0), 1.0), np.float32)
+    centred = (blurred - blurred.mean((0, 1))).ravel()
+    return (centred / max(float(np.linalg.norm(centred)), 1e-6)).astype(np.float32)

@@ -1,0 +1,57 @@
+"""How keyframes look, as vectors whose products say how alike they are: VLAD over the run's own SIFT features.
+
+It stands where the article has DINOv2 features, which need weights: residuals of RootSIFT descriptors to a small
+vocabulary learnt from the run itself, each word normalised (Jégou et al., PAMI 2012; Arandjelović and Zisserman, CVPR 2013).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float32]
+
+
+def learn_vocabulary(descriptors: Float, words: int, seed: int, iterations: int = 10) -> Float:
+    """(words, D) centres by k-means from descriptors (Q, D); fewer when there are fewer descriptors."""
+    rng = np.random.default_rng(seed)
+    centres = descriptors[np.sort(rng.permutation(len(descriptors))[:words])].copy()
+    for _ in range(iterations):
+        nearest = assign(descriptors, centres)
+        counts = np.bincount(nearest, minlength=len(centres))
+        sums = np.zeros_like(centres, dtype=np.float64)
+        np.add.at(sums, nearest, descriptors)
+        filled = counts > 0
+        centres[filled] = (sums[filled] / counts[filled, None]).astype(np.float32)
+    return centres
+
+
+def assign(descriptors: Float, centres: Float) -> NDArray[np.int64]:
+    """(Q,) index of the nearest centre."""
+    distances = (centres**2).sum(1) - 2 * (descriptors @ centres.T)
+    return np.asarray(distances.argmin(1), np.int64)
+
+
+def vlad(descriptors: Float, centres: Float) -> Float:
+    """(words * D,) unit vector of a picture's descriptors (Q, D); zero when it has none."""
+    sums = np.zeros_like(centres)
+    nearest = assign(descriptors, centres)
+    np.add.at(sums, nearest, descriptors - centres[nearest])
+    # Each word counts the same, however much texture of its kind there is.
+    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-6)
+    flat = sums.ravel()
+    return np.asarray(flat / max(float(np.linalg.norm(flat)), 1e-6), np.float32)
+
+
+def describe_keyframes(descriptors: Sequence[Float], words: int, seed: int) -> Float:
+    """(N, words * D) VLAD vectors of the keyframes' descriptors."""
+    pooled = np.concatenate([d[:: max(len(d) // 300, 1)] for d in descriptors])
+    if len(pooled) == 0:
+        return np.zeros((len(descriptors), 1), np.float32)
+    centres = learn_vocabulary(pooled, words, seed)
+    vectors = np.array([vlad(d, centres) for d in descriptors])
+    # What all keyframes of a room share says nothing about which of them are the same place.
+    vectors -= vectors.mean(0)
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-6), np.float32)

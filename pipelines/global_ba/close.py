@@ -1,0 +1,133 @@
+"""Closing loops: a pose graph where there is drift, then bundle adjustment with the loops' own correspondences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import GlobalBaConfig, TrackingConfig
+from pipelines.geometry import se3
+from pipelines.global_ba.pose_graph import Edges, optimise_pose_graph
+from pipelines.global_ba.verify import Loop
+from pipelines.tracking.adjust import LoadProxy, Report, adjust_state
+from pipelines.tracking.state import Sightings, TrackState
+from pipelines.types import Intrinsics
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Closed:
+    """The state after closing, how its adjustment went, and the median reprojection error before and after, pixels, of
+    the sightings that were there before the loops."""
+
+    state: TrackState
+    report: Report
+    error_before: float
+    error_after: float
+
+
+def close_loops(
+    state: TrackState,
+    loops: Sequence[Loop],
+    drifted: bool,
+    intrinsics: Intrinsics,
+    load_proxy: LoadProxy,
+    metric: bool,
+    tracking: TrackingConfig,
+    settings: GlobalBaConfig,
+) -> Closed:
+    """Adjust `state` (changed in place) with the loops."""
+    before = reprojection_error(state, intrinsics)
+    original = {i: s for i, s in state.sightings.items()}
+    if drifted:
+        straighten(state, loops, settings)
+    add_sightings(state, loops)
+    report = adjust_state(state, intrinsics, load_proxy, metric, tracking)
+    after = reprojection_error(state, intrinsics, original)
+    return Closed(state, report, before, after)
+
+
+def reprojection_error(
+    state: TrackState, intrinsics: Intrinsics, sightings: dict[int, Sightings] | None = None
+) -> float:
+    """Median over the sightings (the state's, or those given), in pixels."""
+    errors = []
+    for frame_id, seen in sorted((sightings or state.sightings).items()):
+        motion = state.poses[frame_id]
+        x, y, z = (state.points[seen.point] @ motion[:3, :3].T + motion[:3, 3]).T
+        z = np.where(z > 0, z, np.nan)
+        u, v = intrinsics.fx * x / z + intrinsics.cx, intrinsics.fy * y / z + intrinsics.cy
+        errors.append(np.nan_to_num(np.hypot(u - seen.xy[:, 0], v - seen.xy[:, 1]), nan=1e3))
+    return float(np.median(np.concatenate(errors)))
+
+
+def add_sightings(state: TrackState, loops: Sequence[Loop]) -> None:
+    """Each side of a loop sees the other side's points; a point already seen there keeps its first sighting."""
+    for loop in loops:
+        for frame_id, extra in ((loop.edge.frame2_id, loop.in_second), (loop.edge.frame1_id, loop.in_first)):
+            seen = state.sightings[frame_id]
+            state.sightings[frame_id] = seen.joined(extra.select(~np.isin(extra.point, seen.point)))
+
+
+def straighten(state: TrackState, loops: Sequence[Loop], settings: GlobalBaConfig) -> None:
+    """Spread the drift over the keyframes by a pose graph; points move with the first keyframe that sees them."""
+    ids = state.keyframes
+    place = {frame_id: n for n, frame_id in enumerate(ids)}
+    old = np.array([state.poses[i] for i in ids])
+    depth = np.array([median_depth(state, i) for i in ids])
+    edges = _edges(old, depth, loops, place, settings)
+    new, scales = optimise_pose_graph(old, np.ones(len(ids)), edges)
+    _move_points(state, ids, old, new, scales)
+    for n, frame_id in enumerate(ids):
+        rigid = new[n].copy()
+        rigid[:3, 3] /= scales[n]
+        state.poses[frame_id] = rigid
+
+
+def median_depth(state: TrackState, frame_id: int) -> float:
+    """Of the points the frame sees; 1 when it sees none."""
+    motion, seen = state.poses[frame_id], state.sightings[frame_id]
+    depth = state.points[seen.point] @ motion[2, :3] + motion[2, 3]
+    return float(np.median(depth)) if len(depth) else 1.0
+
+
+def _edges(poses: Array, depth: Array, loops: Sequence[Loop], place: dict[int, int], settings: GlobalBaConfig) -> Edges:
+    """Each keyframe to the next two, and the loops."""
+    n = len(poses)
+    chain = [(i, i + step) for step in (1, 2) for i in range(n - step)]
+    first = [a for a, _ in chain] + [place[loop.edge.frame1_id] for loop in loops]
+    second = [b for _, b in chain] + [place[loop.edge.frame2_id] for loop in loops]
+    motions = [poses[b] @ se3.inverse(poses[a]) for a, b in chain]
+    motions += [_in_second_scale(loop) for loop in loops]
+    scale = np.concatenate([np.ones(len(chain)), [loop.edge.scale for loop in loops]])
+    length = np.array([np.linalg.norm(m[:3, 3]) for m in motions[: len(chain)]])
+    sd = np.empty((len(first), 7))
+    sd[: len(chain), :3] = (0.02 * length + 0.002 * depth[np.array(first[: len(chain)])])[:, None]
+    sd[: len(chain), 3:6] = np.radians(0.2)
+    sd[: len(chain), 6] = 0.02
+    sd[len(chain) :, :3] = 0.01 * depth[np.array(second[len(chain) :])][:, None]
+    sd[len(chain) :, 3:6] = np.radians(0.5)
+    sd[len(chain) :, 6] = 0.03
+    robust = np.arange(len(first)) >= len(chain)
+    return Edges(np.array(first), np.array(second), np.array(motions), scale, sd, robust)
+
+
+def _in_second_scale(loop: Loop) -> Array:
+    """The edge's translation came in the first keyframe's scale."""
+    motion = loop.edge.frame2_from_frame1.copy()
+    motion[:3, 3] *= loop.edge.scale
+    return motion
+
+
+def _move_points(state: TrackState, ids: list[int], old: Array, new: Array, scales: Array) -> None:
+    owner = np.full(len(state.points), -1)
+    for n in reversed(range(len(ids))):
+        owner[state.sightings[ids[n]].point] = n
+    for n in range(len(ids)):
+        mine = owner == n
+        in_cam = state.points[mine] @ old[n, :3, :3].T + old[n, :3, 3]
+        state.points[mine] = (in_cam - new[n, :3, 3]) @ new[n, :3, :3] / scales[n]

@@ -1,0 +1,163 @@
+"""Finding loops: candidates, geometric verification, and the two tests that a false loop of repeated texture fails."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.tensors import load_arrays, save_arrays
+from pipelines.config import GlobalBaConfig
+from pipelines.geometry import se3
+from pipelines.global_ba.verify import KeyframeView, Loop, verify_loop
+from pipelines.tracking.state import Sightings
+from pipelines.types import Intrinsics, LoopEdge
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FoundLoops:
+    """Accepted loops, and how many pairs were rejected at which test."""
+
+    loops: list[Loop]
+    tried: int
+    unverified: int
+    implausible: int
+    unsupported: int
+
+
+def find_loops(
+    pairs: Iterable[tuple[int, int]],
+    views: Sequence[KeyframeView],
+    intrinsics: Intrinsics,
+    settings: GlobalBaConfig,
+    seed: int,
+) -> FoundLoops:
+    """Verify candidate pairs of keyframe indices.
+
+    A verified pair is still refused when the drift it claims is more than the path between its keyframes can have
+    collected, or when no neighbouring pair says the same and it has not many inliers itself: two equal posters on a
+    wall match perfectly, but contradict the path between them.
+    """
+    path = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(_centres(views), axis=0), axis=1))])
+    verified: dict[tuple[int, int], Loop] = {}
+    tried = implausible = unverified = 0
+    for first, second in pairs:
+        tried += 1
+        loop = verify_loop(views[first], views[second], intrinsics, settings, seed)
+        if loop is None:
+            unverified += 1
+        elif not is_plausible(loop, views[first], views[second], float(path[second] - path[first]), settings):
+            implausible += 1
+        else:
+            verified[(first, second)] = loop
+    supported = {
+        pair: loop
+        for pair, loop in verified.items()
+        if loop.edge.inliers >= settings.loop_sure_inliers
+        or _has_support(pair, loop, verified, views, intrinsics, settings, seed)
+    }
+    return FoundLoops(list(supported.values()), tried, unverified, implausible, len(verified) - len(supported))
+
+
+def _centres(views: Sequence[KeyframeView]) -> Array:
+    return se3.inverse(np.array([v.cam_from_world for v in views]))[:, :3, 3]
+
+
+def claimed_drift(loop: Loop, first: KeyframeView, second: KeyframeView) -> tuple[float, float]:
+    """How far (distance, radians) the second camera would have to move to agree with the loop."""
+    now = second.cam_from_world @ se3.inverse(first.cam_from_world)
+    apart = loop.edge.frame2_from_frame1 @ se3.inverse(now)
+    centre_now, centre_then = se3.inverse(now)[:3, 3], se3.inverse(loop.edge.frame2_from_frame1)[:3, 3]
+    return float(np.linalg.norm(centre_now - centre_then)), float(se3.rotation_angle(apart))
+
+
+def is_plausible(loop: Loop, first: KeyframeView, second: KeyframeView, path: float, settings: GlobalBaConfig) -> bool:
+    """Whether a path of that length can have drifted as far as the loop claims."""
+    distance, angle = claimed_drift(loop, first, second)
+    depth = float(np.nanmedian(first.in_cam[:, 2]))
+    scale_drift = abs(np.log(loop.edge.scale))
+    return (
+        distance <= settings.loop_drift * path + settings.loop_translation * depth
+        and angle <= np.radians(settings.loop_angle_drift)
+        and scale_drift <= np.log(settings.loop_scale_drift)
+    )
+
+
+def _has_support(
+    pair: tuple[int, int],
+    loop: Loop,
+    verified: dict[tuple[int, int], Loop],
+    views: Sequence[KeyframeView],
+    intrinsics: Intrinsics,
+    settings: GlobalBaConfig,
+    seed: int,
+) -> bool:
+    """Whether a neighbouring pair is verified too and puts the keyframes in the same places."""
+    first, second = pair
+    near = [(first + a, second + b) for a in (-2, -1, 0, 1, 2) for b in (-2, -1, 0, 1, 2) if (a, b) != (0, 0)]
+    known = [p for p in near if p in verified]
+    fresh = [(first + 1, second), (first, second - 1), (first - 1, second), (first, second + 1)]
+    for other in known + [p for p in fresh if p not in verified and 0 <= p[0] < p[1] < len(views)]:
+        candidate = verified.get(other) or verify_loop(views[other[0]], views[other[1]], intrinsics, settings, seed)
+        if candidate is not None and _agree(loop, pair, candidate, other, views, settings):
+            return True
+    return False
+
+
+def _agree(
+    loop: Loop, pair: tuple[int, int], other: Loop, other_pair: tuple[int, int], views: Sequence[KeyframeView],
+    settings: GlobalBaConfig,
+) -> bool:  # fmt: skip
+    """Carry the other loop over to this pair along the present poses of the neighbours: the same motion?"""
+
+    def relative(target: int, source: int) -> Array:
+        return views[target].cam_from_world @ se3.inverse(views[source].cam_from_world)
+
+    carried = relative(pair[1], other_pair[1]) @ other.edge.frame2_from_frame1 @ relative(other_pair[0], pair[0])
+    apart = carried @ se3.inverse(loop.edge.frame2_from_frame1)
+    depth = float(np.nanmedian(views[pair[1]].in_cam[:, 2]))
+    # Two measurements and the steps between neighbours: three times one measurement's tolerance.
+    return bool(
+        se3.rotation_angle(apart) < 3 * np.radians(settings.loop_rotation)
+        and np.linalg.norm(apart[:3, 3]) < 3 * settings.loop_translation * depth
+    )
+
+
+def save_found(path: Path, found: FoundLoops) -> None:
+    """One npz, for going on after an interruption."""
+    loops = found.loops
+    sides = [s for loop in loops for s in (loop.in_second, loop.in_first)]
+    empty = Sightings(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
+    save_arrays(
+        path,
+        {
+            "counts": np.array([found.tried, found.unverified, found.implausible, found.unsupported]),
+            "ids": np.array([(x.edge.frame1_id, x.edge.frame2_id, x.edge.inliers) for x in loops]).reshape(-1, 3),
+            "motion": np.array([x.edge.frame2_from_frame1 for x in loops]).reshape(-1, 4, 4),
+            "scale": np.array([x.edge.scale for x in loops], dtype=np.float64),
+            "lengths": np.array([len(s) for s in sides], np.int64),
+            "point": np.concatenate([s.point for s in [*sides, empty]]),
+            "xy": np.concatenate([s.xy for s in [*sides, empty]]),
+            "sd": np.concatenate([s.sd for s in [*sides, empty]]),
+        },
+    )
+
+
+def load_found(path: Path) -> FoundLoops:
+    """Inverse of `save_found`."""
+    a = load_arrays(path)
+    ends = np.cumsum(a["lengths"])
+    sides = [
+        Sightings(a["point"][e - n : e], a["xy"][e - n : e], a["sd"][e - n : e])
+        for e, n in zip(ends, a["lengths"], strict=True)
+    ]
+    loops = [
+        Loop(LoopEdge(int(i[0]), int(i[1]), m, float(s), int(i[2])), sides[2 * k], sides[2 * k + 1])
+        for k, (i, m, s) in enumerate(zip(a["ids"], a["motion"], a["scale"], strict=True))
+    ]
+    return FoundLoops(loops, *(int(c) for c in a["counts"]))

@@ -1,0 +1,80 @@
+"""What labels say about keyframes: how much there is to see, and how alike two of them are (MSGS-SLAM eqs. 21-24)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.types import VOID
+
+Array = NDArray[np.float64]
+GRID = (40, 30)
+
+
+@dataclass(frozen=True)
+class LabelSummary:
+    """labels (30, 40) uint8: the picture's labels, sampled; entropy in nats; boundary: share of pixels on a boundary;
+    graph (C, C): how much border each pair of classes shares (off the diagonal) and each class's area (on it)."""
+
+    labels: NDArray[np.uint8]
+    entropy: float
+    boundary: float
+    graph: Array
+
+
+def summarise_labels(labels: NDArray[np.uint8], classes: int) -> LabelSummary:
+    """The summary of a label image (H, W) with `classes` classes; VOID pixels count nowhere."""
+    small = np.asarray(cv2.resize(labels, GRID, interpolation=cv2.INTER_NEAREST), np.uint8)
+    known = small[small != VOID]
+    share = np.bincount(known, minlength=classes)[:classes] / max(len(known), 1)
+    entropy = float(-(share[share > 0] * np.log(share[share > 0])).sum())
+    graph = np.diag(share)
+    borders = 0
+    for first, second in ((small[:, :-1], small[:, 1:]), (small[:-1], small[1:])):
+        edge = (first != second) & (first != VOID) & (second != VOID)
+        borders += int(edge.sum())
+        np.add.at(graph, (first[edge], second[edge]), 1 / small.size)
+        np.add.at(graph, (second[edge], first[edge]), 1 / small.size)
+    return LabelSummary(small, entropy, borders / (2 * small.size), graph)
+
+
+def richness(summaries: Sequence[LabelSummary], theta: float = 0.5) -> Array:
+    """(N,) in 0..1: S = θ H + (1 - θ) E of eq. (22), entropy and boundary density as quantiles over the run.
+
+    The result is again a quantile, so that S > 0.9 of eq. (21) means the top tenth. Ties share the higher rank.
+    """
+
+    def quantiles(values: Array) -> Array:
+        return np.searchsorted(np.sort(values), values, side="right") / len(values)
+
+    entropy = quantiles(np.array([s.entropy for s in summaries]))
+    boundary = quantiles(np.array([s.boundary for s in summaries]))
+    return quantiles(theta * entropy + (1 - theta) * boundary)
+
+
+def mean_iou(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
+    """Mean over the classes in either label image (same shape) of intersection over union; 0 when nothing is known."""
+    both = (first != VOID) & (second != VOID)
+    a, b = first[both], second[both]
+    present = np.union1d(a, b)
+    if len(present) == 0:
+        return 0.0
+    counts = np.bincount(a[a == b], minlength=256)
+    union = np.bincount(a, minlength=256) + np.bincount(b, minlength=256) - counts
+    return float((counts[present] / union[present]).mean())
+
+
+def structure_similarity(first: Array, second: Array) -> float:
+    """StructSim of eq. (24): cosine in 0..1 between two graphs of regions (C, C)."""
+    norms = float(np.linalg.norm(first) * np.linalg.norm(second))
+    return float((first * second).sum() / norms) if norms > 0 else 0.0
+
+
+def similarity(first: LabelSummary, second: LabelSummary, appearance: float, weights: tuple[float, ...]) -> float:
+    """Sim of eq. (24): α₁ mIoU + α₂ appearance + α₃ StructSim."""
+    parts = (mean_iou(first.labels, second.labels), appearance, structure_similarity(first.graph, second.graph))
+    return float(np.dot(weights, parts))

@@ -1,0 +1,240 @@
+"""Stage 5: loops, the global adjustment, and the map moved and refined with it (MSGS-SLAM 3.5)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.gaussians.map import GaussianMap
+from pipelines.geometry import se3
+from pipelines.global_ba.appearance import describe_keyframes
+from pipelines.global_ba.candidates import loop_candidates
+from pipelines.global_ba.close import Closed, close_loops, median_depth
+from pipelines.global_ba.joint import Refined, refine_together
+from pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_found
+from pipelines.global_ba.move_map import follow_keyframes, move_map
+from pipelines.global_ba.semantics import LabelSummary, summarise_labels
+from pipelines.global_ba.verify import KeyframeView, Loop, make_view
+from pipelines.mapping.depth_fields import agree_on_depth
+from pipelines.mapping.load import DepthScales, load_class_ids, load_views
+from pipelines.mapping.poses import move_trajectory
+from pipelines.run_folder import (
+    RunFolder,
+    save_exposure,
+    save_loops,
+    save_map,
+    save_sparse_model,
+    save_trajectory,
+    write_json,
+)
+from pipelines.stages import Stage, StageContext
+from pipelines.tracking.bundle import reprojection_errors
+from pipelines.tracking.depth_scales import sample_proxy
+from pipelines.tracking.features import extract_features
+from pipelines.tracking.klt import to_grey
+from pipelines.tracking.result import to_sparse_model
+from pipelines.tracking.state import TrackState
+from pipelines.types import VOID, Intrinsics, ProxyMaps, SparseModel, Trajectory
+
+Array = NDArray[np.float64]
+
+
+def run(context: StageContext) -> dict[str, Any]:
+    """Find loops; where there are any, adjust everything with them and take the map along; refine both together."""
+    model = context.run.load_sparse("tracking")
+    trajectory = context.run.load_trajectory("mapping")
+    gaussian_map = context.run.load_map("mapping")
+    settings = context.config.global_ba
+
+    found = search(context, model) if settings.use_loops else FoundLoops([], 0, 0, 0, 0)
+    closed = adjust(context, model, found)
+    moved_px = 0.0
+    if closed is not None:
+        before = poses_of(trajectory, model.frame_ids)
+        ratio = depth_ratios(closed.state, model)
+        moved_px = largest_motion(context, closed.state, model)
+        trajectory = correct_trajectory(trajectory, closed.state, model, ratio)
+        after = poses_of(trajectory, model.frame_ids)
+        gaussian_map = move_map(gaussian_map, model.frame_ids, before, after, ratio)
+        model = to_sparse_model(closed.state)
+    refined = refine(context, gaussian_map, trajectory, moved_px)
+    return save(context, model, trajectory, gaussian_map, found, closed, refined, moved_px)
+
+
+def search(context: StageContext, model: SparseModel) -> FoundLoops:
+    """Candidates by appearance and semantics, verified; kept in a snapshot."""
+    snapshot = context.snapshot / "loops.npz"
+    if snapshot.exists():
+        return load_found(snapshot)
+    run, settings, seed = context.run, context.config.global_ba, context.config.run.seed
+    views = load_keyframe_views(context, model)
+    appearance = describe_keyframes([v.features.descriptors for v in views], settings.words, seed)
+    pairs = loop_candidates(model, appearance, load_summaries(run, model), settings)
+    tracked = context.progress.track(pairs, "loops", len(pairs))
+    found = find_loops(tracked, views, run.load_calibration().intrinsics, settings, seed)
+    save_found(snapshot, found)
+    return found
+
+
+def load_keyframe_views(context: StageContext, model: SparseModel) -> list[KeyframeView]:
+    """Features of every keyframe, with what is known of their depth."""
+    run = context.run
+    intrinsics = run.load_calibration().intrinsics
+    frames = {f.id: f for f in run.load_frames()}
+    scales = DepthScales.load(run)
+    state = TrackState.from_backbone(model, 1.0)
+    views = []
+    for k, frame_id in enumerate(context.progress.track(model.frame_ids.tolist(), "features", len(model.frame_ids))):
+        features = extract_features(to_grey(run.image(frames[frame_id])), context.config.global_ba.features)
+        depth = np.zeros(len(features.xy))
+        if run.has_proxy(frame_id) and (maps := scales.apply(frame_id, run.load_proxy(frame_id))) is not None:
+            depth, _ = sample_proxy(maps, features.xy, intrinsics)
+        pose, seen = model.cam_from_world[k], state.sightings[frame_id]
+        views.append(make_view(frame_id, pose, features, seen, model.points_in_world, depth, intrinsics))
+    return views
+
+
+def load_summaries(run: RunFolder, model: SparseModel) -> list[LabelSummary]:
+    """What the labels say of every keyframe; nothing where it has none."""
+    classes = len(run.load_classes())
+    unknown = np.full((2, 2), VOID, np.uint8)
+    ids = model.frame_ids.tolist()
+    return [summarise_labels(run.load_proxy(i).labels if run.has_proxy(i) else unknown, classes) for i in ids]
+
+
+def adjust(context: StageContext, model: SparseModel, found: FoundLoops) -> Closed | None:
+    """Everything adjusted with the loops; None without loops, or when they contradict what was known before."""
+    if not found.loops:
+        return None
+    run, config = context.run, context.config
+    intrinsics = run.load_calibration().intrinsics
+    state = TrackState.from_backbone(model, config.tracking.feature_sd)
+    drift = max(loop_drift_px(loop, state, intrinsics) for loop in found.loops)
+
+    def load_proxy(frame_id: int) -> ProxyMaps | None:
+        return run.load_proxy(frame_id) if run.has_proxy(frame_id) else None
+
+    metric = bool(run.load_proxy_report().get("metric", False))
+    drifted = drift > config.global_ba.drift_px
+    closed = close_loops(state, found.loops, drifted, intrinsics, load_proxy, metric, config.tracking, config.global_ba)
+    if closed.error_after > 1.5 * closed.error_before + 0.05:
+        context.warn(
+            f"{len(found.loops)} loops were refused: with them the reprojection error of what was known before rises "
+            f"from {closed.error_before:.2f} to {closed.error_after:.2f} px"
+        )
+        return None
+    return closed
+
+
+def loop_drift_px(loop: Loop, state: TrackState, intrinsics: Intrinsics) -> float:
+    """Median distance in pixels between where the poses put the loop's points in the second picture and where it sees
+    them."""
+    motion, seen = state.poses[loop.edge.frame2_id], loop.in_second
+    if len(seen) == 0:
+        return 0.0
+    in_cam = state.points[seen.point] @ motion[:3, :3].T + motion[:3, 3]
+    return float(min(np.median(reprojection_errors(in_cam, seen.xy, intrinsics)), intrinsics.width))
+
+
+def poses_of(trajectory: Trajectory, frame_ids: NDArray[np.int64]) -> Array:
+    """(N, 4, 4) poses of these frames."""
+    return trajectory.cam_from_world[np.searchsorted(trajectory.frame_ids, frame_ids)]
+
+
+def depth_ratios(state: TrackState, model: SparseModel) -> Array:
+    """(N,) how much farther, as a factor, each keyframe's points are after the adjustment than in `model`."""
+    out = np.ones(len(model.frame_ids))
+    for k, frame_id in enumerate(model.frame_ids.tolist()):
+        point = state.sightings[frame_id].point
+        new, old = state.poses[frame_id], model.cam_from_world[k]
+        z_new = state.points[point] @ new[2, :3] + new[2, 3]
+        z_old = model.points_in_world[point] @ old[2, :3] + old[2, 3]
+        good = (z_new > 0) & (z_old > 0)
+        if good.sum() >= 5:
+            out[k] = float(np.exp(np.median(np.log(z_new[good] / z_old[good]))))
+    return out
+
+
+def correct_trajectory(trajectory: Trajectory, state: TrackState, model: SparseModel, ratio: Array) -> Trajectory:
+    """Every frame moved as its keyframes were. What mapping had refined since stays: the correction comes on top."""
+    new = np.array([state.poses[i] for i in model.frame_ids.tolist()])
+    old, refined = model.cam_from_world, poses_of(trajectory, model.frame_ids)
+    # new_from_refined = (new_from_old in the camera), with distances stretched by the keyframe's ratio.
+    small = refined @ se3.inverse(old)
+    small[:, :3, 3] *= ratio[:, None]
+    poses = follow_keyframes(
+        trajectory.frame_ids, trajectory.cam_from_world, model.frame_ids, refined, small @ new, ratio
+    )
+    poses[~trajectory.is_posed] = np.eye(4)
+    return replace(trajectory, cam_from_world=poses)
+
+
+def largest_motion(context: StageContext, state: TrackState, model: SparseModel) -> float:
+    """How far, in pixels, the keyframes have moved against each other: the largest over keyframes."""
+    new = np.array([state.poses[i] for i in model.frame_ids.tolist()])
+    moved = se3.inverse(new) @ model.cam_from_world
+    apart = se3.inverse(moved[:1]) @ moved
+    centres = se3.inverse(model.cam_from_world)[:, :3, 3]
+    shift = np.linalg.norm(np.einsum("nij,nj->ni", apart[:, :3, :3], centres) + apart[:, :3, 3] - centres, axis=1)
+    depth = np.array([median_depth(state, i) for i in model.frame_ids.tolist()])
+    focal = context.run.load_calibration().intrinsics.fx
+    return float((focal * (se3.rotation_angle(apart) + shift / depth)).max())
+
+
+def refine(context: StageContext, gaussian_map: GaussianMap, trajectory: Trajectory, moved_px: float) -> Refined | None:
+    """Map and poses together where the adjustment has moved them, or always, or never, as the settings say."""
+    settings = context.config.global_ba
+    if settings.joint == "never" or (settings.joint == "moved" and moved_px < settings.joint_px):
+        return None
+    mapping, device = context.config.mapping, context.config.run.device
+    given = load_views(context.run, trajectory, mapping, "cpu" if device == "auto" else device)
+    views = agree_on_depth(given.views, given.anchors) if mapping.depth_fields else given.views
+    exposure = context.run.load_exposure()
+    gains = {int(i): g for i, g in zip(exposure["frame_ids"], exposure["log_gains"], strict=True)}
+    offsets = {int(i): o for i, o in zip(exposure["frame_ids"], exposure["offsets"], strict=True)}
+    exposures = np.array([gains[v.frame_id] for v in views]), np.array([offsets[v.frame_id] for v in views])
+    classes = len(load_class_ids(context.run))
+    return refine_together(context, gaussian_map, views, exposures, classes, mapping, settings.joint_passes)
+
+
+def save(
+    context: StageContext,
+    model: SparseModel,
+    trajectory: Trajectory,
+    gaussian_map: GaussianMap,
+    found: FoundLoops,
+    closed: Closed | None,
+    refined: Refined | None,
+    moved_px: float,
+) -> dict[str, Any]:
+    """Write the result; returns its key figures."""
+    exposure = context.run.load_exposure()
+    if refined is not None and refined.kept:
+        gaussian_map = refined.gaussian_map
+        trajectory = move_trajectory(trajectory, exposure["frame_ids"], refined.cam_from_world)
+        exposure |= {"log_gains": refined.log_gains, "offsets": refined.offsets}
+    save_trajectory(context.folder, trajectory)
+    save_sparse_model(context.folder / "sparse.npz", model)
+    save_map(context.folder, gaussian_map)
+    save_exposure(context.folder, exposure["frame_ids"], exposure["log_gains"], exposure["offsets"])
+    save_loops(context.folder, [loop.edge for loop in found.loops] if closed is not None else [])
+    figures = {
+        "candidates": found.tried,
+        "verified": len(found.loops) + found.unsupported + found.implausible,
+        "implausible": found.implausible,
+        "unsupported": found.unsupported,
+        "loops": len(found.loops) if closed is not None else 0,
+        "moved_px": round(moved_px, 3),
+        "reprojection_px": None if closed is None else closed.report.figures["reprojection_px"],
+        "joint": "not run" if refined is None else "kept" if refined.kept else "thrown away",
+        "joint_psnr_before": None if refined is None else round(refined.psnr_before, 3),
+        "joint_psnr_after": None if refined is None else round(refined.psnr_after, 3),
+    }
+    write_json(context.folder / "global_ba.json", figures)
+    return figures
+
+
+STAGE = Stage("global_ba", 1, run, "loops, global adjustment, the map moved and refined with it")

@@ -1,0 +1,150 @@
+"""Does the geometry agree that two keyframes show the same place? PnP in both directions must say the same."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pipelines.config import GlobalBaConfig
+from pipelines.geometry import se3
+from pipelines.geometry.camera import project, unproject
+from pipelines.tracking.features import Features, match_features
+from pipelines.tracking.pnp import FramePose, solve_pose
+from pipelines.tracking.relocalise import SNAP
+from pipelines.tracking.state import Sightings
+from pipelines.types import Intrinsics, LoopEdge
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class KeyframeView:
+    """What verification knows of one keyframe: pose (4, 4), features, which point each feature is (-1 for none), and
+    its position in the camera (Q, 3), NaN where neither a point nor a proxy depth gives one."""
+
+    frame_id: int
+    cam_from_world: Array
+    features: Features
+    point: NDArray[np.int64]
+    in_cam: Array
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A verified pair: the edge, and the second keyframe's sightings of the first one's points, and vice versa."""
+
+    edge: LoopEdge
+    in_second: Sightings
+    in_first: Sightings
+
+
+def make_view(
+    frame_id: int,
+    cam_from_world: Array,
+    features: Features,
+    sightings: Sightings,
+    points: Array,
+    depth: Array,
+    intrinsics: Intrinsics,
+) -> KeyframeView:
+    """A keyframe with its points (P, 3), and depth (Q,) at its features, 0 where unknown."""
+    point = np.full(len(features.xy), -1, np.int64)
+    in_cam = np.where(depth[:, None] > 0, unproject(features.xy, depth, intrinsics), np.nan)
+    if len(sightings) and len(features.xy):
+        distance, nearest = cKDTree(sightings.xy).query(features.xy, distance_upper_bound=SNAP)
+        near = np.isfinite(distance)
+        point[near] = sightings.point[nearest[near]]
+        in_cam[near] = points[point[near]] @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
+    return KeyframeView(frame_id, cam_from_world, features, point, in_cam)
+
+
+def verify_loop(
+    first: KeyframeView, second: KeyframeView, intrinsics: Intrinsics, settings: GlobalBaConfig, seed: int
+) -> Loop | None:
+    """The loop, if both directions find enough inliers, the same motion and a believable scale."""
+    pairs = match_features(first.features, second.features, ratio=0.8)
+    forward = _locate(first, pairs[:, 0], second, pairs[:, 1], intrinsics, settings, seed)
+    backward = _locate(second, pairs[:, 1], first, pairs[:, 0], intrinsics, settings, seed)
+    if forward is None or backward is None:
+        return None
+    scale = _relative_scale(first, second, pairs, forward)
+    depth = float(np.nanmedian(second.in_cam[:, 2]))
+    # Backwards the translation comes in the second keyframe's scale.
+    back = se3.inverse(backward.cam_from_world)
+    disagreement = se3.inverse(back) @ _scaled(forward.cam_from_world, scale)
+    if not (0.5 < scale < 2.0 and se3.rotation_angle(disagreement) < np.radians(settings.loop_rotation)):
+        return None
+    if np.linalg.norm(disagreement[:3, 3]) > settings.loop_translation * depth:
+        return None
+    inliers = int(min(forward.inliers.sum(), backward.inliers.sum()))
+    edge = LoopEdge(first.frame_id, second.frame_id, forward.cam_from_world, scale, inliers)
+    agreed = pairs[forward.inliers & backward.inliers]
+    return Loop(
+        edge,
+        _sightings(first, agreed[:, 0], second, agreed[:, 1]),
+        _sightings(second, agreed[:, 1], first, agreed[:, 0]),
+    )
+
+
+def _scaled(motion: Array, scale: float) -> Array:
+    out = motion.copy()
+    out[:3, 3] *= scale
+    return out
+
+
+def _locate(
+    source: KeyframeView,
+    source_index: NDArray[np.int64],
+    target: KeyframeView,
+    target_index: NDArray[np.int64],
+    intrinsics: Intrinsics,
+    settings: GlobalBaConfig,
+    seed: int,
+) -> FramePose | None:
+    """target_from_source by PnP, its inliers over all pairs; None when too few agree or they crowd in one spot."""
+    known = np.isfinite(source.in_cam[source_index, 2])
+    if known.sum() < settings.loop_inliers:
+        return None
+    xy = target.features.xy[target_index]
+    solved = solve_pose(xy[known], source.in_cam[source_index[known]], intrinsics, seed, None, settings.loop_error, 1.0)
+    if solved is None or solved.inliers.sum() < max(settings.loop_inliers, settings.loop_share * known.sum()):
+        return None
+    inliers = np.zeros(len(xy), bool)
+    inliers[known] = solved.inliers
+    spread = xy[inliers].std(0) / np.array([intrinsics.width, intrinsics.height])
+    if spread.min() < 0.06:
+        return None
+    return FramePose(solved.cam_from_world, inliers)
+
+
+def _relative_scale(first: KeyframeView, second: KeyframeView, pairs: NDArray[np.int64], forward: FramePose) -> float:
+    """Depth the second keyframe itself gives its features, over depth by the first one's points; 1 without drift."""
+    used = pairs[forward.inliers]
+    motion = forward.cam_from_world
+    moved = first.in_cam[used[:, 0]] @ motion[:3, :3].T + motion[:3, 3]
+    own = second.in_cam[used[:, 1], 2]
+    both = np.isfinite(own) & (own > 0) & (moved[:, 2] > 0)
+    return float(np.exp(np.median(np.log(own[both] / moved[both, 2])))) if both.sum() >= 10 else 1.0
+
+
+def _sightings(
+    source: KeyframeView, source_index: NDArray[np.int64], target: KeyframeView, target_index: NDArray[np.int64]
+) -> Sightings:
+    """Where the target sees points of the source."""
+    point = source.point[source_index]
+    known = point >= 0
+    xy = target.features.xy[target_index[known]]
+    return Sightings(point[known], xy, np.full(int(known.sum()), 1.0))
+
+
+def disagreement_in_pixels(loop: Loop, first: KeyframeView, second: KeyframeView, intrinsics: Intrinsics) -> float:
+    """Median distance between where the current poses and where the loop put the first keyframe's points."""
+    known = np.isfinite(first.in_cam[:, 2])
+    now = second.cam_from_world @ se3.inverse(first.cam_from_world)
+    a, _ = project(se3.transform(now, first.in_cam[known]), intrinsics)
+    b, _ = project(se3.transform(loop.edge.frame2_from_frame1, first.in_cam[known]), intrinsics)
+    distance = np.linalg.norm(a - b, axis=1)
+    return float(np.nanmedian(distance)) if np.isfinite(distance).any() else float("inf")
