@@ -1,0 +1,59 @@
+"""Splat files of every kind that can be read here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from formats.compact_gaussians import read_compact
+from formats.errors import InputError
+from formats.gaussian_ply import read_gaussian_ply
+from formats.gaussians import GaussianCloud
+from formats.spz import read_spz
+
+_SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
+_SMALLEST_SCALE = 1e-9
+
+
+def read_gaussians(path: Path) -> GaussianCloud:
+    """The Gaussians of a .ply, .spz, .splat or compact .safetensors file, by its suffix.
+
+    Raises InputError for another suffix and as the reader of each kind does.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind == ".ply":
+        return read_gaussian_ply(path)
+    if kind == ".spz":
+        return read_spz(path)
+    if kind == ".splat":
+        return read_splat(path)
+    if kind == ".safetensors":
+        return read_compact(path)[0]
+    raise InputError(f"{path} is no splat file by its name: expected .ply, .spz, .splat or .safetensors")
+
+
+def read_splat(path: Path) -> GaussianCloud:
+    """The Gaussians of a .splat file: 32 bytes each, without header, 8 bit colours and rotations.
+
+    Raises InputError when the file is missing or its length is no multiple of 32.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"no such file: {path}: check the spelling, and that the disk is mounted")
+    if path.stat().st_size % _SPLAT_ROW.itemsize:
+        raise InputError(f"{path} is no whole .splat file (32 bytes for each Gaussian): copy or export it again")
+    rows = np.fromfile(path, dtype=_SPLAT_ROW)
+    if not (np.isfinite(rows["mean"]).all() and np.isfinite(rows["scale"]).all()):
+        raise InputError(f"{path} is no .splat file, or damaged: it holds values that are not finite")
+    opacity = (rows["rgba"][:, 3] / 255.0).clip(1e-4, 1 - 1e-4)
+    quat_wxyz = rows["quat_wxyz"] / 128.0 - 1
+    length = np.linalg.norm(quat_wxyz, axis=1, keepdims=True)
+    return GaussianCloud(
+        means=rows["mean"].astype(np.float32),
+        log_scales=np.log(np.maximum(rows["scale"], _SMALLEST_SCALE)).astype(np.float32),
+        quat_wxyz=np.where(length > 0, quat_wxyz / np.maximum(length, 1e-9), [1.0, 0, 0, 0]).astype(np.float32),
+        opacity_logits=np.log(opacity / (1 - opacity)).astype(np.float32),
+        colors=(rows["rgba"][:, :3] / 255.0).astype(np.float32),
+    )

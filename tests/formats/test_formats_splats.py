@@ -1,0 +1,133 @@
+"""SPZ, .splat and transforms.json, against files of other programs and against our own readers."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from formats.compact_gaussians import write_compact
+from formats.datasets import Camera, open_sequence
+from formats.errors import InputError
+from formats.gaussian_files import read_gaussians, read_splat
+from formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from formats.gaussians import GaussianCloud
+from formats.images import write_rgb
+from formats.nerfstudio import write_transforms
+from formats.spz import read_spz, write_spz
+
+
+def _cloud(m: int = 500, extent: float = 5.0) -> GaussianCloud:
+    rng = np.random.default_rng(2)
+    quat_xyzw = Rotation.random(m, rng=rng).as_quat() if m else np.zeros((0, 4))
+    return GaussianCloud(
+        means=rng.uniform(-extent, extent, (m, 3)).astype(np.float32),
+        log_scales=rng.uniform(-8, 1, (m, 3)).astype(np.float32),
+        quat_wxyz=quat_xyzw[:, [3, 0, 1, 2]].astype(np.float32),
+        opacity_logits=rng.uniform(-4, 4, m).astype(np.float32),
+        colors=rng.uniform(0, 1, (m, 3)).astype(np.float32),
+    )
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-x))
+
+
+def _rotations(cloud: GaussianCloud) -> np.ndarray:
+    return Rotation.from_quat(cloud.quat_wxyz[:, [1, 2, 3, 0]]).as_matrix()
+
+
+@pytest.mark.parametrize("extent", [0.01, 5.0, 3000.0])
+def test_spz_round_trip_within_its_steps(tmp_path: Path, extent: float) -> None:
+    cloud = _cloud(extent=extent)
+    write_spz(tmp_path / "a.spz", cloud)
+    write_spz(tmp_path / "b.spz", cloud)
+    assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
+    back = read_spz(tmp_path / "a.spz")
+    error = np.abs(back.means - cloud.means).max()
+    assert 0 < error <= max(0.51 / 2**16, extent / 2**20)
+    assert 0 < np.abs(back.log_scales - cloud.log_scales).max() <= 0.5 / 16 + 1e-5
+    assert np.abs(_sigmoid(back.opacity_logits) - _sigmoid(cloud.opacity_logits)).max() <= 0.51 / 255
+    assert np.abs(back.colors - cloud.colors).max() <= 0.51 / 255 / 0.15 * 0.2821
+    # w comes from the length of the other three: near half turns their 1/255 steps grow to 0.1
+    assert 0 < np.abs(_rotations(back) - _rotations(cloud)).max() < 0.2
+    assert np.abs(_rotations(back) - _rotations(cloud)).mean() < 0.01
+    assert (tmp_path / "a.spz").stat().st_size < 25 * len(cloud) + 200
+
+
+def test_three_programs_agree_on_the_same_gaussians(shared_data: Path) -> None:
+    folder = shared_data / "format_cases" / "ply_other_writers"
+    ply, spz, splat = (
+        read_gaussians(folder / f"test-splat.3-points-from-train.{kind}") for kind in ("ply", "spz", "splat")
+    )
+    for other, scale_step in ((spz, 1 / 32), (splat, 1e-5)):
+        np.testing.assert_allclose(other.means, ply.means, atol=2e-4)
+        np.testing.assert_allclose(other.log_scales, ply.log_scales, atol=scale_step + 1e-6)
+        np.testing.assert_allclose(_rotations(other), _rotations(ply), atol=0.02)
+        np.testing.assert_allclose(_sigmoid(other.opacity_logits), _sigmoid(ply.opacity_logits), atol=1 / 255)
+        np.testing.assert_allclose(other.colors, ply.colors, atol=1 / 255 / 0.15 * 0.2821)
+    assert spz.dropped_sh_degree == 3
+
+
+def test_every_kind_is_read_by_its_suffix(tmp_path: Path) -> None:
+    cloud = _cloud(7)
+    write_gaussian_ply(tmp_path / "c.ply", cloud)
+    write_spz(tmp_path / "c.spz", cloud)
+    write_compact(tmp_path / "c.safetensors", cloud)
+    for name in ("c.ply", "c.spz", "c.safetensors"):
+        assert len(read_gaussians(tmp_path / name)) == 7
+    (tmp_path / "c.obj").touch()
+    with pytest.raises(InputError, match="no splat file by its name"):
+        read_gaussians(tmp_path / "c.obj")
+    write_spz(tmp_path / "none.spz", _cloud(0))
+    assert len(read_spz(tmp_path / "none.spz")) == 0
+
+
+def test_damaged_splats_are_explained(tmp_path: Path, shared_data: Path) -> None:
+    write_spz(tmp_path / "whole.spz", _cloud())
+    data = (tmp_path / "whole.spz").read_bytes()
+    raw = gzip.decompress(data)
+    for damaged in (
+        b"",
+        b"no gzip",
+        data[: len(data) // 2],
+        gzip.compress(raw[:-1]),
+        gzip.compress(b"OTHER" + raw[5:]),
+        gzip.compress(raw[:8] + b"\xff\xff\xff\x7f" + raw[12:]),
+        gzip.compress(raw[:4] + b"\x09" + raw[5:]),
+    ):
+        (tmp_path / "cut.spz").write_bytes(damaged)
+        with pytest.raises(InputError):
+            read_spz(tmp_path / "cut.spz")
+    (tmp_path / "cut.splat").write_bytes(b"x" * 33)
+    with pytest.raises(InputError, match="whole"):
+        read_splat(tmp_path / "cut.splat")
+    (tmp_path / "nan.splat").write_bytes(b"\xff" * 64)
+    with pytest.raises(InputError, match="not finite"):
+        read_splat(tmp_path / "nan.splat")
+    far = _cloud(2)
+    far.means[0, 0] = 1e9
+    with pytest.raises(ValueError, match="below 4 million"):
+        write_spz(tmp_path / "far.spz", far)
+    ply = shared_data / "format_cases" / "ply_other_writers" / "test-splat.3-points-from-train.ply"
+    assert len(read_gaussian_ply(ply)) == 3
+
+
+def test_transforms_come_back_through_the_data_set_reader(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, :3, :3] = Rotation.random(3, rng=rng).as_matrix()
+    poses[:, :3, 3] = rng.normal(size=(3, 3))
+    names = [f"frames/{i}.png" for i in range(3)]
+    for name in names:
+        write_rgb(tmp_path / name, np.zeros((6, 8, 3), np.uint8))
+    write_transforms(tmp_path / "transforms.json", 8, 6, 7.0, 7.5, 4.25, 3.0, names, poses, "map.ply")
+    sequence = open_sequence(tmp_path)
+    assert sequence.format == "nerfstudio"
+    assert sequence.camera == Camera(8, 6, 7.0, 7.5, 4.25, 3.0)
+    np.testing.assert_allclose(sequence.world_from_cam, poses, atol=1e-12)
+    with pytest.raises(ValueError, match="got 2 images"):
+        write_transforms(tmp_path / "transforms.json", 8, 6, 7.0, 7.5, 4.25, 3.0, names[:2], poses)
