@@ -1,8 +1,8 @@
 """Rigid motions: 4x4 matrices and their twists.
 
-A twist is (6,) = (translation part ρ, rotation part φ), radians, translation first. `exp(twist)` is the motion; a *left*
-perturbation of a pose is `exp(twist) @ cam_from_world`. Everything takes numpy arrays or torch tensors with any leading
-batch dimensions, computes in the float64 of its input, gives back the kind it got, and is differentiable in torch.
+A twist is (6,) = (translation part ρ, rotation part φ), radians, translation first. `exp(twist)` is the motion; a
+*left* perturbation of a pose is `exp(twist) @ cam_from_world`. Everything takes torch tensors, in whose precision it
+computes and through which it differentiates, or numpy arrays, which it takes to float64; any leading batch dimensions.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 ArrayT = TypeVar("ArrayT", Tensor, NDArray[np.float64])
 
 SMALL_ANGLE = 1e-4
-"""Below this angle series replace the closed forms: their truncation error is < 1e-16 there, and gradients stay finite."""
+"""Below this angle series replace the closed forms: they are exact to 1e-16 there and keep gradients finite."""
 
 
 def exp(twist: ArrayT) -> ArrayT:
@@ -123,7 +123,7 @@ def _rotation_log(rotation: Tensor) -> Tensor:
 
 
 def _quaternion(rotation: Tensor) -> Tensor:
-    """(..., 3, 3) -> (..., 4) wxyz with w >= 0, taking for each matrix the one of four formulas that divides by the most."""
+    """(..., 3, 3) -> (..., 4) wxyz with w >= 0, by that one of four formulas that divides by the most."""
     xx, yy, zz = (rotation[..., i, i] for i in range(3))
     squares = torch.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], dim=-1)
     sums = [rotation[..., i, j] + rotation[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2))]

@@ -38,8 +38,8 @@ F32 = np.float32
 LIGHT, DEPTH_LIGHT, BEHIND, DEPTH_BEHIND, PROXY, KAPPA = (PIXELS * i for i in range(6))
 D_DEPTH, D_DEPTH_SEEN, D_SEEN, ALPHA, WEIGHT, PRODUCT = (PIXELS * i for i in range(6, 12))
 """Planes of a tile's state: light, proxy and κ as in the forward pass; what is still behind, in the plain and in the
-depth chain; the gradients of depth sum, depth silhouette and silhouette; and three that pass from one step of a Gaussian
-to the next. With κ = 0 the chains are one: the plain planes stand for both."""
+depth chain; the gradients of depth sum, depth silhouette and silhouette; and three that pass from one step of a
+Gaussian to the next. With κ = 0 the chains are one: the plain planes stand for both."""
 PLANES = 12
 
 _ALPHA_MAX, _LIGHT_MIN = F32(rules.ALPHA_MAX), F32(rules.TRANSMITTANCE_MIN)

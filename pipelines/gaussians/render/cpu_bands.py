@@ -115,10 +115,10 @@ def sort_by_digit(
     for j in range(1 << DIGIT):
         places[j + 1] += places[j]
     for k in range(len(keys)):
-        j = np.intp((keys[k] >> np.uint32(shift)) & digits)
-        keys_out[places[j]] = keys[k]
-        values_out[places[j]] = values[k]
-        places[j] += 1
+        digit = np.intp((keys[k] >> np.uint32(shift)) & digits)
+        keys_out[places[digit]] = keys[k]
+        values_out[places[digit]] = values[k]
+        places[digit] += 1
 
 
 @kernel

@@ -52,8 +52,8 @@ def normal_equations(
     """JᵀWJ (6, 6), JᵀWr (6,), Σ weight |r| and the number of pixels of color_weight |C - I| + depth_weights |D - D̂|.
 
     W makes the absolute values quadratic about the present residuals, `floor` being the least residual divided by.
-    projected: u, v, sigma_px, z, opacity (M,); D is the normalised depth; depth (H, W) is 0 where unknown; pixels with a
-    silhouette below `min_silhouette` do not count. The same bytes for any number of threads.
+    projected: u, v, sigma_px, z, opacity (M,); D is the normalised depth; depth (H, W) is 0 where unknown; pixels with
+    a silhouette below `min_silhouette` do not count. The same bytes for any number of threads.
     """
     height, width = depth.shape
     reach, starts, entries, _ = bin_gaussians(*projected, width, height, F32(near))

@@ -11,22 +11,22 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numba
-
-FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
 # No "nnan" or "ninf": comparisons with a NaN must stay what they are. "contract" lets a*b+c become one instruction.
 _FAST = {"contract", "nsz", "arcp"}
 
 
-def kernel(function: FunctionT) -> FunctionT:
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile to machine code that runs without the GIL, cached on disk between runs."""
     directory = cache_directory()
     with _numba_cache_in(directory):
-        # numba's decorators have no useful types.
-        return numba.njit(nogil=True, cache=directory is not None, fastmath=_FAST, error_model="numpy")(function)
+        compiled: Callable[..., Any] = numba.njit(
+            nogil=True, cache=directory is not None, fastmath=_FAST, error_model="numpy"
+        )(function)
+        return compiled
 
 
 @functools.cache
@@ -81,9 +81,10 @@ def _source_hash() -> str:
 @contextmanager
 def _numba_cache_in(directory: Path | None) -> Iterator[None]:
     """numba reads its cache setting when a function is decorated; other users of numba keep theirs."""
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(directory or "")
+    config: Any = numba.config  # its settings are made at run time
+    before = config.CACHE_DIR
+    config.CACHE_DIR = str(directory or "")
     try:
         yield
     finally:
-        numba.config.CACHE_DIR = before
+        config.CACHE_DIR = before

@@ -13,10 +13,12 @@ from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
-from numba import types
+from numba import extending, types
 from numba.core import cgutils
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, models, register_model
+from numba.extending import lower_builtin, models, register_model
+
+intrinsic: Any = extending.intrinsic  # its own annotation hides the arguments of what it makes
 
 WIDTH = 16
 _FLAGS = ("contract", "nsz", "arcp")
@@ -306,8 +308,8 @@ def _fold(builder: ir.IRBuilder, value: ir.Value, join: Callable[[ir.Value, ir.V
 
 
 # --- channels of a box of pixels -------------------------------------------------------------------------------------
-# A tile keeps `channels` numbers per pixel, pixel after pixel, 16 pixels a row; `channels` is 16 times the length of the
-# tuple `vectors`, whose *type* carries the number, so that kernels are compiled for it and cached like any other.
+# A tile keeps `channels` numbers per pixel, pixel after pixel, 16 pixels a row; `channels` is 16 times the length of
+# the tuple `vectors`, whose *type* carries the number, so that kernels are compiled for it and cached like any other.
 
 
 @intrinsic

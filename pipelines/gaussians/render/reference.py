@@ -14,8 +14,6 @@ from torch import Tensor
 
 from pipelines.gaussians.render.rules import ALPHA_MAX, ALPHA_MIN, CUT_SIGMAS, TRANSMITTANCE_MIN
 
-warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
-
 
 @dataclass(frozen=True)
 class Pairs:
@@ -150,19 +148,21 @@ class _Blend(torch.autograd.Function):
         ctx.save_for_backward(weights, features)
         ctx.pairs = pairs
         size = (len(pairs.pixel_ends) - 1, len(features))
-        return (
-            torch.sparse_csr_tensor(pairs.pixel_ends, pairs.gaussian, weights, size, check_invariants=False) @ features
-        )
+        return _sparse_rows(pairs.pixel_ends, pairs.gaussian, weights, size) @ features
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
         weights, features = ctx.saved_tensors
         pairs, gradient = ctx.pairs, gradients[0].contiguous()
         size = (len(gradient), len(features))
-        pattern = torch.sparse_csr_tensor(
-            pairs.pixel_ends, pairs.gaussian, torch.zeros_like(weights), size, check_invariants=False
-        )
+        pattern = _sparse_rows(pairs.pixel_ends, pairs.gaussian, torch.zeros_like(weights), size)
         d_weights = torch.sparse.sampled_addmm(pattern, gradient, features.t(), beta=0.0).values()
         pixel, listed = pairs.pixel[pairs.by_gaussian], weights[pairs.by_gaussian]
-        transposed = torch.sparse_csr_tensor(pairs.gaussian_ends, pixel, listed, size[::-1], check_invariants=False)
+        transposed = _sparse_rows(pairs.gaussian_ends, pixel, listed, (size[1], size[0]))
         return d_weights, transposed @ gradient, None
+
+
+def _sparse_rows(ends: Tensor, columns: Tensor, values: Tensor, size: tuple[int, int]) -> Tensor:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        return torch.sparse_csr_tensor(ends, columns, values, size, check_invariants=False)

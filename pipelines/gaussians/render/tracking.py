@@ -82,9 +82,9 @@ def track_gn(
         if np.linalg.cond(information) > 1e12:
             reason = "the image does not determine the pose"
             break
-        step = -np.linalg.solve(information, gradient)
-        pose = torch.from_numpy(se3.exp(step)) @ pose
-        step_px = max(intrinsics.fx, intrinsics.fy) * (np.linalg.norm(step[:3]) / z + np.linalg.norm(step[3:]))
+        step = torch.from_numpy(-np.linalg.solve(information, gradient))
+        pose = se3.exp(step) @ pose
+        step_px = max(intrinsics.fx, intrinsics.fy) * float(step[:3].norm() / z + step[3:].norm())
         if step_px < tolerance_px:
             reason = "" if cost <= first_cost else "the cost grew"
             break
