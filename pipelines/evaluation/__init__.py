@@ -1,0 +1,1 @@
+"""Metrics, the evaluation of a run against the truth, and the report."""

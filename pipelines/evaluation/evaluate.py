@@ -1,0 +1,163 @@
+"""A run against the truth: every cell of the table, or why it is empty."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import Any
+
+from numpy.typing import NDArray
+
+from formats.datasets import Sequence
+from formats.errors import InputError
+from pipelines.evaluation.legacy import legacy_cells
+from pipelines.evaluation.measure import Measured, measure_views
+from pipelines.evaluation.mesh_cells import mesh_cells
+from pipelines.evaluation.outcome import Outcome, load_outcome
+from pipelines.evaluation.trajectory_error import AbsoluteError, ErrorStatistics, absolute_error, relative_error
+from pipelines.evaluation.truth import MatchedTruth, match_truth
+from pipelines.progress import Progress, SilentProgress
+from pipelines.run_folder import RunFolder
+
+PROTOCOL = (
+    "Frames belong to the truth of the same {by}; the other frames count as picked and posed only.",
+    "ATE: distance of camera centres after one alignment (Umeyama) over the frames it is given for; Sim(3) finds the "
+    "scale, SE(3) does not.",
+    "RPE: motion from one frame with truth to the next, at the scale of Sim(3).",
+    "PSNR and SSIM (Gaussian window 11, sigma 1.5) of 8-bit pictures of the frames' full size, with the exposure that "
+    "the run found; mean over views.",
+    "Depth of the map: the surface at which half the light is lost, against the true depth at the same pixel, over "
+    "all views with true depth; pixels without either are left out of L1 and shown as the valid fraction.",
+    "Labels: one confusion matrix over all views; pixels without a true class are left out, pixels to which the map "
+    "gives no class count as wrong; the mean is over the classes that occur in the truth.",
+    "Mesh: points spread evenly over it, after Sim(3) (SE(3) where the depth is metric), where a camera with true "
+    "depth sees them; the truth is the points of the true depth.",
+)
+
+
+def evaluate_run(
+    run: RunFolder, truth: Sequence, progress: Progress | None = None, max_views: int = 100, legacy: bool = False
+) -> dict[str, Any]:
+    """All figures as plain JSON values; a group that cannot be had is {"missing": why}.
+
+    At most `max_views` of the keyframes, and as many of the other frames, are rendered. Raises InputError for a run
+    without poses and for a truth of which no frame belongs to the run.
+    """
+    return evaluate_outcome(load_outcome(run), truth, progress, max_views, legacy)[0]
+
+
+def evaluate_outcome(
+    outcome: Outcome,
+    truth: Sequence,
+    progress: Progress | None = None,
+    max_views: int = 100,
+    legacy: bool = False,
+) -> tuple[dict[str, Any], Measured | None]:
+    """As `evaluate_run`, with the measured views beside the figures."""
+    matched = match_truth(outcome.frames, outcome.source_is_folder, truth)
+    if not matched.has_pose.any() and not (matched.image >= 0).any():
+        raise InputError(
+            f"{truth.root}: none of its {len(truth)} frames belongs to the {len(outcome.frames)} frames of "
+            f"{outcome.run.root} by name or by time. Is it the truth of another recording?"
+        )
+    trajectory, alignment = trajectory_cells(outcome, matched)
+    measured = None
+    if outcome.gaussian_map is not None:
+        measured = measure_views(outcome, matched, alignment, progress or SilentProgress(), max_views)
+    result = {
+        "run": outcome.run.root.name,
+        "truth": f"{truth.root.name} ({truth.format})",
+        "stage": {"poses": outcome.pose_stage, "map": outcome.map_stage or "none"},
+        "protocol": [line.format(by=matched.by) for line in PROTOCOL],
+        "frames": frame_cells(outcome, matched),
+        "camera": camera_cells(outcome, truth),
+        "trajectory": trajectory,
+        **(measured.cells(outcome, matched) if measured else _without_map(outcome)),
+        "mesh": mesh_cells(outcome, matched, alignment),
+        "cost": cost_cells(outcome),
+    }
+    if legacy:
+        result["legacy"] = legacy_cells(outcome, matched, measured)
+    # A round trip: what cannot be written as JSON (NaN, arrays) shows here and not at the user's.
+    return json.loads(json.dumps(result, allow_nan=False)), measured
+
+
+def _without_map(outcome: Outcome) -> dict[str, Any]:
+    why = {"missing": f"mapping is not done; the last stage is {outcome.pose_stage}"}
+    return {"images": why, "depth": why, "labels": why, "views": []}
+
+
+def frame_cells(outcome: Outcome, matched: MatchedTruth) -> dict[str, Any]:
+    """How many frames there are of each kind."""
+    t = outcome.trajectory
+    return {
+        "picked": len(t.frame_ids),
+        "posed": int(t.is_posed.sum()),
+        "keyframes": int(t.is_keyframe.sum()),
+        "with true pose": int(matched.has_pose.sum()),
+        "with true image": int((matched.image >= 0).sum()),
+    }
+
+
+def camera_cells(outcome: Outcome, truth: Sequence) -> dict[str, Any]:
+    """The focal length against the true one at the same image size."""
+    calibration = outcome.calibration
+    k = calibration.intrinsics
+    cells: dict[str, Any] = {"origin": calibration.origin, "fx": k.fx, "fy": k.fy, "distortion": calibration.distortion}
+    if truth.camera is None:
+        return cells | {"missing": "the truth has no camera"}
+    true = truth.camera.resized(k.width, k.height)
+    return cells | {"true fx": true.fx, "focal error": k.fx / true.fx - 1}
+
+
+def trajectory_cells(outcome: Outcome, matched: MatchedTruth) -> tuple[dict[str, Any], AbsoluteError | None]:
+    """ATE and RPE, and the Sim(3) alignment over all frames (SE(3) where the depth is metric)."""
+    t = outcome.trajectory
+    usable = t.is_posed & matched.has_pose
+    if usable.sum() < 3:
+        why = f"only {int(usable.sum())} posed frames have a true pose, three are needed"
+        return {"missing": why}, None
+    estimate, truth = t.world_from_cam, matched.world_from_cam
+    cells: dict[str, Any] = {}
+    for name, with_scale in (("sim3", True), ("se3", False)):
+        for frames, rows in (("all", usable), ("keyframes", usable & t.is_keyframe)):
+            cells[f"{name} {frames}"] = _ate(estimate[rows, :3, 3], truth[rows, :3, 3], with_scale)
+    if not outcome.metric:
+        for frames in ("all", "keyframes"):
+            cells[f"se3 {frames}"] = {"missing": "the run has no metric scale"}
+    try:
+        sim3 = absolute_error(estimate[usable, :3, 3], truth[usable, :3, 3], with_scale=True)
+    except ValueError as error:
+        return {"missing": str(error)}, None
+    cells["rpe"] = _rpe(estimate[usable], truth[usable], sim3.alignment.scale)
+    best = absolute_error(estimate[usable, :3, 3], truth[usable, :3, 3], False) if outcome.metric else sim3
+    return cells, best
+
+
+def _ate(centers: NDArray, true_centers: NDArray, with_scale: bool) -> dict[str, Any]:
+    try:
+        error = absolute_error(centers, true_centers, with_scale)
+    except ValueError as problem:
+        return {"missing": str(problem)}
+    return {**asdict(error.statistics), "scale": error.alignment.scale, "frames": len(centers)}
+
+
+def _rpe(estimate: NDArray, truth: NDArray, scale: float) -> dict[str, Any]:
+    error = relative_error(estimate, truth, 1, scale)
+    translation, rotation = ErrorStatistics.of(error.translation), ErrorStatistics.of(error.rotation)
+    return {"translation rmse": translation.rmse, "rotation rmse degrees": rotation.rmse, "pairs": len(error.rotation)}
+
+
+def cost_cells(outcome: Outcome) -> dict[str, Any]:
+    """Seconds of each stage, frames a second over all of them, peak memory, size of the map."""
+    seconds = {name: record.seconds for name, record in outcome.records.items()}
+    total = sum(seconds.values())
+    m = outcome.gaussian_map
+    return {
+        "seconds": seconds,
+        "total seconds": total,
+        "frames per second": len(outcome.frames) / total if total > 0 else 0.0,
+        "peak memory MB": max((r.peak_memory_mb for r in outcome.records.values()), default=0.0),
+        "gaussians": 0 if m is None else len(m),
+        "map MB": 0.0 if m is None else sum(v.numel() * v.element_size() for v in vars(m).values()) / 1e6,
+    }

@@ -1,0 +1,124 @@
+"""What a run has ended with so far: the latest stage wins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.errors import InputError
+from formats.tensors import load_arrays
+from pipelines.config import Config, load_config
+from pipelines.gaussians.map import GaussianMap
+from pipelines.mapping.load import load_class_ids
+from pipelines.run_folder import RunFolder
+from pipelines.stages import StageRecord, load_records, load_source
+from pipelines.types import VOID, Calibration, ClassTable, Frame, Trajectory
+
+_MAP_STAGES = ("global_ba", "mapping")
+_POSE_STAGES = ("global_ba", "mapping", "tracking")
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """log_gains, offsets (N, 3) of the keyframes, in order of their times (N,)."""
+
+    times: NDArray[np.float64]
+    log_gains: NDArray[np.float32]
+    offsets: NDArray[np.float32]
+
+    def apply(self, color: NDArray[np.float32], time: float) -> NDArray[np.float32]:
+        """(H, W, 3) colours 0..1 of the map as a camera at that time would have exposed them."""
+        gain, offset = (
+            np.array([np.interp(time, self.times, a[:, k]) for k in range(3)], np.float32)
+            for a in (self.log_gains, self.offsets)
+        )
+        return np.clip(color * np.exp(gain) + offset, 0, 1)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """map_stage is "" and gaussian_map None before mapping is done; label_of_channel (C,) takes a class channel of the
+    map to its label. `metric`: whether the world's unit is the metre of the proxy depth."""
+
+    run: RunFolder
+    records: Mapping[str, StageRecord]
+    config: Config
+    frames: list[Frame]
+    calibration: Calibration
+    pose_stage: str
+    trajectory: Trajectory
+    map_stage: str
+    gaussian_map: GaussianMap | None
+    classes: ClassTable
+    label_of_channel: NDArray[np.uint8]
+    exposure: Exposure | None
+    metric: bool
+    semantics: str
+
+    @property
+    def source_is_folder(self) -> bool:
+        """Whether frames kept the names of the source's images."""
+        source = Path(load_source(self.run)["path"])
+        return source.is_dir() or source.suffix == ""
+
+    def frame_row(self, frame_id: int) -> int:
+        """Row of a frame in the trajectory."""
+        return int(np.flatnonzero(self.trajectory.frame_ids == frame_id)[0])
+
+
+def load_outcome(run: RunFolder) -> Outcome:
+    """Raises InputError for a run whose tracking is not done."""
+    records = load_records(run)
+    pose_stage = _latest(run, records, _POSE_STAGES, "trajectory.npz")
+    if not pose_stage:
+        raise InputError(
+            f"{run.root}: no camera poses yet (tracking is not done). Type `msgs-slam resume {run.root}` first"
+        )
+    trajectory = run.load_trajectory(pose_stage)
+    map_stage = _latest(run, records, _MAP_STAGES, "map.safetensors")
+    report = run.load_proxy_report()
+    return Outcome(
+        run=run,
+        records=records,
+        config=load_config(run.settings_file),
+        frames=run.load_frames(),
+        calibration=run.load_calibration(),
+        pose_stage=pose_stage,
+        trajectory=trajectory,
+        map_stage=map_stage,
+        gaussian_map=run.load_map(map_stage) if map_stage else None,
+        classes=run.load_classes(),
+        label_of_channel=np.array(load_class_ids(run) if map_stage else (), np.uint8),
+        exposure=_load_exposure(run, map_stage, trajectory),
+        metric=bool(report.get("metric", False)),
+        semantics=str(report.get("semantics", "")),
+    )
+
+
+def _latest(run: RunFolder, records: Mapping[str, StageRecord], stages: tuple[str, ...], file: str) -> str:
+    return next((s for s in stages if s in records and (run.stage(s) / file).exists()), "")
+
+
+def _load_exposure(run: RunFolder, map_stage: str, trajectory: Trajectory) -> Exposure | None:
+    for stage in (map_stage, "mapping"):
+        path = run.stage(stage) / "exposure.npz"
+        if map_stage and path.exists():
+            arrays = load_arrays(path)
+            time_of = dict(zip(trajectory.frame_ids.tolist(), trajectory.timestamps.tolist(), strict=True))
+            times = np.array([time_of[int(i)] for i in arrays["frame_ids"]])
+            order = np.argsort(times, kind="stable")
+            return Exposure(times[order], arrays["log_gains"][order], arrays["offsets"][order])
+    return None
+
+
+def labels_of_channels(
+    channels: NDArray, label_of_channel: NDArray[np.uint8], known: NDArray[np.bool_]
+) -> NDArray[np.uint8]:
+    """(H, W) labels of the strongest channels; VOID where not known."""
+    if len(label_of_channel) == 0:
+        return np.full(channels.shape, VOID, np.uint8)
+    return np.where(known, label_of_channel[channels], np.uint8(VOID)).astype(np.uint8)

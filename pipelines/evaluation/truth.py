@@ -1,0 +1,127 @@
+"""Which truth belongs to which frame of a run, pixel by pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.datasets import Sequence
+from formats.datasets.camera import Camera
+from formats.textfile import read_rows
+from formats.trajectory import read_matrices
+from pipelines.evaluation.trajectory_error import associate
+from pipelines.frames.lens import make_lens, to_pycolmap
+from pipelines.types import Calibration, Frame
+
+_MOST_SECONDS_APART = 0.02
+
+
+@dataclass(frozen=True)
+class MatchedTruth:
+    """For N frames of a run: world_from_cam (N, 4, 4), NaN without; image (N,) index into the sequence, -1 without;
+    `by`: how they were matched, in words."""
+
+    sequence: Sequence
+    world_from_cam: NDArray[np.float64]
+    image: NDArray[np.int64]
+    by: str
+
+    @property
+    def has_pose(self) -> NDArray[np.bool_]:
+        return np.asarray(np.isfinite(self.world_from_cam).all(axis=(1, 2)))
+
+
+def match_truth(frames: list[Frame], names_are_the_sources: bool, sequence: Sequence) -> MatchedTruth:
+    """By file name where the frames kept their names and most are there, else by time.
+
+    Times may differ by a constant: a video counts from its beginning, some data sets from 1970.
+    """
+    index_of = {name: i for i, name in enumerate(sequence.names)}
+    found = [index_of.get(f.name, -1) for f in frames]
+    if names_are_the_sources and sum(i >= 0 for i in found) > 0.5 * len(frames):
+        image = np.array(found, np.int64)
+        poses = np.full((len(frames), 4, 4), np.nan)
+        if sequence.world_from_cam is not None:
+            poses[image >= 0] = sequence.world_from_cam[image[image >= 0]]
+        return MatchedTruth(sequence, poses, image, "file name")
+    return _match_by_time(np.array([f.timestamp for f in frames]), sequence)
+
+
+def _match_by_time(times: NDArray[np.float64], sequence: Sequence) -> MatchedTruth:
+    pose_times, true_poses = true_trajectory(sequence)
+    start = 0.0
+    if sequence.timestamps[0] > times[-1] + 1:
+        start = float(min(sequence.timestamps[0], pose_times[0] if len(pose_times) else np.inf))
+    image = np.full(len(times), -1, np.int64)
+    i, j = associate(times, sequence.timestamps - start, _tolerance(sequence.timestamps))
+    image[i] = j
+    poses = np.full((len(times), 4, 4), np.nan)
+    i, j = associate(times, pose_times - start, _tolerance(pose_times))
+    poses[i] = true_poses[j]
+    by = "time" if start == 0 else f"time, truth shifted by {-start:.3f} s"
+    return MatchedTruth(sequence, poses, image, by)
+
+
+def _tolerance(times: NDArray[np.float64]) -> float:
+    """A third of the usual gap: a frame between two truths belongs to neither."""
+    return min(_MOST_SECONDS_APART, float(np.median(np.diff(times))) / 3) if len(times) > 1 else _MOST_SECONDS_APART
+
+
+def true_trajectory(sequence: Sequence) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(N,) times and (N, 4, 4) world_from_cam: of the images, or of a traj.txt that is denser than the images.
+
+    A recording may keep all its poses and times and only every k-th image.
+    """
+    dense = _dense_trajectory(sequence.root)
+    if dense is not None and len(dense[0]) > len(sequence):
+        return dense
+    if sequence.world_from_cam is None:
+        return np.zeros(0), np.zeros((0, 4, 4))
+    known = sequence.has_pose
+    return sequence.timestamps[known], sequence.world_from_cam[known]
+
+
+def _dense_trajectory(root: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    poses_file, times_file = root / "traj.txt", root / "timestamps.txt"
+    if not (poses_file.is_file() and times_file.is_file()):
+        return None
+    rows = read_rows(times_file)
+    poses = read_matrices(poses_file)
+    if len(rows) != len(poses) or any(len(r) != 1 for r in rows):
+        return None
+    known = np.isfinite(poses).all(axis=(1, 2))
+    times = np.array([float(r[0]) for r in rows])
+    return times[known], poses[known]
+
+
+class FramePixels:
+    """Where in the source's image each pixel of an undistorted frame comes from.
+
+    The way back through the run's own undistortion: right even where its focal length is not.
+    """
+
+    def __init__(self, calibration: Calibration) -> None:
+        k = calibration.intrinsics
+        v, u = np.indices((k.height, k.width)) + 0.5
+        rays = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones_like(u)], axis=-1).reshape(-1, 3)
+        camera = to_pycolmap(_distorted_camera(calibration))
+        self._size = (k.width, k.height)
+        self._xy = camera.img_from_cam(rays).reshape(k.height, k.width, 2)
+
+    def sample(self, image: NDArray) -> NDArray:
+        """(H, W) the nearest pixels of `image` (h, w), which covers the source's whole picture."""
+        scale = (image.shape[1] / self._size[0], image.shape[0] / self._size[1])
+        column, row = (np.floor(self._xy[..., i] * scale[i]).astype(np.int64) for i in (0, 1))
+        return image[row.clip(0, image.shape[0] - 1), column.clip(0, image.shape[1] - 1)]
+
+
+def _distorted_camera(calibration: Calibration) -> Camera:
+    """The lens before undistortion, which may have enlarged the picture to fill the frame."""
+    k, zoom = calibration.intrinsics, 1.0
+    for _ in range(6):
+        camera = Camera(k.width, k.height, k.fx / zoom, k.fy / zoom, k.cx, k.cy, calibration.distortion)
+        zoom = make_lens(to_pycolmap(camera)).pinhole.fx / camera.fx
+    return camera

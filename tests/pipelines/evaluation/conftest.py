@@ -1,0 +1,169 @@
+"""A finished run made from the truth of the synthetic room, without running any stage."""
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from numpy.typing import NDArray
+
+from formats.atomic import write_text
+from formats.datasets import Sequence, open_sequence
+from formats.images import write_rgb
+from pipelines.config import Config, MappingConfig, config_to_toml
+from pipelines.gaussians.map import GaussianMap
+from pipelines.geometry.alignment import Similarity
+from pipelines.run_folder import (
+    RunFolder,
+    proxy_path,
+    save_calibration,
+    save_classes,
+    save_frames,
+    save_map,
+    save_proxy_maps,
+    save_trajectory,
+    write_json,
+)
+from pipelines.stages import StageRecord
+from pipelines.types import VOID, Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, Trajectory
+
+KEYFRAME_EVERY = 4
+OracleRun = Callable[..., RunFolder]
+
+
+@pytest.fixture(scope="session")
+def truth(world_sequence: Path) -> Sequence:
+    return open_sequence(world_sequence)
+
+
+@pytest.fixture(scope="session")
+def oracle_run(truth: Sequence, tmp_path_factory: pytest.TempPathFactory) -> OracleRun:
+    """Makes a run whose poses, depth and labels are the truth's, its world moved by a similarity.
+
+    metric, rename (classes lose their names), wrong_poses (N, 3) metres added to the camera centres, video (the run
+    comes from a video and not from the folder).
+    """
+
+    def make(
+        world_from_truth: Similarity | None = None,
+        metric: bool = True,
+        rename: bool = False,
+        wrong_centers: NDArray | None = None,
+        video: bool = False,
+        hold_out: int = 0,
+    ) -> RunFolder:
+        run = RunFolder(tmp_path_factory.mktemp("oracle") / "walk.msgs")
+        move = world_from_truth or Similarity(1.0, np.eye(3), np.zeros(3))
+        frames = _write_frames(run, truth, video)
+        classes = _write_proxy(run, truth, frames, metric, rename)
+        trajectory = _trajectory(truth, frames, move, wrong_centers)
+        save_trajectory(run.stage("tracking"), trajectory)
+        gaussian_map, class_ids = _seeded_map(truth, move, len(classes))
+        save_map(run.stage("mapping"), gaussian_map)
+        save_trajectory(run.stage("mapping"), trajectory)
+        write_json(run.stage("mapping") / "mapping.json", {"class_ids": class_ids})
+        _write_mesh(run.stage("export") / "mesh.ply", gaussian_map)
+        config = Config(mapping=MappingConfig(hold_out=hold_out))
+        write_text(run.settings_file, config_to_toml(config))
+        record = asdict(StageRecord("", {}, 2.0, 100.0, {}, [], ""))
+        stages = dict.fromkeys(("frames", "proxy", "tracking", "mapping", "export"), record)
+        source = "walk.mp4" if video else str(truth.root / "rgb")
+        write_json(run.manifest_file, {"source": {"path": source, "digest": ""}, "stages": stages})
+        return run
+
+    return make
+
+
+def _write_frames(run: RunFolder, truth: Sequence, video: bool) -> list[Frame]:
+    folder = run.stage("frames")
+    frames = []
+    for i, name in enumerate(truth.names):
+        frames.append(Frame(i, f"{i:06d}.png" if video else name, float(truth.timestamps[i]), i, 1.0))
+        write_rgb(folder / frames[-1].name, truth.rgb(i))
+    save_frames(folder, frames)
+    c = truth.camera
+    assert c is not None
+    intrinsics = Intrinsics(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
+    save_calibration(folder, Calibration(intrinsics, "given", 0.0, (0.0, 0.0, 0.0, 0.0)))
+    return frames
+
+
+def _write_proxy(run: RunFolder, truth: Sequence, frames: list[Frame], metric: bool, rename: bool) -> ClassTable:
+    folder = run.stage("proxy")
+    names = tuple(f"segment {i}" for i in range(len(truth.classes))) if rename else truth.class_names
+    classes = ClassTable(names, tuple(c.color or (9, 9, 9) for c in truth.classes))
+    save_classes(folder, classes)
+    write_json(
+        folder / "proxy.json", {"depth": "files:x", "semantics": "segments" if rename else "files:x", "metric": metric}
+    )
+    for frame in frames[::KEYFRAME_EVERY]:
+        depth, labels = truth.depth(frame.id), truth.labels(frame.id)
+        assert depth is not None
+        assert labels is not None
+        maps = ProxyMaps(depth, np.ones_like(depth), labels, np.ones_like(depth))
+        save_proxy_maps(proxy_path(folder, frame.id), maps)
+    return classes
+
+
+def _trajectory(truth: Sequence, frames: list[Frame], move: Similarity, wrong_centers: NDArray | None) -> Trajectory:
+    assert truth.world_from_cam is not None
+    world_from_cam = truth.world_from_cam.copy()
+    if wrong_centers is not None:
+        world_from_cam[:, :3, 3] += wrong_centers
+    n = len(frames)
+    return Trajectory(
+        np.arange(n),
+        truth.timestamps,
+        move.apply_to_poses(np.linalg.inv(world_from_cam)),
+        np.arange(n) % KEYFRAME_EVERY == 0,
+        ("",) * n,
+    )
+
+
+def _seeded_map(truth: Sequence, move: Similarity, classes: int) -> tuple[GaussianMap, list[int]]:
+    """A Gaussian at every third pixel of every keyframe, as large as its pixels."""
+    means, radii, colors, labels, anchors = [], [], [], [], []
+    assert truth.camera is not None
+    assert truth.world_from_cam is not None
+    for i in range(0, len(truth), KEYFRAME_EVERY):
+        depth, label = truth.depth(i), truth.labels(i)
+        assert depth is not None
+        assert label is not None
+        v, u = np.mgrid[0 : depth.shape[0] : 3, 0 : depth.shape[1] : 3]
+        z = depth[v, u].astype(np.float64)
+        c = truth.camera
+        cam = np.stack([(u + 0.5 - c.cx) / c.fx * z, (v + 0.5 - c.cy) / c.fy * z, z], axis=-1)[z > 0]
+        pose = truth.world_from_cam[i]
+        means.append(move.apply(cam @ pose[:3, :3].T + pose[:3, 3]))
+        radii.append(move.scale * cam[:, 2] / c.fx * 1.3)
+        colors.append(truth.rgb(i)[v, u][z > 0] / 255.0)
+        labels.append(label[v, u][z > 0])
+        anchors.append(np.full(len(cam), i))
+    label_all = np.concatenate(labels)
+    class_ids = [int(k) for k in np.unique(label_all) if k != VOID]
+    # Channels in another order than the labels: what mixes the two up shows.
+    class_ids = class_ids[::-1]
+    logits = np.zeros((len(label_all), len(class_ids)), np.float32)
+    for channel, k in enumerate(class_ids):
+        logits[label_all == k, channel] = 8
+    return GaussianMap(
+        torch.tensor(np.concatenate(means), dtype=torch.float32),
+        torch.tensor(np.log(np.concatenate(radii)), dtype=torch.float32),
+        torch.full((len(label_all),), 3.0),
+        torch.tensor(np.concatenate(colors), dtype=torch.float32),
+        torch.tensor(logits),
+        torch.tensor(np.concatenate(anchors), dtype=torch.int64),
+    ), class_ids
+
+
+def _write_mesh(path: Path, gaussian_map: GaussianMap) -> None:
+    """A small triangle at every fifth Gaussian."""
+    means = gaussian_map.means.numpy()[::5].astype(np.float64)
+    size = 1e-3
+    corners = means[:, None] + size * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]])
+    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(means)).reshape(-1, 3), process=False)
+    path.parent.mkdir(parents=True)
+    mesh.export(path)

@@ -1,0 +1,134 @@
+"""Whole evaluations of runs whose disturbance is known."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from formats.datasets import Sequence, open_sequence
+from formats.errors import InputError
+from pipelines.evaluation.evaluate import evaluate_run
+from pipelines.evaluation.truth import match_truth, true_trajectory
+from pipelines.evaluation.write import write_evaluation
+from pipelines.geometry.alignment import Similarity
+from pipelines.run_folder import RunFolder
+from pipelines.types import Frame
+
+OracleRun = Callable[..., RunFolder]
+
+MOVE = Similarity(2.5, Rotation.from_euler("xyz", (0.3, -0.5, 0.9)).as_matrix(), np.array([4.0, -2.0, 1.0]))
+
+
+def test_every_cell_of_a_true_run(oracle_run: OracleRun, truth: Sequence) -> None:
+    run = oracle_run(hold_out=8)
+    result = write_evaluation(run, truth, max_views=4, legacy=True)
+    assert json.loads((run.root / "evaluation" / "evaluation.json").read_text()) == result
+    assert result["frames"]["posed"] == 32
+    for name in ("sim3 all", "se3 all", "sim3 keyframes", "se3 keyframes"):
+        assert result["trajectory"][name]["max"] < 1e-6
+        assert result["trajectory"][name]["scale"] == pytest.approx(1, abs=1e-6)
+    assert abs(result["camera"]["focal error"]) < 1e-9
+    assert 20 < result["images"]["keyframes"]["psnr"] < 40
+    assert 18 < result["images"]["held out"]["psnr"] <= result["images"]["keyframes"]["psnr"]
+    # Own poses are the true ones here.
+    assert result["images"]["held out at true poses"]["psnr"] == pytest.approx(
+        result["images"]["held out"]["psnr"], abs=0.01
+    )
+    # A Gaussian every third pixel: errors at the edges alone.
+    assert 0.001 < result["depth"]["metric_l1"] < 0.1
+    assert result["depth"]["scale"] == pytest.approx(1, abs=0.01)
+    assert result["depth"]["valid_fraction"] > 0.9
+    assert result["labels"]["matching"] == "by name"
+    assert 0.85 < result["labels"]["pixel_accuracy"] < 1
+    assert 0.5 < result["labels"]["mean_iou"] < result["labels"]["pixel_accuracy"]
+    assert 0 < result["mesh"]["accuracy"] < 0.02
+    assert result["cost"]["total seconds"] == 10
+    assert result["legacy"]["ate as they call it"] < 1e-6
+    table = (run.root / "evaluation" / "evaluation.md").read_text()
+    assert "ATE Sim(3)" in table
+    assert "legacy figures" in table
+    assert (run.root / "evaluation" / "views.png").stat().st_size > 20_000
+
+
+def test_a_similarity_of_the_whole_run_changes_no_figure_but_the_scale(oracle_run: OracleRun, truth: Sequence) -> None:
+    plain, moved = (evaluate_run(oracle_run(m, metric=False), truth, max_views=2) for m in (None, MOVE))
+    assert moved["trajectory"]["sim3 all"]["scale"] == pytest.approx(0.4, rel=1e-6)
+    assert moved["trajectory"]["sim3 all"]["max"] < 1e-6
+    assert "missing" in moved["trajectory"]["se3 all"]
+    assert "missing" in moved["depth"]["metric_l1"]
+    assert moved["depth"]["scale"] == pytest.approx(0.4, rel=0.01)
+    assert moved["depth"]["scaled_l1"] == pytest.approx(plain["depth"]["scaled_l1"], rel=0.02)
+    for kind in ("keyframes", "between", "between at true poses"):
+        assert moved["images"][kind]["psnr"] == pytest.approx(plain["images"][kind]["psnr"], abs=0.05)
+    assert moved["labels"]["mean_iou"] == pytest.approx(plain["labels"]["mean_iou"], abs=0.005)
+    assert moved["mesh"]["completeness"] == pytest.approx(plain["mesh"]["completeness"], rel=0.02)
+    # A metric run of the wrong scale is not forgiven.
+    wrong = evaluate_run(oracle_run(MOVE, metric=True), truth, max_views=1)
+    assert wrong["trajectory"]["se3 all"]["rmse"] > 0.5
+    assert wrong["depth"]["metric_l1"] > 2
+
+
+def test_noise_on_the_poses_is_found_in_ate_and_costs_picture_quality(oracle_run: OracleRun, truth: Sequence) -> None:
+    noise = np.random.default_rng(0).normal(scale=0.06, size=(32, 3))
+    result = evaluate_run(oracle_run(wrong_centers=noise), truth, max_views=3)
+    # 96 numbers, 7 fitted: 0.06 sqrt(3) sqrt(89 / 96), give or take 1 / sqrt(2 x 89).
+    assert result["trajectory"]["sim3 all"]["rmse"] == pytest.approx(0.06 * np.sqrt(3) * 0.963, rel=0.2)
+    own, true = (result["images"][k]["psnr"] for k in ("between", "between at true poses"))
+    assert own < true - 0.5
+
+
+def test_labels_without_names_are_a_clustering_and_stand_apart(oracle_run: OracleRun, truth: Sequence) -> None:
+    by_name = evaluate_run(oracle_run(), truth, max_views=2)["labels"]
+    renamed = evaluate_run(oracle_run(rename=True), truth, max_views=2)["labels"]
+    assert "mean_iou" not in renamed
+    assert renamed["clustering"]["one to one"]["mean_iou"] == pytest.approx(by_name["mean_iou"], abs=1e-9)
+    assert renamed["clustering"]["majority"]["pixel_accuracy"] >= renamed["clustering"]["one to one"]["pixel_accuracy"]
+
+
+def test_a_video_is_matched_by_time_and_a_shifted_clock_too(oracle_run: OracleRun, truth: Sequence) -> None:
+    result = evaluate_run(oracle_run(video=True), truth.subset(range(0, 32, 2)), max_views=1)
+    assert result["frames"]["with true pose"] == 32  # traj.txt keeps the poses of the images left out
+    assert result["frames"]["with true image"] == 16
+    assert result["trajectory"]["sim3 all"]["max"] < 1e-6
+    frames = [Frame(i, f"{i}.jpg", 0.1 * i, i, 1.0) for i in range(8)]
+    epoch = replace(truth, timestamps=truth.timestamps + 1_305_031_102.0, root=Path("nowhere"))
+    matched = match_truth(frames, False, epoch)
+    assert matched.image.tolist() == list(range(8))
+    assert "shifted" in matched.by
+    between = [Frame(i, f"{i}.jpg", 0.1 * i + 0.05, i, 1.0) for i in range(8)]
+    assert (match_truth(between, False, truth).image == -1).all()
+
+
+def test_dense_poses_beside_sparse_images(truth: Sequence, shared_data: Path) -> None:
+    times, poses = true_trajectory(open_sequence(shared_data / "whiteroom"))
+    assert len(times) == len(poses) == 450
+    assert len(true_trajectory(truth)[0]) == 32
+
+
+def test_the_truth_of_another_recording_and_an_unfinished_run_are_refused(
+    oracle_run: OracleRun, truth: Sequence, tmp_path: Path
+) -> None:
+    run = oracle_run(video=True)
+    late = replace(truth, timestamps=truth.timestamps + 0.05, root=tmp_path)
+    with pytest.raises(InputError, match="truth of another recording"):
+        evaluate_run(run, late)
+    manifest = json.loads(run.manifest_file.read_text())
+    manifest["stages"] = {"frames": manifest["stages"]["frames"]}
+    run.manifest_file.write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match="tracking is not done"):
+        evaluate_run(run, truth)
+
+
+def test_without_a_map_the_poses_are_still_judged(oracle_run: OracleRun, truth: Sequence) -> None:
+    run = oracle_run()
+    manifest = json.loads(run.manifest_file.read_text())
+    manifest["stages"] = {k: manifest["stages"][k] for k in ("frames", "proxy", "tracking")}
+    run.manifest_file.write_text(json.dumps(manifest))
+    result = write_evaluation(run, truth)
+    assert result["trajectory"]["sim3 all"]["max"] < 1e-6
+    assert "mapping is not done" in result["images"]["missing"]
+    assert not (run.root / "evaluation" / "views.png").exists()
