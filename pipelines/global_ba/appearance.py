@@ -1,7 +1,7 @@
 """How keyframes look, as vectors whose products say how alike they are: VLAD over the run's own SIFT features.
 
 It stands where the article has DINOv2 features, which need weights: residuals of RootSIFT descriptors to a small
-vocabulary learnt from the run itself, each word normalised (Jégou et al., PAMI 2012; Arandjelović and Zisserman, CVPR 2013).
+vocabulary learnt from the run itself, each word normalised (Jégou et al., PAMI 2012; Arandjelović and Zisserman 2013).
 """
 
 from __future__ import annotations

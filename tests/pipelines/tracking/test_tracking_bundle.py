@@ -1,0 +1,138 @@
+"""Bundle adjustment: right derivatives, the same minimum as Ceres, and metres from proxy depths."""
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+
+from pipelines.geometry import se3
+from pipelines.geometry.alignment import align_points
+from pipelines.tracking import bundle_kernels as kernels
+from pipelines.tracking.bundle import Bundle, adjust_bundle, adjust_pose
+from pipelines.tracking.pnp import colmap_camera
+from pipelines.types import Intrinsics
+from tests.pipelines.tracking.conftest import KnownBundle
+
+
+def without_depth(bundle: Bundle) -> Bundle:
+    return replace(bundle, obs_depth=np.zeros(len(bundle.obs_cam)))
+
+
+def centres(poses: np.ndarray) -> np.ndarray:
+    return se3.inverse(poses)[:, :3, 3]
+
+
+def aligned_error(poses: np.ndarray, truth: np.ndarray, scale: bool) -> float:
+    found, wanted = centres(poses), centres(truth)
+    moved = align_points(found, wanted, with_scale=scale).apply(found)
+    return float(np.sqrt(((moved - wanted) ** 2).sum(1).mean()))
+
+
+def test_gradient_agrees_with_differences_of_the_cost(known_bundle: KnownBundle) -> None:
+    b = known_bundle.bundle
+    camera = np.array([500.0, 500, 320, 240])
+    data = (
+        camera, b.obs_cam, b.obs_point, b.obs_xy, 1 / b.obs_sd, np.log(b.obs_depth), 1 / b.obs_depth_sd, 2.0
+    )  # fmt: skip
+    _, cam_right, _, point_right, _ = kernels.linearise(b.cam_from_world, b.points, *data)
+    for c, k in ((0, 0), (3, 2), (7, 3), (11, 5), (5, 4)):
+        step = np.zeros((12, 6))
+        step[c, k] = 1e-6
+        up = kernels.total_cost(se3.exp(step) @ b.cam_from_world, b.points, *data)
+        down = kernels.total_cost(se3.exp(-step) @ b.cam_from_world, b.points, *data)
+        assert -2 * cam_right[c, k] == pytest.approx((up - down) / 2e-6, rel=1e-4)
+    for p, k in ((0, 0), (40, 1), (149, 2)):
+        step = np.zeros((150, 3))
+        step[p, k] = 1e-6
+        up = kernels.total_cost(b.cam_from_world, b.points + step, *data)
+        down = kernels.total_cost(b.cam_from_world, b.points - step, *data)
+        assert -2 * point_right[p, k] == pytest.approx((up - down) / 2e-6, rel=1e-4)
+
+
+def test_recovers_poses_and_scale_only_with_depth(known_bundle: KnownBundle) -> None:
+    start = known_bundle.bundle
+    larger = replace(start, points=start.points * 1.2, cam_from_world=start.cam_from_world.copy())
+    larger.cam_from_world[:, :3, 3] *= 1.2
+    truth = known_bundle.cam_from_world
+    with_depth = adjust_bundle(larger, known_bundle.intrinsics, 50).bundle
+    free = adjust_bundle(without_depth(larger), known_bundle.intrinsics, 50).bundle
+    assert 0 < aligned_error(with_depth.cam_from_world, truth, scale=False) < 0.01
+    assert 0 < aligned_error(free.cam_from_world, truth, scale=True) < 0.01
+    assert aligned_error(free.cam_from_world, truth, scale=False) > 0.05
+    assert 0.4 < np.sqrt((with_depth.reprojection_errors(known_bundle.intrinsics) ** 2).mean() / 2) < 0.6
+
+
+def test_outliers_hardly_matter(known_bundle: KnownBundle) -> None:
+    rng = np.random.default_rng(1)
+    bundle = known_bundle.bundle
+    xy = bundle.obs_xy.copy()
+    wrong = rng.random(len(xy)) < 0.15
+    xy[wrong] += rng.normal(size=(int(wrong.sum()), 2)) * 40
+    result = adjust_bundle(replace(bundle, obs_xy=xy), known_bundle.intrinsics, 50)
+    assert 0 < aligned_error(result.bundle.cam_from_world, known_bundle.cam_from_world, scale=False) < 0.015
+
+
+def test_fixed_cameras_stay(known_bundle: KnownBundle) -> None:
+    fixed = np.arange(12) < 6
+    result = adjust_bundle(known_bundle.bundle, known_bundle.intrinsics, fixed=fixed)
+    before, after = known_bundle.bundle.cam_from_world, result.bundle.cam_from_world
+    assert np.array_equal(before[fixed], after[fixed])
+    assert (np.abs(before[~fixed] - after[~fixed]).max((1, 2)) > 1e-4).all()
+    assert result.cost < result.initial_cost
+
+
+def test_same_input_same_bytes_and_any_order(known_bundle: KnownBundle) -> None:
+    once = adjust_bundle(known_bundle.bundle, known_bundle.intrinsics).bundle
+    again = adjust_bundle(known_bundle.bundle, known_bundle.intrinsics).bundle
+    assert once.cam_from_world.tobytes() == again.cam_from_world.tobytes()
+    order = np.random.default_rng(2).permutation(len(once.obs_cam))
+    shuffled = adjust_bundle(known_bundle.bundle.select(order), known_bundle.intrinsics).bundle
+    assert shuffled.points.tobytes() == once.points.tobytes()
+
+
+def test_reaches_the_minimum_of_ceres(known_bundle: KnownBundle) -> None:
+    bundle, intrinsics = without_depth(known_bundle.bundle), known_bundle.intrinsics
+    ours = adjust_bundle(bundle, intrinsics, 100, width=1e6, tolerance=1e-12)
+    reconstruction = to_colmap(bundle, intrinsics)
+    options = pycolmap.BundleAdjustmentOptions(
+        refine_focal_length=False, refine_principal_point=False, refine_extra_params=False, print_summary=False
+    )
+    pycolmap.bundle_adjustment(reconstruction, options)
+    theirs = np.array([reconstruction.images[c + 1].cam_from_world().matrix() for c in range(12)])
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    poses[:, :3] = theirs
+    points = np.array([reconstruction.points3D[p].xyz for p in sorted(reconstruction.points3D)])
+    in_cam = np.einsum("oij,oj->oi", poses[bundle.obs_cam, :3, :3], points[bundle.obs_point])
+    xy = (in_cam + poses[bundle.obs_cam, :3, 3]) @ intrinsics.matrix.T
+    ceres_cost = (((xy[:, :2] / xy[:, 2:] - bundle.obs_xy) / 0.5) ** 2).sum()
+    assert ours.cost == pytest.approx(ceres_cost, rel=1e-4)
+
+
+def to_colmap(bundle: Bundle, intrinsics: Intrinsics) -> pycolmap.Reconstruction:
+    reconstruction = pycolmap.Reconstruction()
+    camera = colmap_camera(intrinsics)
+    camera.camera_id = 1
+    reconstruction.add_camera_with_trivial_rig(camera)
+    for c, pose in enumerate(bundle.cam_from_world):
+        mine = np.flatnonzero(bundle.obs_cam == c)
+        image = pycolmap.Image(name=str(c), keypoints=bundle.obs_xy[mine], camera_id=1, image_id=c + 1)
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+    for p, xyz in enumerate(bundle.points):
+        track = pycolmap.Track()
+        for c in range(len(bundle.cam_from_world)):
+            track.add_element(c + 1, p)
+        reconstruction.add_point3D(xyz, track, np.zeros(3, np.uint8))
+    return reconstruction
+
+
+def test_motion_only_adjustment_finds_the_pose(known_bundle: KnownBundle) -> None:
+    b, truth = known_bundle.bundle, known_bundle.cam_from_world[4]
+    mine = b.obs_cam == 4
+    start = se3.exp(np.array([0.1, -0.1, 0.05, 0.02, -0.02, 0.01])) @ truth
+    found = adjust_pose(
+        start, known_bundle.points[b.obs_point[mine]], b.obs_xy[mine], b.obs_sd[mine], known_bundle.intrinsics
+    )
+    twist = se3.log(found @ se3.inverse(truth))
+    assert 0 < np.linalg.norm(twist[:3]) < 0.01
+    assert 0 < np.linalg.norm(twist[3:]) < 0.002

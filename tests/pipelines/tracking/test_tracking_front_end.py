@@ -1,0 +1,133 @@
+"""Flow, prediction, PnP, relocalisation and the state they fill."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipelines.geometry import se3
+from pipelines.geometry.camera import project
+from pipelines.tracking.features import extract_features, frame_descriptor, match_features
+from pipelines.tracking.klt import corners, follow
+from pipelines.tracking.motion import interpolate_pose, predict_pose
+from pipelines.tracking.pnp import solve_pose
+from pipelines.tracking.state import Sightings, TrackState
+from pipelines.types import Intrinsics
+from tests.pipelines.tracking.conftest import KnownBundle
+
+
+def texture(seed: int, shape: tuple[int, int] = (200, 260)) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.5)
+    return np.clip(128 + 300 * smooth, 0, 255).astype(np.uint8)
+
+
+def test_flow_measures_a_subpixel_shift() -> None:
+    first = texture(0)
+    shift = np.array([3.3, -2.6])
+    moved = cv2.warpAffine(first, np.array([[1, 0, shift[0]], [0, 1, shift[1]]]), (260, 200), flags=cv2.INTER_CUBIC)
+    xy = corners(first, np.zeros((0, 2)), 60)
+    inner = (np.abs(xy - [130, 100]) < [100, 70]).all(1)
+    there, found = follow(first, moved, xy[inner], xy[inner].copy())
+    error = np.linalg.norm(there[found] - xy[inner][found] - shift, axis=1)
+    assert found.mean() > 0.9
+    assert 0 < np.median(error) < 0.1
+
+
+def test_flow_refuses_what_is_not_there() -> None:
+    xy = corners(texture(0), np.zeros((0, 2)), 60)
+    _, found = follow(texture(0), texture(1), xy, xy.copy())
+    assert found.mean() < 0.2
+    _, found = follow(texture(0), texture(0), xy, np.full_like(xy, np.nan))
+    assert not found.any()
+
+
+def test_corners_keep_their_distance() -> None:
+    taken = np.array([[50.0, 50.0], [100.0, 80.0]])
+    xy = corners(texture(2), taken, 100, distance=12)
+    assert len(xy) > 20
+    assert np.linalg.norm(xy[:, None] - taken, axis=2).min() > 9
+
+
+def test_prediction_follows_a_steady_screw() -> None:
+    twist = np.array([0.1, 0.02, 0, 0, 0.05, 0.01])
+    poses = {i: se3.exp(twist * i) for i in range(3)}
+    times = {i: 0.1 * i for i in range(10)}
+    assert np.allclose(predict_pose(3, poses, times), se3.exp(twist * 3))
+    uneven = {**times, 3: 0.25}
+    assert np.allclose(predict_pose(3, poses, uneven), se3.exp(twist * 2.5))
+    inside = {0: poses[0], 2: poses[2]}
+    assert np.allclose(predict_pose(1, inside, times), se3.exp(twist))
+    assert np.array_equal(predict_pose(9, poses, times), poses[2])
+    assert predict_pose(0, {}, times) is None
+    assert np.allclose(interpolate_pose(poses[0], poses[2], 0.5), poses[1])
+
+
+def test_pose_from_points_survives_outliers_and_repeats(known_bundle: KnownBundle) -> None:
+    rng = np.random.default_rng(0)
+    truth, points, camera = known_bundle.cam_from_world[2], known_bundle.points, known_bundle.intrinsics
+    xy, _ = project(points @ truth[:3, :3].T + truth[:3, 3], camera)
+    xy = xy + rng.normal(size=xy.shape) * 0.3
+    wrong = np.arange(len(xy)) < 60
+    xy[wrong] = rng.uniform(0, 1, (60, 2)) * [640, 480]
+    solved = solve_pose(xy, points, camera, seed=1)
+    assert solved is not None
+    assert solved.inliers[~wrong].mean() > 0.97
+    assert solved.inliers[wrong].mean() < 0.05
+    assert 0 < np.linalg.norm(se3.log(solved.cam_from_world @ se3.inverse(truth))) < 0.01
+    again = solve_pose(xy, points, camera, seed=1)
+    assert again is not None
+    assert again.cam_from_world.tobytes() == solved.cam_from_world.tobytes()
+
+
+def test_no_pose_from_nonsense() -> None:
+    rng = np.random.default_rng(0)
+    camera = Intrinsics(640, 480, 500, 500, 320, 240)
+    solved = solve_pose(
+        rng.uniform(0, 1, (80, 2)) * [640, 480], rng.normal(size=(80, 3)) + np.array([0, 0, 5]), camera, 0
+    )
+    assert solved is None or solved.inliers.sum() < 16
+    assert solve_pose(np.zeros((3, 2)), np.zeros((3, 3)), camera, 0) is None
+
+
+def test_features_match_a_turned_picture_and_not_another() -> None:
+    first = texture(3, (300, 300))
+    turned = np.ascontiguousarray(np.rot90(first))
+    a, b, other = (extract_features(x, 400) for x in (first, turned, texture(4, (300, 300))))
+    pairs = match_features(a, b)
+    # (x, y) goes to (y, 300 - x) in a picture turned to the left.
+    wanted = np.stack([a.xy[pairs[:, 0], 1], 300 - a.xy[pairs[:, 0], 0]], 1)
+    close = np.linalg.norm(wanted - b.xy[pairs[:, 1]], axis=1) < 1.5
+    assert len(pairs) > 100
+    assert close.mean() > 0.95
+    assert len(match_features(a, other)) < 0.1 * len(pairs)
+    assert len(match_features(a, extract_features(np.zeros((50, 50), np.uint8)))) == 0
+
+
+def test_descriptor_prefers_the_same_place() -> None:
+    first, other = (np.repeat(texture(s)[..., None], 3, 2) for s in (5, 6))
+    brighter = np.clip(first.astype(int) + 20, 0, 255).astype(np.uint8)
+    near, far = (float(frame_descriptor(first) @ frame_descriptor(x)) for x in (brighter, other))
+    assert near > 0.95 > 0.6 > far
+
+
+def test_state_comes_back_from_disk(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    state = TrackState(rng.normal(size=(5, 3)), rng.integers(0, 255, (5, 3)).astype(np.uint8))
+    state.add_frame(4, np.eye(4), Sightings(np.array([1, 1, 3]), rng.normal(size=(3, 2)), np.ones(3)), True, 0)
+    state.add_frame(6, 2 * np.eye(4), Sightings(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)), False, 1)
+    state.lost[5] = "too dark, ½"
+    state.done = 7
+    state.save(tmp_path / "s.npz")
+    back = TrackState.load(tmp_path / "s.npz")
+    assert back.sightings[4].point.tolist() == [1, 3]
+    for name in ("keyframes", "lost", "segment", "done"):
+        assert getattr(back, name) == getattr(state, name)
+    assert np.array_equal(back.points, state.points)
+    assert np.array_equal(back.poses[6], 2 * np.eye(4))
+
+
+@pytest.mark.parametrize(("frame", "wanted"), [(0, [3, 6]), (7, [6, 9, 3, 12]), (20, [12, 9])])
+def test_nearest_keyframes(frame: int, wanted: list[int]) -> None:
+    assert TrackState(keyframes=[3, 6, 9, 12]).nearest_keyframes(frame, 2) == wanted

@@ -1,0 +1,131 @@
+"""The stage on a made-up room: every frame posed, metres from the proxies, losses named, the same bytes again."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from formats.errors import InputError
+from pipelines.config import Config, load_config
+from pipelines.geometry import se3
+from pipelines.geometry.alignment import align_points
+from pipelines.run_folder import load_sparse_model
+from pipelines.stages import StageContext
+from pipelines.tracking.stage import STAGE, stretches
+from tests.pipelines.tracking.conftest import MadeRun
+
+
+def finish(context: StageContext) -> dict:
+    """Run the stage and put its folder in place, as the runner does."""
+    figures = STAGE.run(context)
+    shutil.rmtree(context.folder / "snapshot", ignore_errors=True)
+    context.folder.rename(context.run.stage("tracking"))
+    return figures
+
+
+def trajectory_error(made: MadeRun, scale: bool) -> float:
+    found = made.run.load_trajectory("tracking")
+    posed = found.is_posed
+    centres, truth = found.centers[posed], se3.inverse(made.cam_from_world)[posed, :3, 3]
+    moved = align_points(centres, truth, with_scale=scale).apply(centres)
+    return float(np.sqrt(((moved - truth) ** 2).sum(1).mean()))
+
+
+def test_poses_every_frame_in_metres(
+    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
+) -> None:
+    made = make_run(tmp_path / "run")
+    figures = finish(open_stage(made.run, "tracking"))
+    assert figures["posed"] == 24
+    assert figures["scale"] == "metric"
+    # Frames of 320 x 240 in a room of metres: millimetres, but never exact.
+    assert 0 < trajectory_error(made, scale=False) < 0.01
+    trajectory = made.run.load_trajectory("tracking")
+    assert np.allclose(trajectory.cam_from_world[0], np.eye(4), atol=1e-9)
+    assert trajectory.is_keyframe.sum() == 9
+
+
+def test_sparse_model_reprojects_and_scales_are_right(
+    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
+) -> None:
+    made = make_run(tmp_path / "run", depth_factor=1.25)
+    finish(open_stage(made.run, "tracking"))
+    model = load_sparse_model(made.run.stage("tracking") / "sparse.npz")
+    camera = made.run.load_calibration().intrinsics
+    pose, point = model.cam_from_world[model.obs_frame], model.points_in_world[model.obs_point]
+    in_cam = np.einsum("oij,oj->oi", pose[:, :3, :3], point) + pose[:, :3, 3]
+    xy = (in_cam @ camera.matrix.T)[:, :2] / in_cam[:, 2:]
+    errors = np.linalg.norm(xy - model.obs_xy, axis=1)
+    assert 0.1 < np.median(errors) < 1.0
+    # Depths a quarter too large make a world a quarter too large, and then they are right.
+    scales = made.run.load_depth_scales()
+    assert scales is not None
+    assert np.allclose(scales["scales"], 1, atol=0.01)
+    assert trajectory_error(made, scale=True) < 0.01
+    assert trajectory_error(made, scale=False) > 0.05
+
+
+def test_scale_free_proxies_leave_the_world_as_it_is(
+    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
+) -> None:
+    made = make_run(tmp_path / "run", backbone_scale=0.4, metric=False)
+    figures = finish(open_stage(made.run, "tracking"))
+    assert figures["scale"] == "free"
+    scales = made.run.load_depth_scales()
+    assert scales is not None
+    assert np.allclose(scales["scales"], 0.4, atol=0.01)
+
+
+def test_a_frame_without_picture_is_lost_and_named(
+    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
+) -> None:
+    made = make_run(tmp_path / "run", blank=(7, 8))
+    context = open_stage(made.run, "tracking")
+    figures = finish(context)
+    assert figures["posed"] == 22
+    assert set(figures["lost"]) == {"7", "8"}
+    assert any("7-8" in w for w in context.warnings)
+    assert all("agree" in reason for reason in figures["lost"].values())
+    assert 0 < trajectory_error(made, scale=False) < 0.01
+
+
+def test_interrupted_work_ends_with_the_same_bytes(
+    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
+) -> None:
+    config = load_config(overrides=["tracking.snapshot_every=5"])
+    whole, broken = make_run(tmp_path / "a"), make_run(tmp_path / "b")
+    finish(open_stage(whole.run, "tracking", config))
+    with pytest.raises(KeyboardInterrupt):
+        STAGE.run(interrupted(open_stage(broken.run, "tracking", config), after=13))
+    assert (broken.run.partial("tracking") / "snapshot" / "state.npz").exists()
+    finish(open_stage(broken.run, "tracking", config))
+    for name in ("trajectory.npz", "sparse.npz", "depth_scales.npz", "tracking.json"):
+        assert (whole.run.stage("tracking") / name).read_bytes() == (broken.run.stage("tracking") / name).read_bytes()
+
+
+def interrupted(context: StageContext, after: int) -> StageContext:
+    """A context whose progress breaks off."""
+
+    class Breaking:
+        def track(self, items, label, total=None):  # type: ignore[no-untyped-def]
+            for n, item in enumerate(items):
+                if n == after:
+                    raise KeyboardInterrupt
+                yield item
+
+    return StageContext(context.run, context.source, context.config, context.folder, Breaking())
+
+
+def test_nothing_to_go_by_is_refused(
+    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
+) -> None:
+    made = make_run(tmp_path / "run", keyframes=())
+    with pytest.raises(InputError, match="parallax"):
+        STAGE.run(open_stage(made.run, "tracking", Config()))
+
+
+def test_stretches() -> None:
+    assert stretches([1, 2, 3, 7, 9, 10]) == "1-3, 7, 9-10"
+    assert stretches([]) == ""
