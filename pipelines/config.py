@@ -56,6 +56,10 @@ class ProxyConfig:
     frames: str = setting("keyframes", "which frames get maps; all needs depth that needs no poses", ("keyframes", "all"))
     max_side: int = setting(640, "the maps are at most this many pixels on the long side")
     depth_scale: float = setting(0.001, "metres per unit of integer depth files")
+    fuse: str = setting(
+        "learned", "which depth is fused with multi-view depth: a network's, also that of files, or none",
+        ("learned", "always", "never"),
+    )
     alpha: float = setting(0.7, "eq. (2): how much depth edges lower the reliability")
     beta: float = setting(0.8, "eq. (2): exponent of the depth's confidence")
     gamma: float = setting(0.5, "eq. (2): exponent of the frame's semantic agreement")
@@ -172,6 +176,11 @@ class GlobalBaConfig:
 @dataclass(frozen=True)
 class ExportConfig:
     """Files for other programs."""
+
+    mesh_voxel_px: float = setting(2.0, "side of a voxel of the mesh, in pixels at the median depth")
+    mesh_memory_mb: float = setting(800.0, "most memory for voxels; larger voxels are taken where they would not fit")
+    mesh_min_views: float = setting(1.5, "surface seen by fewer views (at the median depth) than this is left out")
+    mesh_min_part: float = setting(0.005, "connected parts with less than this share of all faces are floaters")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""Stage 6: the results as files that other programs open."""
