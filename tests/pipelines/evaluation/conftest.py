@@ -54,6 +54,7 @@ def oracle_run(truth: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Ora
         wrong_centers: NDArray | None = None,
         video: bool = False,
         hold_out: int = 0,
+        mesh: bool = False,
     ) -> RunFolder:
         run = RunFolder(tmp_path_factory.mktemp("oracle") / "walk.msgs")
         move = world_from_truth or Similarity(1.0, np.eye(3), np.zeros(3))
@@ -65,7 +66,8 @@ def oracle_run(truth: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Ora
         save_map(run.stage("mapping"), gaussian_map)
         save_trajectory(run.stage("mapping"), trajectory)
         write_json(run.stage("mapping") / "mapping.json", {"class_ids": class_ids})
-        _write_mesh(run.stage("export") / "mesh.ply", gaussian_map)
+        if mesh:
+            _write_mesh(run.stage("export") / "mesh.ply", gaussian_map)
         config = Config(mapping=MappingConfig(hold_out=hold_out))
         write_text(run.settings_file, config_to_toml(config))
         record = asdict(StageRecord("", {}, 2.0, 100.0, {}, [], ""))

@@ -24,7 +24,7 @@ MOVE = Similarity(2.5, Rotation.from_euler("xyz", (0.3, -0.5, 0.9)).as_matrix(),
 
 
 def test_every_cell_of_a_true_run(oracle_run: OracleRun, truth: Sequence) -> None:
-    run = oracle_run(hold_out=8)
+    run = oracle_run(hold_out=8, mesh=True)
     result = write_evaluation(run, truth, max_views=4, legacy=True)
     assert json.loads((run.root / "evaluation" / "evaluation.json").read_text()) == result
     assert result["frames"]["posed"] == 32
@@ -55,7 +55,7 @@ def test_every_cell_of_a_true_run(oracle_run: OracleRun, truth: Sequence) -> Non
 
 
 def test_a_similarity_of_the_whole_run_changes_no_figure_but_the_scale(oracle_run: OracleRun, truth: Sequence) -> None:
-    plain, moved = (evaluate_run(oracle_run(m, metric=False), truth, max_views=2) for m in (None, MOVE))
+    plain, moved = (evaluate_run(oracle_run(m, metric=False, mesh=True), truth, max_views=2) for m in (None, MOVE))
     assert moved["trajectory"]["sim3 all"]["scale"] == pytest.approx(0.4, rel=1e-6)
     assert moved["trajectory"]["sim3 all"]["max"] < 1e-6
     assert "missing" in moved["trajectory"]["se3 all"]
