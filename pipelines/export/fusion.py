@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
+from pipelines.gaussians.render.jit import kernel
 from pipelines.gaussians.render.threads import for_each
 from pipelines.types import Intrinsics
 
@@ -158,7 +158,7 @@ def unpack_keys(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.stack([keys >> (2 * _BITS), (keys >> _BITS) & low, keys & low], axis=1) - (1 << (_BITS - 1))
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _integrate_blocks(origins, distances, weights, depth, weight, pose, camera, voxel_size):  # type: ignore[no-untyped-def] # fmt: skip
     height, width = depth.shape
     for b in range(origins.shape[0]):
