@@ -177,6 +177,14 @@ class GlobalBaConfig:
 class ExportConfig:
     """Files for other programs."""
 
+    voxel: float = setting(0.008, "voxel of the mesh, in units of the scene's median depth")
+    truncation: float = setting(4.0, "voxels on either side of a surface that a depth speaks for")
+    max_blocks: int = setting(80000, "blocks of 8 x 8 x 8 voxels; voxels grow where more would be needed")
+    max_views: int = setting(200, "keyframes the mesh is fused from, evenly spread")
+    mesh_side: int = setting(640, "pixels on the long side of their depth images")
+    least_weight: float = setting(1.5, "a voxel seen with less weight, in views at the median depth, has no surface")
+    least_piece: float = setting(0.01, "connected pieces smaller than this share of the largest one are removed")
+
     mesh_voxel_px: float = setting(2.0, "side of a voxel of the mesh, in pixels at the median depth")
     mesh_memory_mb: float = setting(800.0, "most memory for voxels; larger voxels are taken where they would not fit")
     mesh_min_views: float = setting(1.5, "surface seen by fewer views (at the median depth) than this is left out")

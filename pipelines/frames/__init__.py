@@ -1,0 +1,1 @@
+"""Stage 1: from a source to frames, a calibrated camera and a backbone of keyframes."""

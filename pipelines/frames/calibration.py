@@ -82,8 +82,8 @@ def _from_numbers(numbers: list[float], width: int, height: int, where: str) -> 
     fx, fy, cx, cy = numbers[:4]
     if not (0 < cx < width and 0 < cy < height):
         raise InputError(
-            f"{where}: the principal point ({cx:g}, {cy:g}) lies outside the {width}x{height} source: give it in pixels "
-            "of the source, in the order fx,fy,cx,cy"
+            f"{where}: the principal point ({cx:g}, {cy:g}) lies outside the {width}x{height} source: give it in "
+            "pixels of the source, in the order fx,fy,cx,cy"
         )
     return Camera(width, height, fx, fy, cx, cy, distortion)
 

@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from pipelines.frames.adjust import reprojection_errors
 from pipelines.frames.matching import VerifiedPair
 
 _AGREE_PX = 4.0
@@ -17,7 +18,7 @@ _PAIR_AGREES = 0.5
 
 @dataclass(frozen=True)
 class ModelReport:
-    """registered of total keyframes; mean reprojection error in pixels; points.
+    """registered of total keyframes; median reprojection error in pixels; points.
 
     `agreement`: share of the verified matches between registered keyframes that lie within 4 px of the epipolar line
     of the final poses; `pairs_agreeing`: share of the pairs of which more than half of the matches do. A folded
@@ -47,7 +48,7 @@ def judge(
 ) -> ModelReport:
     """Report on a model; `pairs` are indices i of keyframes whose image id is i + 1, `xy` their features' pixels."""
     camera = model.cameras[1]
-    rays = {i - 1: camera.cam_from_img(xy[i - 1]) for i in model.reg_image_ids()}
+    rays = {i - 1: np.asarray(camera.cam_from_img(xy[i - 1])) for i in model.reg_image_ids()}
     poses = {i: model.images[i + 1].cam_from_world().matrix() for i in rays}
     focal = camera.mean_focal_length()
     agreeing, matches, good_pairs, seen = 0, 0, 0, 0
@@ -62,7 +63,7 @@ def judge(
         agreeing, matches = agreeing + agree, matches + len(error)
         good_pairs, seen = good_pairs + (agree > _PAIR_AGREES * len(error)), seen + 1
     return ModelReport(
-        model.num_reg_images(), total, model.num_points3D(), float(model.compute_mean_reprojection_error()),
+        model.num_reg_images(), total, model.num_points3D(), float(np.median(reprojection_errors(model))),
         agreeing / max(matches, 1), good_pairs / max(seen, 1),
     )  # fmt: skip
 

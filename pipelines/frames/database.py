@@ -46,7 +46,7 @@ def _write_pair(database: pycolmap.Database, pair: VerifiedPair) -> None:
     geometry = pycolmap.TwoViewGeometry()
     geometry.config = pair.config
     geometry.inlier_matches = pair.matches
-    for name, matrix in (("F", pair.fundamental), ("E", pair.essential), ("H", pair.homography)):
+    for name, matrix in zip("FEH", pair.matrices, strict=True):
         if matrix.any():
             setattr(geometry, name, matrix)
     database.write_matches(pair.first + 1, pair.second + 1, pair.matches)

@@ -74,7 +74,8 @@ class _Tracker:
     def restart(self, gray: NDArray[np.uint8]) -> None:
         """Take `gray`, the frame advanced to last, as the keyframe."""
         corners = cv2.goodFeaturesToTrack(gray, _MAX_CORNERS, 0.005, 6)
-        self._origin = np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
+        found = np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2)
+        self._origin = found.astype(np.float32)
         self._points = self._origin
         self._started = len(self._origin)
 
@@ -96,7 +97,8 @@ class _Tracker:
 def _track(
     first: NDArray[np.uint8], second: NDArray[np.uint8], points: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(first, second, points, None, winSize=_WINDOW, maxLevel=4)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, moved, None, winSize=_WINDOW, maxLevel=4)
+    guess = points.copy()  # OpenCV wants an array here, and without a flag does not read it
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(first, second, points, guess, winSize=_WINDOW, maxLevel=4)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, moved, guess.copy(), winSize=_WINDOW, maxLevel=4)
     close = np.linalg.norm(back - points, axis=1) < _BACKWARD_PX
-    return moved, (found.ravel() == 1) & (found_back.ravel() == 1) & close
+    return np.asarray(moved, np.float32), (found.ravel() == 1) & (found_back.ravel() == 1) & close

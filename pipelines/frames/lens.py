@@ -22,7 +22,7 @@ def to_pycolmap(camera: Camera) -> pycolmap.Camera:
     if model == "OPENCV":
         params += list(camera.distortion[:4])
     made = pycolmap.Camera.create_from_model_name(1, model, camera.fx, camera.width, camera.height)
-    made.params = np.array(params, dtype=np.float64)
+    made.params = params
     made.has_prior_focal_length = True
     return made
 
@@ -34,11 +34,20 @@ def unknown_camera(width: int, height: int, focal: float, is_prior: bool) -> pyc
     return made
 
 
+def with_second_radial(camera: pycolmap.Camera) -> None:
+    """Turn a SIMPLE_RADIAL camera into a RADIAL one in place, its second coefficient zero."""
+    params = [*camera.params, 0.0]
+    camera.model = pycolmap.CameraModelId.RADIAL
+    camera.params = params
+
+
 def distortion_of(camera: pycolmap.Camera) -> tuple[float, float, float, float]:
     """(k1, k2, p1, p2); zeros for a pinhole."""
     params = [float(p) for p in camera.params]
     if camera.model == pycolmap.CameraModelId.SIMPLE_RADIAL:
         return params[3], 0.0, 0.0, 0.0
+    if camera.model == pycolmap.CameraModelId.RADIAL:
+        return params[3], params[4], 0.0, 0.0
     if camera.model == pycolmap.CameraModelId.OPENCV:
         return params[4], params[5], params[6], params[7]
     return 0.0, 0.0, 0.0, 0.0
@@ -59,13 +68,13 @@ class Lens:
 
     def undistort_points(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
         """(M, 2) pixels of the source to pixels of the pinhole."""
-        rays = self.camera.cam_from_img(np.ascontiguousarray(xy, dtype=np.float64))
+        rays = np.asarray(self.camera.cam_from_img(np.ascontiguousarray(xy, dtype=np.float64)))
         return rays * [self.pinhole.fx, self.pinhole.fy] + [self.pinhole.cx, self.pinhole.cy]
 
     def undistort_image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """(H, W, 3) of the source as the pinhole sees it."""
         x, y = self._maps()
-        return cv2.remap(rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return cv2.remap(rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.uint8, copy=False)
 
     def _maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         columns, rows = np.meshgrid(np.arange(self.pinhole.width) + 0.5, np.arange(self.pinhole.height) + 0.5)
@@ -109,7 +118,7 @@ def _inside(camera: pycolmap.Camera, pinhole: Intrinsics, border: NDArray[np.flo
 def _distort(camera: pycolmap.Camera, pinhole: Intrinsics, xy: NDArray[np.float64]) -> NDArray[np.float64]:
     rays = np.ones((len(xy), 3))
     rays[:, :2] = (xy - [pinhole.cx, pinhole.cy]) / [pinhole.fx, pinhole.fy]
-    return camera.img_from_cam(rays)
+    return np.asarray(camera.img_from_cam(rays))
 
 
 def _border(width: int, height: int) -> NDArray[np.float64]:

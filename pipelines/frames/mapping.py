@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pycolmap
 
+# pycolmap tells of each step on stderr, through the progress bars, and misses images, which it is not given.
+pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+
 
 def calibrate_focal(database: Path, seed: int) -> None:
     """Estimate the focal length in `database` from the fundamental matrices, and make its pairs calibrated ones."""

@@ -27,16 +27,15 @@ class VerifiedPair:
     """Two keyframes (indices into the keyframes, first < second) whose matches obey one geometry.
 
     matches (M, 2) uint32 feature indices; `config` is pycolmap's TwoViewGeometryConfiguration as a number.
-    F, E, H (3, 3) float64, zero where the configuration has none.
+    matrices (3, 3, 3) float64 are F, E and H, zero where the configuration has none. `proposed` counts the matches
+    before verification.
     """
 
     first: int
     second: int
     matches: NDArray[np.uint32]
     config: int
-    fundamental: NDArray[np.float64]
-    essential: NDArray[np.float64]
-    homography: NDArray[np.float64]
+    matrices: NDArray[np.float64]
     proposed: int
 
 
@@ -112,9 +111,8 @@ def verify_matches(
     inliers = np.asarray(geometry.inlier_matches, dtype=np.uint32).reshape(-1, 2)
     if len(inliers) < options.min_inliers:
         return None
-    return VerifiedPair(
-        *pair, inliers, int(geometry.config), *(_matrix(m) for m in (geometry.F, geometry.E, geometry.H)), len(matches)
-    )
+    matrices = np.stack([_matrix(m) for m in (geometry.F, geometry.E, geometry.H)])
+    return VerifiedPair(*pair, inliers, int(geometry.config), matrices, len(matches))
 
 
 def pair_seed(seed: int, pair: tuple[int, int]) -> int:

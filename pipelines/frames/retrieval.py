@@ -36,11 +36,11 @@ def _vocabulary(features: Sequence[Features], rng: np.random.Generator) -> NDArr
         counts = np.bincount(nearest, minlength=len(words))
         sums = np.zeros(words.shape, np.float64)
         np.add.at(sums, nearest, sample)
-        words = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], words).astype(np.float32)
-    return words
+        words = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], words)
+    return words.astype(np.float32)
 
 
-def _nearest_word(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:
+def _nearest_word(descriptors: NDArray[np.floating], words: NDArray[np.floating]) -> NDArray[np.int64]:
     # float64 and rounding: which BLAS kernel adds in which order must not decide between two near-equal words.
     score = descriptors.astype(np.float64) @ words.T.astype(np.float64) - (words.astype(np.float64) ** 2).sum(1) / 2
     return np.argmax(np.round(score, 9), axis=1)

@@ -28,4 +28,6 @@ def reduce_image(image: NDArray[np.uint8], max_side: int) -> NDArray[np.uint8]:
     """The image with its long side at most `max_side` pixels, averaged; itself when it is small enough."""
     height, width = image.shape[:2]
     size = reduced_size(width, height, max_side)
-    return image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    if size == (width, height):
+        return image
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)

@@ -65,7 +65,7 @@ def _pack(pairs: Sequence[VerifiedPair]) -> dict[str, NDArray]:
     return {
         "index": np.array([(p.first, p.second, p.config, p.proposed, len(p.matches)) for p in pairs]).reshape(-1, 5),
         "matches": _concatenated([p.matches for p in pairs]),
-        "matrices": np.array([(p.fundamental, p.essential, p.homography) for p in pairs]).reshape(-1, 3, 3, 3),
+        "matrices": np.array([p.matrices for p in pairs]).reshape(-1, 3, 3, 3),
     }
 
 
@@ -73,7 +73,7 @@ def _unpack(arrays: dict[str, NDArray]) -> list[VerifiedPair]:
     index = arrays["index"].astype(np.int64)
     ends = np.cumsum(index[:, 4])
     return [
-        VerifiedPair(int(i), int(j), arrays["matches"][end - count : end], int(config), *matrices, int(proposed))
+        VerifiedPair(int(i), int(j), arrays["matches"][end - count : end], int(config), matrices, int(proposed))
         for (i, j, config, proposed, count), end, matrices in zip(index, ends, arrays["matrices"], strict=True)
     ]
 

@@ -169,8 +169,8 @@ def _require_one_size(folder: Path, sizes: dict[str, tuple[int, int]]) -> None:
         width, height = sizes[others[0]]
         raise InputError(
             f"the images of {folder} differ in size: {first_name} is {first[0]}x{first[1]}, {others[0]} is "
-            f"{width}x{height} ({len(others)} of {len(sizes)} differ from the first): keep the images of one camera and "
-            "one orientation in the folder"
+            f"{width}x{height} ({len(others)} of {len(sizes)} differ from the first): keep the images of one camera "
+            "and one orientation in the folder"
         )
 
 
@@ -187,8 +187,8 @@ def _warn_of_damage(path: Path, reader: VideoReader, warn: Warn) -> None:
     # Containers count a frame or two too many in passing; that is no damage.
     if reader.missing_frames > max(2, reader.info.frame_count_claimed // 50):
         warn(
-            f"{path.name} is truncated: its header promises {reader.info.frame_count_claimed} frames, {decoded} decode; "
-            "going on with those"
+            f"{path.name} is truncated: its header promises {reader.info.frame_count_claimed} frames, {decoded} "
+            "decode; going on with those"
         )
     if reader.unreadable_frames:
         warn(f"{path.name}: {reader.unreadable_frames} damaged frames were left out")

@@ -146,7 +146,7 @@ def _keyframes(context: StageContext, frames: list[Frame]) -> KeyframeChoice:
 
 
 def _gray(context: StageContext, frame: Frame) -> NDArray[np.uint8]:
-    return cv2.cvtColor(read_rgb(_picked(context, frame.name)), cv2.COLOR_RGB2GRAY)
+    return np.asarray(cv2.cvtColor(read_rgb(_picked(context, frame.name)), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
 def _structure(
@@ -165,7 +165,7 @@ def _structure(
     report = structure.report
     if report.registered < report.total:
         context.warn(
-            f"{report.total - report.registered} of {report.total} keyframes could not be placed by structure from motion"
+            f"structure from motion could not place {report.total - report.registered} of {report.total} keyframes"
         )
     if not report.is_sound:
         context.warn(
