@@ -1,0 +1,210 @@
+"""Loops on a made-up walk round a room of points: found, closed, and not believed where they cannot be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.config import GlobalBaConfig, TrackingConfig
+from pipelines.geometry import se3
+from pipelines.geometry.alignment import align_points
+from pipelines.geometry.camera import project
+from pipelines.global_ba.appearance import describe_keyframes
+from pipelines.global_ba.candidates import loop_candidates, shared_points
+from pipelines.global_ba.close import close_loops, reprojection_error
+from pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_found
+from pipelines.global_ba.semantics import summarise_labels
+from pipelines.global_ba.verify import KeyframeView, make_view, verify_loop
+from pipelines.tracking.features import Features
+from pipelines.tracking.state import TrackState
+from pipelines.types import Intrinsics, SparseModel
+
+Array = NDArray[np.float64]
+CAMERA = Intrinsics(640, 480, 400, 400, 320, 240)
+SETTINGS = GlobalBaConfig(loop_gap=6)
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Keyframes of a walk whose end passes over its beginning, though no point is known to be the same."""
+
+    truth: Array
+    model: SparseModel
+    features: list[Features]
+
+    def views(self) -> list[KeyframeView]:
+        state = TrackState.from_backbone(self.model, 0.5)
+        rows = zip(self.model.frame_ids.tolist(), self.model.cam_from_world, self.features, strict=True)
+        points = self.model.points_in_world
+        return [make_view(i, p, f, state.sightings[i], points, np.zeros(len(f.xy)), CAMERA) for i, p, f in rows]
+
+    def pairs(self, settings: GlobalBaConfig = SETTINGS) -> list[tuple[int, int]]:
+        nothing = [summarise_labels(np.full((4, 4), 255, np.uint8), 3)] * len(self.features)
+        looks = describe_keyframes([f.descriptors for f in self.features], 16, 0)
+        return loop_candidates(self.model, looks, nothing, settings)
+
+    def find(self) -> FoundLoops:
+        return find_loops(self.pairs(), self.views(), CAMERA, SETTINGS, 0)
+
+
+def circle_poses(count: int, laps: float) -> Array:
+    """Cameras on a circle of radius 1, looking outwards."""
+    out = np.tile(np.eye(4), (count, 1, 1))
+    for k, angle in enumerate(np.linspace(0, 2 * np.pi * laps, count)):
+        c, s = np.cos(angle), np.sin(angle)
+        forward, right = np.array([c, 0, s]), np.array([-s, 0, c])
+        world_from_cam = np.eye(4)
+        world_from_cam[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+        world_from_cam[:3, 3] = forward
+        out[k] = np.linalg.inv(world_from_cam)
+    return out
+
+
+def make_walk(drift: float = 0.0, scale_drift: float = 0.0, twins: bool = False) -> Walk:
+    """40 keyframes, 1.12 laps. With `twins` the far side of the room carries the same texture as the near one."""
+    rng = np.random.default_rng(0)
+    count = 2400
+    angle = rng.uniform(0, 2 * np.pi, count)
+    radius = rng.uniform(3, 4.5, count)
+    points = np.stack([radius * np.cos(angle), rng.uniform(-1.5, 1.5, count), radius * np.sin(angle)], 1)
+    words = np.abs(rng.normal(size=(count, 128)))
+    if twins:
+        half = count // 2
+        points[half:] = points[:half] * [-1, 1, -1]
+        words[half:] = words[:half]
+    descriptors = np.sqrt(words / words.sum(1, keepdims=True)).astype(np.float32)
+    truth = circle_poses(40, 1.12)
+    features, frame, point, pixels = [], [], [], []
+    for k, pose in enumerate(truth):
+        xy, z = project(points @ pose[:3, :3].T + pose[:3, 3], CAMERA)
+        seen = np.flatnonzero((z > 0.5) & (xy > 0).all(1) & (xy < [640, 480]).all(1))
+        noisy = xy[seen] + rng.normal(size=(len(seen), 2)) * 0.4
+        features.append(Features(noisy, descriptors[seen]))
+        # In its second lap the walk does not know the points of the first again.
+        point.append(seen + (count if k >= 34 else 0))
+        frame.append(np.full(len(seen), k))
+        pixels.append(noisy)
+    poses, factors = drifted(truth, drift, scale_drift)
+    world = np.concatenate([points, points])
+    frames, owners = np.concatenate(frame), np.concatenate(point)
+    first = np.full(len(world), 0)
+    first[owners[::-1]] = frames[::-1]
+    in_cam = np.einsum("pij,pj->pi", truth[first, :3, :3], world) + truth[first, :3, 3]
+    back = se3.inverse(poses)[first]
+    moved = np.einsum("pij,pj->pi", back[:, :3, :3], in_cam * factors[first, None]) + back[:, :3, 3]
+    colors = np.zeros((len(world), 3), np.uint8)
+    model = SparseModel(np.arange(40), poses, moved, colors, frames, owners, np.concatenate(pixels))
+    return Walk(truth, model, features)
+
+
+def drifted(truth: Array, angle: float, growth: float) -> tuple[Array, Array]:
+    """Poses that turn and grow a little too much at every step, and each one's scale."""
+    poses, factors = [truth[0]], [1.0]
+    for k in range(1, len(truth)):
+        step = truth[k] @ se3.inverse(truth[k - 1])
+        step = se3.exp(np.array([0, 0, 0, 0.3 * angle, angle, 0])) @ step
+        factors.append(factors[-1] * (1 + growth))
+        step[:3, 3] *= factors[-1]
+        poses.append(step @ poses[-1])
+    return np.array(poses), np.array(factors)
+
+
+def error(poses: Array, truth: Array) -> float:
+    centres, wanted = se3.inverse(poses)[:, :3, 3], se3.inverse(truth)[:, :3, 3]
+    moved = align_points(centres, wanted).apply(centres)
+    return float(np.sqrt(((moved - wanted) ** 2).sum(1).mean()))
+
+
+def test_candidates_are_revisits() -> None:
+    walk = make_walk()
+    pairs = walk.pairs()
+    assert len(pairs) >= 4
+    lap = 39 / 1.12
+    apart = [abs(b - a - lap) for a, b in pairs[:4]]
+    assert max(apart) < 5
+    shared = shared_points(walk.model)
+    assert all(shared[a, b] == 0 for a, b in pairs)
+    assert shared[3, 4] > 100
+
+
+def test_verified_loop_has_the_true_motion() -> None:
+    walk = make_walk(drift=0.002, scale_drift=0.003)
+    views = walk.views()
+    loop = verify_loop(views[2], views[37], CAMERA, SETTINGS, 0)
+    assert loop is not None
+    truth = walk.truth[37] @ se3.inverse(walk.truth[2])
+    apart = se3.log(loop.edge.frame2_from_frame1 @ se3.inverse(truth))
+    assert 0 < np.linalg.norm(apart) < 0.05
+    # The second lap has grown by 0.3 % at each of the steps since the first sighting of its points.
+    assert loop.edge.scale == pytest.approx(1.003**35, rel=0.02)
+
+
+def test_places_without_overlap_are_not_verified() -> None:
+    views = make_walk().views()
+    assert verify_loop(views[2], views[20], CAMERA, SETTINGS, 0) is None
+
+
+@pytest.mark.parametrize(("drift", "growth"), [(0.0, 0.0), (0.0015, 0.001), (-0.001, -0.002)])
+def test_closing_takes_the_drift_away(drift: float, growth: float) -> None:
+    walk = make_walk(drift, growth)
+    found = walk.find()
+    assert len(found.loops) >= 3
+    state = TrackState.from_backbone(walk.model, 0.5)
+    before = error(walk.model.cam_from_world, walk.truth)
+    closed = close_loops(state, found.loops, drift != 0, CAMERA, lambda _: None, False, TrackingConfig(), SETTINGS)
+    after = error(np.array([state.poses[k] for k in range(40)]), walk.truth)
+    assert 0 < after < 0.004
+    assert drift == 0 or before > 0.015
+    assert closed.error_after <= closed.error_before * 1.1
+
+
+def test_equal_texture_on_the_far_side_is_no_loop() -> None:
+    walk = make_walk(twins=True)
+    views = walk.views()
+    # The pair matches and verifies: appearance and local geometry cannot know better.
+    trap = verify_loop(views[2], views[20], CAMERA, SETTINGS, 0)
+    assert trap is not None
+    assert trap.edge.inliers > 50
+    found = find_loops([(2, 20), (3, 21), (4, 22), (2, 37), (3, 38)], views, CAMERA, SETTINGS, 0)
+    assert found.implausible == 3
+    assert {(x.edge.frame1_id, x.edge.frame2_id) for x in found.loops} == {(2, 37), (3, 38)}
+
+
+def test_a_weak_loop_needs_a_neighbour_that_agrees() -> None:
+    walk = make_walk()
+    strict = replace(SETTINGS, loop_sure_inliers=10**6)
+    alone = replace(SETTINGS, loop_sure_inliers=10**6, loop_rotation=1e-4, loop_translation=1e-5)
+    assert len(find_loops([(2, 37)], walk.views(), CAMERA, strict, 0).loops) == 1
+    assert len(find_loops([(2, 37)], walk.views(), CAMERA, alone, 0).loops) == 0
+
+
+def test_reprojection_error_is_that_of_the_noise() -> None:
+    state = TrackState.from_backbone(make_walk().model, 0.5)
+    # Median of a Rayleigh variable of sigma 0.4.
+    assert reprojection_error(state, CAMERA) == pytest.approx(0.4 * 1.1774, rel=0.05)
+
+
+def test_found_loops_come_back_from_disk(tmp_path: Path) -> None:
+    found = make_walk().find()
+    save_found(tmp_path / "loops.npz", found)
+    back = load_found(tmp_path / "loops.npz")
+    assert (back.tried, back.unverified) == (found.tried, found.unverified)
+    for a, b in zip(found.loops, back.loops, strict=True):
+        assert a.edge.inliers == b.edge.inliers
+        assert np.array_equal(a.edge.frame2_from_frame1, b.edge.frame2_from_frame1)
+        assert np.array_equal(a.in_first.xy, b.in_first.xy)
+        assert np.array_equal(a.in_second.point, b.in_second.point)
+    empty = FoundLoops([], 3, 3, 0, 0)
+    save_found(tmp_path / "none.npz", empty)
+    assert load_found(tmp_path / "none.npz") == empty
+
+
+def test_search_is_repeatable() -> None:
+    first, second = make_walk().find(), make_walk().find()
+    assert [x.edge.frame2_from_frame1.tobytes() for x in first.loops] == [
+        x.edge.frame2_from_frame1.tobytes() for x in second.loops
+    ]

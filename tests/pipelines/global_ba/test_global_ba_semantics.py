@@ -1,0 +1,67 @@
+"""Richness and likeness of label images (eqs. 21 to 24), and VLAD."""
+
+import numpy as np
+import pytest
+
+from pipelines.global_ba.appearance import describe_keyframes, learn_vocabulary
+from pipelines.global_ba.semantics import mean_iou, richness, similarity, structure_similarity, summarise_labels
+from pipelines.types import VOID
+
+
+def stripes(count: int) -> np.ndarray:
+    return np.repeat(np.arange(count), 120 // count)[None].repeat(90, 0).astype(np.uint8)
+
+
+def test_more_classes_and_borders_are_richer() -> None:
+    summaries = [summarise_labels(stripes(n), 8) for n in (1, 2, 4, 8)]
+    assert np.argsort(richness(summaries)).tolist() == [0, 1, 2, 3]
+    assert summaries[0].entropy == 0
+    assert summaries[3].entropy == pytest.approx(np.log(8), rel=1e-3)
+    assert summaries[1].boundary < summaries[2].boundary
+
+
+def test_only_the_top_tenth_is_rich() -> None:
+    rng = np.random.default_rng(0)
+    summaries = [
+        summarise_labels(rng.integers(0, rng.integers(1, 9), (90, 120)).astype(np.uint8), 9) for _ in range(40)
+    ]
+    assert 1 <= (richness(summaries) > 0.9).sum() <= 5
+
+
+def test_mean_iou_of_known_pictures() -> None:
+    first = np.array([[0, 0, 1, 1]], np.uint8)
+    second = np.array([[0, 1, 1, VOID]], np.uint8)
+    # Known in both: three pixels; class 0: 1 of 2, class 1: 1 of 2.
+    assert mean_iou(first, second) == pytest.approx(0.5)
+    assert mean_iou(first, first) == 1
+    assert mean_iou(first, np.full_like(first, VOID)) == 0
+
+
+def test_structure_knows_neighbours() -> None:
+    a = summarise_labels(stripes(4), 4)
+    shuffled = summarise_labels(np.array([0, 2, 1, 3], np.uint8)[stripes(4)], 4)
+    assert structure_similarity(a.graph, a.graph) == pytest.approx(1)
+    assert structure_similarity(a.graph, shuffled.graph) < 1
+    assert similarity(a, a, 1.0, (0.4, 0.3, 0.3)) == pytest.approx(1)
+    assert similarity(a, shuffled, 0.0, (0.4, 0.3, 0.3)) < 0.6
+
+
+def test_vlad_brings_the_same_place_together() -> None:
+    rng = np.random.default_rng(0)
+
+    def seen(place: np.ndarray) -> np.ndarray:
+        words = np.abs(place + rng.normal(size=place.shape) * 0.1)
+        return (words / np.linalg.norm(words, axis=1, keepdims=True)).astype(np.float32)
+
+    places = [np.abs(rng.normal(size=(200, 32))) for _ in range(6)]
+    vectors = describe_keyframes([seen(places[i]) for i in (0, 1, 2, 3, 4, 5, 0)], 8, 0)
+    scores = vectors @ vectors[0]
+    assert scores[1:6].max() < 0.5 < scores[6]
+    assert np.allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-5)
+
+
+def test_vocabulary_is_repeatable_and_bounded() -> None:
+    data = np.random.default_rng(0).normal(size=(50, 8)).astype(np.float32)
+    assert learn_vocabulary(data, 4, 3).tobytes() == learn_vocabulary(data, 4, 3).tobytes()
+    assert len(learn_vocabulary(data[:3], 8, 0)) == 3
+    assert describe_keyframes([np.zeros((0, 8), np.float32)] * 2, 4, 0).shape[0] == 2
