@@ -72,6 +72,7 @@ def evaluate_outcome(
         "frames": frame_cells(outcome, matched),
         "camera": camera_cells(outcome, truth),
         "trajectory": trajectory,
+        "frame errors": frame_errors(outcome, matched, alignment),
         **(measured.cells(outcome, matched) if measured else _without_map(outcome)),
         "mesh": mesh_cells(outcome, matched, alignment),
         "cost": cost_cells(outcome),
@@ -132,6 +133,14 @@ def trajectory_cells(outcome: Outcome, matched: MatchedTruth) -> tuple[dict[str,
     cells["rpe"] = _rpe(estimate[usable], truth[usable], sim3.alignment.scale)
     best = absolute_error(estimate[usable, :3, 3], truth[usable, :3, 3], False) if outcome.metric else sim3
     return cells, best
+
+
+def frame_errors(outcome: Outcome, matched: MatchedTruth, alignment: AbsoluteError | None) -> list[list[float]]:
+    """[frame id, metres] of every frame that the alignment was made from."""
+    if alignment is None:
+        return []
+    ids = outcome.trajectory.frame_ids[outcome.trajectory.is_posed & matched.has_pose]
+    return [[int(i), float(e)] for i, e in zip(ids, alignment.errors, strict=True)]
 
 
 def _ate(centers: NDArray, true_centers: NDArray, with_scale: bool) -> dict[str, Any]:

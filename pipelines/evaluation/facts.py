@@ -1,0 +1,174 @@
+"""What a run says about its capture, frame by frame, and what to do better next time, in plain words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.evaluation.outcome import Outcome
+from pipelines.types import LoopEdge, SparseModel
+
+_BLURRED = 0.35
+_DARK, _BRIGHT = 35.0, 225.0
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Per picked frame: sharpness (N,) relative to the median, brightness (N,) 0..255; per posed frame of the sparse
+    model: points (F,) seen; per proxied frame: reliability (P,) mean U. ids (.,) go with each."""
+
+    sharpness: NDArray[np.float64]
+    brightness: NDArray[np.float64]
+    point_ids: NDArray[np.int64]
+    points: NDArray[np.int64]
+    proxy_ids: NDArray[np.int64]
+    reliability: NDArray[np.float64]
+
+
+def read_capture(outcome: Outcome, sparse: SparseModel | None) -> Capture:
+    """Reads every frame once, and every proxy."""
+    sharpness = np.array([f.sharpness for f in outcome.frames], np.float64)
+    brightness = np.array([float(outcome.run.image(f)[::8, ::8].mean()) for f in outcome.frames])
+    ids = np.zeros(0, np.int64) if sparse is None else np.asarray(sparse.frame_ids, np.int64)
+    points = np.zeros(0, np.int64) if sparse is None else np.bincount(sparse.obs_frame, minlength=len(ids))
+    proxied = [f.id for f in outcome.frames if outcome.run.has_proxy(f.id)]
+    reliability = np.array([float(outcome.run.load_proxy(i).confidence.mean()) for i in proxied])
+    relative = sharpness / max(float(np.median(sharpness)), 1e-9)
+    return Capture(relative, brightness, ids, points, np.array(proxied, np.int64), reliability)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Consecutive frames that are lost for one reason; seconds in the source."""
+
+    first: int
+    last: int
+    start: float
+    end: float
+    reason: str
+
+
+def lost_stretches(outcome: Outcome) -> list[Stretch]:
+    """Lost frames, neighbours with the same reason together."""
+    t = outcome.trajectory
+    stretches: list[Stretch] = []
+    for row, reason in enumerate(t.lost_reasons):
+        if not reason:
+            continue
+        frame, time = int(t.frame_ids[row]), float(t.timestamps[row])
+        previous = stretches[-1] if stretches else None
+        if previous and previous.last == frame - 1 and previous.reason == reason:
+            stretches[-1] = Stretch(previous.first, frame, previous.start, time, reason)
+        else:
+            stretches.append(Stretch(frame, frame, time, time, reason))
+    return stretches
+
+
+def advice(
+    outcome: Outcome, capture: Capture, sparse: SparseModel | None, loops: list[LoopEdge], psnr: float | None
+) -> list[str]:
+    """Sentences for whoever holds the camera; empty when there is nothing to say."""
+    found = [
+        *_about_pictures(capture),
+        *_about_motion(outcome, sparse, loops),
+        *_about_texture(capture),
+        *_about_camera(outcome),
+    ]
+    if psnr is not None and psnr < 20:
+        found.append(
+            f"The map shows its own keyframes at {psnr:.1f} dB only: moving people, mirrors and changing light are "
+            "usual causes."
+        )
+    return found
+
+
+def _about_pictures(capture: Capture) -> list[str]:
+    found = []
+    blurred = int((capture.sharpness < _BLURRED).sum())
+    if blurred > 0.05 * len(capture.sharpness):
+        found.append(
+            f"{blurred} of {len(capture.sharpness)} frames are blurred (less than a third as sharp as usual): move "
+            "more slowly, or put on more light so that the shutter is shorter."
+        )
+    swing = float(np.quantile(capture.brightness, 0.95) - np.quantile(capture.brightness, 0.05))
+    if swing > 0.35 * float(capture.brightness.mean()):
+        found.append(
+            f"The brightness changes by {swing:.0f} of 255 along the way: lock the exposure of the camera "
+            "(a long press on most phones)."
+        )
+    dark, bright = (float((capture.brightness < _DARK).mean()), float((capture.brightness > _BRIGHT).mean()))
+    if dark > 0.2:
+        found.append(f"{dark:.0%} of the frames are very dark: put on more light.")
+    if bright > 0.2:
+        found.append(f"{bright:.0%} of the frames are burnt out: lower the exposure.")
+    return found
+
+
+def _about_motion(outcome: Outcome, sparse: SparseModel | None, loops: list[LoopEdge]) -> list[str]:
+    found = []
+    t = outcome.trajectory
+    lost = int((~t.is_posed).sum())
+    if lost:
+        found.append(
+            f"{lost} of {len(t.frame_ids)} frames have no pose. The lost stretches are listed below: walk there again "
+            "slowly, and look back at what is already known."
+        )
+    centers = t.centers[t.is_posed]
+    if len(centers) < 3:
+        return found
+    extent = float(np.linalg.norm(centers.max(axis=0) - centers.min(axis=0)))
+    depth = _median_depth(sparse)
+    if depth and extent < 0.2 * depth:
+        found.append(
+            f"The camera moved by {extent / depth:.0%} of the distance to the scene only: walk, do not just turn; "
+            "depth comes from seeing things from different places."
+        )
+    length = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
+    if depth and not loops and length > 8 * depth:
+        found.append(
+            "The walk never came back to a place it had seen before: end where you began, then drift can be taken out."
+        )
+    return found
+
+
+def _median_depth(sparse: SparseModel | None) -> float | None:
+    """Usual distance from a camera to the points it sees."""
+    if sparse is None or len(sparse.obs_frame) == 0:
+        return None
+    centers = np.linalg.inv(sparse.cam_from_world)[:, :3, 3]
+    return float(
+        np.median(np.linalg.norm(sparse.points_in_world[sparse.obs_point] - centers[sparse.obs_frame], axis=1))
+    )
+
+
+def _about_texture(capture: Capture) -> list[str]:
+    found = []
+    if len(capture.points) and (poor := int((capture.points < 60).sum())) > 0.15 * len(capture.points):
+        found.append(
+            f"{poor} of {len(capture.points)} keyframes see fewer than 60 points: bare walls give nothing to hold on "
+            "to; keep furniture, corners or pictures in view."
+        )
+    if len(capture.reliability) and (usual := float(np.median(capture.reliability))) < 0.3:
+        found.append(
+            f"The depth is reliable on few pixels (mean reliability {usual:.2f}): a learned depth network helps on "
+            "bare walls (--depth onnx:CARD)."
+        )
+    return found
+
+
+def _about_camera(outcome: Outcome) -> list[str]:
+    found = []
+    c = outcome.calibration
+    if c.origin != "given" and c.focal_sd > 0.01 * c.intrinsics.fx:
+        found.append(
+            f"The focal length is uncertain by {c.focal_sd / c.intrinsics.fx:.1%}: give it with --intrinsics if you "
+            "know it, or film with more movement to the side."
+        )
+    if not outcome.metric:
+        found.append(
+            "Lengths have no unit: nothing in a single moving camera tells metres. Give metric depth (--depth files or "
+            "a metric network) to get them."
+        )
+    return found

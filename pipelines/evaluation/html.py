@@ -1,0 +1,81 @@
+"""Pieces of a web page that needs nothing but itself."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Sequence
+from html import escape
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+STYLE = """
+:root{--ink:#111827;--soft:#6b7280;--line:#e5e7eb;--card:#fff;--back:#f3f4f6;--accent:#2563eb}
+*{box-sizing:border-box}
+body{margin:0;background:var(--back);color:var(--ink);font:15px/1.5 system-ui,-apple-system,"Segoe UI",sans-serif}
+main{max-width:1240px;margin:0 auto;padding:28px 20px 60px}
+h1{font-size:26px;margin:0 0 2px}h2{font-size:18px;margin:0 0 12px}
+.sub{color:var(--soft);margin:0 0 18px;overflow-wrap:anywhere}
+section{background:var(--card);border:1px solid var(--line);border-radius:12px;padding:18px 20px;margin:16px 0}
+.chips{display:flex;flex-wrap:wrap;gap:10px}
+.chip{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:8px 14px;min-width:120px}
+.chip b{display:block;font-size:20px}.chip span{color:var(--soft);font-size:12px}
+.two{display:grid;grid-template-columns:repeat(auto-fit,minmax(440px,1fr));gap:14px}
+svg.plot{width:100%;height:auto;display:block}
+table{border-collapse:collapse;width:100%;font-size:14px}
+th,td{text-align:left;padding:6px 10px;border-bottom:1px solid var(--line);vertical-align:top}
+th{color:var(--soft);font-weight:600}
+img{max-width:100%;border-radius:6px;display:block}
+ul{margin:0;padding-left:20px}li{margin:4px 0}
+pre{background:#f9fafb;border:1px solid var(--line);border-radius:8px;padding:12px;overflow:auto;font-size:12.5px}
+summary{cursor:pointer;color:var(--accent)}
+.advice{border-left:5px solid #f59e0b}.fine{border-left:5px solid #16a34a}
+.grid{display:grid;grid-template-columns:repeat(4,1fr);gap:6px}
+.grid div{font-size:12px;color:var(--soft)}
+code{background:#f3f4f6;padding:1px 5px;border-radius:4px}
+@media print{body{background:#fff}section{break-inside:avoid}}
+"""
+
+
+def page(title: str, body: str) -> str:
+    """A whole document. The policy forbids every request to the outside."""
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
+        "style-src 'unsafe-inline'\">"
+        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body><main>{body}</main></body></html>\n"
+    )
+
+
+def section(title: str, *content: str, kind: str = "") -> str:
+    """A card with a heading."""
+    return f'<section class="{kind}"><h2>{escape(title)}</h2>{"".join(content)}</section>'
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Cells are plain text."""
+    head = "".join(f"<th>{escape(h)}</th>" for h in header)
+    body = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in row) + "</tr>" for row in rows)
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """Items are plain text."""
+    return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
+
+
+def chips(pairs: Iterable[tuple[str, str]]) -> str:
+    """(name, value) pairs as a row of little cards."""
+    cards = (f'<div class="chip"><b>{escape(value)}</b><span>{escape(name)}</span></div>' for name, value in pairs)
+    return f'<div class="chips">{"".join(cards)}</div>'
+
+
+def image(picture: NDArray[np.uint8], description: str, quality: int = 85) -> str:
+    """An RGB picture (H, W, 3) inside the page, as JPEG."""
+    good, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not good:
+        raise RuntimeError("OpenCV could not encode a JPEG")
+    text = base64.b64encode(data.tobytes()).decode("ascii")
+    return f'<img alt="{escape(description)}" src="data:image/jpeg;base64,{text}">'

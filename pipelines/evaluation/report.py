@@ -1,0 +1,193 @@
+"""One HTML file about a run that opens anywhere, without a network."""
+
+from __future__ import annotations
+
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from formats.atomic import write_text
+from pipelines.config import Config, config_to_dict, config_to_toml
+from pipelines.evaluation.facts import Capture, advice, lost_stretches, read_capture
+from pipelines.evaluation.html import bullets, chips, page, section, table
+from pipelines.evaluation.outcome import Outcome, load_outcome
+from pipelines.evaluation.plots import RED, Line, plot
+from pipelines.evaluation.report_views import RenderedViews, class_section, quality_section, render_views
+from pipelines.evaluation.table import evaluation_table
+from pipelines.evaluation.write import evaluation_file, trajectory_plots
+from pipelines.export.readme import README
+from pipelines.progress import Progress, SilentProgress
+from pipelines.run_folder import RunFolder, read_json
+from pipelines.stages import load_source
+from pipelines.types import LoopEdge, SparseModel
+
+MEASURED_VIEWS = 60
+SHOWN_VIEWS = 8
+
+
+def write_report(run: RunFolder, path: Path | None = None, progress: Progress | None = None) -> Path:
+    """Write RUN/report.html, or `path`; returns where. What has not been done yet is left out.
+
+    Raises InputError for a run without poses.
+    """
+    outcome = load_outcome(run)
+    sparse, loops = _load_sparse(outcome), _load_loops(outcome)
+    capture = read_capture(outcome, sparse)
+    views = None if outcome.gaussian_map is None else render_views(outcome, progress or SilentProgress())
+    evaluation = read_json(evaluation_file(run)) if evaluation_file(run).exists() else None
+    body = "".join(
+        [
+            _heading(outcome, views, loops),
+            _advice_section(outcome, capture, sparse, loops, views),
+            _found_section(outcome, sparse, loops),
+            _path_section(outcome),
+            quality_section(outcome, capture, views),
+            "" if evaluation is None else _truth_section(evaluation),
+            "" if views is None else section("What the map shows", views.sheet),
+            "" if views is None else class_section(outcome, views),
+            _time_section(outcome),
+            _export_section(outcome),
+            _settings_section(outcome),
+        ]
+    )
+    target = path or run.root / "report.html"
+    write_text(target, page(f"{run.root.name} – report", body))
+    return target
+
+
+def _load_sparse(outcome: Outcome) -> SparseModel | None:
+    for stage in (outcome.pose_stage, "tracking"):
+        if (outcome.run.stage(stage) / "sparse.npz").exists():
+            return outcome.run.load_sparse(stage)
+    return None
+
+
+def _load_loops(outcome: Outcome) -> list[LoopEdge]:
+    return outcome.run.load_loops() if "global_ba" in outcome.records else []
+
+
+def _heading(outcome: Outcome, views: RenderedViews | None, loops: list[LoopEdge]) -> str:
+    t = outcome.trajectory
+    pairs = [
+        ("frames posed", f"{int(t.is_posed.sum())} / {len(t.frame_ids)}"),
+        ("keyframes", str(int(t.is_keyframe.sum()))),
+        ("focal length, px", f"{outcome.calibration.intrinsics.fx:.1f}"),
+    ]
+    if outcome.gaussian_map is not None:
+        pairs.append(("Gaussians", f"{len(outcome.gaussian_map):,}"))
+    if views is not None and views.psnr:
+        pairs.append(("keyframe PSNR, dB", f"{np.mean(views.psnr):.1f}"))
+    if "global_ba" in outcome.records:
+        pairs.append(("loops closed", str(len(loops))))
+    pairs.append(("seconds", f"{sum(r.seconds for r in outcome.records.values()):.0f}"))
+    source = escape(str(load_source(outcome.run)["path"]))
+    stage = outcome.map_stage or outcome.pose_stage
+    return f'<h1>{escape(outcome.run.root.name)}</h1><p class="sub">from {source}, as {stage} left it</p>{chips(pairs)}'
+
+
+def _advice_section(
+    outcome: Outcome, capture: Capture, sparse: SparseModel | None, loops: list[LoopEdge], views: RenderedViews | None
+) -> str:
+    lines = advice(outcome, capture, sparse, loops, float(np.mean(views.psnr)) if views and views.psnr else None)
+    if not lines:
+        return section("Advice", "<p>Nothing to complain of in this capture.</p>", kind="fine")
+    return section("Advice", bullets(lines), kind="advice")
+
+
+def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[LoopEdge]) -> str:
+    c, t = outcome.calibration, outcome.trajectory
+    k = c.intrinsics
+    spread = f" ± {c.focal_sd:.2f}" if c.focal_sd > 0 else ""
+    rows = [
+        (
+            "camera",
+            f"{c.origin}: focal length {k.fx:.2f}{spread} px, centre ({k.cx:.1f}, {k.cy:.1f}), {k.width}×{k.height}",
+        ),
+        ("distortion removed", "k1 {:.4f}, k2 {:.4f}, p1 {:.4f}, p2 {:.4f}".format(*c.distortion)),
+        ("scale", _scale_text(outcome)),
+        ("depth", str(outcome.run.load_proxy_report().get("depth", ""))),
+        ("classes", f"{outcome.semantics}: {len(outcome.classes)}"),
+    ]
+    if sparse is not None:
+        rows.append(("sparse points", f"{len(sparse.points_in_world):,} with {len(sparse.obs_frame):,} observations"))
+    if "global_ba" in outcome.records:
+        text = ", ".join(f"{e.frame1_id}–{e.frame2_id} ({e.inliers} matches)" for e in loops[:12])
+        rows.append(("loops", f"{len(loops)}: {text}" if loops else "none"))
+    lost = lost_stretches(outcome)
+    names = [f"frames {s.first}–{s.last} ({s.start:.2f}–{s.end:.2f} s): {s.reason}" for s in lost]
+    rows.append(("lost stretches", "; ".join(names) if names else f"none of {len(t.frame_ids)} frames"))
+    warnings = [f"{stage}: {w}" for stage, record in outcome.records.items() for w in record.warnings]
+    extra = f"<h3>Warnings</h3>{bullets(warnings)}" if warnings else ""
+    return section("What was found", table(("", ""), rows), extra)
+
+
+def _scale_text(outcome: Outcome) -> str:
+    if not outcome.metric:
+        return "free: the unit of length is the run's own"
+    record = outcome.records.get("tracking")
+    spread = None if record is None else record.figures.get("scale_relative_sd")
+    return "metres, from the proxy depth" + (f", ± {spread:.2%}" if isinstance(spread, float) else "")
+
+
+def _path_section(outcome: Outcome) -> str:
+    return section("Camera path", '<div class="two">', *trajectory_plots(outcome, None), "</div>")
+
+
+def _truth_section(evaluation: dict[str, Any]) -> str:
+    lines = evaluation_table(evaluation).splitlines()
+    cells = [[c.strip() for c in line.strip("|").split("|")] for line in lines if line.startswith("| ")]
+    errors = np.array(evaluation.get("frame errors", []), np.float64).reshape(-1, 2)
+    drawn = ""
+    if len(errors):
+        points = np.stack([errors[:, 0], 100 * errors[:, 1]], axis=1)
+        drawn = plot("Distance from the true camera", "frame", "cm", [Line(points, RED, "")], height=240)
+    return section(
+        f"Against the truth: {evaluation['truth']}",
+        f'<div class="two">{drawn}</div>',
+        table(cells[0], [c for c in cells[1:] if not c[0].startswith("---")]),
+        "<details><summary>How this was measured</summary>", bullets(evaluation["protocol"]), "</details>",
+    )  # fmt: skip
+
+
+def _time_section(outcome: Outcome) -> str:
+    rows = [
+        (
+            name,
+            f"{r.seconds:.1f}",
+            f"{r.peak_memory_mb:.0f}",
+            ", ".join(f"{k} {_short(v)}" for k, v in r.figures.items()),
+        )
+        for name, r in outcome.records.items()
+    ]
+    return section("Stages", table(("stage", "seconds", "peak MB", "figures"), rows))
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _export_section(outcome: Outcome) -> str:
+    folder = outcome.run.stage("export")
+    if "export" not in outcome.records:
+        return section("Files for other programs", "<p>Not exported yet.</p>")
+    sizes = [
+        (str(p.relative_to(folder)), f"{p.stat().st_size / 1e6:.2f} MB")
+        for p in sorted(folder.rglob("*"))
+        if p.is_file() and p.parent.name != "frames"
+    ]
+    return section("Files for other programs", f"<pre>{escape(README)}</pre>", table(("in export/", "size"), sizes))
+
+
+def _settings_section(outcome: Outcome) -> str:
+    used, default = config_to_dict(outcome.config), config_to_dict(Config())
+    changed = [
+        (f"{s}.{k}", str(v), str(default[s][k]))
+        for s, values in used.items()
+        for k, v in values.items()
+        if v != default[s][k]
+    ]
+    listed = table(("setting", "here", "default"), changed) if changed else "<p>All at their defaults.</p>"
+    whole = f"<details><summary>All settings</summary><pre>{escape(config_to_toml(outcome.config))}</pre></details>"
+    return section("Settings", listed, whole)

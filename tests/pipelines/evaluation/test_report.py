@@ -1,0 +1,148 @@
+"""The report is whole, self-contained, escapes what it is given, and its advice follows the capture."""
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from formats.datasets import Sequence
+from formats.errors import InputError
+from pipelines.evaluation.facts import Capture, advice, lost_stretches
+from pipelines.evaluation.outcome import load_outcome
+from pipelines.evaluation.plots import Line, plot, ticks
+from pipelines.evaluation.report import write_report
+from pipelines.evaluation.write import write_evaluation
+from pipelines.run_folder import RunFolder, save_trajectory
+from pipelines.types import LoopEdge, SparseModel
+
+OracleRun = Callable[..., RunFolder]
+VOID_TAGS = {"img", "meta", "rect", "line", "path", "circle"}
+
+
+class Balanced(HTMLParser):
+    """Fails on a tag that is closed but was not opened, or the other way round."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.images = 0
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.images += tag == "img"
+        if tag not in VOID_TAGS:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.images += tag == "img"
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, truth: Sequence) -> None:
+    run = oracle_run()
+    write_evaluation(run, truth, max_views=1)
+    classes = json.loads((run.stage("proxy") / "classes.json").read_text())
+    classes[0]["name"] = "<script>alert(1)</script>"
+    (run.stage("proxy") / "classes.json").write_text(json.dumps(classes))
+    html = write_report(run).read_text()
+    parsed = Balanced()
+    parsed.feed(html)
+    assert parsed.open == []
+    assert parsed.images == 4 * 8
+    for heading in ("Advice", "What was found", "Camera path", "Against the truth", "Stages", "Settings"):
+        assert heading in parsed.text
+    assert "ATE Sim(3)" in parsed.text
+    assert "<script" not in html
+    assert re.findall(r'(?:src|href)="(?!data:)', html) == []
+    assert re.findall(r"https?://(?!www\.w3\.org/2000/svg)", html) == []
+    assert len(html) < 3_000_000
+
+
+def test_report_of_a_run_without_a_map_and_with_lost_frames(oracle_run: OracleRun) -> None:
+    run = oracle_run()
+    manifest = json.loads(run.manifest_file.read_text())
+    manifest["stages"] = {k: manifest["stages"][k] for k in ("frames", "proxy", "tracking")}
+    run.manifest_file.write_text(json.dumps(manifest))
+    t = run.load_trajectory("tracking")
+    reasons = tuple("too few matches" if 5 <= i < 8 else ("blurred" if i == 8 else "") for i in range(32))
+    lost = replace(t, is_keyframe=t.is_keyframe & ~np.array([bool(r) for r in reasons]), lost_reasons=reasons)
+    save_trajectory(run.stage("tracking"), lost)
+    outcome = load_outcome(run)
+    assert [(s.first, s.last, s.reason) for s in lost_stretches(outcome)] == [
+        (5, 7, "too few matches"),
+        (8, 8, "blurred"),
+    ]
+    html = write_report(run).read_text()
+    assert "frames 5–7 (0.50–0.70 s): too few matches" in html
+    assert "4 of 32 frames have no pose" in html
+    run.manifest_file.write_text(json.dumps(manifest | {"stages": {}}))
+    with pytest.raises(InputError, match="not done"):
+        write_report(run)
+
+
+def good_capture(count: int = 32) -> Capture:
+    ids = np.arange(count)
+    return Capture(np.ones(count), np.full(count, 120.0), ids, np.full(count, 400), ids, np.full(count, 0.8))
+
+
+def ring_model(radius: float, depth: float) -> SparseModel:
+    """Cameras on a ring of `radius` that see points `depth` away."""
+    angle = np.linspace(0, 2 * np.pi, 16)
+    poses = np.tile(np.eye(4), (16, 1, 1))
+    poses[:, 0, 3], poses[:, 1, 3] = radius * np.cos(angle), radius * np.sin(angle)
+    points = np.array([[0.0, 0.0, depth]])
+    frames, zeros = np.arange(16), np.zeros(16, np.int64)
+    return SparseModel(frames, poses, points, np.zeros((1, 3), np.uint8), frames, zeros, np.zeros((16, 2)))
+
+
+def test_advice_says_what_is_wrong_and_nothing_else(oracle_run: OracleRun) -> None:
+    outcome = load_outcome(oracle_run())
+    model, loop = ring_model(1.0, 2.0), [LoopEdge(0, 30, np.eye(4), 1.0, 50)]
+    fine = good_capture()
+    assert advice(outcome, fine, model, loop, 30.0) == []
+    blurred = replace(fine, sharpness=np.where(np.arange(32) % 4 == 0, 0.1, 1.0))
+    swinging = replace(fine, brightness=np.linspace(60, 180, 32))
+    dark = replace(fine, brightness=np.full(32, 20.0))
+    bare = replace(fine, points=np.full(32, 20))
+    unsure = replace(fine, reliability=np.full(32, 0.1))
+    for capture, words in (
+        (blurred, "8 of 32 frames are blurred"),
+        (swinging, "lock the exposure"),
+        (dark, "very dark"),
+        (bare, "bare walls"),
+        (unsure, "learned depth"),
+    ):
+        lines = advice(outcome, capture, model, loop, 30.0)
+        assert len(lines) == 1
+        assert words in lines[0]
+    assert "do not just turn" in advice(outcome, fine, ring_model(1.0, 500.0), loop, 30.0)[0]
+    assert "16.0 dB" in advice(outcome, fine, model, loop, 16.0)[0]
+    free = replace(outcome, metric=False)
+    assert "Lengths have no unit" in advice(free, fine, model, loop, 30.0)[0]
+    unsure_lens = replace(outcome, calibration=replace(outcome.calibration, origin="self-calibrated", focal_sd=20.0))
+    assert "focal length is uncertain" in advice(unsure_lens, fine, model, loop, 30.0)[0]
+
+
+def test_plots_keep_to_their_frame_and_leave_gaps() -> None:
+    points = np.array([[0, 1.0], [1, 5.0], [2, np.nan], [3, 2.0]])
+    svg = plot("a < b", "x", "y", [Line(points, "#000", "name")])
+    assert "a &lt; b" in svg
+    path = re.search(r'<path d="([^"]*)"', svg)
+    assert path is not None
+    assert path[1].count("M") == 2
+    places = np.array(re.findall(r"[ML]([\d.]+) ([\d.]+)", path[1]), float)
+    assert len(places) == 3
+    assert (places > 0).all()
+    assert (places < (560, 320)).all()
+    assert ticks(0.0, 1.0) == pytest.approx([0, 0.2, 0.4, 0.6, 0.8, 1.0])
+    assert ticks(-3.1, 12.2) == [-2, 0, 2, 4, 6, 8, 10, 12] or ticks(-3.1, 12.2) == [0, 5, 10]
+    assert "NaN" not in plot("nothing", "x", "y", [Line(np.full((3, 2), np.nan), "#000", "")])
