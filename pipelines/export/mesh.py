@@ -1,147 +1,105 @@
-"""The labelled mesh: rendered median depth fused, vertices coloured and labelled by the views that see them."""
+"""The labelled mesh: rendered median depth of the keyframes, fused, extracted, painted."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from formats.mesh import write_mesh_glb, write_mesh_ply
 from pipelines.config import ExportConfig
-from pipelines.export.fusion import TRUNCATION, TsdfVolume, touched_blocks
+from pipelines.export.paint import PaintedView, paint
+from pipelines.export.result import Result
+from pipelines.export.surface import extract_surface, without_floaters
+from pipelines.export.volume import DepthView, fuse
+from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussians.render import get_threads, median_depth, render
 from pipelines.progress import Progress
 from pipelines.types import VOID, Intrinsics, SemanticMesh
 
 
-@dataclass(frozen=True)
-class SurfaceView:
-    """What one camera sees of the map: depth (H, W) 0 = nothing, color (H, W, 3) uint8, labels (H, W), coverage (H, W)
-    in 0..1."""
-
-    cam_from_world: NDArray[np.float64]
-    depth: NDArray[np.float32]
-    color: NDArray[np.uint8]
-    labels: NDArray[np.uint8]
-    coverage: NDArray[np.float32]
-
-
-Draw = Callable[[int], SurfaceView]
-"""Draws view number i. Called once a pass, so that not all views are held in memory."""
-
-
-def fuse_mesh(
-    draw: Draw, count: int, intrinsics: Intrinsics, class_count: int, settings: ExportConfig, progress: Progress
-) -> SemanticMesh:
-    """Fuse `count` views into a mesh with a colour and a label at each vertex; empty where there is no surface.
-
-    The voxel is `mesh_voxel_px` pixels at the median depth, or larger where the blocks would not fit in
-    `mesh_memory_mb`.
-    """
-    surfaces = [_for_fusion(draw(i)) for i in progress.track(range(count), "drawing the map", count)]
-    voxel = _voxel_size(surfaces, intrinsics, settings)
-    if voxel == 0:
-        return _empty_mesh()
-    volume = _allocate(surfaces, intrinsics, voxel, settings.mesh_memory_mb)
-    for surface in progress.track(surfaces, "fusing depth", count):
-        weight = surface.coverage / np.maximum(surface.depth, 1e-6) ** 2
-        volume.integrate(surface.depth, weight.astype(np.float32), surface.cam_from_world, intrinsics)
-    typical = float(np.median([np.median(s.depth[s.depth > 0]) for s in surfaces if (s.depth > 0).any()]))
-    vertices, faces = volume.extract(settings.mesh_min_views / typical**2)
-    vertices, faces = drop_floaters(vertices, faces, settings.mesh_min_part)
-    if not len(faces):
-        return _empty_mesh()
-    colors, labels = paint_vertices(vertices, surfaces, intrinsics, class_count, volume.voxel_size)
+def make_mesh(result: Result, settings: ExportConfig, progress: Progress) -> SemanticMesh:
+    """The surface of the map as the keyframes see it; without a vertex where nothing is seen twice."""
+    poses = _spread([pose for _, pose in sorted(result.keyframe_poses.items())], settings.max_views)
+    camera = _camera(result.calibration.intrinsics, settings.mesh_side)
+    gaussian_map = result.gaussian_map
+    views = [depth_view(gaussian_map, p, camera) for p in progress.track(poses, "depth views", len(poses))]
+    voxel = settings.voxel * _median_depth(views)
+    volume = fuse(views, voxel, settings.truncation, settings.max_blocks, get_threads())
+    least = settings.least_weight if len(views) >= 4 else 0.5
+    vertices, faces = without_floaters(*extract_surface(volume, least), settings.least_piece)
+    painted = progress.track(_painted(gaussian_map, views), "painting", len(views))
+    colors, labels = paint(vertices, painted, result.class_ids, 2 * volume.truncation)
     return SemanticMesh(vertices, faces, colors, labels)
 
 
-def _for_fusion(view: SurfaceView) -> SurfaceView:
-    """The view without the pixels at depth steps, whose depth belongs to neither side."""
-    depth = view.depth
-    steep = np.zeros(depth.shape, bool)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for axis in (0, 1):
-            step = np.abs(np.diff(depth, axis=axis)) > 0.05 * np.minimum(
-                np.delete(depth, 0, axis=axis), np.delete(depth, -1, axis=axis)
-            )
-            low = np.s_[:-1, :] if axis == 0 else np.s_[:, :-1]
-            high = np.s_[1:, :] if axis == 0 else np.s_[:, 1:]
-            steep[low] |= step
-            steep[high] |= step
-    clean = np.where(steep, np.float32(0), depth)
-    # Half precision holds the coverage of many views at a quarter of the memory.
-    return SurfaceView(view.cam_from_world, clean, view.color, view.labels, view.coverage.astype(np.float16))
+def write_mesh(mesh: SemanticMesh, class_names: tuple[str, ...], folder: Path) -> list[Path]:
+    """mesh.ply and, where there is a triangle at all, mesh.glb."""
+    arrays = (mesh.vertices, mesh.faces, mesh.colors, mesh.labels, class_names)
+    write_mesh_ply(folder / "mesh.ply", *arrays)
+    if len(mesh.faces) == 0:
+        return [folder / "mesh.ply"]
+    write_mesh_glb(folder / "mesh.glb", *arrays)
+    return [folder / "mesh.ply", folder / "mesh.glb"]
 
 
-def _voxel_size(surfaces: Sequence[SurfaceView], intrinsics: Intrinsics, settings: ExportConfig) -> float:
-    depths = [np.median(s.depth[s.depth > 0]) for s in surfaces if (s.depth > 0).any()]
-    return float(np.median(depths)) / intrinsics.fx * settings.mesh_voxel_px if depths else 0.0
+def _spread(poses: Sequence[NDArray[np.float64]], most: int) -> list[NDArray[np.float64]]:
+    """At most `most` poses, evenly spread."""
+    picked = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), most)).round().astype(int))
+    return [poses[i] for i in picked]
 
 
-def _allocate(surfaces: Sequence[SurfaceView], intrinsics: Intrinsics, voxel: float, memory_mb: float) -> TsdfVolume:
-    """The blocks that any view touches, with the smallest voxel that fits."""
-    while True:
-        keys = np.zeros(0, np.int64)
-        for surface in surfaces:
-            keys = np.union1d(keys, touched_blocks(surface.depth, surface.cam_from_world, intrinsics, voxel))
-        if len(keys) * 4.1e-3 <= memory_mb:
-            return TsdfVolume.empty(voxel, keys)
-        voxel *= 1.3
+def _camera(intrinsics: Intrinsics, side: int) -> Intrinsics:
+    scale = min(1.0, side / max(intrinsics.width, intrinsics.height))
+    return intrinsics.resized(max(round(intrinsics.width * scale), 1), max(round(intrinsics.height * scale), 1))
 
 
-def drop_floaters(
-    vertices: NDArray[np.float32], faces: NDArray[np.int32], min_part: float
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Without the connected parts that hold less than `min_part` of all faces."""
-    if not len(faces):
-        return vertices, faces
-    n = len(vertices)
-    ones = np.ones(2 * len(faces), dtype=np.int8)
-    edges = (np.concatenate([faces[:, 0], faces[:, 1]]), np.concatenate([faces[:, 1], faces[:, 2]]))
-    _, part = connected_components(coo_array((ones, edges), shape=(n, n)), directed=False)
-    sizes = np.bincount(part[faces[:, 0]], minlength=part.max() + 1)
-    faces = faces[sizes[part[faces[:, 0]]] >= min_part * len(faces)]
-    used = np.unique(faces)
-    place = np.zeros(n, dtype=np.int32)
-    place[used] = np.arange(len(used), dtype=np.int32)
-    return vertices[used], place[faces].astype(np.int32)
+@torch.no_grad()
+def depth_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], camera: Intrinsics) -> DepthView:
+    """Median depth with a weight: none where the map is thin or the depth jumps, less far away."""
+    pose = torch.from_numpy(cam_from_world)
+    m = gaussian_map
+    depth = median_depth(m.means, m.radii, m.opacities, pose, camera).numpy()
+    silhouette = render(m.means, m.radii, m.opacities, m.colors, pose, camera).silhouette.numpy()
+    solid = (silhouette > 0.7) & (depth > 0) & ~_jumps(depth)
+    typical = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
+    # The error of a depth grows with its square.
+    weight = np.where(solid, np.clip(typical / np.maximum(depth, 1e-9), 0.2, 1.5) ** 2 * silhouette, 0)
+    return DepthView(camera, cam_from_world, depth.astype(np.float32), weight.astype(np.float32))
 
 
-def paint_vertices(
-    vertices: NDArray[np.float32],
-    surfaces: Sequence[SurfaceView],
-    intrinsics: Intrinsics,
-    class_count: int,
-    voxel: float,
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """(V, 3) mean colours and (V,) majority labels over the views that see each vertex at its own depth."""
-    total = np.zeros(len(vertices), np.float32)
-    color = np.zeros((len(vertices), 3), np.float32)
-    votes = np.zeros((len(vertices), class_count), np.float32)
-    for view in surfaces:
-        in_cam = vertices @ view.cam_from_world[:3, :3].T.astype(np.float32) + view.cam_from_world[:3, 3]
-        z = in_cam[:, 2]
-        ahead = np.flatnonzero(z > 1e-6)
-        column = np.floor(in_cam[ahead, 0] / z[ahead] * intrinsics.fx + intrinsics.cx).astype(np.int64)
-        row = np.floor(in_cam[ahead, 1] / z[ahead] * intrinsics.fy + intrinsics.cy).astype(np.int64)
-        inside = (column >= 0) & (row >= 0) & (column < intrinsics.width) & (row < intrinsics.height)
-        which, row, column = ahead[inside], row[inside], column[inside]
-        agrees = np.abs(view.depth[row, column] - z[which]) < TRUNCATION * voxel
-        which, row, column = which[agrees], row[agrees], column[agrees]
-        weight = view.coverage[row, column].astype(np.float32) / z[which].astype(np.float32) ** 2
-        total[which] += weight
-        color[which] += weight[:, None] * view.color[row, column]
-        label = view.labels[row, column]
-        known = label < class_count
-        votes[which[known], label[known]] += weight[known]
-    colors = np.where(total[:, None] > 0, color / np.maximum(total, 1e-12)[:, None], 128)
-    labels = np.where(votes.any(axis=1), votes.argmax(axis=1), VOID) if class_count else np.full(len(vertices), VOID)
-    return np.round(colors).astype(np.uint8), labels.astype(np.uint8)
+def _jumps(depth: NDArray[np.float32], tolerance: float = 0.08) -> NDArray[np.bool_]:
+    """Pixels beside a step of the depth, where neither side can be trusted to a pixel."""
+    out = np.zeros(depth.shape, bool)
+    for axis in (0, 1):
+        a, b = np.moveaxis(depth, axis, 0)[:-1], np.moveaxis(depth, axis, 0)[1:]
+        step = np.abs(a - b) > tolerance * np.minimum(a, b)
+        view = np.moveaxis(out, axis, 0)
+        view[:-1] |= step
+        view[1:] |= step
+    return out
 
 
-def _empty_mesh() -> SemanticMesh:
-    return SemanticMesh(
-        np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8)
-    )
+def _median_depth(views: Sequence[DepthView]) -> float:
+    seen = np.concatenate([v.depth[v.weight > 0][::16] for v in views])
+    return float(np.median(seen)) if len(seen) else 1.0
+
+
+@torch.no_grad()
+def _painted(gaussian_map: GaussianMap, views: Sequence[DepthView]) -> Iterator[PaintedView]:
+    m = gaussian_map
+    features = torch.cat([m.colors, m.class_logits], dim=1)
+    for view in views:
+        pose = torch.from_numpy(view.cam_from_world)
+        shown = render(m.means, m.radii, m.opacities, features, pose, view.intrinsics).features
+        channels = shown[..., 3:].argmax(-1).numpy() if shown.shape[-1] > 3 else None
+        yield PaintedView(view, shown[..., :3].numpy(), channels)
+
+
+def mesh_figures(mesh: SemanticMesh) -> dict[str, int | float]:
+    """Counts for the report."""
+    labelled = float((mesh.labels != VOID).mean()) if len(mesh.labels) else 0.0
+    return {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "labelled_share": round(labelled, 4)}

@@ -1,0 +1,58 @@
+"""Colours and labels of mesh vertices, from what the map shows in the views that see them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.export.volume import DepthView
+from pipelines.geometry.camera import project
+from pipelines.types import VOID
+
+
+@dataclass(frozen=True)
+class PaintedView:
+    """A depth view with its colors (H, W, 3) float32 0..1 and class channels (H, W) int64."""
+
+    depth_view: DepthView
+    colors: NDArray[np.float32]
+    channels: NDArray[np.int64] | None
+
+
+def paint(
+    vertices: NDArray[np.float32], views: Iterable[PaintedView], class_ids: tuple[int, ...], tolerance: float
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """colors (V, 3) uint8 and labels (V,) uint8: weighted mean and vote of the views that see a vertex.
+
+    A view sees a vertex where its depth there agrees within `tolerance`. Unseen ones are grey and VOID.
+    """
+    total = np.zeros((len(vertices), 3), np.float32)
+    weight = np.zeros(len(vertices), np.float32)
+    votes = np.zeros((len(vertices), max(len(class_ids), 1)), np.float32)
+    for view in views:
+        rows, place = _seen(vertices, view.depth_view, tolerance)
+        share = view.depth_view.weight[place]
+        total[rows] += view.colors[place] * share[:, None]
+        weight[rows] += share
+        if view.channels is not None and class_ids:
+            votes[rows, view.channels[place]] += share
+    colors = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-9)[:, None], 0.5)
+    table = np.array([*class_ids, VOID] if class_ids else [VOID, VOID], np.uint8)
+    labels = np.where(votes.max(1) > 0, votes.argmax(1), len(table) - 1)
+    return np.round(colors.clip(0, 1) * 255).astype(np.uint8), table[labels]
+
+
+def _seen(
+    vertices: NDArray[np.float32], view: DepthView, tolerance: float
+) -> tuple[NDArray[np.int64], tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Which vertices the view sees, and the (row, column) of each."""
+    pose = view.cam_from_world
+    xy, z = project(vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3], view.intrinsics)
+    inside = np.flatnonzero(((xy >= 0) & (xy < (view.intrinsics.width, view.intrinsics.height))).all(1))
+    place = xy[inside].astype(int)
+    close = np.abs(view.depth[place[:, 1], place[:, 0]] - z[inside]) < tolerance
+    close &= view.weight[place[:, 1], place[:, 0]] > 0
+    return inside[close], (place[close, 1], place[close, 0])
