@@ -38,7 +38,8 @@ def find_class_table(label_folder: Path) -> dict[int, NamedClass] | None:
 
 def read_class_table(path: Path) -> dict[int, NamedClass]:
     """id → class. JSON: {"classes": [{"id", "name", "color"?}]}, such a list, a list of names, or {"id": "name"};
-    text: a name a line (ids from 0), or `id name [anything]` a line; # begins a comment. Raises InputError.
+    text: a name a line (ids from 0) up to the first empty line, or `id name [anything]` a line; # begins a comment.
+    Raises InputError.
     """
     try:
         if path.stat().st_size > _MAX_BYTES:
@@ -74,8 +75,9 @@ def _color(value: Any) -> tuple[int, int, int] | None:
 
 
 def _from_text(text: str) -> dict[int, NamedClass]:
-    lines = [line.split("#")[0].strip() for line in text.splitlines()]
-    lines = [line for line in lines if line]
+    lines = [line.split("#")[0].strip() for line in text.strip().splitlines() if not line.startswith("#")]
+    # Prose may follow the names after an empty line, as in the lists that come with some networks.
+    lines = lines[: lines.index("")] if "" in lines else lines
     rows = [line.split() for line in lines]
     if all(len(r) >= 2 and r[0].isdecimal() for r in rows):
         return {int(r[0]): NamedClass(r[1]) for r in rows}

@@ -40,9 +40,7 @@ class FilesDepth:
         self.name = f"files:{path}"
         self._files = match_files(path, _SUFFIXES, _NAMES, sequence.frames, is_video)
         self._confidences = _match_confidence(path, sequence, is_video)
-        self.invalid_values = 0
         self.estimate(next(f for f in sequence.frames if f.id in self._files))
-        self.invalid_values = 0
 
     def prepare(self, frames: list[Frame]) -> None:
         """Nothing to do."""
@@ -59,7 +57,6 @@ class FilesDepth:
             return DepthEstimate(empty, empty)
         path = self._files[frame.id]
         depth, invalid = clean_depth(_read(path, self._unit))
-        self.invalid_values += invalid
         require_aspect(path, depth, self._sequence)
         depth = resample_nearest(depth, camera.height, camera.width)
         confidence = (depth > 0).astype(np.float32)
@@ -67,11 +64,11 @@ class FilesDepth:
             given = read_grey_png(self._confidences[frame.id])
             require_aspect(self._confidences[frame.id], given, self._sequence)
             confidence *= resample_nearest(given, camera.height, camera.width)
-        return DepthEstimate(depth, confidence)
+        return DepthEstimate(depth, confidence, invalid)
 
     def figures(self) -> dict[str, Any]:
-        """How many values were no depth."""
-        return {"invalid_depth_values": self.invalid_values, "confidence_files": len(self._confidences)}
+        """Whether the folder had confidences too."""
+        return {"confidence_files": len(self._confidences)}
 
 
 def clean_depth(depth: NDArray[np.float32]) -> tuple[NDArray[np.float32], int]:

@@ -64,6 +64,14 @@ class FilesLabels:
             tuple(table[i].name for i in kept), tuple(table[i].color or colors[k] for k, i in enumerate(kept))
         )
 
+    def warnings(self) -> list[str]:
+        """What `prepare` found amiss."""
+        if not self._outside:
+            return []
+        ids = ", ".join(map(str, sorted(self._outside)[:8]))
+        total = sum(self._outside.values())
+        return [f"{total} pixels have label ids that are not in the table of classes ({ids}); they count as void"]
+
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames without a file."""
         return [f for f in frames if f.id not in self._files]

@@ -21,10 +21,10 @@ from formats.errors import InputError
 from pipelines.progress import Progress
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.scratch import load_scratch, save_scratch
-from pipelines.proxy.sequence import Sequence, map_intrinsics
+from pipelines.proxy.sequence import Sequence, map_intrinsics, resize_area
 from pipelines.proxy.stereo.bands import Bands
 from pipelines.proxy.stereo.consistency import fuse_depths
-from pipelines.proxy.stereo.fill import SURE, fill_unsure
+from pipelines.proxy.stereo.fill import fill_unsure
 from pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
 from pipelines.proxy.stereo.refine import refine_inverse_depth
 from pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
@@ -75,7 +75,6 @@ class MultiviewDepth:
         self._camera: Intrinsics = map_intrinsics(sequence.calibration.intrinsics, settings.side)
         self._grey = lru_cache(_CACHED_FRAMES)(self._read_grey)
         self._raw = lru_cache(_CACHED_FRAMES)(self._load_raw)
-        self._kept: list[float] = []
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames that are no keyframes of the backbone."""
@@ -121,10 +120,9 @@ class MultiviewDepth:
             return DepthEstimate(empty, empty)
         index = self._index[frame.id]
         depth, confidence = self._fuse(index)
-        self._kept.append(float((confidence >= SURE).mean()))
         image = self._sequence.image(frame)
         size = (self._camera.width, self._camera.height)
-        depth, confidence = fill_unsure(depth, confidence, cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+        depth, confidence = fill_unsure(depth, confidence, resize_area(image, *size))
         return upsample_depth(depth, confidence, image)
 
     def _fuse(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -141,8 +139,8 @@ class MultiviewDepth:
         return fused, agreement(support, conflict)
 
     def figures(self) -> dict[str, Any]:
-        """Mean fraction of pixels on which the views agree."""
-        return {"stereo_agreeing": round(float(np.mean(self._kept)), 4)} if self._kept else {}
+        """The size that the images were matched at."""
+        return {"stereo_size": [self._camera.width, self._camera.height]}
 
     # what both use ----------------------------------------------------------------------------------------------
 
@@ -160,12 +158,19 @@ class MultiviewDepth:
     def _read_grey(self, frame_id: int) -> NDArray[np.float32]:
         rgb = self._sequence.read_image(self._frame[frame_id])
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-        small = cv2.resize(grey, (self._camera.width, self._camera.height), interpolation=cv2.INTER_AREA)
-        return small.astype(np.float32) / 255
+        small = resize_area(np.asarray(grey, np.uint8), self._camera.width, self._camera.height)
+        return small.astype(np.float32) / np.float32(255)
 
     def _load_raw(self, index: int) -> NDArray[np.float32]:
         inverse = load_scratch(self._path(int(self._model.frame_ids[index])))["inverse_depth"]
-        return np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse > 0)
+        return invert(inverse)
+
+
+def invert(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """1 / values, and 0 stays 0: depth from inverse depth and back."""
+    out = np.zeros_like(values)
+    np.divide(1, values, out=out, where=values > 0)
+    return out
 
 
 def agreement(support: NDArray[np.float32], conflict: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -14,10 +14,14 @@ from pipelines.types import ClassTable, Frame, require_shape
 
 @dataclass(frozen=True)
 class DepthEstimate:
-    """depth (h, w) float32, 0 = unknown; confidence (h, w) float32 in [0, 1], 0 where the depth is unknown."""
+    """depth (h, w) float32, 0 = unknown; confidence (h, w) float32 in [0, 1], 0 where the depth is unknown.
+
+    `invalid` counts the values of the source that were no depth: NaN, infinite or negative.
+    """
 
     depth: NDArray[np.float32]
     confidence: NDArray[np.float32]
+    invalid: int = 0
 
     def __post_init__(self) -> None:
         require_shape("depth", self.depth, (None, None))
@@ -66,6 +70,9 @@ class SemanticsProvider(Protocol):
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Slow passes over all frames that `estimate` and `classes` build on."""
+
+    def warnings(self) -> list[str]:
+        """What `prepare` found amiss, for the report."""
 
     def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
         """Labels at the size of the proxy maps."""

@@ -53,6 +53,10 @@ class SegmentLabels:
         self._gravity: list[float] = []
         self._world_from_cam = {k: np.linalg.inv(v).astype(np.float64) for k, v in sequence.cam_from_world.items()}
 
+    def warnings(self) -> list[str]:
+        """Nothing is ever amiss."""
+        return []
+
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames without a pose."""
         return [f for f in frames if f.id not in self._world_from_cam]

@@ -11,7 +11,11 @@ from pipelines.config import ProxyConfig
 from pipelines.progress import Progress
 from pipelines.proxy.files_depth import FilesDepth
 from pipelines.proxy.files_labels import FilesLabels
+from pipelines.proxy.fused import FusedDepth
 from pipelines.proxy.multiview import MultiviewDepth, StereoSettings
+from pipelines.proxy.networks.card import read_card
+from pipelines.proxy.onnx_depth import OnnxDepth
+from pipelines.proxy.onnx_labels import OnnxLabels
 from pipelines.proxy.providers import DepthProvider, SemanticsProvider
 from pipelines.proxy.segments import SegmentLabels
 from pipelines.proxy.sequence import Sequence
@@ -26,6 +30,7 @@ class Surroundings:
     config: ProxyConfig
     scratch: Callable[[str], Path]
     threads: int
+    device: str
     progress: Progress
 
 
@@ -42,15 +47,45 @@ def split_choice(text: str, setting: str, kinds: tuple[str, ...]) -> tuple[str, 
 def open_depth(around: Surroundings) -> DepthProvider:
     """Raises InputError when the provider cannot work on this video."""
     kind, rest = split_choice(around.config.depth, "proxy.depth", ("auto", "multiview", "files", "onnx"))
+    if kind == "auto":
+        kind, rest = _cached("depth")
     if kind == "files":
-        return FilesDepth(rest, around.source, around.sequence, around.config.depth_scale)
-    settings = StereoSettings(side=around.config.stereo_side, planes=around.config.stereo_planes)
-    return MultiviewDepth(around.sequence, settings, lambda: around.scratch("stereo"), around.threads, around.progress)
+        files = FilesDepth(rest, around.source, around.sequence, around.config.depth_scale)
+        return _fused(around, files) if around.config.fuse == "always" else files
+    if kind == "onnx":
+        network = OnnxDepth(around.sequence, read_card(Path(rest)), *_surroundings(around, "network_depth"))
+        return _fused(around, network) if around.config.fuse != "never" else network
+    return _multiview(around)
 
 
 def open_semantics(around: Surroundings) -> SemanticsProvider:
     """Raises InputError when the provider cannot work on this video."""
     kind, rest = split_choice(around.config.semantics, "proxy.semantics", ("auto", "segments", "files", "onnx"))
+    if kind == "auto":
+        kind, rest = _cached("segmentation")
     if kind == "files":
         return FilesLabels(rest, around.source, around.sequence, around.progress)
+    if kind == "onnx":
+        return OnnxLabels(around.sequence, read_card(Path(rest)), *_surroundings(around, "network_labels"))
     return SegmentLabels(around.sequence, around.config.max_classes, around.progress)
+
+
+def _cached(task: str) -> tuple[str, str]:
+    """A learned model whose weights are in the cache, else the provider that needs none."""
+    return ("multiview", "") if task == "depth" else ("segments", "")
+
+
+def _multiview(around: Surroundings) -> MultiviewDepth:
+    settings = StereoSettings(side=around.config.stereo_side, planes=around.config.stereo_planes)
+    return MultiviewDepth(around.sequence, settings, lambda: around.scratch("stereo"), around.threads, around.progress)
+
+
+def _fused(around: Surroundings, learned: DepthProvider) -> DepthProvider:
+    """With the multi-view depth where structure from motion has poses for it."""
+    if around.sequence.backbone is None or len(around.sequence.backbone.frame_ids) < 2:
+        return learned
+    return FusedDepth(learned, _multiview(around), around.sequence)
+
+
+def _surroundings(around: Surroundings, scratch: str) -> tuple[Callable[[], Path], int, str, Progress]:
+    return lambda: around.scratch(scratch), around.threads, around.device, around.progress

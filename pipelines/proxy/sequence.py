@@ -32,13 +32,14 @@ class Sequence:
 
     def image(self, frame: Frame) -> NDArray[np.uint8]:
         """(h, w, 3) RGB at map size."""
-        rgb = self.read_image(frame)
-        size = (self.intrinsics.width, self.intrinsics.height)
-        return (
-            rgb
-            if rgb.shape[1::-1] == size
-            else np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
-        )
+        return resize_area(self.read_image(frame), self.intrinsics.width, self.intrinsics.height)
+
+
+def resize_area(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """(H, W, ...) → (height, width, ...) by averaging."""
+    if image.shape[:2] == (height, width):
+        return image
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def map_intrinsics(frame_camera: Intrinsics, max_side: int) -> Intrinsics:

@@ -11,6 +11,7 @@ import numpy as np
 from formats.errors import InputError
 from pipelines.config import ProxyConfig
 from pipelines.progress import log
+from pipelines.proxy.compact import compact
 from pipelines.proxy.providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider
 from pipelines.proxy.reliability import reliability, semantic_agreement, theta, warp_labels
 from pipelines.proxy.scratch import load_scratch, save_scratch
@@ -26,7 +27,13 @@ def run(context: StageContext) -> dict[str, Any]:
     config = context.config.proxy
     sequence = _load_sequence(context)
     around = Surroundings(
-        context.source, sequence, config, lambda name: context.snapshot / name, _threads(context), context.progress
+        context.source,
+        sequence,
+        config,
+        lambda name: context.snapshot / name,
+        _threads(context),
+        context.config.run.device,
+        context.progress,
     )
     depths = open_depth(around)
     semantics = open_semantics(around)
@@ -35,9 +42,11 @@ def run(context: StageContext) -> dict[str, Any]:
     _warn_of_missing(context, frames, depths, semantics)
     _depth_pass(context, frames, depths)
     semantics.prepare(frames, lambda frame: _load_depth(context.snapshot, frame))
+    for message in semantics.warnings():
+        context.warn(message)
     save_classes(context.folder, semantics.classes())
     agreements = _maps_pass(context, sequence, frames, semantics)
-    report = _report(context.folder, frames, depths, semantics, agreements)
+    report = _report(context, frames, depths, semantics, agreements)
     write_json(context.folder / "proxy.json", report)
     return report
 
@@ -80,7 +89,8 @@ def _depth_pass(context: StageContext, frames: list[Frame], depths: DepthProvide
     for frame in context.progress.track(frames, "depth", len(frames)):
         path = _depth_path(context.snapshot, frame)
         if not path.exists():
-            save_scratch(path, **vars(depths.estimate(frame)))
+            estimate = depths.estimate(frame)
+            save_scratch(path, depth=estimate.depth, confidence=estimate.confidence, invalid=np.array(estimate.invalid))
 
 
 def _depth_path(snapshot: Path, frame: Frame) -> Path:
@@ -88,7 +98,8 @@ def _depth_path(snapshot: Path, frame: Frame) -> Path:
 
 
 def _load_depth(snapshot: Path, frame: Frame) -> DepthEstimate:
-    return DepthEstimate(**load_scratch(_depth_path(snapshot, frame)))
+    stored = load_scratch(_depth_path(snapshot, frame))
+    return DepthEstimate(stored["depth"], stored["confidence"], int(stored["invalid"]))
 
 
 # maps -----------------------------------------------------------------------------------------------------------
@@ -110,7 +121,7 @@ def _maps_pass(
         if not path.exists():
             trust = theta(m, config.theta_slope, config.theta_middle)
             u = reliability(depth.depth, depth.confidence, trust, config.alpha, config.beta, config.gamma)
-            save_proxy_maps(path, ProxyMaps(depth.depth, u, labels.labels, labels.confidence))
+            save_proxy_maps(path, compact(ProxyMaps(depth.depth, u, labels.labels, labels.confidence)))
         previous = frame
     return agreements
 
@@ -138,15 +149,23 @@ def _agreement(
 
 
 def _report(
-    folder: Path, frames: list[Frame], depths: DepthProvider, semantics: SemanticsProvider, agreements: list[float]
+    context: StageContext,
+    frames: list[Frame],
+    depths: DepthProvider,
+    semantics: SemanticsProvider,
+    agreements: list[float],
 ) -> dict[str, Any]:
     sizes, reliable, void = [], [], []
+    invalid = 0
     for frame in frames:
-        path = proxy_path(folder, frame.id)
+        path = proxy_path(context.folder, frame.id)
+        invalid += _load_depth(context.snapshot, frame).invalid
         maps = load_proxy_maps(path)
         sizes.append(path.stat().st_size)
         reliable.append(float((maps.confidence > 0.35).mean()))
         void.append(float((maps.labels == VOID).mean()))
+    if invalid:
+        context.warn(f"{invalid} depth values were NaN, infinite or negative; they count as unknown")
     return {
         "depth": depths.name,
         "semantics": semantics.name,
@@ -157,6 +176,7 @@ def _report(
         "void_pixels": round(float(np.mean(void)), 4),
         "label_agreement": round(float(np.mean(agreements)), 4),
         "kilobytes_a_frame": round(float(np.mean(sizes)) / 1000, 1),
+        "invalid_depth_values": invalid,
         **depths.figures(),
         **semantics.figures(),
     }

@@ -16,7 +16,8 @@ _SCALE = 60.0
 def cut_parts(voxels: Voxels, largest: int) -> NDArray[np.int64]:
     """(V,) part of every voxel, 0 the largest by weight; parts beyond the `largest` join a neighbour or are -1.
 
-    The graph joins neighbouring voxels. A step of the surface that bends towards the viewer's side (concave) separates objects more than a convex one.
+    The graph joins neighbouring voxels. Where the surface bends towards the viewer (concave) objects touch, so that
+    separates more than a convex edge.
     """
     if len(voxels) == 0:
         return np.empty(0, np.int64)

@@ -45,7 +45,9 @@ def _along_colors(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     votes = np.stack([weight, weight * inverse], axis=-1).astype(np.float32)
     votes = spread_votes(votes, image, _REACH, _COLOR_SD).astype(np.float64)
-    return votes[..., 1] / np.maximum(votes[..., 0], 1e-12), votes[..., 0]
+    return np.asarray(votes[..., 1] / np.maximum(votes[..., 0], 1e-12), np.float64), np.asarray(
+        votes[..., 0], np.float64
+    )
 
 
 def _planes(
@@ -90,4 +92,4 @@ def _solve(
         for j in range(3):
             normal[:, i, j] = np.bincount(group, weight * rows[:, i] * rows[:, j], count)
     normal += np.diag([1e-3, 1e-3, 1e-9]) * (normal[:, 2, 2][:, None, None] + 1e-9)
-    return np.linalg.solve(normal, right[..., None])[..., 0]
+    return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], np.float64)

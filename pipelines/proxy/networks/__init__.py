@@ -1,0 +1,1 @@
+"""Learned depth and classes: any ONNX network that a card describes."""

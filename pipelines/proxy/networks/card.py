@@ -1,0 +1,140 @@
+"""The card of a network: a TOML or JSON file that says what goes in and what comes out.
+
+task = "depth"                    # or "segmentation"
+model = "metric3d.onnx"           # beside the card
+input = "pixel_values"            # 1 x 3 x H x W, RGB
+white = 255.0                     # input value of white; 1.0 for networks that want 0..1
+mean = [0.485, 0.456, 0.406]      # subtracted, in units of `white`; leave out what the graph does itself
+std = [0.229, 0.224, 0.225]
+multiple = 28                     # sides are multiples of this, near `pixels` in total; or: size = [height, width]
+pixels = 263424
+output = "predicted_depth"
+canonical_focal = 1000.0          # depth · focal / canonical_focal is metres; 0: depth is metres as it comes
+valid = [0.1, 200.0]              # values at or beyond these stops are unknown
+confidence = "confidence"         # an output in 0..1, when there is one
+classes = "labels.txt"            # segmentation: names, a file or a list
+kind = "logits"                   # segmentation: logits, probabilities or argmax
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from formats.errors import InputError
+from pipelines.proxy.class_files import read_class_table
+
+_MAX_CARD_BYTES = 1 << 20
+_MAX_SIDE = 8192
+
+
+@dataclass(frozen=True)
+class Card:
+    """See the module's text. `size` is (height, width), (0, 0) when any multiple will do."""
+
+    task: str
+    model: Path
+    input: str
+    output: str
+    white: float = 255.0
+    mean: tuple[float, ...] = (0.0, 0.0, 0.0)
+    std: tuple[float, ...] = (1.0, 1.0, 1.0)
+    size: tuple[int, ...] = (0, 0)
+    multiple: int = 1
+    pixels: int = 448 * 588
+    align_corners: bool = False
+    canonical_focal: float = 0.0
+    valid: tuple[float, ...] = (0.0, float("inf"))
+    confidence: str = ""
+    kind: str = "logits"
+    classes: tuple[str, ...] = ()
+    void: tuple[int, ...] = ()
+    sha256: str = ""
+
+    @property
+    def name(self) -> str:
+        return self.model.stem
+
+
+def read_card(path: Path) -> Card:
+    """Raises InputError for a file that is no card, unknown or missing keys, and values that make no sense."""
+    values = _read(path)
+    known = {f.name: f for f in fields(Card)}
+    for key in values:
+        if key not in known:
+            raise InputError(f"{path}: there is no key {key!r} in a card; known: {', '.join(known)}")
+    for key in ("task", "model", "input", "output"):
+        if not isinstance(values.get(key), str):
+            raise InputError(f'{path}: the card lacks {key} = "…"')
+    values["model"] = _beside(path, values["model"])
+    if isinstance(values.get("classes"), str):
+        table = read_class_table(_beside(path, values["classes"]))
+        values["classes"] = [table[i].name if i in table else f"class {i}" for i in range(max(table) + 1)]
+    try:
+        card = Card(**{k: _converted(k, v, known[k].type) for k, v in values.items()})
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: {error}") from error
+    _check(card, path)
+    return card
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > _MAX_CARD_BYTES:
+            raise InputError(f"{path}: too large for a card; give the card, not the network: onnx:CARD.toml")
+        text = path.read_text(encoding="utf-8")
+        values = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the card of the network ({error.strerror})") from error
+    except (UnicodeDecodeError, json.JSONDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path}: not a card in TOML or JSON ({error}); give the card, not the network") from error
+    if not isinstance(values, dict):
+        raise InputError(f"{path}: not a card: a table of keys is expected")
+    return values
+
+
+def _beside(path: Path, name: str) -> Path:
+    """A file in the card's own folder; a card from elsewhere must not name files all over the disk."""
+    folder = path.parent.resolve()
+    target = (folder / name).resolve()
+    if not target.is_relative_to(folder):
+        raise InputError(f"{path}: {name} lies outside the card's folder. Put the file beside the card")
+    if not target.is_file():
+        raise InputError(f"{path}: there is no {name} beside the card. Put it there, or correct the card")
+    return target
+
+
+def _converted(key: str, value: Any, kind: Any) -> Any:
+    if key == "model":
+        return value
+    if str(kind).startswith("tuple"):
+        if not isinstance(value, list):
+            raise ValueError(f"{key} is a list, got {value!r}")
+        if str(kind) == "tuple[str, ...]":
+            return tuple(str(v) for v in value)
+        number = int if "int" in str(kind) else float
+        return tuple(number(v) for v in value)
+    if kind == "bool" and not isinstance(value, bool):
+        raise ValueError(f"{key} is true or false, got {value!r}")
+    return {"float": float, "int": int, "bool": bool, "str": str}[str(kind)](value)
+
+
+def _check(card: Card, path: Path) -> None:
+    problems = {
+        "task is depth or segmentation": card.task in ("depth", "segmentation"),
+        "kind is logits, probabilities or argmax": card.kind in ("logits", "probabilities", "argmax"),
+        "mean and std have three numbers, std positive": len(card.mean) == len(card.std) == 3 and min(card.std) > 0,
+        "white is positive": card.white > 0,
+        "size is [height, width]": len(card.size) == 2 and all(0 <= s <= _MAX_SIDE for s in card.size),
+        "multiple is 1..512": 1 <= card.multiple <= 512,
+        "pixels is 1000..10000000": 1000 <= card.pixels <= 10_000_000,
+        "valid is [lowest, highest]": len(card.valid) == 2 and 0 <= card.valid[0] < card.valid[1],
+        "canonical_focal is 0 or positive": card.canonical_focal >= 0,
+        "segmentation needs classes": card.task == "depth" or 1 <= len(card.classes) <= 10_000,
+    }
+    for rule, holds in problems.items():
+        if not holds:
+            raise InputError(f"{path}: {rule}")

@@ -1,0 +1,120 @@
+"""Running an ONNX network."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+
+from formats.errors import InputError
+from pipelines.progress import log
+from pipelines.proxy.networks.card import Card
+from pipelines.proxy.networks.letterbox import Letterbox, choose_box
+from pipelines.proxy.networks.onnx_file import require_own_weights
+
+_MAX_OUTPUT_VALUES = 200_000_000
+_IMAGENET_MEAN = (123.675, 116.28, 103.53)
+_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+
+
+class Network:
+    """An opened network that a card describes."""
+
+    def __init__(self, card: Card, threads: int, device: str) -> None:
+        """Raises InputError for a file that is not what the card says, before anything is computed."""
+        self.card = card
+        require_own_weights(card.model)
+        _require_hash(card)
+        self._session = _open(card.model, threads, device)
+        inputs = {i.name: i for i in self._session.get_inputs()}
+        outputs = {o.name: o for o in self._session.get_outputs()}
+        if set(inputs) != {card.input}:
+            raise InputError(f"{card.model}: its inputs are {', '.join(inputs)}; the card says {card.input}")
+        for wanted in filter(None, (card.output, card.confidence)):
+            if wanted not in outputs:
+                raise InputError(f"{card.model}: it has no output {wanted!r}, only {', '.join(outputs)}")
+            _require_bounded(card.model, wanted, outputs[wanted].shape)
+        _require_channels(card, outputs[card.output].shape)
+        kind = inputs[card.input].type
+        if kind not in _TYPES:
+            raise InputError(f"{card.model}: input {card.input} is {kind}; float or float16 is expected")
+        self._dtype = _TYPES[kind]
+
+    def box(self, width: int, height: int) -> Letterbox:
+        """How a picture of width x height goes into the network."""
+        return choose_box(width, height, self.card.size, self.card.multiple, self.card.pixels)
+
+    def run(self, image: NDArray[np.uint8], box: Letterbox) -> list[NDArray]:
+        """The card's outputs (output, then confidence if named) without the batch axis, for an RGB image (h, w, 3)."""
+        card = self.card
+        mean, std = np.array(card.mean, np.float32), np.array(card.std, np.float32)
+        # Padding of the mean colour: 0 after normalisation, here or in the graph.
+        pad = mean * 255 if any(card.mean) else np.array(_IMAGENET_MEAN, np.float32)
+        values = (box.put(image, pad) * np.float32(card.white / 255) - mean * card.white) / (std * _std_unit(card))
+        batch = np.ascontiguousarray(values.transpose(2, 0, 1)[None]).astype(self._dtype)
+        names = [n for n in (card.output, card.confidence) if n]
+        try:
+            outputs: Sequence[NDArray] = self._session.run(names, {card.input: batch})
+        except Exception as error:  # onnxruntime's errors share no narrower base class
+            if type(error).__module__.startswith("onnxruntime"):
+                size = f"{box.box_width}x{box.box_height}"
+                raise InputError(
+                    f"{card.model}: does not run on an input of {size} ({error}). Correct the card"
+                ) from error
+            raise
+        for output in outputs:
+            if output.size > _MAX_OUTPUT_VALUES or output.size == 0:
+                raise InputError(f"{card.model}: gave an output of shape {output.shape}. Correct the card")
+        return [np.asarray(o[0]) for o in outputs]
+
+
+def _std_unit(card: Card) -> float:
+    """std is in units of white too; a std of 1 (the default) means that nothing is divided."""
+    return 1.0 if all(s == 1.0 for s in card.std) else card.white
+
+
+def _open(path: Path, threads: int, device: str) -> ort.InferenceSession:
+    wanted = "CUDAExecutionProvider" if device == "cuda" else "CPUExecutionProvider"
+    if wanted not in ort.get_available_providers():
+        log.warning("this onnxruntime has no CUDA: the network runs on the CPU (pip install onnxruntime-gpu)")
+        wanted = "CPUExecutionProvider"
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3
+    providers = [wanted] if wanted == "CPUExecutionProvider" else [wanted, "CPUExecutionProvider"]
+    try:
+        session = ort.InferenceSession(str(path), options, providers=providers)
+    except Exception as error:  # onnxruntime's errors share no narrower base class
+        if type(error).__module__.startswith("onnxruntime"):
+            raise InputError(f"{path}: onnxruntime cannot load it ({error}). Download it again") from error
+        raise
+    # It falls back to the CPU without an error when CUDA's libraries are missing.
+    if session.get_providers()[0] != wanted:
+        log.warning("%s was asked for, the network runs on %s", wanted, session.get_providers()[0])
+    return session
+
+
+def _require_hash(card: Card) -> None:
+    if not card.sha256:
+        return
+    with card.model.open("rb") as stream:
+        actual = hashlib.file_digest(stream, "sha256").hexdigest()
+    if actual != card.sha256.lower():
+        raise InputError(f"{card.model}: its sha256 is {actual}, the card says {card.sha256}. Download it again")
+
+
+def _require_bounded(path: Path, name: str, shape: Sequence[int | str | None]) -> None:
+    fixed = [s for s in shape if isinstance(s, int)]
+    if np.prod([float(s) for s in fixed]) > _MAX_OUTPUT_VALUES or any(s <= 0 for s in fixed):
+        raise InputError(f"{path}: output {name} has the shape {list(shape)}, which is too large to be an image")
+
+
+def _require_channels(card: Card, shape: Sequence[int | str | None]) -> None:
+    if card.task == "depth" or card.kind == "argmax" or len(shape) != 4 or not isinstance(shape[1], int):
+        return
+    if shape[1] != len(card.classes):
+        raise InputError(f"{card.model}: has {shape[1]} classes, the card names {len(card.classes)}. Correct the card")

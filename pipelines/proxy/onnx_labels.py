@@ -1,0 +1,95 @@
+"""Classes by a network that a card describes, made steady over the video by votes in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.errors import InputError
+from pipelines.progress import Progress
+from pipelines.proxy.networks.card import Card
+from pipelines.proxy.networks.labels import network_labels
+from pipelines.proxy.networks.session import Network
+from pipelines.proxy.palette import class_colors
+from pipelines.proxy.providers import DepthEstimate, LabelEstimate
+from pipelines.proxy.regions.votes import WorldVotes
+from pipelines.proxy.scratch import load_scratch, save_scratch
+from pipelines.proxy.sequence import Sequence
+from pipelines.types import VOID, ClassTable, Frame
+
+_LEAST_SHARE = 0.001
+"""A class on a smaller share of all pixels is noise of the network and becomes void."""
+
+
+class OnnxLabels:
+    """Only the classes that occur in the video are kept."""
+
+    def __init__(
+        self, sequence: Sequence, card: Card, folder: Callable[[], Path], threads: int, device: str, progress: Progress
+    ) -> None:
+        """Opens the network. Raises InputError when it cannot be what the card says."""
+        if card.task != "segmentation":
+            raise InputError(
+                f"{card.model}: its card says {card.task}, but proxy.semantics needs a segmentation network"
+            )
+        self._network = Network(card, threads, device)
+        self._sequence, self._folder, self._progress = sequence, folder, progress
+        self.name = f"onnx:{card.name}"
+        self._label_of = np.full(len(card.classes) + 1, VOID, np.uint8)
+        self._classes = ClassTable((), ())
+        self._votes: WorldVotes | None = None
+
+    def warnings(self) -> list[str]:
+        """Nothing is ever amiss."""
+        return []
+
+    def missing(self, frames: list[Frame]) -> list[Frame]:
+        """None: a network sees every frame."""
+        return []
+
+    def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
+        """Run the network, settle the classes, and let all frames vote on the classes of the places they see."""
+        names = self._network.card.classes
+        counts = np.zeros(len(names) + 1, np.int64)
+        for frame in self._progress.track(frames, "network", len(frames)):
+            counts += np.bincount(self._raw(frame)[0].ravel() + 1, minlength=len(counts))
+        kept = np.flatnonzero(counts[1:] >= _LEAST_SHARE * counts.sum())
+        if not 0 < len(kept) < VOID:
+            raise InputError(f"{self.name}: {len(kept)} classes occur; 1 to {VOID - 1} are needed. Check the card")
+        # Index 0 of the table is void: ids are stored plus one.
+        self._label_of[kept + 1] = np.arange(len(kept), dtype=np.uint8)
+        self._classes = ClassTable(tuple(names[i] for i in kept), class_colors(len(kept)))
+        self._votes = WorldVotes.gather(self._sequence, frames, depth_of, self._labels, len(kept))
+
+    def _raw(self, frame: Frame) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Class ids (-1 void) and probabilities, from the disk when they are there."""
+        path = self._folder() / f"{frame.id:06d}.npz"
+        if not path.exists():
+            ids, probability = network_labels(self._network, self._sequence.image(frame))
+            save_scratch(
+                path, ids=(ids + 1).astype(np.uint16), probability=np.round(probability * 255).astype(np.uint8)
+            )
+        stored = load_scratch(path)
+        return stored["ids"].astype(np.int64) - 1, stored["probability"].astype(np.float32) / np.float32(255)
+
+    def _labels(self, frame: Frame) -> LabelEstimate:
+        ids, probability = self._raw(frame)
+        labels = self._label_of[ids + 1]
+        return LabelEstimate(labels, np.where(labels == VOID, 0, probability).astype(np.float32))
+
+    def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
+        """The network's labels and the votes of the other frames together."""
+        own = self._labels(frame)
+        return own if self._votes is None else self._votes.combine(frame, depth, own)
+
+    def classes(self) -> ClassTable:
+        """The classes that occur, in the network's order."""
+        return self._classes
+
+    def figures(self) -> dict[str, Any]:
+        """How many classes the network knows."""
+        return {"network_classes": len(self._network.card.classes)}
