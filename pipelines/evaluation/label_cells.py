@@ -13,8 +13,8 @@ from pipelines.evaluation.label_score import Counts, LabelScore, matched_by_majo
 def label_cells(
     confusion: Counts, match: NDArray[np.int64] | None, semantics: str, true_names: tuple[str, ...]
 ) -> dict[str, Any]:
-    """confusion as `count_labels` gives it; match (C,) the true class of every class of the run, None where no name
-    is shared. A clustering's classes are named *by the truth*, so its figures are an upper bound and stand apart."""
+    """confusion as `count_labels` gives it; match (C,) the true class of every class of the run, None where their
+    names are not the truth's. A clustering's classes are named *by the truth*, so its figures are an upper bound and stand apart."""
     if confusion.size == 0 or confusion.sum() == 0:
         return {"missing": "no rendered view has true labels"}
     given = "labels from files" if semantics.startswith("files") else "predicted labels"
@@ -22,7 +22,7 @@ def label_cells(
         return {"input": given, "matching": "by name", **_cells(score(renamed(confusion, match)), true_names)}
     return {
         "input": given,
-        "matching": "none: the run's classes have no names of the truth",
+        "matching": "none",
         "missing": "the run's classes have other names than the truth's",
         "clustering": {
             "one to one": _cells(score(renamed(confusion, matched_one_to_one(confusion))), true_names),

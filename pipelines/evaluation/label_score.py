@@ -55,10 +55,14 @@ def score(confusion: Counts) -> LabelScore | None:
 
 
 def indices_by_name(names: tuple[str, ...], true_names: tuple[str, ...]) -> NDArray[np.int64] | None:
-    """(C,) for every class the true class of the same name (any case), -1 without; None where no name is shared."""
+    """(C,) for every class the true class of the same name (any case), -1 without.
+
+    None where fewer than half of the names are shared: then the two lists mean different things, and a "floor" in
+    both is a coincidence.
+    """
     known = {name.strip().lower(): i for i, name in enumerate(true_names)}
     found = np.array([known.get(name.strip().lower(), -1) for name in names], np.int64)
-    return found if (found >= 0).any() else None
+    return found if len(found) and (found >= 0).mean() >= 0.5 else None
 
 
 def matched_one_to_one(confusion: Counts) -> NDArray[np.int64]:

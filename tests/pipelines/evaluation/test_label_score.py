@@ -83,3 +83,4 @@ def test_names_find_each_other() -> None:
     assert found is not None
     assert found.tolist() == [1, 2, -1]
     assert indices_by_name(("segment 1",), ("wall",)) is None
+    assert indices_by_name(("wall", "object1", "object2"), ("floor", "wall", "sofa")) is None
