@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipelines.config import TrackingConfig
 from pipelines.geometry.camera import project
+from pipelines.tracking.extend import promote, start_segment
 from pipelines.tracking.klt import follow
 from pipelines.tracking.motion import predict_pose
 from pipelines.tracking.pictures import Pictures
@@ -18,6 +19,9 @@ from pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
 from pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
+
+REACH = 60
+"""Frames within which a neighbour still says something of where a frame is."""
 
 
 class FrontEnd:
@@ -35,22 +39,73 @@ class FrontEnd:
         self.state, self.pictures, self.times = state, pictures, times
         self.intrinsics, self.settings, self.seed = intrinsics, settings, seed
 
-    def track(self, frame_id: int) -> None:
-        """Pose one frame, or note why it is lost."""
-        start = predict_pose(frame_id, self.state.poses, self.times)
-        seen, solved, reason = NO_SIGHTINGS, None, "nothing before it is posed"
-        if start is not None:
-            seen = self.correspond(frame_id, start, self.state.nearest_keyframes(frame_id, 2))
-            solved = self.solve(frame_id, seen, start)
-            reason = f"{len(seen)} points followed from its keyframes, {_count(solved)} agree on a pose"
+    def track(self, frame_id: int, may_start: bool = True) -> None:
+        """Pose one frame, or note why it is lost.
+
+        In turn: by flow from the keyframes around it; the same after the last posed frame has become a keyframe, where
+        there is none ahead; by recognising it; and, where `may_start`, as the beginning of a new segment.
+        """
+        seen, solved, start = self.by_flow(frame_id)
+        reason = f"{len(seen)} points followed from its keyframes, {_count(solved)} agree on a pose"
+        if not self.is_trusted(seen, solved) and self.extend_before(frame_id):
+            seen, solved, start = self.by_flow(frame_id)
         if not self.is_trusted(seen, solved):
             seen, solved = relocalise(frame_id, self.state, self.pictures, self.intrinsics, self.settings, self.seed)
             reason += f"; {len(seen)} matched in similar keyframes, {_count(solved)} agree"
         if solved is not None and self.is_trusted(seen, solved):
-            segment = self.state.segment[self.state.nearest_keyframes(frame_id, 1)[0]]
+            segment = self.state.segment_of_point(int(seen.point[solved.inliers][0]))
             self.state.add_frame(frame_id, solved.cam_from_world, seen.select(solved.inliers), False, segment)
+            self.extend_at(frame_id)
+        elif may_start and self.settings.new_segments and self._start(frame_id, start):
+            return
         else:
             self.state.lost[frame_id] = reason
+
+    def by_flow(self, frame_id: int) -> tuple[Sightings, FramePose | None, Array | None]:
+        """Sightings, the pose they agree on, and the predicted one, in the segment of the frames before."""
+        near = {i: self.state.poses[i] for i in range(frame_id - REACH, frame_id + REACH) if i in self.state.poses}
+        if not near:
+            return NO_SIGHTINGS, None, None
+        closest = min(near, key=lambda i: (abs(i - frame_id), i))
+        segment = self.state.segment[closest]
+        near = {i: pose for i, pose in near.items() if self.state.segment[i] == segment}
+        keyframes = [k for k in self.state.nearest_keyframes(frame_id, 2) if self.state.segment[k] == segment]
+        start = predict_pose(frame_id, near, self.times)
+        if start is None or not keyframes:
+            return NO_SIGHTINGS, None, start
+        seen = self.correspond(frame_id, start, keyframes)
+        return seen, self.solve(frame_id, seen, start), start
+
+    def is_inside(self, frame_id: int) -> bool:
+        """Whether keyframes of one segment lie on both sides: then there is no need for new ones."""
+        nearest = self.state.nearest_keyframes(frame_id, 1)
+        if len(nearest) < 2 or abs(nearest[0] - nearest[1]) >= REACH:
+            return False
+        return self.state.segment[nearest[0]] == self.state.segment[nearest[1]]
+
+    def extend_at(self, frame_id: int) -> None:
+        """Make the frame a keyframe when it sees much less than its keyframe did, and there is none ahead."""
+        nearest = self.state.nearest_keyframes(frame_id, 1)
+        if self.is_inside(frame_id) or not nearest:
+            return
+        share = len(self.state.sightings[frame_id]) / max(len(self.state.sightings[nearest[0]]), 1)
+        if share < self.settings.keyframe_share:
+            self._promote(frame_id)
+
+    def extend_before(self, frame_id: int) -> bool:
+        """Make the posed frame next to this one a keyframe, where there is none ahead; whether that was possible."""
+        near = [i for i in (frame_id - 1, frame_id + 1) if i in self.state.poses and i not in self.state.keyframes]
+        if not near or self.is_inside(frame_id):
+            return False
+        self._promote(near[0])
+        return True
+
+    def _promote(self, frame_id: int) -> None:
+        promote(frame_id, self.state, self.pictures, self.intrinsics, self.settings)
+
+    def _start(self, frame_id: int, start: Array | None) -> bool:
+        pose = np.eye(4) if start is None else start
+        return start_segment(frame_id, pose, self.state, self.pictures, self.intrinsics, self.settings)
 
     def correspond(self, frame_id: int, start: Array, keyframes: list[int]) -> Sightings:
         """Points of the keyframes found in the frame by KLT, searched from where `start` (4, 4) puts them."""

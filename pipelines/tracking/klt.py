@@ -59,6 +59,8 @@ def _flow(
 
 def corners(grey: NDArray[np.uint8], taken: Array, count: int, distance: float = 10.0) -> Array:
     """Up to `count` new corners (Q, 2), subpixel, none within `distance` pixels of those taken (R, 2) or each other."""
+    if count <= 0:  # OpenCV takes 0 for "as many as there are"
+        return np.zeros((0, 2))
     mask = np.full(grey.shape, 255, np.uint8)
     for x, y in np.asarray(taken).reshape(-1, 2):
         cv2.circle(mask, (int(x), int(y)), int(distance), 0, -1)
@@ -67,4 +69,6 @@ def corners(grey: NDArray[np.uint8], taken: Array, count: int, distance: float =
         return np.zeros((0, 2))
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
     found = cv2.cornerSubPix(grey, found, (3, 3), (-1, -1), criteria)
-    return found.reshape(-1, 2).astype(np.float64) + 0.5
+    xy = found.reshape(-1, 2).astype(np.float64) + 0.5
+    # Refinement may push a corner over the border.
+    return xy[((xy > 0) & (xy < grey.shape[::-1])).all(1)]

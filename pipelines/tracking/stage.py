@@ -15,6 +15,7 @@ from pipelines.tracking.adjust import Report, adjust_state
 from pipelines.tracking.front_end import FrontEnd
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.result import normalise, to_sparse_model, to_trajectory
+from pipelines.tracking.segments import join_segments
 from pipelines.tracking.state import TrackState
 from pipelines.types import Frame
 
@@ -60,6 +61,10 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
         state.done += 1
         if state.done % settings.snapshot_every == 0:
             state.save(snapshot)
+    # Frames before the first keyframe could not be followed from anywhere; now there are neighbours behind them.
+    for frame_id in sorted(state.lost, reverse=True):
+        front_end.track(frame_id, may_start=False)
+    join_segments(state, pictures, intrinsics, settings, context.config.run.seed)
     return state
 
 

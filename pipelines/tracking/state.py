@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -89,10 +90,14 @@ class TrackState:
         self.colors = np.concatenate([self.colors, colors])
         return np.arange(first, len(self.points))
 
+    def segment_of_point(self, point: int) -> int:
+        """The segment of the keyframes that see a point."""
+        return next(self.segment[k] for k in self.keyframes if point in self.sightings[k].point)
+
     def nearest_keyframes(self, frame_id: int, count: int) -> list[int]:
         """Up to `count` keyframes on each side in time, nearest first."""
-        before = [k for k in self.keyframes if k < frame_id][-count:]
-        after = [k for k in self.keyframes if k > frame_id][:count]
+        place, behind = bisect_left(self.keyframes, frame_id), bisect_right(self.keyframes, frame_id)
+        before, after = self.keyframes[max(place - count, 0) : place], self.keyframes[behind : behind + count]
         return sorted(before + after, key=lambda k: (abs(k - frame_id), k))
 
     def save(self, path: Path) -> None:

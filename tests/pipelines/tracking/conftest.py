@@ -94,7 +94,7 @@ def room_frames() -> tuple[Intrinsics, list[WorldFrame]]:
 
 @pytest.fixture(scope="session")
 def make_run(room_frames: tuple[Intrinsics, list[WorldFrame]]) -> Callable[..., MadeRun]:
-    """make_run(folder, keyframes=..., depth_factor=..., metric=..., blank=...)."""
+    """make_run(folder, keyframes=..., depth_factor=..., metric=..., blank=..., all_proxies=...)."""
 
     def make(
         folder: Path,
@@ -103,6 +103,7 @@ def make_run(room_frames: tuple[Intrinsics, list[WorldFrame]]) -> Callable[..., 
         depth_factor: float = 1.0,
         metric: bool = True,
         blank: tuple[int, ...] = (),
+        all_proxies: bool = False,
     ) -> MadeRun:
         intrinsics, frames = room_frames
         truth = np.linalg.inv(np.array([f.world_from_cam for f in frames]))
@@ -112,7 +113,7 @@ def make_run(room_frames: tuple[Intrinsics, list[WorldFrame]]) -> Callable[..., 
         for row, frame in zip(rows, frames, strict=True):
             picture = np.full_like(frame.rgb, 128) if row.id in blank else frame.rgb
             write_rgb(folder / "frames" / row.name, picture)
-            if row.id in keyframes:
+            if all_proxies or row.id in keyframes:
                 save_proxy_maps(proxy_path(folder / "proxy", row.id), _maps(frame, depth_factor))
         save_frames(folder / "frames", rows)
         save_calibration(folder / "frames", Calibration(intrinsics, "given", 0.0, (0, 0, 0, 0)))

@@ -8,6 +8,7 @@ import pytest
 
 from pipelines.geometry import se3
 from pipelines.geometry.camera import project
+from pipelines.tracking.extend import triangulate
 from pipelines.tracking.features import extract_features, frame_descriptor, match_features
 from pipelines.tracking.klt import corners, follow
 from pipelines.tracking.motion import interpolate_pose, predict_pose
@@ -48,6 +49,22 @@ def test_corners_keep_their_distance() -> None:
     xy = corners(texture(2), taken, 100, distance=12)
     assert len(xy) > 20
     assert np.linalg.norm(xy[:, None] - taken, axis=2).min() > 9
+
+
+def test_triangulation_measures_depth_and_refuses_parallel_rays() -> None:
+    rng = np.random.default_rng(0)
+    camera = Intrinsics(640, 480, 500, 500, 320, 240)
+    points = rng.uniform([-1, -1, 3], [1, 1, 6], (40, 3))
+    points[30:, 2] *= 100
+    motion = se3.exp(np.array([-0.3, 0.02, 0.05, 0.02, 0.05, 0.0]))
+    xy1, _ = project(points, camera)
+    xy2, _ = project(se3.transform(motion, points), camera)
+    xy2[:5, 1] += 20
+    found, good = triangulate(xy1, xy2, motion, camera, 2.0)
+    assert good[5:30].all()
+    assert not good[:5].any()
+    assert not good[30:].any()
+    assert np.allclose(found[5:30], points[5:30], atol=1e-6)
 
 
 def test_prediction_follows_a_steady_screw() -> None:

@@ -118,6 +118,35 @@ def interrupted(context: StageContext, after: int) -> StageContext:
     return StageContext(context.run, context.source, context.config, context.folder, Breaking())
 
 
+def test_works_without_structure_from_motion(
+    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
+) -> None:
+    made = make_run(tmp_path / "run", keyframes=(), all_proxies=True)
+    figures = finish(open_stage(made.run, "tracking"))
+    assert figures["posed"] == 24
+    assert figures["segments"] == 1
+    assert 2 <= figures["keyframes"] <= 12
+    assert 0 < trajectory_error(made, scale=False) < 0.02
+
+
+def test_goes_on_where_structure_from_motion_ends(
+    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
+) -> None:
+    made = make_run(tmp_path / "run", keyframes=(8, 11, 14), all_proxies=True, backbone_scale=0.4)
+    figures = finish(open_stage(made.run, "tracking"))
+    assert figures["posed"] == 24
+    assert figures["segments"] == 1
+    assert 0 < trajectory_error(made, scale=False) < 0.02
+
+
+def test_without_new_segments_what_cannot_be_reached_is_lost(
+    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
+) -> None:
+    made = make_run(tmp_path / "run", keyframes=(), all_proxies=True)
+    with pytest.raises(InputError, match="no camera motion"):
+        STAGE.run(open_stage(made.run, "tracking", load_config(overrides=["tracking.new_segments=false"])))
+
+
 def test_nothing_to_go_by_is_refused(
     tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
 ) -> None:

@@ -1,0 +1,155 @@
+"""New keyframes where structure from motion has none: points from proxy depth, or triangulated from the last one."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import TrackingConfig
+from pipelines.geometry import se3
+from pipelines.geometry.camera import project, unproject
+from pipelines.tracking.depth_scales import keyframe_scale, sample_proxy
+from pipelines.tracking.klt import corners, follow
+from pipelines.tracking.pictures import Pictures
+from pipelines.tracking.state import Sightings, TrackState
+from pipelines.types import Intrinsics
+
+Array = NDArray[np.float64]
+
+MIN_ANGLE = np.radians(1.5)
+"""Rays that meet at a smaller angle say nothing of the depth."""
+
+
+def promote(
+    frame_id: int, state: TrackState, pictures: Pictures, intrinsics: Intrinsics, settings: TrackingConfig
+) -> int:
+    """Make a posed frame a keyframe with new points; returns how many are new."""
+    earlier = [k for k in state.nearest_keyframes(frame_id, 2) if state.segment[k] == state.segment[frame_id]]
+    state.keyframes = sorted({*state.keyframes, frame_id})
+    added = 0
+    if earlier:
+        added += _triangulate(earlier[0], frame_id, state, pictures, intrinsics, settings)
+    return added + _from_proxy(frame_id, state, pictures, intrinsics, settings)
+
+
+def start_segment(
+    frame_id: int,
+    cam_from_world: Array,
+    state: TrackState,
+    pictures: Pictures,
+    intrinsics: Intrinsics,
+    settings: TrackingConfig,
+) -> bool:
+    """A new beginning from one frame's proxy depth; False, and nothing changed, when it has too few points for that."""
+    if pictures.proxy(frame_id) is None:
+        return False
+    before = len(state.points)
+    segment = max(state.segment.values(), default=-1) + 1
+    nothing = Sightings(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
+    state.add_frame(frame_id, cam_from_world, nothing, True, segment)
+    if _from_proxy(frame_id, state, pictures, intrinsics, settings) >= settings.min_inliers:
+        return True
+    for table in (state.poses, state.sightings, state.segment):
+        del table[frame_id]
+    state.keyframes.remove(frame_id)
+    state.points, state.colors = state.points[:before], state.colors[:before]
+    return False
+
+
+def _from_proxy(
+    frame_id: int, state: TrackState, pictures: Pictures, intrinsics: Intrinsics, settings: TrackingConfig
+) -> int:
+    """Corners that are no points yet, at the proxy depth, scaled to agree with the points the frame sees."""
+    maps = pictures.proxy(frame_id)
+    if maps is None:
+        return 0
+    seen = state.sightings[frame_id]
+    xy = corners(pictures.grey(frame_id), seen.xy, max(settings.new_points - len(seen), 0))
+    depth, _ = sample_proxy(maps, xy, intrinsics)
+    known, trust = sample_proxy(maps, seen.xy, intrinsics)
+    motion = state.poses[frame_id]
+    z = state.points[seen.point] @ motion[2, :3] + motion[2, 3]
+    both = (known > 0) & (z > 0)
+    enough = int(both.sum()) >= settings.min_inliers
+    scale = np.exp(keyframe_scale(np.log(z[both] / known[both]), trust[both])) if enough else 1.0
+    good = depth > 0
+    in_cam = unproject(xy[good], depth[good] * scale, intrinsics)
+    points = se3.transform(se3.inverse(motion), in_cam)
+    _add(frame_id, None, points, xy[good], None, state, pictures, settings)
+    return int(good.sum())
+
+
+def _triangulate(
+    first: int, second: int, state: TrackState, pictures: Pictures, intrinsics: Intrinsics, settings: TrackingConfig
+) -> int:
+    """Corners of the first keyframe that are no points yet, followed into the second."""
+    taken = state.sightings[first].xy
+    grey = pictures.grey(first)
+    xy = corners(grey, taken, settings.new_points)
+    motion = state.poses[second] @ se3.inverse(state.poses[first])
+    depth = _nearby_depth(first, xy, state)
+    guess, _ = project(se3.transform(motion, unproject(xy, depth, intrinsics)), intrinsics)
+    there, found = follow(
+        grey, pictures.grey(second), xy, guess, settings.flow_window, settings.flow_levels, settings.flow_error
+    )
+    xy, there = xy[found], there[found]
+    in_first, good = triangulate(xy, there, motion, intrinsics, settings.pose_error)
+    points = se3.transform(se3.inverse(state.poses[first]), in_first[good])
+    _add(first, second, points, xy[good], there[good], state, pictures, settings)
+    return int(good.sum())
+
+
+def _nearby_depth(frame_id: int, xy: Array, state: TrackState) -> Array:
+    """(Q,) depth of the nearest known point in the picture: a fair first guess."""
+    seen, motion = state.sightings[frame_id], state.poses[frame_id]
+    z = state.points[seen.point] @ motion[2, :3] + motion[2, 3]
+    ahead = z > 0
+    if not ahead.any() or len(xy) == 0:
+        return np.ones(len(xy))
+    distance = ((xy[:, None] - seen.xy[ahead][None]) ** 2).sum(2)
+    return z[ahead][distance.argmin(1)]
+
+
+def triangulate(
+    xy1: Array, xy2: Array, cam2_from_cam1: Array, intrinsics: Intrinsics, max_error: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Points in the first camera (Q, 3) nearest to both rays, and which (Q,) are good: in front of both cameras, rays
+    at an angle of at least 1.5 degrees, and within `max_error` pixels in both pictures."""
+    ones = np.ones(len(xy1))
+    ray1 = unproject(xy1, ones, intrinsics)
+    centre2 = se3.inverse(cam2_from_cam1)[:3, 3]
+    ray2 = unproject(xy2, ones, intrinsics) @ cam2_from_cam1[:3, :3]
+    ray1 /= np.linalg.norm(ray1, axis=1, keepdims=True)
+    ray2 /= np.linalg.norm(ray2, axis=1, keepdims=True)
+    cosine = (ray1 * ray2).sum(1)
+    # Closest points of two lines; the denominator is the squared sine of their angle.
+    sine2 = np.maximum(1 - cosine**2, 1e-12)
+    along1, along2 = ray1 @ centre2, ray2 @ centre2
+    t1 = (along1 - cosine * along2) / sine2
+    t2 = (cosine * along1 - along2) / sine2
+    points = (ray1 * t1[:, None] + centre2 + ray2 * t2[:, None]) / 2
+    good = (t1 > 0) & (t2 > 0) & (np.arccos(np.clip(cosine, -1, 1)) > MIN_ANGLE)
+    for motion, xy in ((np.eye(4), xy1), (cam2_from_cam1, xy2)):
+        seen, _ = project(se3.transform(motion, points), intrinsics)
+        good &= np.nan_to_num(np.linalg.norm(seen - xy, axis=1), nan=np.inf) < max_error
+    return points, good
+
+
+def _add(
+    first: int,
+    second: int | None,
+    points: Array,
+    xy: Array,
+    xy2: Array | None,
+    state: TrackState,
+    pictures: Pictures,
+    settings: TrackingConfig,
+) -> None:
+    """New points with their sightings in one or two keyframes; colours from the first."""
+    image = pictures.color(first)
+    colors = image[xy[:, 1].astype(int), xy[:, 0].astype(int)]
+    index = state.add_points(points, colors)
+    for frame_id, pixels in ((first, xy), (second, xy2)):
+        if frame_id is not None and pixels is not None:
+            extra = Sightings(index, pixels, np.full(len(index), settings.flow_sd))
+            state.sightings[frame_id] = state.sightings[frame_id].joined(extra)

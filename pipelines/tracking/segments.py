@@ -1,0 +1,137 @@
+"""Joining stretches that began anew after a loss, when a keyframe of one is recognised in another."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import TrackingConfig
+from pipelines.geometry import se3
+from pipelines.geometry.alignment import Similarity
+from pipelines.tracking.pictures import Pictures
+from pipelines.tracking.pnp import solve_pose
+from pipelines.tracking.relocalise import match_keyframe
+from pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
+from pipelines.types import Intrinsics
+
+Array = NDArray[np.float64]
+
+TRIES = 12
+"""Keyframes of a segment that are looked for in another: the nearest in time, then those that look most like it."""
+
+
+def join_segments(
+    state: TrackState, pictures: Pictures, intrinsics: Intrinsics, settings: TrackingConfig, seed: int
+) -> int:
+    """Bring every segment that can be recognised into the largest one's world; returns how many were joined.
+
+    One keyframe is not believed: two must be recognised, and say the same of how the worlds lie to each other.
+    """
+    joined, again = 0, True
+    while again:
+        again = False
+        counts = Counter(state.segment.values())
+        order = sorted(counts, key=lambda s: (-counts[s], s))
+        for segment in order[1:]:
+            if _join(segment, order[0], state, pictures, intrinsics, settings, seed):
+                joined, again = joined + 1, True
+                break
+    return joined
+
+
+def _join(
+    segment: int,
+    main: int,
+    state: TrackState,
+    pictures: Pictures,
+    intrinsics: Intrinsics,
+    settings: TrackingConfig,
+    seed: int,
+) -> bool:
+    ours = [k for k in state.keyframes if state.segment[k] == segment]
+    theirs = [k for k in state.keyframes if state.segment[k] == main]
+    looks = np.array([[float(pictures.descriptor(a) @ pictures.descriptor(b)) for b in theirs] for a in ours])
+    answers: list[tuple[int, Similarity, Sightings]] = []
+    gap = np.array([min(abs(a - b) for b in theirs) for a in ours])
+    near = np.argsort(gap, kind="stable")[: TRIES // 3].tolist()
+    for n in near + [i for i in np.argsort(-looks.max(1), kind="stable")[:TRIES].tolist() if i not in near]:
+        alike = [theirs[i] for i in np.argsort(-looks[n], kind="stable")[:3]]
+        alike += [k for k in sorted(theirs, key=lambda k: abs(k - ours[n]))[:2] if k not in alike]
+        found = _recognise(ours[n], alike, state, pictures, intrinsics, settings, seed)
+        if found is None:
+            continue
+        if any(_agree(found[0], other, state.poses[ours[n]]) for _, other, _ in answers):
+            answers.append((ours[n], *found))
+            _move(segment, main, found[0], state)
+            for frame_id, _, seen in answers:
+                known = state.sightings[frame_id]
+                state.sightings[frame_id] = known.joined(seen.select(~np.isin(seen.point, known.point)))
+            return True
+        answers.append((ours[n], *found))
+    return False
+
+
+def _recognise(
+    frame_id: int,
+    keyframes: list[int],
+    state: TrackState,
+    pictures: Pictures,
+    intrinsics: Intrinsics,
+    settings: TrackingConfig,
+    seed: int,
+) -> tuple[Similarity, Sightings] | None:
+    """main_from_segment, and the main segment's points in the frame."""
+    seen = NO_SIGHTINGS
+    for keyframe in keyframes:
+        found = match_keyframe(frame_id, keyframe, state, pictures)
+        seen = seen.joined(found.select(~np.isin(found.point, seen.point)))
+    solved = solve_pose(seen.xy, state.points[seen.point], intrinsics, seed + frame_id, None, settings.pose_error, 1.0)
+    if solved is None or solved.inliers.sum() < max(settings.min_inliers, 0.4 * len(seen)):
+        return None
+    seen = seen.select(solved.inliers)
+    scale = _depth_ratio(frame_id, solved.cam_from_world, seen, state)
+    # main_from_cam @ cam_from_segment, distances in the segment stretched by the scale.
+    main_from_cam, cam_from_segment = se3.inverse(solved.cam_from_world), state.poses[frame_id]
+    rotation = main_from_cam[:3, :3] @ cam_from_segment[:3, :3]
+    translation = scale * (main_from_cam[:3, :3] @ cam_from_segment[:3, 3]) + main_from_cam[:3, 3]
+    return Similarity(scale, rotation, translation), seen
+
+
+def _depth_ratio(frame_id: int, cam_from_main: Array, seen: Sightings, state: TrackState) -> float:
+    """Unit of the segment in units of the main world: depths of what both worlds see in the same places."""
+    own = state.sightings[frame_id]
+    distance = ((own.xy[None] - seen.xy[:, None]) ** 2).sum(2)
+    nearest = distance.argmin(1)
+    close = distance[np.arange(len(seen)), nearest] < 15.0**2
+    if close.sum() < 8:
+        return 1.0
+    motion = state.poses[frame_id]
+    theirs = state.points[seen.point[close]] @ cam_from_main[2, :3] + cam_from_main[2, 3]
+    ours = state.points[own.point[nearest[close]]] @ motion[2, :3] + motion[2, 3]
+    good = (theirs > 0) & (ours > 0)
+    return float(np.exp(np.median(np.log(theirs[good] / ours[good])))) if good.sum() >= 8 else 1.0
+
+
+def _agree(first: Similarity, second: Similarity, cam_from_world: Array) -> bool:
+    """Whether both put this camera in nearly the same place: 3 degrees, a tenth of its distance from the origin or of a
+    unit, a tenth of scale."""
+    a, b = (s.apply_to_poses(cam_from_world[None])[0] for s in (first, second))
+    apart = a @ se3.inverse(b)
+    reach = max(float(np.linalg.norm(se3.inverse(a)[:3, 3])), first.scale)
+    return bool(
+        se3.rotation_angle(apart) < np.radians(3)
+        and np.linalg.norm(apart[:3, 3]) < 0.1 * reach
+        and abs(np.log(first.scale / second.scale)) < 0.1
+    )
+
+
+def _move(segment: int, main: int, main_from_segment: Similarity, state: TrackState) -> None:
+    """Poses and points of a segment into the main one's world."""
+    frames = [i for i in sorted(state.poses) if state.segment[i] == segment]
+    points = np.unique(np.concatenate([state.sightings[i].point for i in frames]))
+    state.points[points] = main_from_segment.apply(state.points[points])
+    for i in frames:
+        state.poses[i] = main_from_segment.apply_to_poses(state.poses[i][None])[0]
+        state.segment[i] = main
