@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pycolmap
 
-# pycolmap tells of each step on stderr, through the progress bars, and misses images, which it is not given.
-pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+# pycolmap tells of each step on stderr, through the progress bars; what fails is told by whoever called it.
+pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
 
 
 def calibrate_focal(database: Path, seed: int) -> None:

@@ -17,6 +17,7 @@ HOW_TO_FILM = (
 _MOVING_FRACTION = 0.01
 _TURN_ONLY_PX = 1.5
 _MIN_DISPLACEMENT_PX = 10.0
+_SAMPLED_PAIRS = 40
 _FOCAL_FACTORS = np.geomspace(0.4, 4.0, 28)
 
 
@@ -43,6 +44,7 @@ def require_parallax(
     moved = [p for p in pairs if _displacement(p, xy) > _MIN_DISPLACEMENT_PX]
     if not moved:
         return
+    moved = moved[:: max(1, len(moved) // _SAMPLED_PAIRS)]
     focals = [focal] if focal else [f * max(size) for f in _FOCAL_FACTORS]
     residuals = [np.median([rotation_residual(p, xy, size, f) for p in moved]) for f in focals]
     if min(residuals) < _TURN_ONLY_PX:

@@ -36,6 +36,7 @@ from pipelines.types import Calibration, Frame
 _SIGNIFICANT_SHIFT_PX = 0.3
 _FEW_KEYFRAMES = 12
 _FOCAL_GUESS = 1.2
+_UNSURE_FOCAL = 0.05
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -48,7 +49,7 @@ def run(context: StageContext) -> dict[str, Any]:
     choice = _keyframes(context, frames)
     structure = _structure(context, camera, origin == "given", frames, choice.keyframes)
     lens = make_lens(structure.model.cameras[1])
-    calibration = _calibration(lens, origin, structure.focal_sd)
+    calibration = _calibration(context, lens, origin, structure.focal_sd)
     _write_backbone(context, structure, choice.keyframes, lens, frames)
     _write_frames(context, source, frames, lens)
     save_calibration(context.folder, calibration)
@@ -179,9 +180,14 @@ def _threads(context: StageContext) -> int:
     return context.config.run.threads or os.cpu_count() or 1
 
 
-def _calibration(lens: Lens, origin: str, focal_sd: float) -> Calibration:
-    zoom = lens.pinhole.fx / lens.camera.focal_length_x
-    return Calibration(lens.pinhole, origin, focal_sd * zoom, distortion_of(lens.camera))
+def _calibration(context: StageContext, lens: Lens, origin: str, focal_sd: float) -> Calibration:
+    focal_sd *= lens.pinhole.fx / lens.camera.focal_length_x
+    if focal_sd > _UNSURE_FOCAL * lens.pinhole.fx:
+        context.warn(
+            f"the focal length is unsure: {lens.pinhole.fx:.0f} ± {focal_sd:.0f} px. If you know them, "
+            "give the intrinsics with --intrinsics"
+        )
+    return Calibration(lens.pinhole, origin, focal_sd, distortion_of(lens.camera))
 
 
 # results --------------------------------------------------------------------------------------------------------

@@ -29,6 +29,7 @@ from pipelines.progress import Progress
 
 _PAIRS_PER_BLOCK = 64
 _MIN_KEYFRAMES = 3
+_MIN_POINTS = 30
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -119,7 +120,7 @@ class StructureFromMotion:
             report = judge(model, pairs, xy, len(features))
             if best is None or report.score > best[2].score:
                 best = model, name, report
-        if best is None or best[2].registered < min(_MIN_KEYFRAMES, len(features)):
+        if best is None or best[2].registered < min(_MIN_KEYFRAMES, len(features)) or best[2].points < _MIN_POINTS:
             raise InputError(
                 f"no structure could be found: {len(pairs)} pairs of {len(features)} views match. The views have too "
                 f"little texture, blur or overlap. {HOW_TO_FILM}, slowly and in good light"

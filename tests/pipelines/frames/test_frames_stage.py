@@ -1,0 +1,198 @@
+"""The whole stage on a rendered walk: accuracy, bytes, going on after a kill, and what it refuses."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+import pytest
+
+from formats.errors import InputError
+from formats.images import read_rgb, write_rgb
+from pipelines.config import load_config
+from pipelines.frames.stage import run
+from pipelines.geometry.alignment import align_points
+from pipelines.progress import SilentProgress
+from pipelines.run_folder import RunFolder, calibration_from_json, load_sparse_model, read_json
+from pipelines.stages import StageContext
+from tests.pipelines.frames.conftest import Walk, render, sideways, turn, write_walk
+
+T = TypeVar("T")
+
+
+class Killed(Exception):
+    """Stands for the end of the process."""
+
+
+class KillAt(SilentProgress):
+    """Ends the work when the n-th item of a bar has been handed out."""
+
+    def __init__(self, label: str, item: int) -> None:
+        self._label, self._item = label, item
+
+    def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+        for i, item in enumerate(items):
+            if label == self._label and i == self._item:
+                raise Killed
+            yield item
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """SHA-256 of every result, the snapshots left out."""
+    files = [p for p in sorted(folder.rglob("*")) if p.is_file() and "snapshot" not in p.parts]
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+@pytest.fixture(scope="session")
+def finished(bent_walk: Walk, tmp_path_factory: pytest.TempPathFactory) -> tuple[StageContext, dict]:
+    root = tmp_path_factory.mktemp("finished")
+    (root / "frames").mkdir()
+    config = load_config(overrides=["run.threads=2", "frames.max_features=800"])
+    context = StageContext(RunFolder(root), bent_walk.folder, config, root / "frames", SilentProgress())
+    return context, run(context)
+
+
+def test_the_walk_is_recovered(finished: tuple[StageContext, dict], bent_walk: Walk) -> None:
+    context, figures = finished
+    calibration = context.run.load_calibration()
+    assert calibration.origin == "self-calibrated"
+    error = abs(calibration.intrinsics.fx / bent_walk.focal - 1)
+    assert 0 < error < 0.02
+    assert 0 < calibration.focal_sd < 0.1 * bent_walk.focal
+    assert abs(calibration.distortion[0] - bent_walk.k1) < 0.03
+    model = context.run.load_backbone()
+    assert model is not None
+    assert len(model.frame_ids) == figures["keyframes"] >= 10
+    centers = -np.einsum("nji,nj->ni", model.cam_from_world[:, :3, :3], model.cam_from_world[:, :3, 3])
+    truth = bent_walk.centers[model.frame_ids]
+    errors = np.linalg.norm(align_points(centers, truth).apply(centers) - truth, axis=1)
+    assert 0 < np.sqrt((errors**2).mean()) < 0.01  # of a walk of 1.9 m
+
+
+def test_points_reproject_into_the_undistorted_frames(finished: tuple[StageContext, dict]) -> None:
+    context, _ = finished
+    model, matrix = context.run.load_backbone(), context.run.load_calibration().intrinsics.matrix
+    assert model is not None
+    np.testing.assert_array_equal(model.cam_from_world[0], np.eye(4))
+    poses = model.cam_from_world[model.obs_frame]
+    points = (poses[:, :3, :3] @ model.points_in_world[model.obs_point][..., None])[..., 0] + poses[:, :3, 3]
+    assert (points[:, 2] > 0).all()
+    assert np.median(points[:, 2]) == pytest.approx(1.0)
+    projected = points @ matrix.T
+    error = np.linalg.norm(projected[:, :2] / projected[:, 2:] - model.obs_xy, axis=1)
+    assert 0 < np.median(error) < 0.5
+    assert error.max() < 6
+    frames = context.run.load_frames()
+    first = model.obs_frame == 0
+    rgb = context.run.image(frames[model.frame_ids[0]])
+    x, y = model.obs_xy[first].astype(int).clip(0, [rgb.shape[1] - 1, rgb.shape[0] - 1]).T
+    difference = np.abs(rgb[y, x].astype(int) - model.colors[model.obs_point[first]])
+    assert np.median(difference) < 20
+
+
+def test_frames_are_undistorted(finished: tuple[StageContext, dict], bent_walk: Walk) -> None:
+    context, _ = finished
+    center, rotation = list(sideways(18))[5]
+    frame = context.run.load_frames()[5]
+    straight = render(center, rotation, bent_walk.focal).astype(float)
+    ours = context.run.image(frame).astype(float)
+    bent = read_rgb(bent_walk.folder / frame.name).astype(float)
+    assert frame.name == "view_005.png"
+    assert np.abs(ours - straight).mean() < 0.6 * np.abs(bent - straight).mean()
+
+
+def _copy(source: Path, target: Path) -> None:
+    if source.is_dir():
+        shutil.copytree(source, target)
+    else:
+        shutil.copyfile(source, target)
+
+
+@pytest.mark.parametrize(
+    ("label", "item"), [("picking", 7), ("features", 3), ("matches", 1), ("mapping", 1), ("undistorting", 4)]
+)
+def test_a_killed_stage_goes_on_to_the_same_bytes(
+    label: str, item: int, finished: tuple[StageContext, dict], bent_walk: Walk,
+    make_context: Callable[..., StageContext],
+) -> None:  # fmt: skip
+    if label != "picking":
+        # How the parts before go on is tested by the other cases: begin with what they leave.
+        for name in ("picked", "picked.json", *(("features",) if label != "features" else ())):
+            _copy(finished[0].snapshot / name, make_context(bent_walk.folder).snapshot / name)
+    with pytest.raises(Killed):
+        run(make_context(bent_walk.folder, progress=KillAt(label, item)))
+    again = make_context(bent_walk.folder)
+    figures = run(again)
+    assert figures == finished[1]
+    assert digests(again.folder) == digests(finished[0].folder)
+
+
+def test_given_intrinsics_are_kept(bent_walk: Walk, make_context: Callable[..., StageContext]) -> None:
+    intrinsics = f"{bent_walk.focal},{bent_walk.focal},160,120,{bent_walk.k1},0,0,0"
+    context = make_context(bent_walk.folder, f"frames.intrinsics={intrinsics}", "frames.overlap=4")
+    figures = run(context)
+    calibration = calibration_from_json(read_json(context.folder / "calibration.json"))
+    assert (calibration.origin, calibration.focal_sd) == ("given", 0.0)
+    assert calibration.distortion == (bent_walk.k1, 0.0, 0.0, 0.0)
+    assert calibration.intrinsics.fx == pytest.approx(bent_walk.focal)  # barrel distortion needs no zoom
+    assert figures["keyframes_placed"] == figures["keyframes"]
+    model = load_sparse_model(context.folder / "backbone" / "model.npz")
+    centers = -np.einsum("nji,nj->ni", model.cam_from_world[:, :3, :3], model.cam_from_world[:, :3, 3])
+    truth = bent_walk.centers[model.frame_ids]
+    assert np.linalg.norm(align_points(centers, truth).apply(centers) - truth, axis=1).max() < 0.01
+
+
+def test_frames_of_a_good_lens_are_the_source_byte_for_byte(
+    tmp_path: Path, make_context: Callable[..., StageContext]
+) -> None:
+    walk = write_walk(tmp_path / "straight", sideways(8))
+    context = make_context(walk.folder, "frames.intrinsics=280,280,160,120")
+    run(context)
+    for path in walk.folder.iterdir():
+        assert (context.folder / path.name).read_bytes() == path.read_bytes()
+
+
+def test_a_camera_that_stands_still_is_refused(tmp_path: Path, make_context: Callable[..., StageContext]) -> None:
+    rng = np.random.default_rng(0)
+    view = render(np.zeros(3), turn(0.0)).astype(float)
+    for i in range(6):
+        noisy = np.clip(view + rng.normal(0, 3, view.shape), 0, 255).astype(np.uint8)
+        write_rgb(tmp_path / "still" / f"{i}.png", noisy)
+    with pytest.raises(InputError, match=r"no parallax.*stands still.*walking"):
+        run(make_context(tmp_path / "still"))
+
+
+def test_a_camera_that_only_turns_is_refused(tmp_path: Path, make_context: Callable[..., StageContext]) -> None:
+    turns = ((np.zeros(3), turn(a, 0.1 * np.sin(5 * a))) for a in np.linspace(-0.5, 0.3, 12))
+    walk = write_walk(tmp_path / "turning", turns)
+    with pytest.raises(InputError, match=r"no parallax.*turning.*walking"):
+        run(make_context(walk.folder))
+
+
+def test_views_without_anything_in_common_are_refused(
+    tmp_path: Path, make_context: Callable[..., StageContext]
+) -> None:
+    rng = np.random.default_rng(1)
+    for i in range(5):
+        noise = cv2.resize(rng.integers(0, 255, (30, 40, 3), dtype=np.uint8), (320, 240))
+        write_rgb(tmp_path / "noise" / f"{i}.png", noise)
+    with pytest.raises(InputError, match="no structure"):
+        run(make_context(tmp_path / "noise"))
+
+
+def test_an_unreadable_image_is_left_out_with_a_warning(
+    bent_walk: Walk, tmp_path: Path, make_context: Callable[..., StageContext]
+) -> None:
+    folder = tmp_path / "damaged"
+    shutil.copytree(bent_walk.folder, folder)
+    (folder / "view_004.png").write_bytes(b"\x89PNG\r\n not really")
+    context = make_context(folder, "frames.intrinsics=280,280,160,120,-0.06,0,0,0", "frames.overlap=3")
+    figures = run(context)
+    assert figures["frames"] == 17
+    assert any("view_004.png" in w for w in context.warnings)
+    assert not (context.folder / "view_004.png").exists()
