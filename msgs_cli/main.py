@@ -42,6 +42,7 @@ def main() -> None:
     msgs-slam resume video.msgs         go on after a stop
     msgs-slam status video.msgs         what is done, what was found
     msgs-slam export video.msgs         write the export files again, or elsewhere
+    msgs-slam evaluate video.msgs --truth DATASET    errors against a known truth
     msgs-slam config                    every setting with its default and meaning
     """
 
@@ -189,6 +190,71 @@ def export(run_path: Path, only: str | None, to: Path | None, quiet: bool, verbo
     for path in export_run(run, folder, only, _progress(quiet)):
         if not quiet:
             click.echo(path)
+
+
+@main.command()
+@click.argument("run_path", metavar="RUN", type=FOLDER)
+@click.option(
+    "--truth",
+    required=True,
+    type=click.Path(path_type=Path, exists=True),
+    metavar="PATH",
+    help="A data set with true poses and, if it has them, depth and labels.",
+)
+@click.option("--format", "truth_format", default="auto", help="Layout of the truth; auto recognises it.")
+@click.option(
+    "--protocol",
+    type=click.Choice(["msgs", "splatam"]),
+    default="msgs",
+    help="splatam adds that code's figures, for comparison with papers.",
+)
+@verbosity_options
+def evaluate(run_path: Path, truth: Path, truth_format: str, protocol: str, quiet: bool, verbose: bool) -> None:
+    """Compare RUN with the truth: poses, images, depth, labels, mesh. Writes RUN/evaluation/."""
+    _set_up_logging(quiet, verbose)
+    from formats.datasets import open_sequence
+    from pipelines.evaluation.table import evaluation_table
+    from pipelines.evaluation.write import write_evaluation
+    from pipelines.reconstruct import require_run
+    from pipelines.run_folder import RunFolder
+
+    run = RunFolder(run_path)
+    require_run(run)
+    sequence = open_sequence(truth, truth_format)
+    figures = write_evaluation(run, sequence, _progress(quiet), legacy=protocol == "splatam")
+    click.echo(evaluation_table(figures))
+
+
+@main.command()
+@click.option(
+    "--out",
+    type=FOLDER,
+    default=Path("msgs-demo"),
+    metavar="DIR",
+    show_default=True,
+    help="Where the clip, its truth and the run are written.",
+)
+@settings_options
+@verbosity_options
+def demo(out: Path, config_file: Path | None, overrides: tuple[str, ...], quiet: bool, verbose: bool) -> None:
+    """Make a short synthetic room video with known truth, reconstruct it, print the errors and where to look."""
+    _set_up_logging(quiet, verbose)
+    from pipelines.config import load_config
+    from pipelines.demo import demo_summary, run_demo
+    from pipelines.reconstruct import reconstruct as run_reconstruct
+    from pipelines.run_folder import RunFolder
+
+    config = load_config(config_file, overrides)
+
+    def reconstruct_clip(video: Path, run: RunFolder) -> None:
+        records = _interruptible(lambda: run_reconstruct(video, run, config, _progress(quiet)), run.root)
+        if not quiet:
+            _print_summary(run.root, records)
+
+    result = run_demo(out, reconstruct_clip, _progress(quiet))
+    click.echo("\nAgainst the known truth:")
+    for line in demo_summary(result):
+        click.echo(f"  {line}")
 
 
 @main.command("config")

@@ -124,6 +124,8 @@ def run_stages(
                 records.pop(later, None)
             record = _run_one(stage, run, source, config, progress, fingerprint)
             records[stage.name] = record
+            for later in STAGES[STAGES.index(stage.name) + 1 :]:  # made from what is no longer there
+                shutil.rmtree(run.stage(later), ignore_errors=True)
             _save_manifest(run, source, source_digest, records)
         else:
             log.info("%s: up to date", stage.name)

@@ -74,11 +74,12 @@ def another_value(value: Any) -> Any:
     return value + 1 if isinstance(value, int | float) else f'"{value}x"'
 
 
-def test_same_result_upstream_stops_the_wave(recorder: Recorder, tmp_path: Path) -> None:
-    """A stage that ran again but gave the same bytes leaves the later ones with the same fingerprint."""
+def test_until_stops_there_and_leaves_nothing_stale_behind(recorder: Recorder, tmp_path: Path) -> None:
     bring_up_to_date(recorder, tmp_path / "r")
     (tmp_path / "r" / "proxy" / "result.txt").unlink()
     assert bring_up_to_date(recorder, tmp_path / "r", until="proxy") == ["proxy"]
+    assert not (tmp_path / "r" / "export").exists()
+    assert bring_up_to_date(recorder, tmp_path / "r") == ["tracking", "mapping", "global_ba", "export"]
 
 
 def test_damaged_file_is_made_again(recorder: Recorder, tmp_path: Path) -> None:

@@ -1,0 +1,92 @@
+"""SIGKILL in every stage: the run goes on, keeps what is finished, and ends with the bytes of an unbroken run."""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from pipelines.run_folder_names import STAGES
+from pipelines.world import ClipOptions, iter_clip, make_world, write_video
+
+SETTINGS = (
+    "run.threads=2", "mapping.passes=2", "mapping.min_iterations=40", "mapping.snapshot_every=15",
+    "mapping.max_gaussians=30000",
+)  # fmt: skip
+COMPARED = ("frames", "proxy", "tracking", "mapping", "global_ba", "export")
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    options = ClipOptions(frames=24, width=240, height=180, fps=10.0, laps=0.4)
+    path = tmp_path_factory.mktemp("clip") / "room.avi"
+    return write_video(path, [f.rgb for f in iter_clip(make_world(texel=0.01), options)], options.fps)
+
+
+def start(*arguments: object) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "msgs_cli.main", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+
+def finish(process: subprocess.Popen[bytes]) -> None:
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors.decode()[-3000:]
+
+
+def kill_when(process: subprocess.Popen[bytes], reached: Callable[[], bool]) -> bool:
+    """SIGKILL as soon as `reached`; False when the process ended by itself before."""
+    while process.poll() is None:
+        if reached():
+            os.kill(process.pid, signal.SIGKILL)
+            process.communicate()
+            return True
+        time.sleep(0.01)
+    process.communicate()
+    return False
+
+
+def digests(run: Path) -> dict[str, str]:
+    """Of every file of every stage."""
+    files = [p for stage in COMPARED for p in sorted((run / stage).rglob("*")) if p.is_file()]
+    return {str(p.relative_to(run)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+def written(folder: Path, more_than: int) -> Callable[[], bool]:
+    """Whether the stage has begun to write its own files (the stamp and its folder aside)."""
+    return lambda: folder.exists() and sum(p.is_file() for p in folder.rglob("*")) > more_than
+
+
+def finished_at(run: Path) -> dict[str, float]:
+    stages = json.loads((run / "manifest.json").read_text())["stages"]
+    return {name: (run / name).stat().st_mtime for name in stages}
+
+
+def test_killed_in_every_stage_the_run_ends_as_an_unbroken_one(clip: Path, tmp_path: Path) -> None:
+    options = [x for s in SETTINGS for x in ("--set", s)]
+    whole, broken = tmp_path / "whole.msgs", tmp_path / "broken.msgs"
+    finish(start("reconstruct", clip, "--out", whole, *options))
+
+    killed = []
+    process = start("reconstruct", clip, "--out", broken, *options)
+    for stage in STAGES:
+        if kill_when(process, written(broken / f"{stage}.partial", 1)):
+            killed.append(stage)
+            before = finished_at(broken)
+            assert list(before) == list(STAGES[: STAGES.index(stage)])
+        process = start("resume", broken)
+    finish(process)
+    after = finished_at(broken)
+    assert {name: after[name] for name in before} == before, "a finished stage was done again"
+    assert set(killed) >= set(STAGES[:4]), f"killed only in {killed}: the others were too quick to catch"
+    assert digests(broken) == digests(whole)
+
+    # A changed setting of mapping: mapping and what follows are done again, nothing before.
+    finish(start("resume", broken, "--set", "mapping.min_iterations=41"))
+    later = finished_at(broken)
+    assert [name for name in STAGES if later[name] != after[name]] == ["mapping", "global_ba", "export"]
