@@ -53,11 +53,14 @@ class ProxyConfig:
 
     depth: str = setting("auto", "depth provider: auto, multiview, files:FOLDER, files, onnx:CARD")
     semantics: str = setting("auto", "semantics provider: auto, segments, files:FOLDER, files, onnx:CARD")
-    frames: str = setting("keyframes", "which frames get maps; all needs depth that needs no poses", ("keyframes", "all"))
+    frames: str = setting(
+        "keyframes", "which frames get maps; all needs depth that needs no poses", ("keyframes", "all")
+    )
     max_side: int = setting(640, "the maps are at most this many pixels on the long side")
     depth_scale: float = setting(0.001, "metres per unit of integer depth files")
     fuse: str = setting(
-        "learned", "which depth is fused with multi-view depth: a network's, also that of files, or none",
+        "learned",
+        "which depth is fused with multi-view depth: a network's, also that of files, or none",
         ("learned", "always", "never"),
     )
     alpha: float = setting(0.7, "eq. (2): how much depth edges lower the reliability")
@@ -127,7 +130,9 @@ class MappingConfig:
     depth_tolerance: float = setting(0.05, "T_depth, relative: a proxy nearer than the map by more adds Gaussians")
     densify_every: int = setting(2, "passes between two rounds of densification and pruning; 0 = never")
     densify_until: float = setting(0.45, "share of the visits after which the map no longer grows")
-    error_share: float = setting(0.02, "share of a view's pixels, those of largest error, that may add Gaussians a round")
+    error_share: float = setting(
+        0.02, "share of a view's pixels, those of largest error, that may add Gaussians a round"
+    )
     prune_opacity: float = setting(0.03, "Gaussians more transparent than this are removed")
     prune_radius: float = setting(0.15, "and those larger than this, in units of the scene's median depth")
     mean_rate: float = setting(3e-4, "learning rate of positions, in units of the scene's median depth")
@@ -187,11 +192,6 @@ class ExportConfig:
     mesh_side: int = setting(640, "pixels on the long side of their depth images")
     least_weight: float = setting(1.5, "a voxel seen with less weight, in views at the median depth, has no surface")
     least_piece: float = setting(0.01, "connected pieces smaller than this share of the largest one are removed")
-
-    mesh_voxel_px: float = setting(2.0, "side of a voxel of the mesh, in pixels at the median depth")
-    mesh_memory_mb: float = setting(800.0, "most memory for voxels; larger voxels are taken where they would not fit")
-    mesh_min_views: float = setting(1.5, "surface seen by fewer views (at the median depth) than this is left out")
-    mesh_min_part: float = setting(0.005, "connected parts with less than this share of all faces are floaters")
 
 
 @dataclass(frozen=True)
