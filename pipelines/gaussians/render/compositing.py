@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import importlib.util
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -85,13 +87,33 @@ def require_finite(name: str, tensor: Tensor) -> None:
 
 
 def choose_backend(backend: str | None, example: Tensor) -> ModuleType:
-    """The module that composites tensors like `example`; float64 and exotic devices go to the reference."""
-    if backend is None:
-        backend = "cpu" if example.device.type == "cpu" and example.dtype == torch.float32 else "reference"
-    if backend == "reference":
+    """The module that composites tensors like `example`; without a choice, the fastest that can."""
+    name = backend or _fastest(example)
+    if name == "reference":
         return reference
-    if backend == "cpu":
+    if name == "cpu":
         from pipelines.gaussians.render import cpu  # importing numba takes a while: only where it is used
 
         return cpu
+    if name == "cuda":
+        if not _has_triton():
+            raise ValueError("backend: 'cuda' needs the package triton, which comes with torch's CUDA builds")
+        from pipelines.gaussians.render import cuda
+
+        return cuda
     raise ValueError(f"backend: got {backend!r}, expected 'reference', 'cpu', 'cuda' or None")
+
+
+def _fastest(example: Tensor) -> str:
+    if example.dtype != torch.float32:
+        return "reference"
+    if example.device.type == "cpu":
+        return "cpu"
+    # Older cards have too little shared memory for the kernels.
+    modern = example.device.type == "cuda" and torch.cuda.get_device_capability(example.device) >= (8, 0)
+    return "cuda" if modern and _has_triton() else "reference"
+
+
+@functools.cache
+def _has_triton() -> bool:
+    return importlib.util.find_spec("triton") is not None

@@ -1,0 +1,200 @@
+"""Triton kernels: one program per tile, its 256 pixels in lanes, sixteen Gaussians at a time as a matrix.
+
+Within a step the light before each Gaussian is a running product along the matrix, and all sums over Gaussians or
+pixels are matrix products, on tensor cores with the digits of float32 ("tf32x3"). Gradients leave a tile with one
+atomic addition per Gaussian and value. The interpreter of Triton (environment variable TRITON_INTERPRET=1) runs these
+kernels on CPU tensors.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+RECORD = 6
+"""Numbers per Gaussian: u, v, sigma_px, z, opacity, reach."""
+
+
+@triton.jit
+def load_step(
+    records: tl.tensor, members: tl.tensor, first: tl.tensor, end: tl.tensor, STEP: tl.constexpr
+) -> tl.tensor:
+    """The next Gaussians of a tile; those past its end get opacity 0."""
+    place = first + tl.arange(0, STEP)
+    used = place < end
+    index = tl.load(members + place, mask=used, other=0)
+    at = records + index * 6
+    opacity = tl.where(used, tl.load(at + 4), 0.0)
+    return index, used, tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3), opacity, tl.load(at + 5)
+
+
+@triton.jit
+def opacities(
+    x: tl.tensor,
+    y: tl.tensor,
+    u: tl.tensor,
+    v: tl.tensor,
+    sigma: tl.tensor,
+    opacity: tl.tensor,
+    reach: tl.tensor,
+    ALPHA_MAX: tl.constexpr,
+) -> tl.tensor:
+    """(pixels, Gaussians): dx, dy, distance² and the opacity at the pixel, 0 beyond the Gaussian's reach."""
+    dx = x[:, None] - u[None, :]
+    dy = y[:, None] - v[None, :]
+    distance2 = dx * dx + dy * dy
+    alpha = opacity[None, :] * tl.exp(-0.5 * distance2 / (sigma * sigma)[None, :])
+    alpha = tl.where(distance2 <= (reach * reach)[None, :], tl.minimum(alpha, ALPHA_MAX), 0.0)
+    return dx, dy, distance2, alpha
+
+
+@triton.jit
+def light_before(light: tl.tensor, occlusion: tl.tensor, STEP: tl.constexpr) -> tl.tensor:
+    """(pixels, Gaussians) light that reaches each Gaussian, and (pixels,) what is left behind all of them."""
+    passed = tl.cumprod(1.0 - occlusion, axis=1)
+    last = tl.arange(0, STEP) == STEP - 1
+    after = light * tl.sum(tl.where(last[None, :], passed, 0.0), axis=1)
+    return light[:, None] * (passed / (1.0 - occlusion)), after
+
+
+@triton.jit
+def agreements(z: tl.tensor, proxy: tl.tensor, kappa: tl.tensor) -> tl.tensor:
+    """(pixels, Gaussians) error against the proxy depth and w_d of MSGS-SLAM eq. (7); 1 where there is no proxy."""
+    error = z[None, :] - proxy[:, None]
+    return error, tl.where(proxy[:, None] > 0, tl.exp(-kappa * error * error), 1.0)
+
+
+@triton.jit
+def forward_tile(
+    starts: tl.tensor, members: tl.tensor, records: tl.tensor, features: tl.tensor,
+    proxy_depth: tl.tensor, kappa: tl.tensor,
+    out_features: tl.tensor, out_depth: tl.tensor, out_depth_seen: tl.tensor, out_seen: tl.tensor,
+    width: tl.tensor, height: tl.tensor, channels: tl.tensor,
+    GUIDED: tl.constexpr, PADDED: tl.constexpr, STEP: tl.constexpr, TILE: tl.constexpr,
+    ALPHA_MAX: tl.constexpr, LIGHT_MIN: tl.constexpr,
+) -> None:  # fmt: skip
+    """Blends the Gaussians of one tile and stores its four images."""
+    tile = tl.program_id(0)
+    across = (width + TILE - 1) // TILE
+    lane = tl.arange(0, TILE * TILE)
+    column, row = (tile % across) * TILE + lane % TILE, (tile // across) * TILE + lane // TILE
+    inside = (column < width) & (row < height)
+    pixel = row * width + column
+    x, y = column.to(tl.float32) + 0.5, row.to(tl.float32) + 0.5
+    channel = tl.arange(0, PADDED)
+    light = tl.where(inside, 1.0, 0.0)
+    depth_light = light
+    image = tl.zeros((TILE * TILE, PADDED), tl.float32)
+    depth = tl.zeros((TILE * TILE,), tl.float32)
+    depth_seen = tl.zeros((TILE * TILE,), tl.float32)
+    seen = tl.zeros((TILE * TILE,), tl.float32)
+    proxy = tl.zeros((TILE * TILE,), tl.float32)
+    if GUIDED:
+        proxy = tl.load(proxy_depth + pixel, mask=inside, other=0.0)
+    first, end = tl.load(starts + tile), tl.load(starts + tile + 1)
+    while (first < end) & (tl.max(depth_light, axis=0) >= LIGHT_MIN):
+        index, used, u, v, sigma, z, opacity, reach = load_step(records, members, first, end, STEP)
+        _, _, _, alpha = opacities(x, y, u, v, sigma, opacity, reach, ALPHA_MAX)
+        before, light = light_before(light, alpha, STEP)
+        depth_before = before
+        if GUIDED:
+            _, agreement = agreements(z, proxy, kappa)
+            depth_before, depth_light = light_before(depth_light, alpha * agreement, STEP)
+        else:
+            depth_light = light
+        live = depth_before >= LIGHT_MIN
+        weight = tl.where(live, alpha * before, 0.0)
+        depth_weight = tl.where(live, alpha * depth_before, 0.0)
+        mask = used[:, None] & (channel < channels)[None, :]
+        values = tl.load(features + index[:, None] * channels + channel[None, :], mask=mask, other=0.0)
+        image += tl.dot(weight, values, input_precision="tf32x3")
+        depth += tl.sum(depth_weight * z[None, :], axis=1)
+        depth_seen += tl.sum(depth_weight, axis=1)
+        seen += tl.sum(weight, axis=1)
+        first += STEP
+    mask = inside[:, None] & (channel < channels)[None, :]
+    tl.store(out_features + pixel[:, None] * channels + channel[None, :], image, mask=mask)
+    tl.store(out_depth + pixel, depth, mask=inside)
+    tl.store(out_depth_seen + pixel, depth_seen, mask=inside)
+    tl.store(out_seen + pixel, seen, mask=inside)
+
+
+@triton.jit
+def backward_tile(
+    starts: tl.tensor, members: tl.tensor, records: tl.tensor, features: tl.tensor,
+    proxy_depth: tl.tensor, kappa: tl.tensor,
+    image: tl.tensor, depth: tl.tensor, depth_seen: tl.tensor, seen: tl.tensor,
+    d_image: tl.tensor, d_depth: tl.tensor, d_depth_seen: tl.tensor, d_seen: tl.tensor,
+    d_records: tl.tensor, d_features: tl.tensor,
+    width: tl.tensor, height: tl.tensor, channels: tl.tensor,
+    GUIDED: tl.constexpr, PADDED: tl.constexpr, STEP: tl.constexpr, TILE: tl.constexpr,
+    ALPHA_MAX: tl.constexpr, LIGHT_MIN: tl.constexpr,
+) -> None:  # fmt: skip
+    """Front to back once more; what is behind a Gaussian is the pixel's total minus what has been blended so far."""
+    tile = tl.program_id(0)
+    across = (width + TILE - 1) // TILE
+    lane = tl.arange(0, TILE * TILE)
+    column, row = (tile % across) * TILE + lane % TILE, (tile // across) * TILE + lane // TILE
+    inside = (column < width) & (row < height)
+    pixel = row * width + column
+    x, y = column.to(tl.float32) + 0.5, row.to(tl.float32) + 0.5
+    channel = tl.arange(0, PADDED)
+    mask = inside[:, None] & (channel < channels)[None, :]
+    at = pixel[:, None] * channels + channel[None, :]
+    pull = tl.load(d_image + at, mask=mask, other=0.0)
+    pull_depth = tl.load(d_depth + pixel, mask=inside, other=0.0)
+    pull_depth_seen = tl.load(d_depth_seen + pixel, mask=inside, other=0.0)
+    pull_seen = tl.load(d_seen + pixel, mask=inside, other=0.0)
+    behind = tl.sum(pull * tl.load(image + at, mask=mask, other=0.0), axis=1)
+    behind += pull_seen * tl.load(seen + pixel, mask=inside, other=0.0)
+    depth_behind = pull_depth * tl.load(depth + pixel, mask=inside, other=0.0)
+    depth_behind += pull_depth_seen * tl.load(depth_seen + pixel, mask=inside, other=0.0)
+    light = tl.where(inside, 1.0, 0.0)
+    depth_light = light
+    proxy = tl.zeros((TILE * TILE,), tl.float32)
+    if GUIDED:
+        proxy = tl.load(proxy_depth + pixel, mask=inside, other=0.0)
+    first, end = tl.load(starts + tile), tl.load(starts + tile + 1)
+    while (first < end) & (tl.max(depth_light, axis=0) >= LIGHT_MIN):
+        index, used, u, v, sigma, z, opacity, reach = load_step(records, members, first, end, STEP)
+        dx, dy, distance2, alpha = opacities(x, y, u, v, sigma, opacity, reach, ALPHA_MAX)
+        before, light = light_before(light, alpha, STEP)
+        feature_mask = used[:, None] & (channel < channels)[None, :]
+        feature_at = index[:, None] * channels + channel[None, :]
+        values = tl.load(features + feature_at, mask=feature_mask, other=0.0)
+        q = tl.dot(pull, tl.trans(values), input_precision="tf32x3") + pull_seen[:, None]
+        depth_q = pull_depth[:, None] * z[None, :] + pull_depth_seen[:, None]
+        if GUIDED:
+            error, agreement = agreements(z, proxy, kappa)
+            depth_before, depth_light = light_before(depth_light, alpha * agreement, STEP)
+            live = depth_before >= LIGHT_MIN
+            depth_weight = tl.where(live, alpha * depth_before, 0.0)
+            depth_left = depth_behind[:, None] - tl.cumsum(depth_weight * depth_q, axis=1)
+            depth_behind -= tl.sum(depth_weight * depth_q, axis=1)
+            d_occlusion = tl.where(live, -depth_left / (1.0 - alpha * agreement), 0.0)
+            d_alpha = depth_before * depth_q + agreement * d_occlusion
+            known = tl.where(proxy[:, None] > 0, 2.0 * kappa * error, 0.0)
+            d_z = tl.sum(depth_weight * pull_depth[:, None] - alpha * agreement * d_occlusion * known, axis=0)
+            weight = tl.where(live, alpha * before, 0.0)
+        else:
+            depth_light = light
+            live = before >= LIGHT_MIN
+            weight = tl.where(live, alpha * before, 0.0)
+            left = depth_behind[:, None] - tl.cumsum(weight * depth_q, axis=1)
+            depth_behind -= tl.sum(weight * depth_q, axis=1)
+            d_alpha = before * depth_q - left / (1.0 - alpha)
+            d_z = tl.sum(weight * pull_depth[:, None], axis=0)
+        left = behind[:, None] - tl.cumsum(weight * q, axis=1)
+        behind -= tl.sum(weight * q, axis=1)
+        d_alpha += before * q - left / (1.0 - alpha)
+        m = tl.where(live & (alpha < ALPHA_MAX), d_alpha * alpha, 0.0)
+        precision = 1.0 / (sigma * sigma)
+        target = d_records + index * 5
+        tl.atomic_add(target, tl.sum(m * dx, axis=0) * precision, mask=used)
+        tl.atomic_add(target + 1, tl.sum(m * dy, axis=0) * precision, mask=used)
+        tl.atomic_add(target + 2, tl.sum(m * distance2, axis=0) * precision / sigma, mask=used)
+        tl.atomic_add(target + 3, d_z, mask=used)
+        tl.atomic_add(target + 4, tl.sum(m, axis=0) / tl.where(used, opacity, 1.0), mask=used)
+        of_features = tl.dot(tl.trans(weight), pull, input_precision="tf32x3")
+        tl.atomic_add(d_features + feature_at, of_features, mask=feature_mask)
+        first += STEP
