@@ -28,17 +28,16 @@ def run(context: StageContext) -> dict[str, Any]:
         context.warn("the mesh is empty: no surface is seen by enough keyframes")
     return {
         "images": int(result.trajectory.is_posed.sum()),
-        "points": len(result.sparse.points_in_world),
         "gaussians": len(result.gaussian_map),
+        "compact_map_mb": round((context.folder / "point_cloud_compact.safetensors").stat().st_size / 1e6, 2),
         **mesh_figures(mesh),
     }
 
 
 def write_all_but_mesh(run: RunFolder, result: Result, folder: Path) -> list[Path]:
     """COLMAP model, PLYs, trajectory, notes."""
-    metric = bool(run.load_proxy_report().get("metric", False))
     paths = write_colmap(run, result, folder) + write_ply(result, folder) + write_trajectory(result, folder)
-    return paths + write_notes(result, metric, folder)
+    return paths + write_notes(result, folder)
 
 
 def _finished_mesh(folder: Path) -> SemanticMesh | None:

@@ -49,8 +49,8 @@ def _chunk_surface(
     distance[~seen] = 1
     if distance.min() >= 0:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    # Distances that fall through zero from front to back: the outside is positive.
-    points, triangles, _, _ = marching_cubes(distance, 0.0, gradient_direction="ascent")
+    # Free space is positive: "descent" makes the faces look that way.
+    points, triangles, _, _ = marching_cubes(distance, 0.0, gradient_direction="descent")
     whole = _whole_cells(seen)
     cell = np.floor(points[triangles].mean(1)).astype(int).clip(0, size - 2)
     kept = triangles[whole[cell[:, 0], cell[:, 1], cell[:, 2]]]

@@ -8,46 +8,50 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from formats.atomic import atomic_path, write_text
 from formats.colmap import write_colmap_model
 from formats.compact_gaussians import write_compact
 from formats.gaussian_ply import write_gaussian_ply
 from formats.gaussians import GaussianCloud, isotropic_cloud
+from formats.nerfstudio import write_transforms
 from formats.trajectory import write_tum
+from pipelines.export.readme import README
 from pipelines.export.result import Result
 from pipelines.run_folder import RunFolder, save_classes
-
-README = """Made by msgs-slam. World axes are those of the first camera: x right, y down, z forward; {unit}.
-
-sparse/0, frames/         COLMAP model (binary and text, one PINHOLE camera) and its images: splatting trainers and
-                          other COLMAP programs take this folder as it is
-point_cloud.ply           the Gaussian map in the layout of the original 3D Gaussian splatting, with class_id and
-                          class_prob_* after it: any splat viewer
-point_cloud_semantic.ply  the same, coloured by class
-map_compact.safetensors   the same in a few megabytes: quantised, the most probable classes only
-mesh.ply, mesh.glb        triangles with a colour and a class label a vertex: MeshLab, Blender, any glTF viewer
-trajectory.txt            camera poses, `timestamp tx ty tz qx qy qz qw` (TUM), seconds in the source: evo
-classes.json              number, name and colour of every class; 255 = none
-"""
+from pipelines.types import SparseModel
 
 
 def write_colmap(run: RunFolder, result: Result, folder: Path) -> list[Path]:
-    """`sparse/0` and `frames/` beside it."""
-    trajectory, sparse, k = result.trajectory, result.sparse, result.calibration.intrinsics
+    """`sparse/0` (binary and text) and transforms.json, with the posed frames beside them in `frames/`."""
+    trajectory, k = result.trajectory, result.calibration.intrinsics
     posed = np.flatnonzero(trajectory.is_posed)
-    row = {int(trajectory.frame_ids[r]): n for n, r in enumerate(posed)}
     names = tuple(result.frames[int(trajectory.frame_ids[r])].name for r in posed)
-    image_of = np.array([row.get(int(i), -1) for i in sparse.frame_ids], dtype=np.int64)
-    seen = image_of[sparse.obs_frame] >= 0
-    write_colmap_model(
-        folder / "sparse" / "0", k.width, k.height, k.fx, k.fy, k.cx, k.cy, names, trajectory.cam_from_world[posed],
-        sparse.points_in_world, sparse.colors, image_of[sparse.obs_frame][seen], sparse.obs_point[seen],
-        sparse.obs_xy[seen],
-    )  # fmt: skip
+    camera = (k.width, k.height, k.fx, k.fy, k.cx, k.cy)
     for name in names:
         place_image(run.stage("frames") / name, folder / "frames" / name)
-    return [folder / "sparse" / "0", folder / "frames"]
+    points = seen_points(result.sparse, trajectory.frame_ids[posed])
+    write_colmap_model(folder / "sparse" / "0", *camera, names, trajectory.cam_from_world[posed], *points)
+    paths = [f"frames/{name}" for name in names]
+    write_transforms(folder / "transforms.json", *camera, paths, trajectory.world_from_cam[posed])
+    return [folder / "sparse" / "0", folder / "frames", folder / "transforms.json"]
+
+
+def seen_points(
+    model: SparseModel, image_ids: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """points, colors, and obs_image, obs_point, obs_xy of the points that at least two of the images see."""
+    row = {int(i): n for n, i in enumerate(image_ids)}
+    image = np.array([row.get(int(i), -1) for i in model.frame_ids], dtype=np.int64)[model.obs_frame]
+    kept = image >= 0
+    views = np.bincount(model.obs_point[kept], minlength=len(model.points_in_world))
+    used = views >= 2
+    place = np.cumsum(used) - 1
+    kept &= used[model.obs_point]
+    return (
+        model.points_in_world[used], model.colors[used], image[kept], place[model.obs_point[kept]], model.obs_xy[kept],
+    )  # fmt: skip
 
 
 def place_image(source: Path, target: Path) -> None:
@@ -68,7 +72,7 @@ def write_ply(result: Result, folder: Path) -> list[Path]:
         m.means.numpy(), m.log_radii.numpy(), m.opacity_logits.numpy(), m.colors.numpy(),
         result.class_probabilities if result.class_ids else None,
     )  # fmt: skip
-    paths = [folder / n for n in ("point_cloud.ply", "point_cloud_semantic.ply", "map_compact.safetensors")]
+    paths = [folder / n for n in ("point_cloud.ply", "point_cloud_semantic.ply", "point_cloud_compact.safetensors")]
     write_gaussian_ply(paths[0], cloud, names)
     write_gaussian_ply(paths[1], _by_class(cloud, result), names)
     write_compact(paths[2], cloud, names)
@@ -89,9 +93,8 @@ def write_trajectory(result: Result, folder: Path) -> list[Path]:
     return [folder / "trajectory.txt"]
 
 
-def write_notes(result: Result, metric: bool, folder: Path) -> list[Path]:
+def write_notes(result: Result, folder: Path) -> list[Path]:
     """The class table and what each file is for."""
     save_classes(folder, result.classes)
-    unit = "lengths in metres" if metric else "the unit of length is arbitrary (monocular, no metric depth)"
-    write_text(folder / "README.txt", README.format(unit=unit))
+    write_text(folder / "README.txt", README)
     return [folder / "classes.json", folder / "README.txt"]

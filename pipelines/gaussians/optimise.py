@@ -19,7 +19,7 @@ from pipelines.gaussians.map import GaussianMap
 from pipelines.gaussians.parameters import AdamTable, MapParameters, empty_map
 from pipelines.gaussians.render import Rendering, render
 from pipelines.gaussians.schedule import Schedule, Step
-from pipelines.gaussians.seeding import SEED_OPACITY, complete_depth, seed_gaussians, seed_grid
+from pipelines.gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_grid
 from pipelines.geometry import se3
 from pipelines.mapping.views import View, halved
 from pipelines.progress import Progress, SilentProgress
@@ -52,13 +52,15 @@ def optimise_map(
     progress: Progress | None = None,
     snapshot: Path | None = None,
     label: str = "mapping",
+    exposure: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None,
 ) -> OptimisedMap:
     """The map that explains the views (MSGS-SLAM eqs. 17-20), with their poses and exposures refined together.
 
     Without `initial` the map is seeded along the views; with it the views are only visited, `passes` times each. With
-    `snapshot`, a file, the work goes on from there when it exists, and ends with the same bytes.
+    `snapshot`, a file, the work goes on from there when it exists, and ends with the same bytes. `exposure`: log gains
+    and offsets (N, 3) to start from.
     """
-    state = _load_state(snapshot, views) or _fresh_state(views, classes, initial)
+    state = _load_state(snapshot, views) or _fresh_state(views, classes, initial, exposure)
     schedule = Schedule.plan(views, settings, seed, seeding=initial is None, passes=passes)
     optimiser = MapOptimiser(views, classes, settings, state)
     remaining = range(state.iteration, schedule.total)
@@ -107,10 +109,23 @@ def _load_state(snapshot: Path | None, views: Sequence[View]) -> OptimiserState 
     return OptimiserState.from_tensors(load_tensors(snapshot), len(views), views[0].image.device)
 
 
-def _fresh_state(views: Sequence[View], classes: int, initial: GaussianMap | None) -> OptimiserState:
+def _fresh_state(
+    views: Sequence[View],
+    classes: int,
+    initial: GaussianMap | None,
+    exposure: tuple[NDArray[np.float32], NDArray[np.float32]] | None,
+) -> OptimiserState:
     device = views[0].image.device
+    gains, offsets = exposure or (np.zeros((len(views), 3), np.float32), np.zeros((len(views), 3), np.float32))
     tables = [
-        AdamTable({"twist": torch.zeros(6), "log_gain": torch.zeros(3), "offset": torch.zeros(3)}) for _ in views
+        AdamTable(
+            {
+                "twist": torch.zeros(6, device=device),
+                "log_gain": torch.as_tensor(g, dtype=torch.float32, device=device),
+                "offset": torch.as_tensor(o, dtype=torch.float32, device=device),
+            }
+        )
+        for g, o in zip(gains, offsets, strict=True)
     ]
     return OptimiserState(MapParameters.from_map(initial or empty_map(classes, device)), tables)
 
@@ -125,6 +140,7 @@ class MapOptimiser:
     state: OptimiserState
     halves: list[View] = field(init=False)
     unit: float = field(init=False)
+    completed: dict[int, SeedDepth] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.halves = [halved(v) for v in self.views]
@@ -177,9 +193,9 @@ class MapOptimiser:
         if s.depth_weight > 0 and s.use_proxy_depth:
             weight = losses.depth_weight(view.trust, s.depth_nu)
             loss = loss + s.depth_weight * losses.depth_loss(rendering.depth, view.depth, weight, self.unit)
-        if s.edge_weight > 0 and self.classes > 0:
+        if s.edge_weight > 0 and with_labels and self.classes > 0:
             edge = losses.edge_loss(rendering.depth, view.channels, s.edge_sharpness, self.unit)
-            loss = loss + s.edge_weight * edge
+            loss = loss + s.edge_weight * s.label_every * edge
         if with_labels and s.label_weight > 0 and self.classes > 0:
             loss = loss + s.label_weight * s.label_every * self._label_loss(view, rendering.features[..., 3:])
         # Exposures are relative: without a pull to zero they and the colours drift together.
@@ -242,11 +258,13 @@ class MapOptimiser:
             needed = needed | densify.hidden_surfaces(rendering.depth, view.depth, view.trust, tolerance)
         return needed
 
-    def _append(self, index: int, pixels: Tensor, spacing: float, rendering: Rendering | None, opacity: float = SEED_OPACITY) -> None:
+    def _append(
+        self, index: int, pixels: Tensor, spacing: float, rendering: Rendering | None, opacity: float = SEED_OPACITY
+    ) -> None:
         parameters, view = self.state.parameters, self.views[index]
         if not pixels.any() or len(parameters) >= self.settings.max_gaussians:
             return
-        depth, trust = self._seed_depth(view, rendering)
+        depth, trust = self._seed_depth(index, rendering)
         pose = se3.exp(self.state.view_tables[index].values["twist"].detach().double()) @ view.cam_from_world
         seeds = seed_gaussians(
             pixels, depth, view.colors, view.channels, spacing, self.classes, pose, view.intrinsics, view.frame_id
@@ -254,12 +272,20 @@ class MapOptimiser:
         seeds.opacity_logits.fill_(math.log(opacity / (1 - opacity)))
         parameters.append(seeds, trust[pixels & (depth > 0)])
 
-    def _seed_depth(self, view: View, rendering: Rendering | None) -> tuple[Tensor, Tensor]:
-        """(H, W) depth and trust: the completed proxy; where the map already agrees with it or is surer, the map's."""
-        completed = complete_depth(
-            view.depth.cpu().numpy(), view.trust.cpu().numpy(), view.channels.cpu().numpy(), _LOW_RELIABILITY,
-            self.settings.region_prior,
-        )  # fmt: skip
+    def _completed(self, index: int) -> SeedDepth:
+        """`complete_depth` of a view, kept: it does not change."""
+        if index not in self.completed:
+            view = self.views[index]
+            self.completed[index] = complete_depth(
+                view.depth.cpu().numpy(), view.trust.cpu().numpy(), view.channels.cpu().numpy(), _LOW_RELIABILITY,
+                self.settings.region_prior,
+            )  # fmt: skip
+        return self.completed[index]
+
+    def _seed_depth(self, index: int, rendering: Rendering | None) -> tuple[Tensor, Tensor]:
+        """(H, W) depth and trust: the completed proxy; where that is weak and the map is there, the map's."""
+        view = self.views[index]
+        completed = self._completed(index)
         depth, trust = (torch.from_numpy(x).to(view.image.device) for x in (completed.depth, completed.trust))
         if rendering is None:
             return depth, trust

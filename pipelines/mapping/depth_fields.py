@@ -67,8 +67,10 @@ def fit_fields(views: Sequence[View], anchors: Mapping[int, Anchors]) -> Array:
     samples = [_Samples.of(v) for v in views]
     near = _neighbours(views)
     for _ in range(ROUNDS):
-        parts = [_point_equations(n, v, anchors[v.frame_id], fields) for n, v in enumerate(views) if v.frame_id in anchors]
-        parts += [_pair_equations(i, j, samples[i], views[j], fields) for i, j in near]
+        parts = [
+            _point_equations(n, v, anchors[v.frame_id], fields) for n, v in enumerate(views) if v.frame_id in anchors
+        ]
+        parts += [_pair_equations(i, j, samples, views[j], fields) for i, j in near]
         fields = fields + _solve(parts, fields)
     return fields.reshape(-1, ROWS, COLUMNS)
 
@@ -85,7 +87,7 @@ def _neighbours(views: Sequence[View]) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class _Samples:
-    """A grid of pixels with depth: xy (S, 2), depth, trust (S,), rays (S, 3) in the world, center (3,)."""
+    """A grid of pixels with depth: xy (S, 2), depth, trust (S,), rays (S, 3) in the world, center (3,); and all of it."""
 
     xy: Array
     depth: Array
@@ -93,18 +95,22 @@ class _Samples:
     rays: Array
     center: Array
     basis: Basis
+    depth_map: NDArray[np.float32]
+    trust_map: NDArray[np.float32]
 
     @staticmethod
     def of(view: View) -> _Samples:
         stride = max(view.intrinsics.width // SAMPLES_ACROSS, 1)
-        depth = view.depth.cpu().numpy().astype(np.float64)[stride // 2 :: stride, stride // 2 :: stride]
-        trust = view.trust.cpu().numpy().astype(np.float64)[stride // 2 :: stride, stride // 2 :: stride]
+        depth_map, trust_map = view.depth.cpu().numpy(), view.trust.cpu().numpy()
+        depth = depth_map[stride // 2 :: stride, stride // 2 :: stride].astype(np.float64)
+        trust = trust_map[stride // 2 :: stride, stride // 2 :: stride].astype(np.float64)
         rows, columns = np.nonzero((depth > 0) & (trust > 0.1))
         xy = np.stack([columns, rows], 1) * stride + stride // 2 + 0.5
         world_from_cam = np.linalg.inv(view.cam_from_world.cpu().numpy())
         rays = unproject(xy, np.ones(len(xy)), view.intrinsics) @ world_from_cam[:3, :3].T
         basis = Basis.at(xy, view.intrinsics.width, view.intrinsics.height)
-        return _Samples(xy, depth[rows, columns], trust[rows, columns], rays, world_from_cam[:3, 3], basis)
+        picked = (depth[rows, columns], trust[rows, columns])
+        return _Samples(xy, *picked, rays, world_from_cam[:3, 3], basis, depth_map, trust_map)
 
 
 @dataclass(frozen=True)
@@ -134,8 +140,9 @@ class Basis:
         return (field[self.nodes] * self.weights).sum(1)
 
 
-def _pair_equations(i: int, j: int, samples: _Samples, other: View, fields: Array) -> Equations:
+def _pair_equations(i: int, j: int, all_samples: list[_Samples], other: View, fields: Array) -> Equations:
     """Samples of view i carried into view j: their depth there against what view j says."""
+    samples, there_too = all_samples[i], all_samples[j]
     depth = samples.depth * np.exp(samples.basis.of(fields[i]))
     pose = other.cam_from_world.cpu().numpy()
     along = samples.rays @ pose[2, :3] * depth
@@ -144,8 +151,8 @@ def _pair_equations(i: int, j: int, samples: _Samples, other: View, fields: Arra
     size = (other.intrinsics.width, other.intrinsics.height)
     inside = ((xy >= 0) & (xy < size)).all(1)
     place = np.where(inside[:, None], xy, 0).astype(int)
-    seen = other.depth.cpu().numpy()[place[:, 1], place[:, 0]].astype(np.float64)
-    trust = other.trust.cpu().numpy()[place[:, 1], place[:, 0]].astype(np.float64) * samples.trust
+    seen = there_too.depth_map[place[:, 1], place[:, 0]].astype(np.float64)
+    trust = there_too.trust_map[place[:, 1], place[:, 0]].astype(np.float64) * samples.trust
     use = inside & (seen > 0) & (z > 0) & (trust > 0.05)
     there = Basis.at(place[use] + 0.5, *size)
     residual = np.log(z[use]) - np.log(seen[use]) - there.of(fields[j])
@@ -206,7 +213,10 @@ def _prior(views: int) -> sparse.csr_matrix:
     """Normal matrix of "a node is 0" and "neighbouring nodes are equal" for every view."""
     index = np.arange(ROWS * COLUMNS).reshape(ROWS, COLUMNS)
     pairs = np.concatenate(
-        [np.stack([index[:, :-1].ravel(), index[:, 1:].ravel()], 1), np.stack([index[:-1].ravel(), index[1:].ravel()], 1)]
+        [
+            np.stack([index[:, :-1].ravel(), index[:, 1:].ravel()], 1),
+            np.stack([index[:-1].ravel(), index[1:].ravel()], 1),
+        ]
     )
     step = sparse.coo_matrix(
         (np.tile([1.0, -1.0], len(pairs)), (np.repeat(np.arange(len(pairs)), 2), pairs.ravel())),

@@ -87,9 +87,7 @@ def _measure_held_out(
     gains = interpolate_rows(wanted, times, result.log_gains)
     offsets = interpolate_rows(wanted, times, result.offsets)
     poses = [moved.cam_from_world[row[v.frame_id]] for v in held_out]
-    return [
-        measure_view(result.gaussian_map, *args) for args in zip(held_out, poses, gains, offsets, strict=True)
-    ]
+    return [measure_view(result.gaussian_map, *args) for args in zip(held_out, poses, gains, offsets, strict=True)]
 
 
 STAGE = Stage("mapping", 1, run, "the semantic Gaussian map from the keyframes")
