@@ -20,6 +20,8 @@ _GRID_REACH = 1 / 10
 _PRIOR = 0.02
 _TRUSTED_SPREAD = 0.05
 _LEARNED_CONFIDENCE = 0.7
+_OUTLIER = 0.05
+_FAR_OFF, _PROVEN = 0.2, 0.7
 
 
 class FusedDepth:
@@ -96,6 +98,10 @@ def fuse(learned: DepthEstimate, geometry: DepthEstimate, scale: float, frame_sc
     ratio = np.log(np.where(both, geometry.depth * scale, 1)) - np.log(np.where(both, learned.depth, 1)) - base
     weight = np.where(both, geometry.confidence, 0).astype(np.float64)
     field, spread = _smooth_field(ratio, weight)
+    for _ in range(2):
+        field, spread = _smooth_field(ratio, weight / (1 + ((ratio - field) / _OUTLIER) ** 2))
+    # A wrong match agrees with a view or two by chance, but then stands far off the learned surface as well.
+    lead &= ~both | (np.abs(ratio - field) < _FAR_OFF) | (geometry.confidence > _PROVEN)
     bent = learned.depth * np.exp(base + field)
     sure = np.maximum(_LEARNED_CONFIDENCE * np.exp(-((spread / _TRUSTED_SPREAD) ** 2)), 0.1) * learned.confidence
     depth = np.where(lead, geometry.depth * scale, bent).astype(np.float32)

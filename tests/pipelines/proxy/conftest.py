@@ -1,0 +1,46 @@
+"""Fixtures: the synthetic room, and a run over it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from proxy_room import Room, perfect_backbone, write_source
+
+from formats.images import write_rgb
+from pipelines.config import load_config
+from pipelines.progress import SilentProgress
+from pipelines.run_folder import RunFolder, save_calibration, save_frames, save_sparse_model
+from pipelines.stages import StageContext
+from pipelines.types import Calibration, Frame
+from pipelines.world import ClipOptions, make_world, render_frame
+
+
+@pytest.fixture(scope="session")
+def room() -> Room:
+    world = make_world(texel=0.01)
+    options = ClipOptions(frames=110, width=256, height=192, laps=1.0, noise=1.0)
+    views = [render_frame(world, options, i) for i in range(20, 31)]
+    frames = [Frame(i, f"{i:06d}.png", i / 10, i, 1.0) for i in range(len(views))]
+    calibration = Calibration(options.intrinsics, "given", 0.0, (0.0, 0.0, 0.0, 0.0))
+    return Room(views, frames, calibration, perfect_backbone(views, options.intrinsics))
+
+
+@pytest.fixture
+def make_context(room: Room, tmp_path: Path) -> Callable[..., StageContext]:
+    """A stage's surroundings over a finished frames stage; the source has depth and labels beside its pictures."""
+
+    def make(*settings: str, name: str = "run", backbone: bool = True) -> StageContext:
+        source = write_source(room, tmp_path / "source")
+        run = RunFolder(tmp_path / name)
+        folder = run.stage("frames")
+        save_frames(folder, room.frames)
+        save_calibration(folder, room.calibration)
+        if backbone:
+            save_sparse_model(folder / "backbone" / "model.npz", room.backbone)
+        for frame in room.frames:
+            write_rgb(folder / frame.name, room.views[frame.id].rgb)
+        run.stage("proxy").mkdir(exist_ok=True)
+        config = load_config(None, ["run.threads=2", *settings])
+        return StageContext(run, source, config, run.stage("proxy"), SilentProgress())
+
+    return make

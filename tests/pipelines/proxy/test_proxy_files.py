@@ -1,0 +1,217 @@
+"""Depth and labels from folders: what is read, and what is refused before any slow work."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from proxy_room import Room, write_source
+
+from formats.errors import InputError
+from formats.images import write_grey_png, write_rgb
+from pipelines.progress import SilentProgress
+from pipelines.proxy.class_files import find_class_table, read_class_table
+from pipelines.proxy.files_depth import FilesDepth
+from pipelines.proxy.files_labels import FilesLabels
+from pipelines.proxy.matching_files import frame_key
+from pipelines.proxy.providers import DepthEstimate
+from pipelines.proxy.sequence import Sequence
+from pipelines.types import VOID, Calibration, Frame, Intrinsics
+
+
+@pytest.fixture
+def source(room: Room, tmp_path: Path) -> Path:
+    return write_source(room, tmp_path / "source")
+
+
+def depth_files(source: Path, room: Room, folder: str = "", unit: float = 0.001) -> FilesDepth:
+    return FilesDepth(folder, source, room.sequence(), unit)
+
+
+def label_files(source: Path, room: Room) -> FilesLabels:
+    provider = FilesLabels("", source, room.sequence(), SilentProgress())
+    empty = DepthEstimate(np.zeros((1, 1), np.float32), np.zeros((1, 1), np.float32))
+    provider.prepare(room.frames, lambda frame: empty)
+    return provider
+
+
+def test_depth_files_give_the_depth_back(source: Path, room: Room) -> None:
+    provider = depth_files(source, room)
+    for frame in room.frames[:3]:
+        estimate = provider.estimate(frame)
+        np.testing.assert_allclose(estimate.depth, room.views[frame.id].depth, atol=5.1e-4)
+        assert (estimate.confidence == (estimate.depth > 0)).all()
+    assert (
+        depth_files(source, room, unit=0.002).estimate(room.frames[0]).depth.max()
+        > 1.9 * provider.estimate(room.frames[0]).depth.max()
+    )
+
+
+def test_maps_of_half_the_size_take_the_pixels_under_their_centres(source: Path, room: Room) -> None:
+    half = FilesDepth("", source, room.sequence(128), 0.001).estimate(room.frames[1]).depth
+    np.testing.assert_allclose(half, room.views[1].depth[1::2, 1::2], atol=5.1e-4)
+
+
+def test_0_and_65535_are_unknown_and_float_files_are_metres(source: Path, room: Room) -> None:
+    stored = np.full((192, 256), 1500, np.uint16)
+    stored[0, :5] = 0
+    stored[1, :5] = 65535
+    write_grey_png(source.parent / "depth" / room.frames[0].name, stored)
+    depth = depth_files(source, room).estimate(room.frames[0]).depth
+    assert (depth[:2, :5] == 0).all()
+    assert np.unique(depth).tolist() == pytest.approx([0, 1.5])
+    floats = np.full((192, 256), 2.25, np.float32)
+    floats[0, 0], floats[0, 1], floats[0, 2] = np.nan, np.inf, -1
+    folder = source.parent / "floats"
+    folder.mkdir()
+    for frame in room.frames:
+        np.save(folder / f"{frame.id:06d}.npy", floats)
+    estimate = depth_files(source, room, str(folder)).estimate(room.frames[0])
+    assert estimate.invalid == 3
+    assert (estimate.depth[0, :3] == 0).all()
+    assert (estimate.depth.ravel()[3:] == 2.25).all()
+
+
+def test_confidence_files_are_used(source: Path, room: Room) -> None:
+    for frame in room.frames:
+        write_grey_png(source.parent / "confidence" / frame.name, np.full((192, 256), 51, np.uint8))
+    estimate = depth_files(source, room).estimate(room.frames[0])
+    np.testing.assert_allclose(estimate.confidence[estimate.depth > 0], 0.2)
+
+
+def broken_depth(kind: str, path: Path) -> None:
+    if kind == "wrong size":
+        write_grey_png(path, np.ones((100, 256), np.uint16))
+    elif kind == "8 bits":
+        write_grey_png(path, np.ones((192, 256), np.uint8))
+    elif kind == "colour":
+        write_rgb(path, np.zeros((192, 256, 3), np.uint8))
+    elif kind == "cannot read":
+        path.write_bytes(b"\x89PNG but no more")
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [("wrong size", "not the shape"), ("8 bits", "8 bits"), ("colour", "colour picture"), ("cannot read", "read")],
+)
+def test_hostile_depth_images_are_refused_at_once(source: Path, room: Room, kind: str, said: str) -> None:
+    broken_depth(kind, source.parent / "depth" / room.frames[0].name)
+    with pytest.raises(InputError, match=said):
+        depth_files(source, room)
+
+
+@pytest.mark.parametrize(
+    "array", [np.ones((192, 256), np.int32), np.ones((192, 256, 2), np.float32), np.array([{"a": 1}], dtype=object)]
+)
+def test_hostile_npy_files_are_refused_at_once(source: Path, room: Room, array: np.ndarray) -> None:
+    folder = source.parent / "npy"
+    folder.mkdir()
+    np.save(folder / "000000.npy", array, allow_pickle=True)
+    with pytest.raises(InputError, match=r"000000\.npy"):
+        depth_files(source, room, str(folder))
+
+
+def test_missing_folders_and_foreign_names_are_refused(source: Path, room: Room, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="looked in"):
+        depth_files(source, room, str(tmp_path / "nothing"))
+    write_grey_png(tmp_path / "foreign" / "kitchen.png", np.ones((192, 256), np.uint16))
+    with pytest.raises(InputError, match=r"none of its 1 files \(kitchen.png"):
+        depth_files(source, room, str(tmp_path / "foreign"))
+    with pytest.raises(InputError, match="must be positive"):
+        depth_files(source, room, unit=0)
+
+
+@pytest.mark.parametrize(
+    ("picture", "other"),
+    [("frame-000002.color.jpg", "frame-000002.depth.png"), ("rgb_7.png", "depth_7.npy"), ("a b.jpg", "a b.tif")],
+)
+def test_names_of_one_instant_have_one_key(picture: str, other: str) -> None:
+    assert frame_key(picture) == frame_key(other)
+
+
+def test_a_video_matches_files_by_the_number_of_its_frame(source: Path, room: Room, tmp_path: Path) -> None:
+    video = tmp_path / "source" / "video.mp4"
+    video.write_bytes(b"only its name is looked at")
+    picked = [replace(f, name=f"{i:06d}.jpg", id=i, source_index=2 * i) for i, f in enumerate(room.frames[:5])]
+    sequence = replace(room.sequence(), frames=picked)
+    provider = FilesDepth("", video, sequence, 0.001)
+    np.testing.assert_allclose(provider.estimate(picked[3]).depth, room.views[6].depth, atol=5.1e-4)
+    assert provider.missing([*picked, replace(picked[0], id=9, source_index=99)])[0].id == 9
+
+
+def test_labels_keep_the_classes_that_occur_in_the_order_of_their_ids(source: Path, room: Room) -> None:
+    provider = label_files(source, room)
+    ids = np.unique([i for v in room.views for i in np.unique(v.labels)])
+    assert provider.classes().names == tuple(f"kind {i}" for i in ids if i)
+    estimate = provider.estimate(room.frames[2], None)  # type: ignore[arg-type]
+    names = np.array([*provider.classes().names, *[""] * 256])
+    given = np.array([f"kind {i}" if i else "" for i in range(256)])
+    assert (names[np.where(estimate.labels == VOID, 255, estimate.labels)] == given[room.views[2].labels]).all()
+    assert provider.warnings() == []
+
+
+def test_label_ids_outside_the_table_are_void_and_counted(source: Path, room: Room) -> None:
+    labels = room.views[0].labels.copy()
+    labels[:10, :10] = 200
+    write_grey_png(source.parent / "labels" / room.frames[0].name, labels)
+    provider = label_files(source, room)
+    assert (provider.estimate(room.frames[0], None).labels[:10, :10] == VOID).all()  # type: ignore[arg-type]
+    assert "100 pixels" in provider.warnings()[0]
+    assert provider.figures()["label_ids_outside_table"] == {"200": 100}
+
+
+def test_only_void_or_too_many_classes_are_refused(source: Path, room: Room) -> None:
+    for frame in room.frames:
+        write_grey_png(source.parent / "labels" / frame.name, np.zeros((192, 256), np.uint8))
+    with pytest.raises(InputError, match="no class at all"):
+        label_files(source, room)
+    (source.parent / "classes.json").unlink()
+    for frame in room.frames:
+        write_grey_png(source.parent / "labels" / frame.name, np.arange(192 * 256, dtype=np.uint16).reshape(192, 256))
+    with pytest.raises(InputError, match="instance ids"):
+        label_files(source, room)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("classes.json", '["wall", "floor"]', {0: "wall", 1: "floor"}),
+        ("classes.json", '{"classes": [{"id": 7, "name": "bed"}]}', {7: "bed"}),
+        ("classes.json", '{"3": "lamp"}', {3: "lamp"}),
+        ("classes.txt", "# id name\n93 wall 0.3\n0 void 0.2\n", {93: "wall", 0: "void"}),
+        ("labels.txt", "background\npotted plant\n\nprose follows\n", {0: "background", 1: "potted plant"}),
+    ],
+)
+def test_class_tables_of_all_kinds(tmp_path: Path, name: str, text: str, expected: dict[int, str]) -> None:
+    (tmp_path / name).write_text(text)
+    table = find_class_table(tmp_path / "labels")
+    assert table is not None
+    assert {k: v.name for k, v in table.items()} == expected
+
+
+@pytest.mark.parametrize("text", ["{", "[1, 2]", '{"classes": 3}', '{"-1": "a"}', "[]"])
+def test_damaged_class_tables_are_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "classes.json").write_text(text)
+    with pytest.raises(InputError, match=r"classes\.json"):
+        read_class_table(tmp_path / "classes.json")
+
+
+@pytest.mark.parametrize(
+    ("folder", "camera", "classes"), [("replica_office0", Intrinsics(600, 340, 300, 300, 300, 170), 22)]
+)
+def test_a_real_data_set_is_understood(
+    shared_data: Path, folder: str, camera: Intrinsics, classes: int, tmp_path: Path
+) -> None:
+    source = shared_data / folder / "rgb"
+    frames = [Frame(i, p.name, 0.0, i, 1.0) for i, p in enumerate(sorted(source.iterdir()))]
+    calibration = Calibration(camera, "given", 0, (0, 0, 0, 0))
+    sequence = Sequence(frames, calibration, camera, None, lambda f: np.zeros((1, 1, 3), np.uint8))
+    depth = FilesDepth("", source, sequence, 0.001).estimate(frames[5])
+    stored = cv2.imread(str(shared_data / folder / "depth" / f"{Path(frames[5].name).stem}.png"), -1)
+    np.testing.assert_allclose(depth.depth, stored / 1000, rtol=1e-6)
+    labels = FilesLabels("", source, sequence, SilentProgress())
+    labels.prepare(frames, lambda f: depth)
+    assert len(labels.classes()) == classes
+    assert {"wall", "sofa", "tv-screen"} <= set(labels.classes().names)
+    assert labels.warnings() == []

@@ -1,0 +1,146 @@
+"""Multi-view depth, fused depth and regions on the synthetic room, against its exact truth."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from proxy_room import UNIT, Room
+
+from formats.errors import InputError
+from pipelines.progress import SilentProgress
+from pipelines.proxy.fused import FusedDepth
+from pipelines.proxy.multiview import MultiviewDepth, StereoSettings
+from pipelines.proxy.providers import DepthEstimate
+from pipelines.proxy.reliability import semantic_agreement, warp_labels
+from pipelines.proxy.segments import SegmentLabels
+from pipelines.proxy.sequence import Sequence
+from pipelines.types import VOID, Frame, Intrinsics
+
+SETTINGS = StereoSettings(side=256, planes=64)
+
+
+@pytest.fixture(scope="module")
+def stereo(room: Room, tmp_path_factory: pytest.TempPathFactory) -> MultiviewDepth:
+    folder = tmp_path_factory.mktemp("stereo")
+    provider = MultiviewDepth(room.sequence(), SETTINGS, lambda: folder, 2, SilentProgress())
+    provider.prepare(room.frames)
+    return provider
+
+
+def relative_errors(room: Room, estimate: DepthEstimate, frame: Frame, unit: float = UNIT) -> np.ndarray:
+    truth = room.views[frame.id].depth * unit
+    return np.abs(estimate.depth / truth - 1)
+
+
+def test_multiview_is_exact_where_it_is_sure_and_its_confidence_sorts(room: Room, stereo: MultiviewDepth) -> None:
+    errors, confidences = [], []
+    for frame in room.frames[2:9]:
+        estimate = stereo.estimate(frame)
+        errors.append(relative_errors(room, estimate, frame).ravel())
+        confidences.append(estimate.confidence.ravel())
+    error, confidence = np.concatenate(errors), np.concatenate(confidences)
+    reliable = confidence > 0.3
+    assert reliable.mean() > 0.7
+    assert 0 < np.median(error[reliable]) < 0.008
+    low, high = np.quantile(confidence, [1 / 3, 2 / 3])
+    assert error[confidence >= high].mean() < 0.5 * error[confidence <= low].mean()
+
+
+def test_multiview_gives_the_same_bytes_with_other_threads(room: Room, stereo: MultiviewDepth, tmp_path: Path) -> None:
+    single = MultiviewDepth(room.sequence(), SETTINGS, lambda: tmp_path, 1, SilentProgress())
+    single.prepare(room.frames[4:6])
+    few = MultiviewDepth(room.sequence(), SETTINGS, lambda: tmp_path, 3, SilentProgress())
+    few.prepare(room.frames[6:8])
+    for frame in room.frames[4:8]:
+        ours, theirs = (p._path(frame.id).read_bytes() for p in (few, stereo))
+        assert ours == theirs
+
+
+def test_multiview_without_parallax_says_so(room: Room) -> None:
+    still = Sequence(room.frames, room.calibration, room.calibration.intrinsics, None, lambda f: room.views[f.id].rgb)
+    with pytest.raises(InputError, match="parallax"):
+        MultiviewDepth(still, SETTINGS, lambda: Path("nowhere"), 1, SilentProgress())
+    with pytest.raises(InputError, match="poses"):
+        SegmentLabels(still, 16, SilentProgress())
+
+
+class Learned:
+    """A network's output: the truth in metres with a smooth error in each frame and a scale error of its own."""
+
+    name, metric = "learned", True
+
+    def __init__(self, room: Room) -> None:
+        self._room = room
+
+    def missing(self, frames: list[Frame]) -> list[Frame]:
+        return []
+
+    def prepare(self, frames: list[Frame]) -> None:
+        pass
+
+    def estimate(self, frame: Frame) -> DepthEstimate:
+        truth = self._room.views[frame.id].depth
+        y, x = np.indices(truth.shape) / 60
+        field = 0.05 * np.sin(x + frame.id) * np.cos(1.3 * y - frame.id) + 0.02 * np.sin(2.7 * frame.id)
+        depth = (truth * np.exp(field)).astype(np.float32)
+        return DepthEstimate(depth, np.full(depth.shape, 0.9, np.float32))
+
+    def figures(self) -> dict[str, float]:
+        return {}
+
+
+def test_fused_depth_is_metric_and_better_than_either(room: Room, stereo: MultiviewDepth) -> None:
+    learned = Learned(room)
+    fused = FusedDepth(learned, stereo, room.sequence())
+    fused.prepare(room.frames)
+    assert fused.metric
+    scale = fused.figures()["metres_per_unit"] * UNIT
+    assert scale == pytest.approx(1, abs=0.03)
+    table = []
+    for frame in room.frames[2:9:2]:
+        together = relative_errors(room, fused.estimate(frame), frame, scale)
+        network = relative_errors(room, learned.estimate(frame), frame, 1.0)
+        geometry = relative_errors(room, stereo.estimate(frame), frame)
+        table.append([[e.mean(), np.median(e)] for e in (together, network, geometry)])
+    together, network, geometry = np.mean(table, axis=0)
+    assert (together > 0).all()
+    assert (together < 0.75 * network).all()
+    assert (together < np.add(geometry, [0, 1e-5])).all()
+
+
+def test_regions_mean_the_same_in_all_frames_and_know_the_floor(room: Room) -> None:
+    truth = {
+        f.id: DepthEstimate(room.views[f.id].depth * np.float32(UNIT), np.full(room.views[0].depth.shape, 0.9, "f4"))
+        for f in room.frames
+    }
+    sequence = room.sequence()
+    segments = SegmentLabels(sequence, 16, SilentProgress())
+    segments.prepare(room.frames, lambda frame: truth[frame.id])
+    names = segments.classes().names
+    assert {"floor", "wall"} <= set(names)
+    assert 4 <= len(names) <= 16
+    labels = {f.id: segments.estimate(f, truth[f.id]).labels for f in room.frames}
+    agreements = [flicker_free(labels, truth, sequence, a, b) for a, b in pairwise(room.frames)]
+    assert min(agreements) > 0.75
+    found = np.stack([labels[f.id] == names.index("floor") for f in room.frames])
+    height = np.stack([world_height(room, f, sequence.intrinsics) for f in room.frames])
+    true_floor = np.abs(height - np.quantile(height, 0.002)) < 0.02
+    assert (found & true_floor).sum() / (found | true_floor).sum() > 0.75
+    assert np.mean([(v == VOID).mean() for v in labels.values()]) < 0.02
+
+
+def flicker_free(labels: dict, truth: dict, sequence: Sequence, a: Frame, b: Frame) -> float:
+    b_from_a = sequence.cam_from_world[b.id] @ np.linalg.inv(sequence.cam_from_world[a.id])
+    warped = warp_labels(labels[b.id], b_from_a, truth[a.id].depth, sequence.intrinsics)
+    return semantic_agreement(labels[a.id], warped) or 0.0
+
+
+def world_height(room: Room, frame: Frame, camera: Intrinsics) -> np.ndarray:
+    view = room.views[frame.id]
+    v, u = np.indices(view.depth.shape) + 0.5
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1)
+    points = (rays * view.depth[..., None]) @ view.world_from_cam[:3, :3].T + view.world_from_cam[:3, 3]
+    up = -np.mean([w.world_from_cam[:3, 1] for w in room.views], axis=0)
+    axis = int(np.abs(up).argmax())
+    return points[..., axis] * np.sign(up[axis])

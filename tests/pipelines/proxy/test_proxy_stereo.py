@@ -1,0 +1,202 @@
+"""The stereo kernels against slow references and known scenes."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.proxy.stereo.bands import Bands
+from pipelines.proxy.stereo.consistency import fuse_depths
+from pipelines.proxy.stereo.fill import SURE, fill_unsure
+from pipelines.proxy.stereo.refine import refine_inverse_depth
+from pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
+from pipelines.proxy.stereo.sweep import RADIUS, VARIANCE_FLOOR, sweep_cost, warps_to
+from pipelines.proxy.stereo.upsample import upsample_depth
+
+HEIGHT, WIDTH, FOCAL = 40, 60, 50.0
+MATRIX = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+
+
+def texture(x: NDArray, y: NDArray) -> NDArray[np.float32]:
+    return (0.5 + 0.2 * np.sin(9 * x + 3 * y) + 0.15 * np.sin(17 * y - 5 * x) + 0.1 * np.sin(31 * x)).astype(np.float32)
+
+
+def view_of_plane(cam_from_world: NDArray, slope: float) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Picture and depth of the textured plane z = 2 + slope·x, from a camera that is only shifted."""
+    v, u = np.indices((HEIGHT, WIDTH)) + 0.5
+    rays = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], -1)
+    center = -cam_from_world[:3, 3]
+    depth = (2 + slope * center[0] - center[2]) / (1 - slope * rays[..., 0])
+    points = rays * depth[..., None] + center
+    return texture(points[..., 0], points[..., 1]), depth
+
+
+def shifted(x: float, y: float = 0.0) -> NDArray[np.float64]:
+    cam_from_world = np.eye(4)
+    cam_from_world[:2, 3] = x, y
+    return cam_from_world
+
+
+CAMERAS = [shifted(0.12), shifted(-0.12), shifted(0.0, 0.15), shifted(-0.1, -0.1)]
+
+
+def scene(slope: float) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray, NDArray]:
+    image, depth = view_of_plane(np.eye(4), slope)
+    others = np.stack([view_of_plane(c, slope)[0] for c in CAMERAS])
+    return image, others, warps_to(MATRIX, np.eye(4), [MATRIX] * 4, CAMERAS), depth
+
+
+def slow_score(image: NDArray, other: NDArray, warp: NDArray, inverse: float, y: int, x: int) -> float:
+    """Normalised correlation of one window, written out."""
+    values = []
+    for j in range(-RADIUS, RADIUS + 1):
+        for i in range(-RADIUS, RADIUS + 1):
+            q = warp @ np.array([x + i + 0.5, y + j + 0.5, 1, inverse])
+            px, py = q[0] / q[2] - 0.5, q[1] / q[2] - 0.5
+            ix, iy = int(px), int(py)
+            fx, fy = px - ix, py - iy
+            patch = other[iy : iy + 2, ix : ix + 2]
+            sample = np.array([1 - fy, fy]) @ patch @ np.array([1 - fx, fx])
+            values.append((image[y + j, x + i], sample))
+    a, b = np.array(values, np.float64).T
+    covariance = ((a - a.mean()) * (b - b.mean())).mean()
+    return covariance / np.sqrt((a.var() + VARIANCE_FLOOR) * (b.var() + VARIANCE_FLOOR))
+
+
+def test_sweep_is_the_correlation_written_out() -> None:
+    image, others, warps, _ = scene(0.3)
+    planes = np.linspace(1 / 3, 1 / 1.4, 7)
+    cost = sweep_cost(image, others, warps, planes, 2, Bands(1))
+    for y, x, d in ((15, 25, 1), (20, 30, 3), (24, 36, 6)):
+        scores = sorted(slow_score(image, o, w, planes[d], y, x) for o, w in zip(others, warps, strict=True))
+        assert cost[y, x, d] == pytest.approx(1 - np.mean(scores[-2:]), abs=2e-4)
+
+
+def test_views_that_do_not_see_the_point_do_not_count() -> None:
+    image, others, warps, _ = scene(0.0)
+    behind = warps.copy()
+    behind[:, 2] *= -1
+    planes = np.linspace(0.3, 0.6, 5)
+    assert (sweep_cost(image, others, behind, planes, 3, Bands(1)) == 1).all()
+    mixed = np.concatenate([warps[:2], behind[2:]])
+    alone = sweep_cost(image, others[:2], warps[:2], planes, 3, Bands(1))
+    np.testing.assert_array_equal(sweep_cost(image, others, mixed, planes, 3, Bands(1)), alone)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.5])
+def test_sweep_smoothing_and_refinement_find_the_plane(slope: float) -> None:
+    image, others, warps, truth = scene(slope)
+    planes = np.linspace(1 / 4, 1, 40)
+    total = smooth_cost(sweep_cost(image, others, warps, planes, 2, Bands(2)), image, 0.05, 0.4, 0.05, Bands(2))
+    step = planes[1] - planes[0]
+    coarse = (planes[0] + pick_planes(total)[0] * step).astype(np.float32)
+    fine, score = refine_inverse_depth(image, others, warps, coarse, step / 3, 2, 0.003, 2, Bands(2))
+    inner = (slice(6, -6), slice(8, -8))
+    error = np.abs(fine * truth - 1)[inner]
+    assert 0 < np.median(error) < 0.008  # a fifth of the distance between two planes
+    assert np.median(error) < np.median(np.abs(coarse * truth - 1)[inner])
+    assert np.median(score[inner]) > 0.98
+
+
+def test_bytes_do_not_depend_on_the_threads() -> None:
+    image, others, warps, _ = scene(0.3)
+    planes = np.linspace(0.3, 0.7, 9)
+    results = []
+    for threads in (1, 2, 3):
+        cost = sweep_cost(image, others, warps, planes, 2, Bands(threads))
+        total = smooth_cost(cost, image, 0.05, 0.4, 0.05, Bands(threads))
+        start = (planes[0] + pick_planes(total)[0] * 0.05).astype(np.float32)
+        fine, _ = refine_inverse_depth(image, others, warps, start, 0.01, 2, 0.01, 2, Bands(threads))
+        results.append(total.tobytes() + fine.tobytes())
+    assert results[0] == results[1] == results[2]
+
+
+def slow_path(cost: NDArray, image: NDArray, small: float, large: float, edge: float) -> NDArray:
+    """Path costs from left to right along every row, written out."""
+    out = np.zeros_like(cost, dtype=np.float64)
+    for y in range(cost.shape[0]):
+        out[y, 0] = cost[y, 0]
+        for x in range(1, cost.shape[1]):
+            before = out[y, x - 1]
+            jump = max(large / (1 + abs(image[y, x] - image[y, x - 1]) / edge), small)
+            for d in range(cost.shape[2]):
+                ways = [before[d], before.min() + jump]
+                ways += [before[k] + small for k in (d - 1, d + 1) if 0 <= k < cost.shape[2]]
+                out[y, x, d] = cost[y, x, d] + min(ways) - before.min()
+    return out
+
+
+def test_smoothing_sums_the_paths_written_out() -> None:
+    rng = np.random.default_rng(0)
+    cost = rng.random((5, 7, 6)).astype(np.float32)
+    image = rng.random((5, 7)).astype(np.float32)
+    expected = np.zeros((5, 7, 6))
+    for flip in (False, True):
+        for turn in (False, True):
+            c, i = (a.transpose(1, 0, *range(2, a.ndim)) if turn else a for a in (cost, image))
+            c, i = (a[:, ::-1] if flip else a for a in (c, i))
+            path = slow_path(c, i, 0.1, 0.5, 0.2)
+            path = path[:, ::-1] if flip else path
+            expected += path.transpose(1, 0, 2) if turn else path
+    for dy, dx in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        expected += slow_diagonal(cost, image, dy, dx)
+    np.testing.assert_allclose(smooth_cost(cost, image, 0.1, 0.5, 0.2, Bands(2)), expected, rtol=1e-5)
+
+
+def slow_diagonal(cost: NDArray, image: NDArray, dy: int, dx: int) -> NDArray:
+    c, i = cost[::dy, ::dx], image[::dy, ::dx]
+    out = np.zeros_like(c, dtype=np.float64)
+    for start in range(-c.shape[0] + 1, c.shape[1]):
+        cells = [(y, y + start) for y in range(c.shape[0]) if 0 <= y + start < c.shape[1]]
+        rows, columns = np.array(cells).T
+        out[rows, columns] = slow_path(c[rows, columns][None], i[rows, columns][None], 0.1, 0.5, 0.2)[0]
+    return out[::dy, ::dx]
+
+
+def test_agreeing_views_support_and_better_the_depth_and_liars_do_not() -> None:
+    rng = np.random.default_rng(1)
+    truth = view_of_plane(np.eye(4), 0.3)[1]
+    others = np.stack([view_of_plane(c, 0.3)[1] for c in CAMERAS])
+    back = np.array([warps_to(MATRIX, c, [MATRIX], [np.eye(4)])[0][2] for c in CAMERAS])
+    warps = warps_to(MATRIX, np.eye(4), [MATRIX] * 4, CAMERAS)
+
+    def noisy(depth: NDArray) -> NDArray[np.float32]:
+        return (depth * (1 + 0.004 * rng.standard_normal(depth.shape))).astype(np.float32)
+
+    own = noisy(truth)
+    fused, support, conflict = fuse_depths(own, noisy(others), warps, back, 0.01, Bands(2))
+    inner = (slice(8, -8), slice(10, -10))
+    assert np.abs(fused / truth - 1)[inner].mean() < 0.7 * np.abs(own / truth - 1)[inner].mean()
+    assert support[inner].mean() > 3
+    assert conflict.max() == 0
+    in_front = (own * 0.8).astype(np.float32)
+    _, support, conflict = fuse_depths(in_front, noisy(others), warps, back, 0.01, Bands(2))
+    assert support.max() == 0
+    assert conflict[inner].mean() > 3
+    nothing = np.zeros_like(own)
+    fused, support, _ = fuse_depths(nothing, others.astype(np.float32), warps, back, 0.01, Bands(1))
+    assert fused.max() == support.max() == 0
+
+
+def test_a_blank_wall_is_filled_with_the_plane_of_its_border() -> None:
+    truth = 1 / (0.5 - 0.002 * np.arange(WIDTH)[None] + 0.001 * np.arange(HEIGHT)[:, None])
+    image = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
+    confidence = np.full((HEIGHT, WIDTH), 0.9, np.float32)
+    blank = np.zeros((HEIGHT, WIDTH), bool)
+    blank[5:-5, 6:-6] = True
+    confidence[blank] = 0.05
+    seen = np.where(blank, np.random.default_rng(2).uniform(1, 9, truth.shape), truth).astype(np.float32)
+    filled, trust = fill_unsure(seen, confidence, image)
+    np.testing.assert_array_equal(filled[~blank], seen[~blank])
+    assert np.abs(filled / truth - 1)[blank].max() < 0.02
+    assert 0 < trust[blank].min() <= trust[blank].max() < SURE
+
+
+def test_enlarged_depth_has_its_edge_where_the_picture_has_it() -> None:
+    image = np.zeros((80, 120, 3), np.uint8)
+    image[:, 63:] = 200
+    depth = np.where(np.arange(60) < 31, 1.0, 3.0)[None].repeat(40, 0).astype(np.float32)
+    confidence = np.full((40, 60), 0.8, np.float32)
+    enlarged = upsample_depth(depth, confidence, image)
+    assert set(np.unique(np.round(enlarged.depth, 3))) == {1.0, 3.0}
+    assert (enlarged.depth[:, :62] < 2).all()
+    assert (enlarged.depth[:, 64:] > 2).all()
