@@ -14,7 +14,7 @@ def label_cells(
     confusion: Counts, match: NDArray[np.int64] | None, semantics: str, true_names: tuple[str, ...]
 ) -> dict[str, Any]:
     """confusion as `count_labels` gives it; match (C,) the true class of every class of the run, None where their
-    names are not the truth's. A clustering's classes are named *by the truth*, so its figures are an upper bound and stand apart."""
+    names are not the truth's. A clustering's classes are named *by the truth*: its figures flatter and stand apart."""
     if confusion.size == 0 or confusion.sum() == 0:
         return {"missing": "no rendered view has true labels"}
     given = "labels from files" if semantics.startswith("files") else "predicted labels"

@@ -2,7 +2,7 @@
 
 from pipelines.world.build import World
 from pipelines.world.clip import ClipOptions, WorldFrame, make_world, render_frame, render_view, walk
-from pipelines.world.write import iter_clip, write_sequence, write_video
+from pipelines.world.write import iter_clip, write_sequence
 
 __all__ = [
     "ClipOptions",
@@ -14,5 +14,4 @@ __all__ = [
     "render_view",
     "walk",
     "write_sequence",
-    "write_video",
 ]

@@ -1,4 +1,4 @@
-"""A clip on disk: a sequence with its truth, and a video."""
+"""A clip on disk: a sequence with its truth."""
 
 from __future__ import annotations
 
@@ -6,18 +6,13 @@ import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from formats.atomic import write_text
-from formats.errors import InputError
 from formats.images import write_grey_png, write_rgb
 from pipelines.progress import Progress, SilentProgress
 from pipelines.world.build import World
 from pipelines.world.clip import ClipOptions, WorldFrame, render_frame
-
-_CODECS = {".mp4": "mp4v", ".avi": "FFV1", ".mkv": "FFV1"}
 
 
 def iter_clip(world: World, options: ClipOptions, progress: Progress | None = None) -> Iterator[WorldFrame]:
@@ -69,33 +64,3 @@ def _camera_json(options: ClipOptions) -> dict[str, object]:
         "distortion": [options.k1, 0.0, 0.0, 0.0],
         "pixel_centre": "integer: cx, cy for a first pixel centre at (0, 0); cx_colmap, cy_colmap for (0.5, 0.5)",
     }
-
-
-def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> Path:
-    """Encode RGB frames (H, W, 3) of one size: MPEG-4 for .mp4, lossless FFV1 for .avi and .mkv; returns `path`.
-
-    Raises InputError for another ending, no frame at all, or a codec that this OpenCV does not have.
-    """
-    codec = _CODECS.get(path.suffix.lower())
-    if codec is None:
-        raise InputError(f"{path}: the ending of a video is one of {', '.join(_CODECS)}; choose one of them")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    writer: cv2.VideoWriter | None = None
-    try:
-        for frame in frames:
-            if writer is None:
-                writer = _open_writer(path, codec, fps, frame.shape[1], frame.shape[0])
-            writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-    finally:
-        if writer is not None:
-            writer.release()
-    if writer is None:
-        raise InputError(f"{path}: there is no frame to write")
-    return path
-
-
-def _open_writer(path: Path, codec: str, fps: float, width: int, height: int) -> cv2.VideoWriter:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), fps, (width, height))
-    if not writer.isOpened():
-        raise InputError(f"{path}: this OpenCV cannot write {codec} video; install opencv-python-headless from PyPI")
-    return writer

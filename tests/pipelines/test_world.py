@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from formats.datasets import open_sequence
 from formats.errors import InputError
 from formats.video import iter_video
+from formats.video_writer import write_video
 from pipelines.types import Intrinsics
 from pipelines.world import (
     ClipOptions,
@@ -23,7 +24,6 @@ from pipelines.world import (
     render_frame,
     walk,
     write_sequence,
-    write_video,
 )
 from pipelines.world.shapes import TOP, Material, Solid, box, cylinder, sphere
 

@@ -1,0 +1,52 @@
+"""Writing videos with what OpenCV brings along."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.atomic import atomic_path
+from formats.errors import InputError
+
+CODECS = {".mp4": "mp4v", ".avi": "FFV1", ".mkv": "FFV1"}
+"""By the file's ending: MPEG-4 plays everywhere, FFV1 loses nothing."""
+
+
+def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> Path:
+    """Encode RGB frames (H, W, 3) of one size, atomically: MPEG-4 for .mp4, lossless FFV1 for .avi and .mkv.
+
+    An odd row or column at the end is left out: MPEG-4 has none. Returns `path`. Raises InputError for another ending,
+    no frame at all, or a codec that this OpenCV does not have; ValueError for frames of different sizes.
+    """
+    codec = CODECS.get(path.suffix.lower())
+    if codec is None:
+        raise InputError(f"{path}: the ending of a video is one of {', '.join(CODECS)}; choose one of them")
+    with atomic_path(path) as temporary:
+        writer: cv2.VideoWriter | None = None
+        size = (0, 0)
+        try:
+            for frame in frames:
+                even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
+                if writer is None:
+                    size = (even.shape[1], even.shape[0])
+                    writer = _open_writer(temporary, codec, fps, size)
+                if (even.shape[1], even.shape[0]) != size:
+                    raise ValueError(f"write_video: a frame of {even.shape[1]}x{even.shape[0]} among those of {size}")
+                writer.write(cv2.cvtColor(np.ascontiguousarray(even), cv2.COLOR_RGB2BGR))
+        finally:
+            if writer is not None:
+                writer.release()
+        if writer is None:
+            raise InputError(f"{path}: there is no frame to write")
+    return path
+
+
+def _open_writer(path: Path, codec: str, fps: float, size: tuple[int, int]) -> cv2.VideoWriter:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), fps, size)
+    if not writer.isOpened():
+        raise InputError(f"{path}: this OpenCV cannot write {codec} video; install opencv-python-headless from PyPI")
+    return writer

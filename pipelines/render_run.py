@@ -1,0 +1,95 @@
+"""The finished map as a video or as pictures, along the run's own path or another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.errors import InputError
+from formats.images import write_rgb
+from formats.video_writer import CODECS, write_video
+from pipelines.evaluation.camera_paths import orbit, resampled, smoothed
+from pipelines.evaluation.measure import render_outcome
+from pipelines.evaluation.outcome import Outcome, load_outcome
+from pipelines.evaluation.pictures import Picture, depth_picture, depth_range, label_picture
+from pipelines.progress import Progress, SilentProgress
+from pipelines.run_folder import RunFolder
+
+KINDS = ("color", "depth", "labels", "side-by-side")
+PATHS = ("own", "smooth", "orbit")
+_SMOOTHING_SECONDS = 0.5
+
+
+def render_run(
+    run: RunFolder,
+    target: Path,
+    kind: str = "side-by-side",
+    path: str = "smooth",
+    fps: float = 30.0,
+    frames: int = 0,
+    progress: Progress | None = None,
+) -> Path:
+    """Draw the map along a path into a video (.mp4, .avi, .mkv) or, for any other name, a folder of PNG files.
+
+    kind: one of `KINDS`; path: one of `PATHS`; frames: how many pictures, 0 = as long as the walk took (an orbit: ten
+    seconds). Returns `target`. Raises InputError for an unknown kind or path, or a run without a map.
+    """
+    _require_choice("kind", kind, KINDS)
+    _require_choice("path", path, PATHS)
+    if target.suffix.lower() not in CODECS and target.is_file():
+        raise InputError(f"{target} is a file. Name a folder for pictures, or a video ending in {', '.join(CODECS)}")
+    outcome = load_outcome(run)
+    if outcome.gaussian_map is None:
+        raise InputError(f"{run.root}: there is no map yet. Type `msgs-slam resume {run.root}` first")
+    near, far = _depth_range(outcome)
+    world_from_cam = _path(outcome, path, fps, frames, (near * far) ** 0.5)
+    steps = (progress or SilentProgress()).track(range(len(world_from_cam)), "rendering", len(world_from_cam))
+    pictures = (_draw(outcome, world_from_cam[i], kind, near, far) for i in steps)
+    if target.suffix.lower() in CODECS:
+        return write_video(target, pictures, fps)
+    return _write_pictures(target, pictures)
+
+
+def _require_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise InputError(f"{name} is one of {', '.join(choices)}; got {value!r}")
+
+
+def _write_pictures(folder: Path, pictures: Iterator[Picture]) -> Path:
+    for i, picture in enumerate(pictures):
+        write_rgb(folder / f"{i:06d}.png", picture)
+    return folder
+
+
+def _path(outcome: Outcome, path: str, fps: float, frames: int, scene_depth: float) -> NDArray[np.float64]:
+    t = outcome.trajectory
+    own = t.world_from_cam[t.is_posed]
+    times = t.timestamps[t.is_posed]
+    if path == "orbit":
+        return orbit(own, scene_depth, frames or round(10 * fps))
+    seconds = float(times[-1] - times[0]) if len(times) > 1 else 1.0
+    dense = resampled(own, frames or max(2, round(seconds * fps)))
+    return dense if path == "own" else smoothed(dense, _SMOOTHING_SECONDS * len(dense) / max(seconds, 1e-6))
+
+
+def _depth_range(outcome: Outcome) -> tuple[float, float]:
+    """One range of colours for the whole video, from a few of the run's views."""
+    poses = outcome.trajectory.cam_from_world[outcome.trajectory.is_posed]
+    chosen = poses[np.linspace(0, len(poses) - 1, min(5, len(poses))).astype(int)]
+    ranges = np.array([depth_range(render_outcome(outcome, pose).depth) for pose in chosen])
+    return float(ranges[:, 0].min()), float(ranges[:, 1].max())
+
+
+def _draw(outcome: Outcome, world_from_cam: NDArray[np.float64], kind: str, near: float, far: float) -> Picture:
+    view = render_outcome(outcome, np.asarray(np.linalg.inv(world_from_cam), np.float64))
+    pictures = {
+        "color": lambda: view.exposed(None, 0.0),
+        "depth": lambda: depth_picture(view.depth, near, far),
+        "labels": lambda: label_picture(view.labels, outcome.classes.colors),
+    }
+    if kind == "side-by-side":
+        return np.concatenate([draw() for draw in pictures.values()], axis=1)
+    return pictures[kind]()

@@ -1,0 +1,80 @@
+"""Videos and pictures of a finished map, and the demo around them."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from formats.datasets import Sequence
+from formats.errors import InputError
+from formats.images import list_images, read_rgb
+from formats.video import iter_video
+from pipelines.demo import demo_summary, make_demo_clip, run_demo
+from pipelines.evaluation.image_quality import psnr
+from pipelines.progress import SilentProgress
+from pipelines.render_run import render_run
+from pipelines.run_folder import RunFolder
+from pipelines.world import ClipOptions
+
+OracleRun = Callable[..., RunFolder]
+SAME_CLIP = ClipOptions(frames=32, width=240, height=180, laps=0.5)
+"""The clip of the `world_sequence` fixture."""
+
+
+def test_own_path_in_colour_shows_the_frames(oracle_run: OracleRun, truth: Sequence, tmp_path: Path) -> None:
+    folder = render_run(oracle_run(), tmp_path / "pictures", kind="color", path="own", frames=5)
+    pictures = [read_rgb(p) for p in list_images(folder)]
+    assert len(pictures) == 5
+    # Frames 0 and 31 are the ends of the path; 0 is a keyframe.
+    assert 18 < psnr(pictures[0], truth.rgb(0)) < 45
+    assert psnr(pictures[0], truth.rgb(0)) > psnr(pictures[0], truth.rgb(20)) + 4
+
+
+def test_side_by_side_video_of_an_orbit(oracle_run: OracleRun, tmp_path: Path) -> None:
+    video = render_run(oracle_run(), tmp_path / "orbit.mp4", path="orbit", frames=4)
+    frames = [f.rgb for f in iter_video(video)]
+    assert len(frames) == 4
+    assert frames[0].shape == (180, 3 * 240, 3)
+    for first, second in ((frames[0], frames[1]), (frames[0][:, :240], frames[0][:, 240:480])):
+        assert np.abs(first.astype(float) - second).mean() > 5
+
+
+def test_unknown_kinds_and_runs_without_a_map_are_refused(oracle_run: OracleRun, tmp_path: Path) -> None:
+    run = oracle_run()
+    with pytest.raises(InputError, match="kind is one of"):
+        render_run(run, tmp_path / "x", kind="colour")
+    with pytest.raises(InputError, match="path is one of"):
+        render_run(run, tmp_path / "x", path="helix")
+    (tmp_path / "taken.txt").write_text("x")
+    with pytest.raises(InputError, match="is a file"):
+        render_run(run, tmp_path / "taken.txt")
+    (run.stage("mapping") / "map.safetensors").unlink()
+    with pytest.raises(InputError, match="no map yet"):
+        render_run(run, tmp_path / "x")
+    assert not (tmp_path / "x").exists()
+
+
+def test_demo_reconstructs_the_video_alone_and_then_opens_the_truth(oracle_run: OracleRun, tmp_path: Path) -> None:
+    seen: list[Path] = []
+
+    def reconstruct(video: Path, run: RunFolder) -> None:
+        seen.append(video)
+        shutil.copytree(oracle_run(video=True, metric=False, rename=True).root, run.root)
+
+    result = run_demo(tmp_path, reconstruct, SilentProgress(), SAME_CLIP)
+    assert seen == [tmp_path / "room.mp4"]
+    assert sum(1 for _ in iter_video(result.video)) == 32
+    assert result.figures["trajectory"]["sim3 all"]["rmse"] < 1e-6
+    assert "32 of 32 frames posed" in demo_summary(result)[0]
+    assert (result.run.root / "evaluation" / "views.png").exists()
+    stamp = result.video.stat().st_mtime_ns
+    assert make_demo_clip(tmp_path, SilentProgress(), SAME_CLIP)[0].stat().st_mtime_ns == stamp
+
+
+def test_demo_does_not_write_over_another_video(tmp_path: Path) -> None:
+    (tmp_path / "room.mp4").write_bytes(b"mine")
+    with pytest.raises(InputError, match="not the demo's"):
+        make_demo_clip(tmp_path, SilentProgress(), SAME_CLIP)
+    assert (tmp_path / "room.mp4").read_bytes() == b"mine"
