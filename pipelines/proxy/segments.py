@@ -30,6 +30,7 @@ _GATHER_SIDE = 200
 _LEAST_CONFIDENCE = 0.3
 _REACH = 24.0
 _COLOR_SD = 40.0
+_LEAST_VOTE = 1e-3
 _LEAST_WEIGHT = 1.5
 
 
@@ -119,7 +120,7 @@ class SegmentLabels:
         known = (label != VOID) & (depth.depth > 0)
         votes = np.zeros((*label.shape, len(self._classes)), np.float32)
         rows, columns = np.nonzero(known)
-        votes[rows, columns, label[known]] = 0.02 + depth.confidence[known]
+        votes[rows, columns, label[known]] = _LEAST_VOTE + depth.confidence[known] ** 2
         votes = spread_votes(votes, self._sequence.image(frame), _REACH, _COLOR_SD)
         total = votes.sum(-1)
         best = votes.argmax(-1).astype(np.uint8)

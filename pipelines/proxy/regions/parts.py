@@ -10,7 +10,7 @@ from pipelines.proxy.regions.voxels import Voxels, find, neighbour_keys
 
 _COLOR_UNIT = 12.0
 """Difference in CIE Lab that counts as much as a right angle between the normals."""
-_SCALE = 60.0
+_SCALE = 20.0
 
 
 def cut_parts(voxels: Voxels, largest: int) -> NDArray[np.int64]:

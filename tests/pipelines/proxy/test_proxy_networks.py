@@ -1,0 +1,351 @@
+"""Networks by card: stand-ins with the exact contracts, and what must be refused."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+
+from formats.errors import InputError
+from formats.images import read_rgb
+from pipelines.proxy.networks.card import Card, read_card
+from pipelines.proxy.networks.depth import network_depth
+from pipelines.proxy.networks.labels import network_labels
+from pipelines.proxy.networks.letterbox import choose_box
+from pipelines.proxy.networks.onnx_file import external_locations, require_own_weights
+from pipelines.proxy.networks.session import Network
+from pipelines.types import Intrinsics
+
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+NEAREST, SPAN = 1.5, 2.0
+FAMILIES = {
+    # name: (white, normalised in the graph, output name, batch x channel axes, size rule)
+    "official": (255.0, True, "pred_depth", 4, "same"),
+    "community": (255.0, True, "predicted_depth", 3, "14"),
+    "outside": (255.0, False, "pred_depth", 4, "same"),
+    "unit range": (1.0, False, "predicted_depth", 3, "same"),
+}
+
+
+def const(name: str, value: Any, kind: Any = np.float32) -> onnx.TensorProto:
+    return numpy_helper.from_array(np.array(value, kind), name)
+
+
+def stand_in(path: Path, family: str, canonical_per_metre: float) -> None:
+    """A network that reads metres off the red channel (NEAREST + SPAN · red) and answers in its canonical space."""
+    white, in_graph, output, axes, rule = FAMILIES[family]
+    nodes, weights = [], [const("red", 0, np.int64), const("span", SPAN * canonical_per_metre)]
+    weights += [const("nearest", NEAREST * canonical_per_metre), const("axis", [1], np.int64)]
+    if in_graph:  # normalised and back: proves that nothing was normalised before
+        weights += [const("scale", 1 / white)]
+        nodes += [helper.make_node("Mul", ["x", "scale"], ["unit"])]
+    else:
+        weights += [const("std", np.array(STD).reshape(3, 1, 1)), const("mean", np.array(MEAN).reshape(3, 1, 1))]
+        nodes += [
+            helper.make_node("Mul", ["x", "std"], ["spread"]),
+            helper.make_node("Add", ["spread", "mean"], ["unit"]),
+        ]
+    nodes += [
+        helper.make_node("Gather", ["unit", "red"], ["one"], axis=1),
+        helper.make_node("Mul", ["one", "span"], ["scaled"]),
+        helper.make_node("Add", ["scaled", "nearest"], ["depth3"]),
+        helper.make_node("Unsqueeze", ["depth3", "axis"], ["depth4"]),
+    ]
+    last = "depth4"
+    if rule == "14":  # 4 · floor(3.5 · floor(H / 14)): 518 gives 516
+        weights += [const("start", [2], np.int64), const("end", [4], np.int64), const("seven", [7], np.int64)]
+        weights += [const(n, [v], np.int64) for n, v in (("two", 2), ("four", 4), ("fourteen", 14))]
+        weights += [const("lead", [1, 1], np.int64)]
+        chain = [("Div", "hw", "fourteen", "p"), ("Mul", "p", "seven", "q"), ("Div", "q", "two", "r")]
+        nodes += [
+            helper.make_node("Shape", ["x"], ["shape"]),
+            helper.make_node("Slice", ["shape", "start", "end"], ["hw"]),
+        ]
+        nodes += [helper.make_node(op, [a, b], [c]) for op, a, b, c in [*chain, ("Mul", "r", "four", "s")]]
+        nodes += [helper.make_node("Concat", ["lead", "s"], ["sizes"], axis=0)]
+        nodes += [helper.make_node("Resize", ["depth4", "", "", "sizes"], ["resized"], mode="linear")]
+        last = "resized"
+    if axes == 3:
+        nodes += [helper.make_node("Squeeze", [last, "axis"], [output])]
+    else:
+        nodes += [helper.make_node("Identity", [last], [output])]
+    save(path, nodes, weights, output, [None] * axes)
+
+
+def save(path: Path, nodes: list, weights: list, output: str, shape: list, x_shape: tuple = (1, 3, "H", "W")) -> None:
+    graph = helper.make_graph(
+        nodes,
+        "stand-in",
+        [helper.make_tensor_value_info("x", TensorProto.FLOAT, x_shape)],
+        [helper.make_tensor_value_info(output, TensorProto.FLOAT, shape)],
+        weights,
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
+    model.ir_version = 8
+    onnx.save(model, path)
+
+
+def write_card(path: Path, **values: Any) -> Card:
+    def text(value: Any) -> str:
+        return repr(value).replace("'", '"').replace("True", "true").replace("(", "[").replace(")", "]")
+
+    path.write_text("".join(f"{k} = {text(v)}\n" for k, v in values.items()))
+    return read_card(path)
+
+
+def ramp(camera: Intrinsics) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """A picture whose red channel runs over the image, and the metres that it stands for."""
+    y, x = np.indices((camera.height, camera.width))
+    red = np.round(255 * (0.2 + 0.4 * x / camera.width + 0.3 * y / camera.height))
+    picture = np.stack([red, np.full_like(red, 30), np.full_like(red, 200)], -1).astype(np.uint8)
+    return picture, NEAREST + SPAN * red / 255
+
+
+CAMERAS = {
+    "landscape": Intrinsics(640, 480, 525, 515, 320, 240),
+    "portrait": Intrinsics(360, 640, 500, 500, 180, 320),
+    "replica": Intrinsics(600, 340, 300, 300, 300, 170),
+}
+SIZES: dict[str, dict[str, Any]] = {
+    "28": {"multiple": 28, "pixels": 100_000},
+    "518": {"size": [518, 518]},
+    "616": {"size": [308, 532]},
+}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_a_perfect_network_comes_back_as_metres(tmp_path: Path, family: str, size: str, camera: Intrinsics) -> None:
+    white, in_graph, output, _, _ = FAMILIES[family]
+    box = choose_box(
+        camera.width, camera.height, SIZES[size].get("size", (0, 0)), SIZES[size].get("multiple", 1), 100_000
+    )
+    scale = min(box.box_width / camera.width, box.box_height / camera.height)
+    stand_in(tmp_path / "net.onnx", family, 1000 / ((camera.fx + camera.fy) / 2 * scale))
+    norm = {} if in_graph else {"mean": list(MEAN), "std": list(STD)}
+    keys: dict[str, Any] = {"task": "depth", "model": "net.onnx", "input": "x", "output": output, "white": white}
+    card = write_card(tmp_path / "c.toml", **keys, **norm, **SIZES[size], canonical_focal=1000.0, valid=[0.1, 200.0])
+    picture, truth = ramp(camera)
+    depth, confidence, invalid = network_depth(Network(card, 1, "cpu"), picture, camera)
+    inner = (slice(12, -12), slice(12, -12))
+    error = np.abs(depth / truth - 1)[inner]
+    assert np.median(error) <= 1e-3
+    assert abs((depth / truth)[inner].mean() - 1) <= 2e-3
+    assert confidence is None
+    assert invalid == 0
+
+
+@pytest.mark.parametrize("mistake", ["normalised twice", "no focal length", "wrong range"])
+def test_a_mistaken_card_is_far_off(tmp_path: Path, mistake: str) -> None:
+    camera = CAMERAS["landscape"]
+    box = choose_box(640, 480, (0, 0), 28, 100_000)
+    stand_in(tmp_path / "net.onnx", "community", 1000 / (520 * box.box_width / 640))
+    keys: dict[str, Any] = {"task": "depth", "model": "net.onnx", "input": "x", "output": "predicted_depth"}
+    keys |= {"multiple": 28, "pixels": 100_000, "canonical_focal": 1000.0}
+    if mistake == "normalised twice":
+        keys |= {"mean": list(MEAN), "std": list(STD)}
+    if mistake == "no focal length":
+        keys["canonical_focal"] = 0.0
+    if mistake == "wrong range":
+        keys["white"] = 1.0
+    picture, truth = ramp(camera)
+    depth, _, _ = network_depth(Network(write_card(tmp_path / "c.toml", **keys), 1, "cpu"), picture, camera)
+    assert np.median(np.abs(depth / truth - 1)) > 0.05
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 480), (480, 640), (600, 340), (1920, 1080), (333, 517)])
+def test_the_box_is_a_multiple_keeps_the_aspect_and_the_budget(width: int, height: int) -> None:
+    box = choose_box(width, height, (0, 0), 28, 448 * 588)
+    assert box.box_width % 28 == box.box_height % 28 == 0
+    assert 0.8 < box.box_width * box.box_height / (448 * 588) < 1.25
+    inner = box.inner
+    assert inner[0] * inner[1] > 0.9 * box.box_width * box.box_height
+    assert min(box.box_width - inner[0], box.box_height - inner[1]) == 0
+
+
+def depth_card(folder: Path, nodes: list, weights: list, output_shape: list, **more: Any) -> Card:
+    save(folder / "net.onnx", nodes, weights, "y", output_shape)
+    keys = {"task": "depth", "model": "net.onnx", "input": "x", "output": "y", "size": [32, 32], **more}
+    return write_card(folder / "c.toml", **keys)
+
+
+def test_stops_nan_and_negative_values_are_unknown_and_counted(tmp_path: Path) -> None:
+    plane = np.full((1, 32, 32), 2.0, np.float32)
+    plane[0, 0, 0], plane[0, 8, 8], plane[0, 16, 16], plane[0, 24, 24] = np.nan, -1, 200, 0.1
+    zero = helper.make_node("ReduceSum", ["x"], ["s"], keepdims=0)
+    nodes = [zero, helper.make_node("Mul", ["s", "none"], ["z"]), helper.make_node("Add", ["plane", "z"], ["y"])]
+    weights = [const("none", 0), numpy_helper.from_array(plane, "plane")]
+    card = depth_card(tmp_path, nodes, weights, [1, 32, 32], valid=[0.1, 200.0])
+    camera = Intrinsics(32, 32, 30, 30, 16, 16)
+    depth, _, invalid = network_depth(Network(card, 1, "cpu"), np.zeros((32, 32, 3), np.uint8), camera)
+    assert invalid == 2
+    assert all(depth[i, i] == 0 for i in (0, 8, 16, 24))
+    assert (depth == 2).sum() == 32 * 32 - 4
+
+
+def test_wrong_outputs_and_inputs_are_refused_when_opened(tmp_path: Path) -> None:
+    nodes = [helper.make_node("ReduceMean", ["x"], ["y"], axes=[1], keepdims=0)]
+    card = depth_card(tmp_path, nodes, [], [1, "h", "w"])
+    Network(card, 1, "cpu")
+    keys = {"task": "depth", "model": "net.onnx", "input": "x", "output": "y", "size": [32, 32]}
+    for change, said in (({"output": "z"}, "no output 'z'"), ({"input": "pixels"}, "inputs are x")):
+        with pytest.raises(InputError, match=said):
+            Network(write_card(tmp_path / "d.toml", **{**keys, **change}), 1, "cpu")
+    with pytest.raises(InputError, match="sha256"):
+        Network(write_card(tmp_path / "d.toml", **keys, sha256="0" * 64), 1, "cpu")
+    save(tmp_path / "net.onnx", nodes, [], "y", [1, 100_000, 100_000])
+    with pytest.raises(InputError, match="too large"):
+        Network(card, 1, "cpu")
+    (tmp_path / "net.onnx").write_bytes(b"this is no protobuf at all, but text")
+    with pytest.raises(InputError, match="not an ONNX"):
+        Network(card, 1, "cpu")
+
+
+def test_an_output_that_is_no_image_is_refused(tmp_path: Path) -> None:
+    card = depth_card(tmp_path, [helper.make_node("ReduceMean", ["x"], ["y"], axes=[2, 3], keepdims=0)], [], [1, 3])
+    camera = Intrinsics(32, 32, 30, 30, 16, 16)
+    with pytest.raises(InputError, match="image of depth"):
+        network_depth(Network(card, 1, "cpu"), np.zeros((32, 32, 3), np.uint8), camera)
+
+
+def external(path: Path, location: str) -> None:
+    """A network that keeps a weight in another file."""
+    weight = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[1], data_location=TensorProto.EXTERNAL)
+    weight.external_data.add(key="location", value=location)
+    save(path, [helper.make_node("Add", ["x", "w"], ["y"])], [weight], "y", [1, 3, "h", "w"])
+
+
+@pytest.mark.parametrize("location", ["../secret.bin", "/etc/passwd", "a/../../secret.bin"])
+def test_weights_outside_the_folder_are_refused_before_anything_is_loaded(
+    tmp_path: Path, location: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(onnxruntime, "InferenceSession", lambda *a, **k: pytest.fail("it was loaded"))
+    folder = tmp_path / "model"
+    folder.mkdir()
+    (tmp_path / "secret.bin").write_bytes(b"1234")
+    external(folder / "net.onnx", location)
+    keys = {"task": "depth", "model": "net.onnx", "input": "x", "output": "y", "size": [32, 32]}
+    with pytest.raises(InputError, match="outside its own folder"):
+        Network(write_card(folder / "c.toml", **keys), 1, "cpu")
+
+
+def test_weights_beside_the_network_are_found_also_in_subgraphs(tmp_path: Path) -> None:
+    external(tmp_path / "net.onnx", "weights.bin")
+    assert external_locations(tmp_path / "net.onnx") == ["weights.bin"]
+    with pytest.raises(InputError, match="not beside it"):
+        require_own_weights(tmp_path / "net.onnx")
+    (tmp_path / "weights.bin").write_bytes(np.float32(1).tobytes())
+    require_own_weights(tmp_path / "net.onnx")
+    inner = onnx.load(tmp_path / "net.onnx", load_external_data=False).graph
+    outer = helper.make_node("If", ["c"], ["y"], then_branch=inner, else_branch=inner)
+    save(tmp_path / "outer.onnx", [outer], [], "y", [1])
+    assert external_locations(tmp_path / "outer.onnx") == ["weights.bin"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"outputs": "y"}, "no key 'outputs'"),
+        ({"task": "flow"}, "task is"),
+        ({"model": "../net.onnx"}, "outside the card's folder"),
+        ({"model": "gone.onnx"}, "no gone.onnx"),
+        ({"white": 0.0}, "white"),
+        ({"valid": [5.0, 1.0]}, "valid"),
+        ({"mean": [1.0]}, "three numbers"),
+        ({"size": [100_000, 8]}, "size"),
+        ({"multiple": "x"}, "invalid literal"),
+        ({"task": "segmentation"}, "needs classes"),
+    ],
+)
+def test_cards_that_make_no_sense_are_refused(tmp_path: Path, change: dict[str, Any], said: str) -> None:
+    (tmp_path / "net.onnx").write_bytes(b"")
+    keys = {"task": "depth", "model": "net.onnx", "input": "x", "output": "y", **change}
+    with pytest.raises(InputError, match=said):
+        write_card(tmp_path / "c.toml", **keys)
+
+
+def segmentation(folder: Path, scores: NDArray[np.float32], **more: Any) -> Network:
+    zero = helper.make_node("ReduceSum", ["x"], ["s"], keepdims=0)
+    nodes = [zero, helper.make_node("Mul", ["s", "none"], ["z"]), helper.make_node("Add", ["scores", "z"], ["y"])]
+    save(
+        folder / "net.onnx",
+        nodes,
+        [const("none", 0), numpy_helper.from_array(scores, "scores")],
+        "y",
+        list(scores.shape),
+    )
+    keys = {"task": "segmentation", "model": "net.onnx", "input": "x", "output": "y", "size": [64, 64]}
+    return Network(write_card(folder / "c.toml", **{**keys, "classes": ["a", "b", "c"], **more}), 1, "cpu")
+
+
+def test_logits_are_read_where_the_picture_lies_in_the_box(tmp_path: Path) -> None:
+    scores = np.zeros((1, 3, 16, 16), np.float32)
+    scores[0, 1, :, :8] = 4
+    scores[0, 2, :, 8:] = 4
+    picture = np.zeros((60, 120, 3), np.uint8)
+    ids, probability = network_labels(segmentation(tmp_path, scores), picture)
+    assert (ids[:, :59] == 1).all()
+    assert (ids[:, 61:] == 2).all()
+    assert probability[30, 5] == pytest.approx(np.exp(4) / (np.exp(4) + 2), rel=1e-5)
+    ids, _ = network_labels(segmentation(tmp_path, scores, void=[2]), picture)
+    assert set(np.unique(ids)) == {-1, 1}
+    ids, _ = network_labels(
+        segmentation(tmp_path, scores.argmax(1).astype(np.float32)[:, None], kind="argmax"), picture
+    )
+    assert (ids[:, :59] == 1).all()
+    assert (ids[:, 61:] == 2).all()
+
+
+def test_nan_scores_and_a_wrong_number_of_classes_are_refused(tmp_path: Path) -> None:
+    picture = np.zeros((64, 64, 3), np.uint8)
+    with pytest.raises(InputError, match="NaN"):
+        network_labels(segmentation(tmp_path, np.full((1, 3, 8, 8), np.nan, np.float32)), picture)
+    with pytest.raises(InputError, match="4 classes, the card names 3"):
+        segmentation(tmp_path, np.zeros((1, 4, 8, 8), np.float32))
+
+
+def test_the_real_network_sees_chair_and_table(shared_data: Path, tmp_path: Path) -> None:
+    for name in ("deeplabv3_mnv2_voc.onnx", "coral_pascal_voc_segmentation_labels.txt"):
+        (tmp_path / name).symlink_to(shared_data / "models" / name)
+    with pytest.raises(InputError, match="outside the card's folder"):
+        real_card(tmp_path)  # a link that leads out of the folder is not followed
+    for name in ("deeplabv3_mnv2_voc.onnx", "coral_pascal_voc_segmentation_labels.txt"):
+        (tmp_path / name).unlink()
+        (tmp_path / name).write_bytes((shared_data / "models" / name).read_bytes())
+    card = real_card(tmp_path)
+    assert len(card.classes) == 21
+    picture = read_rgb(shared_data / "kitchen" / "frame-000000.color.jpg")
+    ids, probability = network_labels(Network(card, 2, "cpu"), picture)
+    table, chair = card.classes.index("diningtable"), card.classes.index("chair")
+    # In the first frame the table fills the lower right, a chair stands left of its middle, the floor is lower left.
+    assert (ids[250:330, 420:600] == table).mean() > 0.9
+    assert (ids[170:230, 190:270] == chair).mean() > 0.5
+    assert (ids[330:, :120] == 0).mean() > 0.8
+    assert 0.5 < probability.mean() <= 1
+
+
+def real_card(folder: Path) -> Card:
+    return write_card(
+        folder / "deeplab.toml", task="segmentation", model="deeplabv3_mnv2_voc.onnx", input="pixel_values",
+        size=[513, 513], output="logits", align_corners=True, classes="coral_pascal_voc_segmentation_labels.txt",
+    )  # fmt: skip
+
+
+def test_the_toy_network_has_the_516_rule(shared_data: Path, tmp_path: Path) -> None:
+    (tmp_path / "toy_metric3d.onnx").write_bytes((shared_data / "models" / "toy_metric3d.onnx").read_bytes())
+    card = write_card(
+        tmp_path / "toy.toml", task="depth", model="toy_metric3d.onnx", input="pixel_values", size=[518, 518],
+        output="predicted_depth", canonical_focal=1000.0,
+    )  # fmt: skip
+    camera = CAMERAS["landscape"]
+    network = Network(card, 1, "cpu")
+    picture, _ = ramp(camera)
+    assert network.run(picture, network.box(640, 480))[0].shape == (516, 516)
+    depth, _, _ = network_depth(network, picture, camera)
+    assert depth.shape == (480, 640)
+    assert np.isfinite(depth).all()

@@ -1,0 +1,128 @@
+"""The stage from frames to maps: contents, resuming, and what it says of itself."""
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from proxy_room import UNIT, Room
+
+from formats.errors import InputError
+from pipelines.proxy.stage import run
+from pipelines.run_folder import load_proxy_maps, proxy_path, read_json
+from pipelines.stages import StageContext
+from pipelines.types import VOID
+
+Make = Callable[..., StageContext]
+FILES = ("proxy.depth=files", "proxy.semantics=files")
+EMBEDDED = ("proxy.stereo_side=128", "proxy.stereo_planes=32")
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    files = (p for p in folder.rglob("*") if p.is_file() and "snapshot" not in p.parts)
+    return {str(p.relative_to(folder)): p.read_bytes() for p in files}
+
+
+def test_files_become_maps_with_reliability(room: Room, make_context: Make) -> None:
+    context = make_context(*FILES)
+    report = run(context)
+    assert report == read_json(context.folder / "proxy.json")
+    assert report["metric"] is True
+    assert report["frames"] == len(room.frames)
+    assert context.warnings == []
+    classes = context.run.load_classes()
+    for frame in room.frames[::4]:
+        maps, view = context.run.load_proxy(frame.id), room.views[frame.id]
+        error = np.abs(maps.depth / view.depth - 1)
+        assert 0 < error[maps.confidence > 0.36].max() < 2e-3
+        assert error.max() < 6e-3
+        assert 0 <= maps.confidence.min() < 0.3 < 0.9 < np.median(maps.confidence) <= 1
+        assert (maps.labels[view.labels == 0] == VOID).all()
+        assert classes.names[maps.labels[96, 128]] == f"kind {view.labels[96, 128]}"
+    assert report["reliable_pixels"] > 0.9
+
+
+def test_embedded_providers_go_end_to_end(room: Room, make_context: Make) -> None:
+    context = make_context(*EMBEDDED)
+    report = run(context)
+    assert (report["depth"], report["semantics"], report["metric"]) == ("multiview", "segments", False)
+    assert report["reliable_pixels"] > 0.5
+    assert report["label_agreement"] > 0.6
+    errors = []
+    for frame in room.frames[2:9]:
+        maps = context.run.load_proxy(frame.id)
+        assert maps.depth.shape == (192, 256)
+        error = np.abs(maps.depth / (room.views[frame.id].depth * UNIT) - 1)
+        errors.append(np.median(error[maps.confidence > 0.35]))
+    assert 0 < np.mean(errors) < 0.02
+
+
+class Killed(Exception):
+    """Stands for SIGKILL."""
+
+
+class Stops:
+    """A progress that is killed at the `after`-th item of the bar `label`."""
+
+    def __init__(self, label: str, after: int) -> None:
+        self._label, self._after = label, after
+
+    def track(self, items: Iterable[Any], label: str, total: int | None = None) -> Iterator[Any]:
+        for i, item in enumerate(items):
+            if label == self._label and i == self._after:
+                raise Killed
+            yield item
+
+
+def test_killed_in_each_pass_it_goes_on_and_ends_with_the_same_bytes(make_context: Make) -> None:
+    whole = make_context(*EMBEDDED, name="whole")
+    run(whole)
+    broken = make_context(*EMBEDDED, name="broken")
+    for label, after in (("stereo", 4), ("depth", 5), ("regions", 3), ("classes", 6)):
+        object.__setattr__(broken, "progress", Stops(label, after))
+        with pytest.raises(Killed):
+            run(broken)
+    maps = sorted((broken.folder / "maps").iterdir())
+    assert len(maps) == 6
+    stamps = [p.stat().st_mtime_ns for p in maps]
+    object.__setattr__(broken, "progress", whole.progress)
+    run(broken)
+    assert stamps == [p.stat().st_mtime_ns for p in maps]
+    assert tree(broken.folder) == tree(whole.folder)
+
+
+def test_the_number_of_threads_changes_no_byte(make_context: Make) -> None:
+    trees = []
+    for threads in (1, 2):
+        context = make_context(*EMBEDDED, f"run.threads={threads}", name=f"threads{threads}")
+        run(context)
+        trees.append(tree(context.folder))
+    assert trees[0] == trees[1]
+
+
+def test_without_a_backbone_files_serve_every_frame_and_the_rest_says_what_to_do(
+    room: Room, make_context: Make
+) -> None:
+    context = make_context(*FILES, backbone=False)
+    assert run(context)["frames"] == len(room.frames)
+    with pytest.raises(InputError, match="parallax"):
+        run(make_context(name="still", backbone=False))
+
+
+def test_missing_files_are_warned_of_and_leave_unknown_depth(room: Room, make_context: Make) -> None:
+    context = make_context(*FILES)
+    (context.source.parent / "depth" / room.frames[3].name).unlink()
+    run(context)
+    assert "1 of 11 frames have no depth map" in context.warnings[0]
+    maps = load_proxy_maps(proxy_path(context.folder, 3))
+    assert maps.depth.max() == maps.confidence.max() == 0
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [("proxy.depth=radar", "radar"), ("proxy.semantics=onnx", "card"), ("proxy.depth=onnx:/no/card.toml", "card.toml")],
+)
+def test_unknown_providers_are_refused(make_context: Make, setting: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        run(make_context(*FILES, setting))
