@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 
 from pipelines.frames.features import DESCRIPTOR_NORM, Features
 
@@ -34,8 +35,7 @@ def _vocabulary(features: Sequence[Features], rng: np.random.Generator) -> NDArr
     for _ in range(_ROUNDS):
         nearest = _nearest_word(sample, words)
         counts = np.bincount(nearest, minlength=len(words))
-        sums = np.zeros(words.shape, np.float64)
-        np.add.at(sums, nearest, sample)
+        sums = _sum_by_word(sample, nearest, len(words))
         words = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], words)
     return words.astype(np.float32)
 
@@ -46,12 +46,17 @@ def _nearest_word(descriptors: NDArray[np.floating], words: NDArray[np.floating]
     return np.argmax(np.round(score, 9), axis=1)
 
 
+def _sum_by_word(vectors: NDArray[np.floating], word: NDArray[np.int64], words: int) -> NDArray[np.float64]:
+    members = csr_matrix((np.ones(len(word)), (word, np.arange(len(word)))), shape=(words, len(word)))
+    return np.asarray(members @ vectors.astype(np.float64))
+
+
 def _vlad(descriptors: NDArray[np.uint8], words: NDArray[np.float32]) -> NDArray[np.float32]:
     scaled = descriptors.astype(np.float32) / DESCRIPTOR_NORM
     total = np.zeros(words.shape, np.float64)
     if len(scaled):
         nearest = _nearest_word(scaled, words)
-        np.add.at(total, nearest, scaled - words[nearest])
+        total = _sum_by_word(scaled - words[nearest], nearest, len(words))
     total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
     flat = total.ravel()
     return (flat / max(float(np.linalg.norm(flat)), 1e-12)).astype(np.float32)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,8 @@ from pipelines.stages import StageContext
 
 WIDTH, HEIGHT = 320, 240
 FOCAL = 280.0
+WALK_FRAMES = 12
+QUICK = ("run.threads=2", "frames.max_features=500", "frames.overlap=5", "frames.loop_candidates=2")
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,7 @@ class Walk:
     k1: float
 
 
+@cache
 def _texture(seed: int) -> NDArray[np.uint8]:
     rng = np.random.default_rng(seed)
     total = np.zeros((1024, 1024, 3), np.float32)
@@ -93,7 +97,7 @@ def write_walk(folder: Path, poses: Iterator[tuple[NDArray, NDArray]], focal: fl
 @pytest.fixture(scope="session")
 def bent_walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
     """A walk seen through a lens with barrel distortion."""
-    return write_walk(tmp_path_factory.mktemp("bent"), sideways(18), k1=-0.06)
+    return write_walk(tmp_path_factory.mktemp("bent"), sideways(WALK_FRAMES), k1=-0.06)
 
 
 @pytest.fixture
@@ -103,7 +107,7 @@ def make_context(tmp_path: Path) -> Callable[..., StageContext]:
     def make(source: Path, *overrides: str, name: str = "run", progress: SilentProgress | None = None) -> StageContext:
         folder = tmp_path / name
         folder.mkdir(exist_ok=True)
-        config = load_config(overrides=["run.threads=2", "frames.max_features=800", *overrides])
+        config = load_config(overrides=[*QUICK, *overrides])
         return StageContext(RunFolder(tmp_path), source, config, folder, progress or SilentProgress())
 
     return make

@@ -1,0 +1,153 @@
+"""Intrinsics as users write them, and the lens made from them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from formats.datasets.camera import Camera
+from formats.errors import InputError
+from pipelines.frames.calibration import read_intrinsics
+from pipelines.frames.lens import make_lens, to_pycolmap, unknown_camera, with_second_radial
+
+
+def test_numbers_on_the_command_line() -> None:
+    assert read_intrinsics("525,526,320,240", 640, 480) == Camera(640, 480, 525, 526, 320, 240)
+    assert read_intrinsics("525, 526, 320, 240, 0.1, -0.2, 0.01, 0.02", 640, 480).distortion == (0.1, -0.2, 0.01, 0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.txt", "525 526 320 240\n"),
+        ("b.txt", "# K\n525 0 320\n0 526 240\n0 0 1\n"),
+        ("cameras.txt", "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 PINHOLE 640 480 525 526 320 240\n"),
+        ("twice.txt", "1 PINHOLE 1280 960 1050 1052 640 480\n"),
+        ("c.json", '{"width": 640, "height": 480, "fx": 525, "fy": 526, "cx": 320, "cy": 240}'),
+        ("d.json", '{"w": 640, "h": 480, "fx": 525, "fy": 526, "cx": 319.5, "cy": 239.5, "pixel_centre": "integer"}'),
+    ],
+)
+def test_files_that_say_the_same(name: str, text: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    assert read_intrinsics(str(tmp_path / name), 640, 480) == Camera(640, 480, 525, 526, 320, 240)
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"])
+def test_cameras_txt_projects_as_pycolmap_does(model: str, tmp_path: Path) -> None:
+    theirs = pycolmap.Camera.create_from_model_name(1, model, 500.0, 640, 480)
+    rng = np.random.default_rng(3)
+    theirs.params = [p + (0 if p else float(rng.normal(0, 0.02))) for p in theirs.params]
+    reconstruction = pycolmap.Reconstruction()
+    reconstruction.add_camera_with_trivial_rig(theirs)
+    reconstruction.write_text(tmp_path)
+    ours = to_pycolmap(read_intrinsics(str(tmp_path / "cameras.txt"), 640, 480))
+    points = np.column_stack([rng.uniform(-0.5, 0.5, (50, 2)), np.ones(50)])
+    np.testing.assert_allclose(ours.img_from_cam(points), theirs.img_from_cam(points), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("525,526,320", "3 numbers"),
+        ("525,526,3200,240", "principal point"),
+        ("no_such_file.json", "neither numbers nor an existing file"),
+        ("-525,526,320,240", "no camera"),
+    ],
+)
+def test_wrong_text_is_refused(text: str, what: str) -> None:
+    with pytest.raises(InputError, match=what):
+        read_intrinsics(text, 640, 480)
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        ("1 PINHOLE 480 640 525 526 240 320\n", "another shape"),
+        ("1 OPENCV_FISHEYE 640 480 525 526 320 240 0 0 0 0\n", "not supported"),
+        ("1 PINHOLE 640 480 525 526 320\n", "4 parameters"),
+        ("hello world\n", "holds no camera"),
+        ("1 2 3 4 5 6 7 8 9\n", "no calibration matrix"),
+    ],
+)
+def test_wrong_files_are_refused(content: str, what: str, tmp_path: Path) -> None:
+    (tmp_path / "camera.txt").write_text(content)
+    with pytest.raises(InputError, match=what):
+        read_intrinsics(str(tmp_path / "camera.txt"), 640, 480)
+
+
+def test_a_fifth_coefficient_is_refused(tmp_path: Path) -> None:
+    camera = {"w": 640, "h": 480, "fx": 525, "fy": 526, "cx": 320, "cy": 240, "distortion": [0.1, 0, 0, 0, 0.3]}
+    (tmp_path / "k3.json").write_text(json.dumps(camera))
+    with pytest.raises(InputError, match="beyond k1, k2, p1, p2"):
+        read_intrinsics(str(tmp_path / "k3.json"), 640, 480)
+
+
+LENSES = [(-0.15, 0.02, 0.001, -0.002), (0.08, -0.03, 0.0, 0.0), (-0.3, 0.1, 0.0, 0.003), (0.0, 0.0, 0.0, 0.0)]
+
+
+@pytest.mark.parametrize("distortion", LENSES)
+def test_points_are_undistorted_as_opencv_does(distortion: tuple[float, float, float, float]) -> None:
+    camera = Camera(640, 480, 500.0, 505.0, 315.0, 243.0, distortion)
+    lens = make_lens(to_pycolmap(camera))
+    xy = np.random.default_rng(0).uniform([80, 60], [560, 420], (200, 2))
+    matrix = np.array([[500.0, 0, 315.0], [0, 505.0, 243.0], [0, 0, 1]])
+    new = lens.pinhole.matrix
+    # The (0.5, 0.5) convention drops out when all of K, K' and the points follow it.
+    exactly = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+    expected = cv2.undistortPoints(xy[:, None], matrix, np.array(distortion), P=new, criteria=exactly)[:, 0]
+    np.testing.assert_allclose(lens.undistort_points(xy), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("distortion", LENSES)
+def test_images_and_points_are_undistorted_alike_and_no_border_is_blank(
+    distortion: tuple[float, float, float, float],
+) -> None:
+    camera = Camera(320, 240, 250.0, 252.0, 158.0, 121.0, distortion)
+    lens = make_lens(to_pycolmap(camera))
+    x, y = np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5)
+    ramps = np.stack([x / 320 * 255, y / 240 * 255, np.full_like(x, 255)], axis=-1).round().astype(np.uint8)
+    straight = lens.undistort_image(ramps)
+    assert straight.shape == ramps.shape
+    # Each undistorted pixel must show the ramp's value at the place that `undistort_points` sends there.
+    source = np.random.default_rng(1).uniform([40, 30], [280, 210], (300, 2))
+    at = lens.undistort_points(source)
+    seen = straight[np.clip(at[:, 1].astype(int), 0, 239), np.clip(at[:, 0].astype(int), 0, 319)].astype(float)
+    inside = (at > 1).all(1) & (at < [319, 239]).all(1)
+    assert inside.mean() > 0.8
+    assert np.abs(seen[inside, 0] / 255 * 320 - source[inside, 0]).max() < 2.5
+    assert np.abs(seen[inside, 1] / 255 * 240 - source[inside, 1]).max() < 2.5
+    assert (straight[..., 2] == 255).all()
+    assert (lens.shift_px > 0.3) == any(distortion)
+
+
+def test_a_camera_without_distortion_keeps_its_intrinsics() -> None:
+    lens = make_lens(to_pycolmap(Camera(640, 480, 525.0, 525.0, 320.0, 240.0)))
+    assert lens.shift_px < 1e-9
+    assert (lens.pinhole.fx, lens.pinhole.cx) == (525.0, 320.0)
+
+
+def test_pincushion_distortion_zooms_in_just_enough() -> None:
+    camera = unknown_camera(640, 480, 600.0, is_prior=False)
+    camera.params = [600.0, 320.0, 240.0, 0.1]
+    lens = make_lens(camera)
+    assert lens.pinhole.fx > 600
+    corners = np.array([[0.0, 0.0], [640.0, 480.0], [0.0, 480.0]])
+    rays = np.column_stack([(corners - np.array([320, 240])) / lens.pinhole.fx, np.ones(3)])
+    source = camera.img_from_cam(rays)
+    assert (source > -0.02).all()
+    assert np.abs(source[0]).min() < 1  # the corner shows the source's edge, not less
+
+
+def test_a_second_coefficient_changes_nothing_by_itself() -> None:
+    camera = unknown_camera(640, 480, 600.0, is_prior=False)
+    camera.params = [600.0, 320.0, 240.0, -0.07]
+    points = np.random.default_rng(0).uniform([-0.4, -0.4, 0.6], [0.4, 0.4, 1.4], (20, 3))
+    before = camera.img_from_cam(points)
+    with_second_radial(camera)
+    assert camera.model == pycolmap.CameraModelId.RADIAL
+    np.testing.assert_array_equal(camera.img_from_cam(points), before)

@@ -1,0 +1,242 @@
+"""Descriptors, verification, candidates: the parts of structure from motion on planted data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from pipelines.frames.consistency import epipolar_error, judge
+from pipelines.frames.database import write_database
+from pipelines.frames.features import FeatureExtractor, Features
+from pipelines.frames.keyframes import KeyframeOptions, choose_keyframes
+from pipelines.frames.matching import MatchOptions, VerifiedPair, match_descriptors, verify_matches
+from pipelines.frames.parallax import rotation_residual
+from pipelines.frames.retrieval import frame_descriptors, loop_pairs, sequential_pairs
+from pipelines.frames.snapshots import Snapshots
+from tests.pipelines.frames.conftest import FOCAL, HEIGHT, WIDTH, render, sideways, turn
+
+CAMERA = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, WIDTH, HEIGHT)
+
+
+def _descriptors(rng: np.random.Generator, count: int) -> np.ndarray:
+    values = rng.random((count, 128)) ** 4
+    return np.round(np.sqrt(values / values.sum(1, keepdims=True)) * 512).clip(0, 255).astype(np.uint8)
+
+
+def _two_views(noise: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels (200, 2) in two views of random points, and the two poses (3, 4)."""
+    rng = np.random.default_rng(5)
+    points = rng.uniform([-1, -0.8, 2], [1, 0.8, 6], (200, 3))
+    first = np.eye(4)[:3]
+    second = np.column_stack([cv2.Rodrigues(np.array([0.05, -0.2, 0.02]))[0], [0.5, 0.05, 0.1]])
+    xy = [CAMERA.img_from_cam(points @ p[:, :3].T + p[:, 3]) + rng.normal(0, noise, (200, 2)) for p in (first, second)]
+    return xy[0], xy[1], first, second
+
+
+def test_matching_finds_a_planted_permutation() -> None:
+    rng = np.random.default_rng(0)
+    first = _descriptors(rng, 300)
+    order = rng.permutation(300)
+    noisy = np.clip(first[order].astype(int) + rng.integers(-2, 3, (300, 128)), 0, 255).astype(np.uint8)
+    matches = match_descriptors(first, noisy, MatchOptions())
+    assert len(matches) == 300
+    np.testing.assert_array_equal(order[matches[:, 1]], matches[:, 0])
+
+
+def test_matching_equals_its_definition() -> None:
+    rng = np.random.default_rng(1)
+    pool = _descriptors(rng, 150)
+    first, second = pool[:100], np.concatenate([pool[60:], pool[70:80]])  # with repetitions, which must be refused
+    options = MatchOptions(max_ratio=0.9, max_angle=1.2)
+    angle = np.arccos(np.clip(first.astype(float) @ second.astype(float).T / 512**2, 0, 1))
+    expected = []
+    for i in range(100):
+        j, k = np.argsort(angle[i], kind="stable")[:2]
+        if angle[i, j] < 1.2 and angle[i, j] < 0.9 * angle[i, k] and np.argmin(angle[:, j]) == i:
+            expected.append((i, j))
+    assert match_descriptors(first, second, options).tolist() == [list(map(int, m)) for m in expected]
+    assert 20 < len(expected) < 40
+
+
+def test_too_few_descriptors_match_nothing() -> None:
+    few = _descriptors(np.random.default_rng(0), 1)
+    assert len(match_descriptors(few, few, MatchOptions())) == 0
+
+
+def test_verification_drops_outliers_and_depends_on_the_seed_and_the_pair_alone() -> None:
+    first, second, _, _ = _two_views(noise=0.3)
+    rng = np.random.default_rng(2)
+    matches = np.stack([np.arange(200)] * 2, axis=1).astype(np.uint32)
+    wrong = rng.permutation(200)[:60]
+    matches[wrong, 1] = np.roll(matches[wrong, 1], 7)
+    found = verify_matches((0, 1), matches, (first, second), CAMERA, MatchOptions(), 0)
+    assert found is not None
+    assert found.proposed == 200
+    assert 120 <= len(found.matches) <= 150
+    right = found.matches[:, 0] == found.matches[:, 1]
+    assert right.mean() > 0.95
+    verify_matches((3, 4), matches, (second, first), CAMERA, MatchOptions(), 9)
+    again = verify_matches((0, 1), matches, (first, second), CAMERA, MatchOptions(), 0)
+    assert again is not None
+    np.testing.assert_array_equal(again.matches, found.matches)
+    np.testing.assert_array_equal(again.matrices, found.matrices)
+
+
+def test_unrelated_points_are_not_verified() -> None:
+    rng = np.random.default_rng(0)
+    xy = rng.uniform([0, 0], [WIDTH, HEIGHT], (2, 40, 2))
+    matches = np.stack([np.arange(40)] * 2, axis=1).astype(np.uint32)
+    assert verify_matches((0, 1), matches, (xy[0], xy[1]), CAMERA, MatchOptions(max_error=1.0), 0) is None
+
+
+def test_epipolar_error_is_pycolmaps_sampson_error() -> None:
+    first, second, first_pose, second_pose = _two_views(noise=1.0)
+    rays = [CAMERA.cam_from_img(v) for v in (first, second)]
+    ours = epipolar_error(first_pose, second_pose, *rays)
+    essential = pycolmap.essential_matrix_from_pose(pycolmap.Rigid3d(second_pose))
+    squared = pycolmap.compute_squared_sampson_error(rays[0], rays[1], essential)
+    np.testing.assert_allclose(ours**2, squared, rtol=1e-9)
+    exact_first, exact_second, _, _ = _two_views()
+    exact = epipolar_error(first_pose, second_pose, CAMERA.cam_from_img(exact_first), CAMERA.cam_from_img(exact_second))
+    assert exact.max() < 1e-9 < np.median(ours)
+
+
+def test_a_turn_is_told_from_a_step_without_the_focal_length() -> None:
+    first, second, _, _ = _two_views(noise=0.3)
+    turned_rays = np.column_stack([CAMERA.cam_from_img(first), np.ones(200)]) @ turn(0.15, 0.05)
+    turned = CAMERA.img_from_cam(turned_rays) + np.random.default_rng(0).normal(0, 0.3, (200, 2))
+    matches = np.stack([np.arange(200)] * 2, axis=1).astype(np.uint32)
+    pair = VerifiedPair(0, 1, matches, 3, np.zeros((3, 3, 3)), 200)
+    size = (WIDTH, HEIGHT)
+    step = min(rotation_residual(pair, (first, second), size, f) for f in np.geomspace(100, 1500, 30))
+    only_turned = min(rotation_residual(pair, (first, turned), size, f) for f in np.geomspace(100, 1500, 30))
+    assert 0 < only_turned < 1.5 < 5 < step
+
+
+def test_sequential_pairs_reach_every_neighbour_and_no_pair_twice() -> None:
+    pairs = sequential_pairs(30, 4)
+    assert len(set(pairs)) == len(pairs)
+    assert all(i < j for i, j in pairs)
+    assert {(i, j) for i in range(30) for j in range(i + 1, min(30, i + 5))} <= set(pairs)
+    assert len(sequential_pairs(300, 4)) < 6 * 300
+
+
+def test_a_revisit_is_found_by_appearance() -> None:
+    extractor = FeatureExtractor(400, 0.004)
+    poses = list(sideways(8))
+    views = [render(*p) for p in [*poses, *poses[1:3]]]
+    features = [extractor(cv2.cvtColor(v, cv2.COLOR_RGB2GRAY)) for v in views]
+    descriptors = frame_descriptors(features, seed=0)
+    np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, rtol=1e-5)
+    pairs = loop_pairs(descriptors, per_frame=1, min_gap=5)
+    assert {(1, 8), (2, 9)} <= set(pairs)
+    assert all(j - i >= 5 for i, j in pairs)
+    np.testing.assert_array_equal(frame_descriptors(features, seed=0), descriptors)
+
+
+def test_retrieval_stands_frames_without_features() -> None:
+    empty = Features(np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8))
+    assert loop_pairs(frame_descriptors([empty, empty, empty], 0), 2, 1) == []
+
+
+def test_features_of_a_blank_image_are_none() -> None:
+    assert len(FeatureExtractor(400, 0.004)(np.full((100, 120), 128, np.uint8))) == 0
+
+
+def _sliding(step: float, count: int) -> list[np.ndarray]:
+    wide = cv2.cvtColor(render(np.zeros(3), turn(0.0)), cv2.COLOR_RGB2GRAY)
+    shifts = [np.float32([[1, 0, -step * i], [0, 1, 0]]) for i in range(count)]
+    return [cv2.warpAffine(wide, s, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT) for s in shifts]
+
+
+def test_keyframes_follow_the_displacement() -> None:
+    # 4.5 px a frame, a keyframe after more than 5 % of 320 px = 16 px: each fourth frame.
+    choice = choose_keyframes(_sliding(4.5, 20), KeyframeOptions(parallax=0.05, min_survivors=0.2))
+    assert choice.keyframes[:4] == [0, 4, 8, 12]
+    assert choice.displacement[1:5] * WIDTH == pytest.approx([4.5, 9, 13.5, 18], abs=0.5)
+
+
+def test_no_displacement_gives_no_second_keyframe() -> None:
+    choice = choose_keyframes(_sliding(0.0, 8), KeyframeOptions())
+    assert choice.keyframes == [0]
+    assert choice.largest_displacement < 0.001
+
+
+def test_unrelated_frames_are_all_keyframes() -> None:
+    rng = np.random.default_rng(0)
+    frames = [cv2.resize(rng.integers(0, 255, (30, 40), dtype=np.uint8), (WIDTH, HEIGHT)) for _ in range(4)]
+    assert choose_keyframes(frames, KeyframeOptions()).keyframes == [0, 1, 2, 3]
+
+
+def test_snapshots_come_back_as_they_were_and_are_not_computed_twice(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    features = Features(rng.random((9, 4)).astype(np.float32), _descriptors(rng, 9))
+    pairs = [
+        VerifiedPair(i, i + 2, rng.integers(0, 99, (5 + i, 2)).astype(np.uint32), 3, rng.random((3, 3, 3)), 20)
+        for i in range(3)
+    ]
+    snapshots = Snapshots(tmp_path)
+    for compute in (True, False):
+        calls: list[str] = []
+        made = snapshots.features(4, lambda calls=calls: calls.append("f") or features)  # type: ignore[misc]
+        found = snapshots.pairs(0, lambda calls=calls: calls.append("p") or pairs)  # type: ignore[misc]
+        assert calls == (["f", "p"] if compute else [])
+        np.testing.assert_array_equal(made.keypoints, features.keypoints)
+        np.testing.assert_array_equal(made.descriptors, features.descriptors)
+        for a, b in zip(found, pairs, strict=True):
+            assert (a.first, a.second, a.config, a.proposed) == (b.first, b.second, b.config, b.proposed)
+            np.testing.assert_array_equal(a.matches, b.matches)
+            np.testing.assert_array_equal(a.matrices, b.matrices)
+    assert snapshots.pairs(1, lambda: []) == snapshots.pairs(1, lambda: pairs) == []
+
+
+def _known_model(bend: float) -> tuple[pycolmap.Reconstruction, list[VerifiedPair], list[np.ndarray]]:
+    """A model of ten views of which the later half is turned by `bend` radians against the matches."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, 10, 120
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(options)
+    xy = [np.array([p.xy for p in model.images[i].points2D]) for i in range(1, 11)]
+    points = [
+        {p.point3D_id: k for k, p in enumerate(model.images[i].points2D) if p.has_point3D()} for i in range(1, 11)
+    ]
+    pairs = []
+    for i in range(10):
+        for j in range(i + 1, 10):
+            common = sorted(points[i].keys() & points[j].keys())
+            matches = np.array([(points[i][p], points[j][p]) for p in common], np.uint32)
+            pairs.append(VerifiedPair(i, j, matches, 2, np.zeros((3, 3, 3)), len(matches)))
+    swing = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, np.sin(bend / 2), 0.0, np.cos(bend / 2)])), np.zeros(3))
+    for frame_id in range(6, 11):
+        frame = model.frames[frame_id]
+        frame.rig_from_world = frame.rig_from_world * swing
+    return model, pairs, xy
+
+
+def test_a_folded_model_is_recognised() -> None:
+    straight, folded = (judge(*_known_model(bend), total=10) for bend in (0.0, 0.5))
+    assert straight.is_sound
+    assert straight.agreement > 0.99
+    assert not folded.is_sound
+    assert 0.2 < folded.pairs_agreeing < 0.8  # the pairs within either half still agree
+    assert folded.score < 0.7 * straight.score
+
+
+def test_pycolmap_reads_the_database(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    features = [Features(rng.random((20, 4)).astype(np.float32) * 100, _descriptors(rng, 20)) for _ in range(3)]
+    matches = np.stack([np.arange(15), np.arange(15)[::-1]], axis=1).astype(np.uint32)
+    pair = VerifiedPair(0, 2, matches, 3, np.stack([rng.random((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))]), 18)
+    for _ in range(2):  # the second replaces the first
+        write_database(tmp_path / "a.db", CAMERA, ["x", "y", "z"], features, [pair])
+    with pycolmap.Database.open(tmp_path / "a.db") as database:
+        assert [i.name for i in database.read_all_images()] == ["x", "y", "z"]
+        assert database.num_verified_image_pairs() == 1
+        geometry = database.read_two_view_geometry(1, 3)
+        np.testing.assert_array_equal(geometry.inlier_matches, matches)
+        np.testing.assert_allclose(geometry.F, pair.matrices[0])
+        np.testing.assert_array_equal(database.read_keypoints(2)[:, :2], features[1].keypoints[:, :2])

@@ -1,0 +1,150 @@
+"""Videos and folders of images as sources, the odd ones included."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from formats.errors import InputError
+from formats.images import read_rgb, write_rgb
+from pipelines.frames.source import FolderSource, VideoSource, open_source
+from pipelines.frames.stage import run
+from pipelines.stages import StageContext
+
+
+def _noise(seed: int, size: tuple[int, int] = (48, 64)) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 255, (*size, 3), dtype=np.uint8)
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    """Twenty frames of 64x48 at 10 a second."""
+    path = tmp_path / "short.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 48))
+    for i in range(20):
+        writer.write(np.full((48, 64, 3), 10 * i, np.uint8))
+    writer.release()
+    return path
+
+
+def test_a_video_is_read_in_order_with_times(video: Path) -> None:
+    source = open_source(video)
+    assert isinstance(source, VideoSource)
+    assert (source.width, source.height, source.has_times) == (64, 48, True)
+    frames = list(source.read())
+    assert [f.source_index for f in frames] == list(range(20))
+    np.testing.assert_allclose([f.timestamp for f in frames], np.arange(20) / 10, atol=1e-6)
+    assert [f.source_index for f in source.read({3, 7})] == [3, 7]
+    assert [round(f.rgb.mean() / 10) for f in source.read({3, 7})] == [3, 7]
+    assert source.name(12, 55) == "000012.jpg"
+
+
+def test_a_folder_keeps_names_and_natural_order(tmp_path: Path) -> None:
+    for i in (10, 9, 2):
+        write_rgb(tmp_path / f"img{i}.jpg", _noise(i))
+    source = open_source(tmp_path)
+    assert isinstance(source, FolderSource)
+    assert [source.name(k, k) for k in range(3)] == ["img2.jpg", "img9.jpg", "img10.jpg"]
+    assert not source.has_times
+    assert source.original(0) == tmp_path / "img2.jpg"
+
+
+def test_times_beside_the_images_are_used(tmp_path: Path) -> None:
+    for i in range(3):
+        write_rgb(tmp_path / f"{i}.png", _noise(i))
+    (tmp_path / "timestamps.txt").write_text("5.0\n5.5\n7.25\n")
+    source = open_source(tmp_path)
+    assert source.has_times
+    assert [f.timestamp for f in source.read()] == [5.0, 5.5, 7.25]
+
+
+def test_images_that_others_would_see_differently_are_not_copied(tmp_path: Path) -> None:
+    plain = Image.fromarray(_noise(0))
+    turned = Image.Exif()
+    turned[0x0112] = 3
+    plain.save(tmp_path / "a_turned.jpg", exif=turned)
+    plain.save(tmp_path / "b.bmp")
+    Image.fromarray(np.dstack([_noise(1), np.full((48, 64), 90, np.uint8)])).save(tmp_path / "c_clear.png")
+    plain.save(tmp_path / "d.png")
+    source = open_source(tmp_path)
+    assert [source.original(i) is not None for i in range(4)] == [False, False, False, True]
+    assert source.name(1, 1) == "b.bmp.png"
+
+
+@pytest.mark.parametrize("sizes", [((48, 64), (48, 65)), ((48, 64), (64, 48))])
+def test_images_of_different_sizes_are_refused(sizes: tuple[tuple[int, int], ...], tmp_path: Path) -> None:
+    for i, size in enumerate(sizes):
+        write_rgb(tmp_path / f"{i}.png", _noise(i, size))
+    with pytest.raises(InputError, match=r"differ in size: 0\.png is 64x48, 1\.png"):
+        open_source(tmp_path)
+
+
+def test_a_folder_of_damaged_images_is_refused(tmp_path: Path) -> None:
+    for i in range(3):
+        (tmp_path / f"{i}.jpg").write_bytes(b"\xff\xd8\xff damaged")
+    with pytest.raises(InputError, match="none of the 3 images"):
+        open_source(tmp_path)
+
+
+def test_one_image_is_refused(tmp_path: Path, make_context: Callable[..., StageContext]) -> None:
+    write_rgb(tmp_path / "one" / "a.jpg", _noise(0))
+    with pytest.raises(InputError, match="one image only"):
+        run(make_context(tmp_path / "one"))
+
+
+def test_an_empty_folder_is_refused(tmp_path: Path, make_context: Callable[..., StageContext]) -> None:
+    (tmp_path / "none").mkdir()
+    with pytest.raises(InputError, match="no images"):
+        run(make_context(tmp_path / "none"))
+
+
+def test_too_many_frames_are_refused(video: Path, make_context: Callable[..., StageContext]) -> None:
+    with pytest.raises(InputError, match=r"more than frames\.max_frames = 5"):
+        run(make_context(video, "frames.max_frames=5"))
+
+
+def test_picked_frames_are_reduced_and_their_table_is_not_made_twice(
+    tmp_path: Path, make_context: Callable[..., StageContext]
+) -> None:
+    for i in range(4):
+        write_rgb(tmp_path / "large" / f"{i}.png", np.repeat(np.repeat(_noise(0), 4, axis=0), 4, axis=1))
+    context = make_context(tmp_path / "large", "frames.max_side=128")
+    with pytest.raises(InputError, match="stands still"):
+        run(context)
+    assert read_rgb(context.snapshot / "picked" / "2.png").shape == (96, 128, 3)
+    shutil.rmtree(context.snapshot / "picked")
+    with pytest.raises(InputError, match="no such image"):
+        run(context)  # it goes on from the table, and does not pick again
+
+
+ODD = [
+    ("d_empty.mp4", "empty"),
+    ("d_text.mp4", "text file"),
+    ("d_one_frame.mp4", "one frame only"),
+    ("tc_audio_only.mp3", "no picture can be decoded"),
+    ("not_there.mp4", "no such file"),
+]
+
+
+@pytest.mark.parametrize(("name", "what"), ODD)
+def test_odd_videos_are_refused(
+    name: str, what: str, shared_data: Path, make_context: Callable[..., StageContext]
+) -> None:
+    with pytest.raises(InputError, match=what):
+        run(make_context(shared_data / "odd_videos" / name))
+
+
+def test_a_truncated_video_is_read_to_its_end_with_a_warning(shared_data: Path) -> None:
+    said: list[str] = []
+    source = open_source(shared_data / "odd_videos" / "d_odd_423x181_mjpeg.avi")
+    frames = list(source.read(warn=said.append))
+    assert len(frames) == 150
+    assert (source.width, source.height) == (423, 181)
+    assert len(said) == 1
+    assert "180 frames, 150 decode" in said[0]
