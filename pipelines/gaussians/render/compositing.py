@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import importlib.util
+import importlib.metadata
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -97,7 +97,7 @@ def choose_backend(backend: str | None, example: Tensor) -> ModuleType:
         return cpu
     if name == "cuda":
         if not _has_triton():
-            raise ValueError("backend: 'cuda' needs the package triton, which comes with torch's CUDA builds")
+            raise ValueError("backend: 'cuda' needs triton >= 3.3, which comes with torch >= 2.7 built for CUDA")
         from pipelines.gaussians.render import cuda
 
         return cuda
@@ -116,4 +116,9 @@ def _fastest(example: Tensor) -> str:
 
 @functools.cache
 def _has_triton() -> bool:
-    return importlib.util.find_spec("triton") is not None
+    try:
+        version = importlib.metadata.version("triton")
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    # 3.2 does not refuse the kernels but ends the process while compiling them.
+    return tuple(int(part) for part in version.split(".")[:2]) >= (3, 3)

@@ -40,35 +40,36 @@ def cache_directory() -> Path | None:
     given = os.environ.get("NUMBA_CACHE_DIR")
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "msgs-slam"
     name = f"renderer-{_source_hash()}"
-    if (directory := _private_directory(Path(given) if given else home, name)) is not None:
-        return directory
-    fallback = Path(tempfile.gettempdir()) / f"msgs-slam-{os.getuid() if hasattr(os, 'getuid') else 'user'}"
-    directory = _private_directory(fallback, name)
-    refused = given or home
-    if directory is None:
-        warnings.warn(f"cannot write to {refused} nor {fallback}: kernels are compiled at every start", stacklevel=3)
-    else:
-        warnings.warn(f"cannot write to {refused}: compiled kernels are kept in {directory}", stacklevel=3)
-    return directory
+    first = (Path(given) if given else home) / name
+    if _is_private(first):
+        return first
+    second = Path(tempfile.gettempdir()) / f"msgs-slam-{os.getuid() if hasattr(os, 'getuid') else 'user'}-{name}"
+    if _is_private(second):
+        warnings.warn(f"cannot write to {first.parent}: compiled kernels are kept in {second}", stacklevel=3)
+        return second
+    warnings.warn(
+        f"cannot write to {first.parent} nor {second.parent}: kernels are compiled at every start", stacklevel=3
+    )
+    return None
 
 
-def _private_directory(parent: Path, name: str) -> Path | None:
-    """parent/name, made if need be, if it is ours and nobody else may write there; else None.
+def _is_private(directory: Path) -> bool:
+    """Makes the folder if need be; whether it can be written, is ours, and nobody else may write there.
 
     The cache is executable code: in a shared temporary folder another user could have put it there first.
     """
-    directory = parent / name
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        for folder in (directory, parent) if parent.parent == Path(tempfile.gettempdir()) else (directory,):
-            status = folder.lstat()
-            foreign = hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & stat.S_IWOTH)
-            if foreign or not stat.S_ISDIR(status.st_mode):
-                return None
+        status = directory.lstat()
+        foreign = hasattr(os, "getuid") and (
+            status.st_uid != os.getuid() or status.st_mode & (stat.S_IWOTH | stat.S_IWGRP)
+        )
+        if foreign or not stat.S_ISDIR(status.st_mode):
+            return False
         with tempfile.TemporaryFile(dir=directory):
-            return directory
+            return True
     except OSError:
-        return None
+        return False
 
 
 def _source_hash() -> str:

@@ -11,7 +11,7 @@ import torch
 ON_CARD = torch.cuda.is_available()
 if not ON_CARD:
     os.environ["TRITON_INTERPRET"] = "1"  # read when triton is imported and again when the kernels are
-pytest.importorskip("triton", reason="needs triton: pip install 'msgs-slam[cuda-check]'")
+pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip install 'msgs-slam[cuda-check]'")
 
 from render_scenes import IMAGES, NAMES, random_gaussians, random_proxy, room  # noqa: E402
 
@@ -86,7 +86,6 @@ def test_full_size_room():
 )
 def test_kernels_compile_for_cards_and_fit_their_shared_memory(name, guided, padded, tmp_path):
     """The interpreter accepts more than the compiler does; compiling needs no card."""
-    pytest.importorskip("triton", minversion="3.3", reason="an older triton names the compiler's arguments otherwise")
     code = COMPILE.format(name=name, guided=guided, padded=padded)
     environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"} | {"TRITON_CACHE_DIR": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", code], env=environment, cwd=ROOT, capture_output=True, text=True)

@@ -1,0 +1,91 @@
+"""Where compiled kernels are kept: a writable place of our own, or nowhere, and the user is told."""
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from pipelines.gaussians.render import jit
+
+ROOT = Path(__file__).resolve().parents[4]
+
+
+@pytest.fixture(autouse=True)
+def _fresh(monkeypatch, tmp_path):
+    for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    jit.cache_directory.cache_clear()
+    yield
+    jit.cache_directory.cache_clear()
+
+
+def unwritable(monkeypatch, tmp_path, name: str) -> None:
+    """A folder cannot be made inside a file, not even by root."""
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv(name, str(tmp_path / "file" / "home"))
+
+
+def test_the_place_the_user_names_comes_first(monkeypatch, tmp_path, recwarn):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "mine"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert jit.cache_directory().parent == tmp_path / "mine"
+    assert not recwarn.list
+
+
+def test_else_the_users_cache_folder(monkeypatch, tmp_path, recwarn):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    directory = jit.cache_directory()
+    assert directory.parent == tmp_path / ".cache" / "msgs-slam"
+    assert directory.stat().st_mode & 0o777 == 0o700
+    assert not recwarn.list
+
+
+def test_a_home_that_cannot_be_written_is_said_once(monkeypatch, tmp_path):
+    unwritable(monkeypatch, tmp_path, "HOME")
+    with pytest.warns(UserWarning, match="compiled kernels are kept in") as warned:
+        found = [jit.cache_directory() for _ in range(3)]
+    assert len(warned) == 1
+    assert found[0] == found[1] == found[2]
+    assert found[0].parent == tmp_path / "tmp"
+    assert found[0].stat().st_mode & 0o777 == 0o700
+
+
+def test_no_place_at_all_is_said(monkeypatch, tmp_path):
+    unwritable(monkeypatch, tmp_path, "HOME")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "file" / "tmp"))
+    with pytest.warns(UserWarning, match="compiled at every start"):
+        assert jit.cache_directory() is None
+
+
+def test_a_folder_others_may_write_to_is_not_trusted(monkeypatch, tmp_path):
+    """The cache is machine code: who can write it can run anything as us."""
+    unwritable(monkeypatch, tmp_path, "HOME")
+    planted = tmp_path / "tmp" / f"msgs-slam-{os.getuid()}-renderer-{jit._source_hash()}"
+    planted.mkdir()
+    planted.chmod(0o777)
+    with pytest.warns(UserWarning, match="compiled at every start"):
+        assert jit.cache_directory() is None
+
+
+def test_the_name_follows_the_sources(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    first = jit.cache_directory()
+    monkeypatch.setattr(jit, "_source_hash", lambda: "other")
+    jit.cache_directory.cache_clear()
+    assert jit.cache_directory() != first
+
+
+def test_kernels_run_and_are_cached_without_a_home(tmp_path):
+    code = "import numpy as np; from pipelines.gaussians.render.cpu_bands import first_pixel; "
+    code += "assert first_pixel(np.float32(2.7)) == 3; print(sum(first_pixel.stats.cache_hits.values()))"
+    environment = {**os.environ, "HOME": "/dev/null", "TMPDIR": str(tmp_path)}
+    for hits in ("0", "1"):
+        done = subprocess.run([sys.executable, "-c", code], env=environment, cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.strip() == hits
+        assert done.stderr.count("compiled kernels are kept in") == 1
