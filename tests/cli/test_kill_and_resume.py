@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from formats.video_writer import write_video
 from pipelines.run_folder_names import STAGES
-from pipelines.world import ClipOptions, iter_clip, make_world, write_video
+from pipelines.world import ClipOptions, iter_clip, make_world
 
 SETTINGS = (
     "run.threads=2", "mapping.passes=2", "mapping.min_iterations=40", "mapping.snapshot_every=15",
@@ -35,7 +36,7 @@ def start(*arguments: object) -> subprocess.Popen[bytes]:
 
 
 def finish(process: subprocess.Popen[bytes]) -> None:
-    _, errors = process.communicate(timeout=300)
+    _, errors = process.communicate(timeout=600)
     assert process.returncode == 0, errors.decode()[-3000:]
 
 
