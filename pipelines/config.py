@@ -88,6 +88,12 @@ class TrackingConfig:
     keyframe_share: float = setting(0.6, "there, a frame that sees less than this share of its keyframe's is one")
     new_segments: bool = setting(True, "begin anew from proxy depth after a loss, and join the parts later")
     relocalise_candidates: int = setting(6, "similar keyframes in which a lost frame is looked for")
+    render: str = setting(
+        "fallback", "compare with Gaussians, eq. (16): lost frames, all, or never", ("fallback", "all", "never")
+    )
+    silhouette: float = setting(0.95, "T_sil of eq. (16)")
+    color_weight: float = setting(1.0, "λ_C of eq. (16)")
+    render_loss: float = setting(0.4, "a lost frame is posed by it when less than this share of its contrast is left")
     use_depth: bool = setting(True, "tie triangulated points to metric proxy depths in the adjustment")
     depth_sd: float = setting(0.05, "relative standard deviation of a reliable proxy depth after its scale is known")
     grid_rows: int = setting(3, "rows of the scale field of a proxy depth")

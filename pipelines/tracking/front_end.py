@@ -14,6 +14,7 @@ from pipelines.tracking.klt import follow
 from pipelines.tracking.motion import predict_pose
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.pnp import FramePose, solve_pose
+from pipelines.tracking.refine import compare_frame
 from pipelines.tracking.relocalise import relocalise
 from pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
 from pipelines.types import Intrinsics
@@ -56,9 +57,7 @@ class FrontEnd:
             segment = self.state.segment_of_point(int(seen.point[solved.inliers][0]))
             self.state.add_frame(frame_id, solved.cam_from_world, seen.select(solved.inliers), False, segment)
             self.extend_at(frame_id)
-        elif may_start and self.settings.new_segments and self._start(frame_id, start):
-            return
-        else:
+        elif not (self._by_rendering(frame_id) or (may_start and self._start(frame_id, start))):
             self.state.lost[frame_id] = reason
 
     def by_flow(self, frame_id: int) -> tuple[Sightings, FramePose | None, Array | None]:
@@ -75,6 +74,23 @@ class FrontEnd:
             return NO_SIGHTINGS, None, start
         seen = self.correspond(frame_id, start, keyframes)
         return seen, self.solve(frame_id, seen, start), start
+
+    def _by_rendering(self, frame_id: int) -> bool:
+        """Pose the frame by comparing it with Gaussians, where a neighbour is posed and the picture agrees well."""
+        neighbours = [i for i in (frame_id - 1, frame_id + 1) if i in self.state.poses]
+        if not neighbours or self.settings.render == "never":
+            return False
+        segment = self.state.segment[neighbours[0]]
+        keyframes = [k for k in self.state.nearest_keyframes(frame_id, 1) if self.state.segment[k] == segment]
+        start = self.by_flow(frame_id)[2]
+        if start is None or not keyframes:
+            return False
+        found = compare_frame(frame_id, start, keyframes, self.state, self.pictures, self.intrinsics, self.settings)
+        if found is None or not found.is_better or found.unexplained > self.settings.render_loss:
+            return False
+        self.state.add_frame(frame_id, found.cam_from_world, NO_SIGHTINGS, False, segment)
+        self.state.rendered.append(frame_id)
+        return True
 
     def is_inside(self, frame_id: int) -> bool:
         """Whether keyframes of one segment lie on both sides: then there is no need for new ones."""
@@ -104,6 +120,8 @@ class FrontEnd:
         promote(frame_id, self.state, self.pictures, self.intrinsics, self.settings)
 
     def _start(self, frame_id: int, start: Array | None) -> bool:
+        if not self.settings.new_segments:
+            return False
         pose = np.eye(4) if start is None else start
         return start_segment(frame_id, pose, self.state, self.pictures, self.intrinsics, self.settings)
 

@@ -14,6 +14,7 @@ from pipelines.stages import Stage, StageContext
 from pipelines.tracking.adjust import Report, adjust_state
 from pipelines.tracking.front_end import FrontEnd
 from pipelines.tracking.pictures import Pictures
+from pipelines.tracking.refine import compare_frame
 from pipelines.tracking.result import normalise, to_sparse_model, to_trajectory
 from pipelines.tracking.segments import join_segments
 from pipelines.tracking.state import TrackState
@@ -35,13 +36,14 @@ def run(context: StageContext) -> dict[str, Any]:
             "rotation or pictures without texture give no parallax; film while walking, or choose another part"
         )
     report = adjust_state(state, intrinsics, pictures.proxy, metric, settings)
+    compared = compare_all(context, state, pictures) if settings.render == "all" else {}
     normalise(state)
 
     trajectory = to_trajectory(state, frames)
     save_trajectory(context.folder, trajectory)
     save_sparse_model(context.folder / "sparse.npz", to_sparse_model(state))
     save_depth_scales(context, state, report)
-    figures = describe(state, frames, report, metric)
+    figures = {**describe(state, frames, report, metric), **compared}
     write_json(context.folder / "tracking.json", figures)
     warn_of_losses(context, state)
     return figures
@@ -74,6 +76,22 @@ def start_state(context: StageContext, settings: TrackingConfig) -> TrackState:
     return TrackState() if backbone is None else TrackState.from_backbone(backbone, settings.feature_sd)
 
 
+def compare_all(context: StageContext, state: TrackState, pictures: Pictures) -> dict[str, Any]:
+    """Every frame but the keyframes against Gaussians seeded around it; the new pose stays where the loss falls."""
+    intrinsics, settings = context.run.load_calibration().intrinsics, context.config.tracking
+    others = [i for i in sorted(state.poses) if i not in state.keyframes]
+    better = []
+    for frame_id in context.progress.track(others, "comparing", len(others)):
+        segment = state.segment[frame_id]
+        keyframes = [k for k in state.nearest_keyframes(frame_id, 1) if state.segment[k] == segment]
+        found = compare_frame(frame_id, state.poses[frame_id], keyframes, state, pictures, intrinsics, settings)
+        if found is not None and found.is_better:
+            state.poses[frame_id] = found.cam_from_world
+            better.append(found.loss_after / found.loss_before)
+    share = float(np.mean(better)) if better else 1.0
+    return {"compared": len(others), "compared_better": len(better), "compared_loss_ratio": round(share, 4)}
+
+
 def save_depth_scales(context: StageContext, state: TrackState, report: Report) -> None:
     """depth in the world = scales * proxy depth of the keyframe; grids (N, rows, columns) is the same, field by field.
 
@@ -93,6 +111,7 @@ def describe(state: TrackState, frames: list[Frame], report: Report, metric: boo
         "frames": len(frames),
         "posed": len(state.poses),
         "keyframes": len(state.keyframes),
+        "by_rendering": len(state.rendered),
         "segments": len(set(state.segment.values())),
         "lost": {str(i): reason for i, reason in sorted(state.lost.items())},
         "scale": "metric" if metric and world else "free",

@@ -46,8 +46,8 @@ NO_SIGHTINGS = Sightings(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
 class TrackState:
     """points (P, 3) in the world, colors (P, 3); per frame id its pose cam_from_world, its sightings or why it is lost.
 
-    `segment` numbers connected stretches: poses of different segments cannot be compared. `done` counts the frames
-    that have been visited.
+    `segment` numbers connected stretches: poses of different segments cannot be compared. `rendered` are the
+    frames that only rendering could pose; `done` counts the frames that have been visited.
     """
 
     points: Array = field(default_factory=lambda: np.zeros((0, 3)))
@@ -57,6 +57,7 @@ class TrackState:
     keyframes: list[int] = field(default_factory=list)
     lost: dict[int, str] = field(default_factory=dict)
     segment: dict[int, int] = field(default_factory=dict)
+    rendered: list[int] = field(default_factory=list)
     done: int = 0
 
     @staticmethod
@@ -118,6 +119,7 @@ class TrackState:
             "keyframes": np.array(self.keyframes, np.int64),
             "lost": np.array(lost, np.int64),
             "reasons": np.array([self.lost[i] for i in lost], np.str_),
+            "rendered": np.array(self.rendered, np.int64),
             "done": np.array(self.done),
         }
         save_arrays(path, arrays)
@@ -140,5 +142,6 @@ class TrackState:
             [int(k) for k in a["keyframes"]],
             {int(i): str(r) for i, r in zip(a["lost"], a["reasons"], strict=True)},
             dict(zip(ids, (int(s) for s in a["segment"]), strict=True)),
+            [int(i) for i in a["rendered"]],
             int(a["done"]),
         )

@@ -1,0 +1,321 @@
+"""Measures camera poses on real and made-up sequences, beside pycolmap's two mappers on the same pictures.
+
+    python tests/benchmarks/tracking.py                              all sequences, the table
+    python tests/benchmarks/tracking.py kitchen whiteroom_files      some of them
+    python tests/benchmarks/tracking.py --set tracking.use_depth=false --json rows.json
+    python tests/benchmarks/tracking.py --colmap                     pycolmap's mappers too, self-calibrated
+    python tests/benchmarks/tracking.py --until global_ba            loops and the joint refinement as well
+    python tests/benchmarks/tracking.py --lengths 250 500 1000       a walk of that many frames in the made-up room
+
+ATE is the RMSE of camera centres in centimetres after Sim(3), or SE(3) where the depth is metric; seconds are those of
+the stages named, on this machine and whatever else it does. Every row runs in a process of its own, whose peak memory
+is the row's.
+"""
+
+# ruff: noqa: E402 (the packages are found only once the path is set)
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import resource
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+DATA = ROOT.parent / "shared" / "data"
+Truth = Callable[[str, int], NDArray[np.float64] | None]
+"""(name in the source, index in the source) -> world_from_cam (4, 4), None where it is not known."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A source, the settings it is run with, and its truth."""
+
+    source: Path
+    settings: tuple[str, ...]
+    truth: Truth
+    glob: str = "*"
+    last: int = 0
+
+
+def rows_of(path: Path) -> NDArray[np.float64]:
+    """(N, 4, 4) from lines of sixteen numbers."""
+    return np.loadtxt(path).reshape(-1, 4, 4)
+
+
+def by_number(poses: NDArray[np.float64], step: int = 1) -> Truth:
+    """The number in the name (or the index, for a video) over `step` is the row."""
+
+    def look_up(name: str, index: int) -> NDArray[np.float64] | None:
+        digits = "".join(c for c in Path(name).stem if c.isdigit()) if name else str(index)
+        row = int(digits) // step
+        return poses[row] if row < len(poses) else None
+
+    return look_up
+
+
+def kitchen_truth(name: str, index: int) -> NDArray[np.float64] | None:
+    """Its folder holds the poses of even frames only."""
+    number = int(name.split(".")[0][-6:]) if name else index
+    path = DATA / "kitchen" / f"frame-{number:06d}.pose.txt"
+    return np.loadtxt(path) if path.exists() else None
+
+
+def cases(work: Path) -> dict[str, Case]:
+    """All sequences by name. `work` takes what has to be written for them."""
+    replica, white, phone = DATA / "replica_office0", DATA / "whiteroom", DATA / "phone_desk"
+    office, room = by_number(rows_of(replica / "traj_derived_c2w.txt"), 10), by_number(rows_of(white / "traj.txt"))
+    known = "frames.intrinsics=300,300,300,170"
+    files = f'proxy.depth="files:{white / "proxy_depth"}"'
+    return {
+        "kitchen_video": Case(DATA / "videos/kitchen_640x480_30fps.mp4", (), kitchen_truth),
+        "kitchen": Case(DATA / "kitchen", (), kitchen_truth, "*.color.jpg"),
+        "replica": Case(replica / "rgb", (), office),
+        "replica_files": Case(replica / "rgb", (known, f'proxy.depth="files:{work / "noisy"}"'), office),
+        "phone_desk": Case(phone / "images", (), by_number(rows_of(phone / "poses_c2w.txt")), last=60),
+        "phone_desk_jump": Case(phone / "images", (), by_number(rows_of(phone / "poses_c2w.txt"))),
+        "whiteroom_video": Case(white / "video.mp4", (), room),
+        "whiteroom_files": Case(white / "rgb", (files,), room),
+        "corridor": Case(work / "corridor" / "rgb", (), lambda *_: None),
+        "bedroom": Case(DATA / "videos/bedroom_848x364_58fps.mp4", (), lambda *_: None),
+    }
+
+
+def prepare(name: str, case: Case, work: Path) -> Path:
+    """The source to reconstruct: written or cut where the case asks for it."""
+    if name == "replica_files":
+        write_noisy_depth(DATA / "replica_office0" / "depth", work / "noisy")
+    if name == "corridor":
+        return write_walk(work / "corridor", "corridor", frames=150, laps=1.08)
+    if case.glob == "*" and not case.last:
+        return case.source
+    folder = work / f"{name}_pictures"
+    folder.mkdir(exist_ok=True)
+    pictures = sorted(case.source.glob(case.glob))[: case.last or None]
+    for picture in pictures:
+        if not (folder / picture.name).exists():
+            shutil.copy(picture, folder / picture.name)
+    return folder
+
+
+def write_walk(folder: Path, layout: str, frames: int, laps: float) -> Path:
+    """A walk in the made-up world as a folder of pictures, with traj.txt beside it."""
+    from pipelines.world.clip import ClipOptions, make_world
+    from pipelines.world.write import write_sequence
+
+    if not (folder / "traj.txt").exists():
+        options = ClipOptions(frames=frames, width=480, height=360, laps=laps)
+        write_sequence(folder, make_world(layout, texel=0.006), options)
+    return folder / "rgb"
+
+
+def write_noisy_depth(source: Path, target: Path) -> None:
+    """Each depth times its own factor (3 %) and a smooth field (6 %): what a good network does wrong."""
+    target.mkdir(exist_ok=True)
+    rng = np.random.default_rng(0)
+    for path in sorted(source.glob("*.png")):
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float64)
+        field = rng.normal(size=(7, 9)).astype(np.float32)
+        field = cv2.resize(field, depth.shape[::-1], interpolation=cv2.INTER_CUBIC)
+        depth *= np.exp(rng.normal() * 0.03) * (1 + 0.06 * field / field.std())
+        cv2.imwrite(str(target / path.name), np.clip(np.round(depth), 0, 65535).astype(np.uint16))
+
+
+def measure_ours(name: str, work: Path, settings: Sequence[str], until: str) -> dict[str, Any]:
+    """Run the stages and compare the trajectory with the truth."""
+    from pipelines.config import load_config
+    from pipelines.progress import SilentProgress
+    from pipelines.reconstruct import reconstruct
+    from pipelines.run_folder import RunFolder
+
+    case = walk_case(name, work) if name.startswith("walk_") else cases(work)[name]
+    source = prepare(name, case, work)
+    run = RunFolder(work / f"{name}.msgs")
+    config = load_config(overrides=[*case.settings, *settings])
+    records = reconstruct(source, run, config, SilentProgress(), until)
+    trajectory, frames = run.load_trajectory(until), run.load_frames()
+    is_video = source.is_file()
+    originals = original_names(source, len(frames), is_video)
+    truth = [case.truth(n, f.source_index) for n, f in zip(originals, frames, strict=True)]
+    metric = bool(run.load_proxy_report().get("metric", False))
+    return {
+        **errors(trajectory.cam_from_world, trajectory.is_posed, truth, metric),
+        "seconds": {s: round(records[s].seconds, 1) for s in records},
+        "figures": {s: records[s].figures for s in ("tracking", "global_ba") if s in records},
+        "warnings": [w for r in records.values() for w in r.warnings],
+    }
+
+
+def walk_case(name: str, work: Path) -> Case:
+    """walk_N: N frames of the made-up room, at the same speed whatever their number."""
+    count = int(name.removeprefix("walk_"))
+    folder = write_walk(work / name, "room", count, count / 250)
+    return Case(folder, (), by_number(rows_of(folder.parent / "traj.txt")))
+
+
+def original_names(source: Path, count: int, is_video: bool) -> list[str]:
+    """Names of the pictures of a folder in order; nothing for a video."""
+    if is_video:
+        return [""] * count
+    from formats.images import list_images
+
+    return [p.name for p in list_images(source)]
+
+
+def errors(
+    cam_from_world: NDArray[np.float64],
+    posed: NDArray[np.bool_],
+    truth: Sequence[NDArray[np.float64] | None],
+    metric: bool,
+) -> dict[str, Any]:
+    """Frames posed, ATE after Sim(3), after SE(3) where metric, scale error; centimetres and per cent."""
+    from pipelines.geometry.alignment import align_points
+
+    out: dict[str, Any] = {"posed": int(posed.sum()), "frames": len(posed)}
+    use = posed & np.array([t is not None for t in truth])
+    if use.sum() < 3:
+        return out
+    centres = np.linalg.inv(cam_from_world[use])[:, :3, 3]
+    wanted = np.array([t[:3, 3] for t, used in zip(truth, use, strict=True) if used and t is not None])
+    for key, with_scale in (("sim3_cm", True), ("se3_cm", False)):
+        if with_scale or metric:
+            similarity = align_points(centres, wanted, with_scale)
+            apart = similarity.apply(centres) - wanted
+            out[key] = round(100 * float(np.sqrt((apart**2).sum(1).mean())), 3)
+            if with_scale and metric:
+                out["scale_error_percent"] = round(100 * (1 / similarity.scale - 1), 2)
+    extent = float(np.linalg.norm(wanted.max(0) - wanted.min(0)))
+    out["sim3_percent_of_extent"] = round(out["sim3_cm"] / extent, 3)
+    return out
+
+
+def measure_colmap(name: str, work: Path, mapper: str) -> dict[str, Any]:
+    """pycolmap's mapper on the same pictures, camera unknown, sequential matching with overlap 10."""
+    import pycolmap
+
+    from pipelines.run_folder import RunFolder
+
+    case = cases(work)[name]
+    run = RunFolder(work / f"{name}.msgs")
+    frames = run.load_frames()
+    source = prepare(name, case, work)
+    folder = run.stage("frames") if source.is_file() else source
+    names = [f.name for f in frames] if source.is_file() else original_names(source, len(frames), False)
+    place = work / f"{name}_{mapper}"
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir()
+    started = time.monotonic()
+    database = place / "database.db"
+    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
+    pycolmap.extract_features(database, folder, names, pycolmap.CameraMode.SINGLE, reader_options=reader)
+    pycolmap.match_sequential(database, pairing_options=pycolmap.SequentialPairingOptions(overlap=10))
+    if mapper == "global":
+        pycolmap.calibrate_view_graph(database)
+        models = pycolmap.global_mapping(database, folder, place)
+    else:
+        models = pycolmap.incremental_mapping(database, folder, place)
+    poses, posed = np.tile(np.eye(4), (len(names), 1, 1)), np.zeros(len(names), bool)
+    if models:
+        model = max(models.values(), key=lambda m: m.num_reg_images())
+        for image in model.images.values():
+            poses[names.index(image.name), :3] = image.cam_from_world().matrix()
+            posed[names.index(image.name)] = True
+    truth = [case.truth("" if source.is_file() else n, f.source_index) for n, f in zip(names, frames, strict=True)]
+    return {**errors(poses, posed, truth, False), "seconds": {mapper: round(time.monotonic() - started, 1)}}
+
+
+def in_process(job: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
+    """Run the job in a new process; adds its peak memory, or the reason of its failure."""
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_answer, args=(sender, job, arguments))
+    process.start()
+    sender.close()
+    try:
+        return receiver.recv()
+    except EOFError:
+        return {"failed": "the process died"}
+    finally:
+        process.join()
+
+
+def _answer(sender: Any, job: Callable[..., dict[str, Any]], arguments: tuple[Any, ...]) -> None:
+    from formats.errors import InputError
+
+    try:
+        row = job(*arguments)
+    except InputError as error:
+        row = {"failed": str(error)}
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    sender.send({**row, "peak_mb": round(peak)})
+
+
+def print_row(name: str, method: str, row: dict[str, Any]) -> None:
+    """One line of the table."""
+    if "failed" in row:
+        print(f"{name:18} {method:12} {row['failed']}", flush=True)
+        return
+    seconds = row["seconds"]
+    own = sum(v for k, v in seconds.items() if k in ("tracking", "global_ba", "global", "incremental"))
+    cells = [
+        f"{row['posed']}/{row['frames']}",
+        *(f"{row[k]:.3f}" if k in row else "-" for k in ("sim3_cm", "se3_cm", "scale_error_percent")),
+        f"{sum(seconds.values()):.0f}",
+        f"{own:.0f}",
+        str(row["peak_mb"]),
+    ]
+    print(f"{name:18} {method:12}" + "".join(f"{c:>11}" for c in cells), flush=True)
+
+
+HEADER = f"{'sequence':18} {'method':12}" + "".join(
+    f"{h:>11}" for h in ("posed", "Sim3 cm", "SE3 cm", "scale %", "s in all", "s own", "peak MB")
+)
+
+
+def main() -> None:
+    """Parse, run, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sequences", nargs="*")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    parser.add_argument("--until", choices=("tracking", "mapping", "global_ba"), default="tracking")
+    parser.add_argument("--colmap", action="store_true")
+    parser.add_argument("--lengths", nargs="*", type=int, default=[])
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--keep", type=Path, help="folder for the runs, which a second call then takes up again")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        work = arguments.keep or Path(temporary)
+        work.mkdir(exist_ok=True)
+        names = [f"walk_{n}" for n in arguments.lengths] or arguments.sequences or list(cases(work))
+        rows = []
+        print(HEADER)
+        for name in names:
+            jobs: list[tuple[str, Callable[..., dict[str, Any]], tuple[Any, ...]]] = [
+                ("ours", measure_ours, (name, work, arguments.set, arguments.until))
+            ]
+            if arguments.colmap and not name.startswith("walk_"):
+                jobs += [(m, measure_colmap, (name, work, m)) for m in ("incremental", "global")]
+            for method, job, args in jobs:
+                row = in_process(job, *args)
+                print_row(name, method, row)
+                rows.append({"sequence": name, "method": method, **row})
+        if arguments.json:
+            arguments.json.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
