@@ -28,7 +28,7 @@ _VOXELS_PER_DEPTH = 60
 """A voxel is this fraction of the scene's median depth: 5 cm at 3 m."""
 _GATHER_SIDE = 200
 _LEAST_CONFIDENCE = 0.3
-_REACH = 24.0
+_REACH = 40.0
 _COLOR_SD = 40.0
 _LEAST_VOTE = 1e-3
 _LEAST_WEIGHT = 1.5

@@ -8,12 +8,13 @@ from pathlib import Path
 
 from formats.errors import InputError
 from pipelines.config import ProxyConfig
-from pipelines.progress import Progress
+from pipelines.progress import Progress, log
 from pipelines.proxy.files_depth import FilesDepth
 from pipelines.proxy.files_labels import FilesLabels
 from pipelines.proxy.fused import FusedDepth
+from pipelines.proxy.models.registry import ModelStore
 from pipelines.proxy.multiview import MultiviewDepth, StereoSettings
-from pipelines.proxy.networks.card import read_card
+from pipelines.proxy.networks.card import Card, read_card
 from pipelines.proxy.onnx_depth import OnnxDepth
 from pipelines.proxy.onnx_labels import OnnxLabels
 from pipelines.proxy.providers import DepthProvider, SemanticsProvider
@@ -47,13 +48,12 @@ def split_choice(text: str, setting: str, kinds: tuple[str, ...]) -> tuple[str, 
 def open_depth(around: Surroundings) -> DepthProvider:
     """Raises InputError when the provider cannot work on this video."""
     kind, rest = split_choice(around.config.depth, "proxy.depth", ("auto", "multiview", "files", "onnx"))
-    if kind == "auto":
-        kind, rest = _cached("depth")
+    card = _cached("depth") if kind == "auto" else read_card(Path(rest)) if kind == "onnx" else None
     if kind == "files":
         files = FilesDepth(rest, around.source, around.sequence, around.config.depth_scale)
         return _fused(around, files) if around.config.fuse == "always" else files
-    if kind == "onnx":
-        network = OnnxDepth(around.sequence, read_card(Path(rest)), *_surroundings(around, "network_depth"))
+    if card is not None:
+        network = OnnxDepth(around.sequence, card, *_surroundings(around, "network_depth"))
         return _fused(around, network) if around.config.fuse != "never" else network
     return _multiview(around)
 
@@ -61,18 +61,22 @@ def open_depth(around: Surroundings) -> DepthProvider:
 def open_semantics(around: Surroundings) -> SemanticsProvider:
     """Raises InputError when the provider cannot work on this video."""
     kind, rest = split_choice(around.config.semantics, "proxy.semantics", ("auto", "segments", "files", "onnx"))
-    if kind == "auto":
-        kind, rest = _cached("segmentation")
+    card = _cached("segmentation") if kind == "auto" else read_card(Path(rest)) if kind == "onnx" else None
     if kind == "files":
         return FilesLabels(rest, around.source, around.sequence, around.progress)
-    if kind == "onnx":
-        return OnnxLabels(around.sequence, read_card(Path(rest)), *_surroundings(around, "network_labels"))
+    if card is not None:
+        return OnnxLabels(around.sequence, card, *_surroundings(around, "network_labels"))
     return SegmentLabels(around.sequence, around.config.max_classes, around.progress)
 
 
-def _cached(task: str) -> tuple[str, str]:
-    """A learned model whose weights are in the cache, else the provider that needs none."""
-    return ("multiview", "") if task == "depth" else ("segments", "")
+def _cached(task: str) -> Card | None:
+    """The card of the best learned model whose weights are in the cache; nothing is ever downloaded here."""
+    store = ModelStore.open()
+    model = store.first_here(task)
+    if model is None:
+        log.info("no learned model for %s is in %s; `msgs-slam models list` shows what there is", task, store.cache)
+        return None
+    return store.card(model)
 
 
 def _multiview(around: Surroundings) -> MultiviewDepth:

@@ -29,6 +29,7 @@ from pipelines.proxy.class_files import read_class_table
 
 _MAX_CARD_BYTES = 1 << 20
 _MAX_SIDE = 8192
+_KINDS = {"depth": ("plane", "points"), "segmentation": ("logits", "probabilities", "argmax")}
 
 
 @dataclass(frozen=True)
@@ -49,9 +50,12 @@ class Card:
     canonical_focal: float = 0.0
     valid: tuple[float, ...] = (0.0, float("inf"))
     confidence: str = ""
-    kind: str = "logits"
+    kind: str = ""
     classes: tuple[str, ...] = ()
     void: tuple[int, ...] = ()
+    tokens: str = ""
+    mask: str = ""
+    metric_scale: str = ""
     sha256: str = ""
 
     @property
@@ -62,7 +66,7 @@ class Card:
 def read_card(path: Path) -> Card:
     """Raises InputError for a file that is no card, unknown or missing keys, and values that make no sense."""
     values = _read(path)
-    known = {f.name: f for f in fields(Card)}
+    known = {f.name for f in fields(Card)}
     for key in values:
         if key not in known:
             raise InputError(f"{path}: there is no key {key!r} in a card; known: {', '.join(known)}")
@@ -73,6 +77,12 @@ def read_card(path: Path) -> Card:
     if isinstance(values.get("classes"), str):
         table = read_class_table(_beside(path, values["classes"]))
         values["classes"] = [table[i].name if i in table else f"class {i}" for i in range(max(table) + 1)]
+    return card_from_values(values, path)
+
+
+def card_from_values(values: dict[str, Any], path: Path) -> Card:
+    """A card from its keys, `model` already a path; `path` is what errors call it. Raises InputError."""
+    known = {f.name: f for f in fields(Card)}
     try:
         card = Card(**{k: _converted(k, v, known[k].type) for k, v in values.items()})
     except (TypeError, ValueError) as error:
@@ -125,7 +135,7 @@ def _converted(key: str, value: Any, kind: Any) -> Any:
 def _check(card: Card, path: Path) -> None:
     problems = {
         "task is depth or segmentation": card.task in ("depth", "segmentation"),
-        "kind is logits, probabilities or argmax": card.kind in ("logits", "probabilities", "argmax"),
+        f"kind is {', '.join(_KINDS.get(card.task, ()))}": card.kind in ("", *_KINDS.get(card.task, ())),
         "mean and std have three numbers, std positive": len(card.mean) == len(card.std) == 3 and min(card.std) > 0,
         "white is positive": card.white > 0,
         "size is [height, width]": len(card.size) == 2 and all(0 <= s <= _MAX_SIDE for s in card.size),

@@ -33,7 +33,7 @@ def network_labels(network: Network, image: NDArray[np.uint8]) -> tuple[NDArray[
     scores = box.take(scores, card.align_corners)
     ids = scores.argmax(-1)
     best = scores.max(-1)
-    likely = 1 / np.exp(scores - best[..., None]).sum(-1) if card.kind == "logits" else np.clip(best, 0, 1)
+    likely = 1 / np.exp(scores - best[..., None]).sum(-1) if card.kind != "probabilities" else np.clip(best, 0, 1)
     probability = np.asarray(likely, np.float32)
     ids = np.where(np.isin(ids, card.void), -1, ids)
     if broken.any():

@@ -18,6 +18,7 @@ from pipelines.proxy.networks.onnx_file import require_own_weights
 
 _MAX_OUTPUT_VALUES = 200_000_000
 _IMAGENET_MEAN = (123.675, 116.28, 103.53)
+_TOKENS = (1200, 3600)
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 
@@ -32,9 +33,9 @@ class Network:
         self._session = _open(card.model, threads, device)
         inputs = {i.name: i for i in self._session.get_inputs()}
         outputs = {o.name: o for o in self._session.get_outputs()}
-        if set(inputs) != {card.input}:
+        if set(inputs) != set(filter(None, (card.input, card.tokens))):
             raise InputError(f"{card.model}: its inputs are {', '.join(inputs)}; the card says {card.input}")
-        for wanted in filter(None, (card.output, card.confidence)):
+        for wanted in _outputs(card):
             if wanted not in outputs:
                 raise InputError(f"{card.model}: it has no output {wanted!r}, only {', '.join(outputs)}")
             _require_bounded(card.model, wanted, outputs[wanted].shape)
@@ -43,22 +44,29 @@ class Network:
         if kind not in _TYPES:
             raise InputError(f"{card.model}: input {card.input} is {kind}; float or float16 is expected")
         self._dtype = _TYPES[kind]
+        shape = inputs[card.input].shape
+        fixed = len(shape) == 4 and all(isinstance(s, int) and s > 0 for s in shape[2:])
+        self._size = card.size if all(card.size) or not fixed else tuple(shape[2:])
 
     def box(self, width: int, height: int) -> Letterbox:
         """How a picture of width x height goes into the network."""
-        return choose_box(width, height, self.card.size, self.card.multiple, self.card.pixels)
+        return choose_box(width, height, self._size, self.card.multiple, self.card.pixels)
 
     def run(self, image: NDArray[np.uint8], box: Letterbox) -> list[NDArray]:
-        """The card's outputs (output, then confidence if named) without the batch axis, for an RGB image (h, w, 3)."""
+        """The card's outputs that are named (output, confidence, mask, metric_scale) without the batch axis, for an
+        RGB image (h, w, 3). Raises InputError when the network fails on it or answers with something huge."""
         card = self.card
         mean, std = np.array(card.mean, np.float32), np.array(card.std, np.float32)
         # Padding of the mean colour: 0 after normalisation, here or in the graph.
         pad = mean * 255 if any(card.mean) else np.array(_IMAGENET_MEAN, np.float32)
         values = (box.put(image, pad) * np.float32(card.white / 255) - mean * card.white) / (std * _std_unit(card))
         batch = np.ascontiguousarray(values.transpose(2, 0, 1)[None]).astype(self._dtype)
-        names = [n for n in (card.output, card.confidence) if n]
+        feed: dict[str, NDArray] = {card.input: batch}
+        if card.tokens:
+            tokens = round(box.box_width * box.box_height / card.multiple**2)
+            feed[card.tokens] = np.array(min(max(tokens, _TOKENS[0]), _TOKENS[1]), np.int64)
         try:
-            outputs: Sequence[NDArray] = self._session.run(names, {card.input: batch})
+            outputs: Sequence[NDArray] = self._session.run(_outputs(card), feed)
         except Exception as error:  # onnxruntime's errors share no narrower base class
             if type(error).__module__.startswith("onnxruntime"):
                 size = f"{box.box_width}x{box.box_height}"
@@ -70,6 +78,10 @@ class Network:
             if output.size > _MAX_OUTPUT_VALUES or output.size == 0:
                 raise InputError(f"{card.model}: gave an output of shape {output.shape}. Correct the card")
         return [np.asarray(o[0]) for o in outputs]
+
+
+def _outputs(card: Card) -> list[str]:
+    return [n for n in (card.output, card.confidence, card.mask, card.metric_scale) if n]
 
 
 def _std_unit(card: Card) -> float:

@@ -13,7 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 from formats.errors import InputError
 from formats.images import read_rgb
 from pipelines.proxy.networks.card import Card, read_card
-from pipelines.proxy.networks.depth import network_depth
+from pipelines.proxy.networks.depth import network_depth, solve_shift, solve_shift_and_focal
 from pipelines.proxy.networks.labels import network_labels
 from pipelines.proxy.networks.letterbox import choose_box
 from pipelines.proxy.networks.onnx_file import external_locations, require_own_weights
@@ -349,3 +349,56 @@ def test_the_toy_network_has_the_516_rule(shared_data: Path, tmp_path: Path) -> 
     depth, _, _ = network_depth(network, picture, camera)
     assert depth.shape == (480, 640)
     assert np.isfinite(depth).all()
+
+
+def test_a_point_map_finds_its_shift_and_its_focal_length() -> None:
+    rng = np.random.default_rng(5)
+    camera = CAMERAS["landscape"]
+    rays = rng.uniform(-0.5, 0.5, (500, 2))
+    z = rng.uniform(1, 4, 500)
+    points = np.column_stack([rays * z[:, None], z - 0.7])
+    points[:25] += rng.normal(0, 1, (25, 3))
+    assert solve_shift(points, rays) == pytest.approx(0.7, abs=0.003)
+    shift, focal = solve_shift_and_focal(points, rays * camera.fx)
+    assert shift == pytest.approx(0.7, abs=0.02)
+    assert focal == pytest.approx(camera.fx, rel=0.01)
+
+
+def test_the_point_map_family_comes_back_as_metres(tmp_path: Path) -> None:
+    camera = CAMERAS["landscape"]
+    box = choose_box(640, 480, (0, 0), 14, 100_000)
+    y, x = np.indices((box.box_height, box.box_width)) + 0.5
+    rays_x = ((x - box.offset[0]) / box.scale[0] - camera.cx) / camera.fx
+    rays_y = ((y - box.offset[1]) / box.scale[1] - camera.cy) / camera.fy
+    metres = 2 + 0.5 * rays_x - 0.8 * rays_y
+    points = np.stack([rays_x * metres, rays_y * metres, metres], -1) / 2.5 - [0, 0, 0.3]
+    mask = np.ones(metres.shape)
+    mask[:, :40] = 0
+    values = {"points": points, "mask": mask}
+    weights = [const(f"{k}_value", v[None]) for k, v in values.items()] + [const("s_value", [2.5]), const("none", 0)]
+    weights += [const("sum_axes", [0, 1, 2, 3], np.int64)]
+    nodes = [helper.make_node("ReduceSum", ["x", "sum_axes"], ["sum"], keepdims=0)]
+    nodes += [helper.make_node("Cast", ["num_tokens"], ["t"], to=TensorProto.FLOAT)]
+    nodes += [helper.make_node("Add", ["sum", "t"], ["u"])]
+    nodes += [helper.make_node("Mul", ["u", "none"], ["zero"])]
+    outputs = []
+    for name, rank in (("points", 4), ("mask", 3), ("s", 1)):
+        nodes.append(helper.make_node("Add", [f"{name}_value", "zero"], [name]))
+        outputs.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, [None] * rank))
+    inputs = [helper.make_tensor_value_info("x", TensorProto.FLOAT, ["B", 3, "H", "W"])]
+    inputs += [helper.make_tensor_value_info("num_tokens", TensorProto.INT64, [])]
+    model = helper.make_model(
+        helper.make_graph(nodes, "points", inputs, outputs, weights), opset_imports=[helper.make_opsetid("", 17)]
+    )
+    model.ir_version = 8
+    onnx.save(model, tmp_path / "net.onnx")
+    card = write_card(
+        tmp_path / "c.toml", task="depth", model="net.onnx", input="x", white=1.0, multiple=14, pixels=100_000,
+        output="points", kind="points", tokens="num_tokens", mask="mask", metric_scale="s",
+    )  # fmt: skip
+    depth, _, _ = network_depth(Network(card, 1, "cpu"), np.zeros((480, 640, 3), np.uint8), camera)
+    v, u = np.indices((480, 640)) + 0.5
+    truth = 2 + 0.5 * (u - camera.cx) / camera.fx - 0.8 * (v - camera.cy) / camera.fy
+    known = depth > 0
+    assert 0.85 < known.mean() < 0.95
+    assert np.abs(depth / truth - 1)[known].max() < 1e-3

@@ -1,0 +1,163 @@
+"""The table of models and the cache folder that holds their files."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from formats.atomic import atomic_path
+from formats.errors import InputError
+from pipelines.proxy.models.download import fetch, file_sha256
+from pipelines.proxy.networks.card import Card, card_from_values
+
+_TABLE = Path(__file__).with_name("registry.toml")
+
+
+@dataclass(frozen=True)
+class Model:
+    """One row of the table. `sha256` is "" while it is unknown."""
+
+    name: str
+    family: str
+    urls: tuple[str, ...]
+    bytes: int
+    sha256: str
+    licence: str
+    commercial: bool
+
+
+@dataclass(frozen=True)
+class ModelStore:
+    """Known models over a cache folder."""
+
+    cache: Path
+    models: tuple[Model, ...]
+    families: dict[str, dict[str, Any]]
+
+    @staticmethod
+    def open(cache: Path | None = None, table: Path = _TABLE) -> ModelStore:
+        """The store of this user. `MSGS_SLAM_CACHE` names another cache folder."""
+        values = tomllib.loads(table.read_text(encoding="utf-8"))
+        rows = [Model(**{**row, "urls": tuple(row["urls"])}) for row in values["model"]]
+        store = ModelStore(cache or default_cache(), tuple(rows), values["family"])
+        own = store._load_own()
+        pinned = own["pinned"]
+        rows = [replace(r, sha256=r.sha256 or pinned.get(r.name, "")) for r in rows]
+        added = [Model(**{**row, "urls": ()}) for row in own["added"]]
+        return replace(store, models=(*added, *rows))
+
+    def path(self, model: Model) -> Path:
+        """Where the model's file lies, or would lie."""
+        return self.cache / f"{model.name}.onnx"
+
+    def is_here(self, model: Model) -> bool:
+        """Whether the file is there with the right size (the content is checked when it is opened)."""
+        path = self.path(model)
+        return path.is_file() and path.stat().st_size == model.bytes and bool(model.sha256)
+
+    def get(self, name: str) -> Model:
+        """Raises InputError for an unknown name."""
+        for model in self.models:
+            if model.name == name:
+                return model
+        raise InputError(f"there is no model {name!r}; known: {', '.join(m.name for m in self.models)}")
+
+    def card(self, model: Model) -> Card:
+        """The contract of the model's family, for its file in the cache."""
+        values = {**self.families[model.family], "model": self.path(model), "sha256": model.sha256}
+        return card_from_values(values, _TABLE)
+
+    def first_here(self, task: str) -> Model | None:
+        """The best model of a task whose file is in the cache."""
+        for model in self.models:
+            if self.families[model.family]["task"] == task and self.is_here(model):
+                return model
+        return None
+
+    def pull(
+        self, model: Model, progress: Callable[[int, int], None], trust: bool = False, offline: bool = False
+    ) -> Path:
+        """Download the model's file unless it is here and whole; a row without a hash only with `trust`, which pins it.
+
+        Raises InputError when no mirror delivers it, when it is not what the table says, and when offline.
+        """
+        path = self.path(model)
+        if model.sha256 and path.is_file() and file_sha256(path) == model.sha256:
+            return path
+        if not model.sha256 and not trust:
+            raise InputError(f"{model.name}: its sha256 is unknown. Pull it with --trust to accept the first download")
+        if offline:
+            raise InputError(
+                f"{model.name} is not in {self.cache} and this is offline. Pull it where there is a network"
+            )
+        actual = fetch(model.urls, path, model.bytes, model.sha256, progress)
+        if not model.sha256:
+            own = self._load_own()
+            own["pinned"][model.name] = actual
+            self._save_own(own)
+        return path
+
+    def add(self, file: Path, family: str, name: str = "") -> Model:
+        """Copy the user's own file into the cache as a model of `family`. InputError unless it fits the family."""
+        if family not in self.families:
+            raise InputError(f"there is no family {family!r}; known: {', '.join(self.families)}")
+        if not file.is_file():
+            raise InputError(f"{file}: there is no such file")
+        from pipelines.proxy.networks.session import Network
+
+        digest, size = file_sha256(file), file.stat().st_size
+        model = Model(name or file.stem, family, (), size, digest, "the user's own file", False)
+        if any(m.name == model.name and m.urls for m in self.models):
+            raise InputError(f"{model.name} is the name of a known model. Give another with --name")
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", model.name):
+            raise InputError(f"{model.name!r} is no name for a model: letters, digits, dot, dash and underscore")
+        values = {**self.families[family], "model": file.resolve(), "sha256": digest}
+        Network(card_from_values(values, _TABLE), 1, "cpu")
+        with atomic_path(self.path(model)) as temporary:
+            shutil.copyfile(file, temporary)
+        own = self._load_own()
+        row = {k: getattr(model, k) for k in ("name", "family", "bytes", "sha256", "licence", "commercial")}
+        own["added"] = [r for r in own["added"] if r["name"] != model.name] + [row]
+        self._save_own(own)
+        return model
+
+    def verify(self) -> dict[str, str]:
+        """Name → "ok", "not pulled" or what is wrong, for every model."""
+        found = {}
+        for model in self.models:
+            path = self.path(model)
+            if not path.is_file():
+                found[model.name] = "not pulled"
+            elif not model.sha256:
+                found[model.name] = "no known sha256"
+            else:
+                found[model.name] = "ok" if file_sha256(path) == model.sha256 else "damaged: pull it again"
+        return found
+
+    def _load_own(self) -> dict[str, Any]:
+        path = self.cache / "own.json"
+        if not path.exists():
+            return {"pinned": {}, "added": []}
+        try:
+            own = json.loads(path.read_text(encoding="utf-8"))
+            return {"pinned": dict(own["pinned"]), "added": list(own["added"])}
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path}: is damaged ({error}). Delete it and add your models again") from error
+
+    def _save_own(self, own: dict[str, Any]) -> None:
+        with atomic_path(self.cache / "own.json") as temporary:
+            temporary.write_text(json.dumps(own, indent=1) + "\n", encoding="utf-8")
+
+
+def default_cache() -> Path:
+    """`$MSGS_SLAM_CACHE`, else `msgs-slam` in the user's cache folder."""
+    if own := os.environ.get("MSGS_SLAM_CACHE"):
+        return Path(own)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "msgs-slam"

@@ -1,0 +1,197 @@
+"""The table of models and the downloader, against a server of the test's own on loopback."""
+
+import hashlib
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from formats.errors import DiskFullError, InputError
+from pipelines.proxy.models.download import fetch, file_sha256
+from pipelines.proxy.models.registry import Model, ModelStore
+
+DATA = np.random.default_rng(0).bytes(700_000)
+SHA = hashlib.sha256(DATA).hexdigest()
+
+
+@dataclass
+class Behaviour:
+    """What the server does with the next requests, and what it saw."""
+
+    cuts: list[int] = field(default_factory=list)
+    ranges: bool = True
+    missing: tuple[str, ...] = ()
+    data: bytes = DATA
+    etag: str = '"one"'
+    requests: list[tuple[str, str]] = field(default_factory=list)
+
+
+@pytest.fixture
+def server() -> Iterator[tuple[str, Behaviour]]:
+    behaviour = Behaviour()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            wanted = self.headers.get("Range", "")
+            behaviour.requests.append((self.path, wanted))
+            if self.path in behaviour.missing:
+                self.send_error(404)
+                return
+            same = self.headers.get("If-Range", behaviour.etag) == behaviour.etag
+            start = int(wanted[6:-1]) if wanted and behaviour.ranges and same else 0
+            body = behaviour.data[start:]
+            self.send_response(206 if start else 200)
+            self.send_header("Content-Length", str(len(body)))
+            self.send_header("ETag", behaviour.etag)
+            self.end_headers()
+            if behaviour.cuts:
+                body = body[: behaviour.cuts.pop(0)]
+                self.close_connection = True
+            self.wfile.write(body)
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    httpd = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=httpd.serve_forever, daemon=True)
+    thread.start()
+    yield f"http://127.0.0.1:{httpd.server_port}", behaviour
+    httpd.shutdown()
+    thread.join()
+    httpd.server_close()
+
+
+def silent(done: int, size: int) -> None:
+    assert 0 < done <= size
+
+
+def test_a_line_cut_twice_is_continued_where_it_broke(server: tuple[str, Behaviour], tmp_path: Path) -> None:
+    url, behaviour = server
+    behaviour.cuts = [300_000, 200_000]
+    assert fetch([f"{url}/m"], tmp_path / "m.onnx", len(DATA), SHA, silent) == SHA
+    assert (tmp_path / "m.onnx").read_bytes() == DATA
+    assert [r for _, r in behaviour.requests] == ["", "bytes=300000-", "bytes=500000-"]
+    assert [p.name for p in tmp_path.iterdir()] == ["m.onnx"]
+
+
+def test_a_later_call_goes_on_and_a_changed_file_begins_again(server: tuple[str, Behaviour], tmp_path: Path) -> None:
+    url, behaviour = server
+    behaviour.cuts = [300_000, 0]
+    with pytest.raises(InputError, match="no mirror"):
+        fetch([f"{url}/m"], tmp_path / "m.onnx", len(DATA), SHA, silent)
+    assert (tmp_path / "m.onnx.part").stat().st_size == 300_000
+    behaviour.etag, behaviour.data = '"two"', DATA[::-1]
+    fetch([f"{url}/m"], tmp_path / "m.onnx", len(DATA), hashlib.sha256(DATA[::-1]).hexdigest(), silent)
+    assert (tmp_path / "m.onnx").read_bytes() == DATA[::-1]
+
+
+def test_without_ranges_it_begins_again(server: tuple[str, Behaviour], tmp_path: Path) -> None:
+    url, behaviour = server
+    behaviour.ranges, behaviour.cuts = False, [100_000, 400_000]
+    fetch([f"{url}/m"], tmp_path / "m.onnx", len(DATA), SHA, silent)
+    assert (tmp_path / "m.onnx").read_bytes() == DATA
+
+
+def test_404_and_a_wrong_hash_go_to_the_next_mirror(server: tuple[str, Behaviour], tmp_path: Path) -> None:
+    url, behaviour = server
+    behaviour.missing = ("/gone",)
+    fetch([f"{url}/gone", f"{url}/m"], tmp_path / "m.onnx", len(DATA), SHA, silent)
+    assert [p for p, _ in behaviour.requests] == ["/gone", "/m"]
+    with pytest.raises(InputError, match=r"sha256 is .* expected 0000"):
+        fetch([f"{url}/m"], tmp_path / "n.onnx", len(DATA), "0" * 64, silent)
+    assert not list(tmp_path.glob("n.onnx*"))
+    with pytest.raises(InputError, match="404"):
+        fetch([f"{url}/gone"], tmp_path / "n.onnx", len(DATA), SHA, silent)
+
+
+def test_another_size_is_refused_before_it_is_written(server: tuple[str, Behaviour], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="700000 bytes, expected 5"):
+        fetch([f"{server[0]}/m"], tmp_path / "m.onnx", 5, SHA, silent)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_keeps_what_came(
+    server: tuple[str, Behaviour], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(done: int, size: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(DiskFullError, match="disk is full"):
+        fetch([f"{server[0]}/m"], tmp_path / "m.onnx", len(DATA), SHA, full)
+    assert 0 < (tmp_path / "m.onnx.part").stat().st_size <= len(DATA)
+    fetch([f"{server[0]}/m"], tmp_path / "m.onnx", len(DATA), SHA, silent)
+    assert file_sha256(tmp_path / "m.onnx") == SHA
+
+
+def test_only_https_is_downloaded_from(tmp_path: Path) -> None:
+    for url in ("file:///etc/passwd", "http://example.org/m", "ftp://example.org/m"):
+        with pytest.raises(InputError, match="only https"):
+            fetch([url], tmp_path / "m", 5, SHA, silent)
+
+
+def store(folder: Path, url: str, sha256: str = SHA) -> ModelStore:
+    model = Model("net", "metric3d-community", (f"{url}/m",), len(DATA), sha256, "MIT", True)
+    return ModelStore(folder, (model,), ModelStore.open(folder).families)
+
+
+def test_pull_mends_a_corrupted_file_and_offline_says_what_is_missing(
+    server: tuple[str, Behaviour], tmp_path: Path
+) -> None:
+    url, behaviour = server
+    models = store(tmp_path, url)
+    model = models.get("net")
+    with pytest.raises(InputError, match="offline"):
+        models.pull(model, silent, offline=True)
+    assert models.first_here("depth") is None
+    path = models.pull(model, silent)
+    assert models.pull(model, silent, offline=True) == path
+    assert len(behaviour.requests) == 1
+    assert models.first_here("depth") == model
+    assert models.card(model).canonical_focal == 1000
+    path.write_bytes(DATA[:-1] + b"?")
+    assert "damaged" in models.verify()["net"]
+    models.pull(model, silent)
+    assert models.verify() == {"net": "ok"}
+
+
+def test_an_unknown_hash_is_refused_unless_trusted_and_then_recorded(
+    server: tuple[str, Behaviour], tmp_path: Path
+) -> None:
+    models = store(tmp_path, server[0], sha256="")
+    with pytest.raises(InputError, match="--trust"):
+        models.pull(models.get("net"), silent)
+    assert server[1].requests == []
+    models.pull(models.get("net"), silent, trust=True)
+    assert models._load_own()["pinned"] == {"net": SHA}
+
+
+def test_the_table_is_complete_and_every_family_makes_a_card(tmp_path: Path) -> None:
+    models = ModelStore.open(tmp_path)
+    assert {"metric3d-small", "metric3d-large", "moge2-small"} <= {m.name for m in models.models}
+    for model in models.models:
+        assert len(model.sha256) == 64
+        assert model.licence
+        assert all(u.startswith("https://") for u in model.urls)
+        assert models.card(model).task == "depth"
+    with pytest.raises(InputError, match="known: metric3d"):
+        models.get("metric4d")
+
+
+def test_own_files_are_added_checked_and_used_first(shared_data: Path, tmp_path: Path) -> None:
+    models = ModelStore.open(tmp_path)
+    toy = shared_data / "models" / "toy_metric3d.onnx"
+    with pytest.raises(InputError, match="inputs are pixel_values"):
+        models.add(toy, "metric3d-official")
+    with pytest.raises(InputError, match="no name for a model"):
+        models.add(toy, "metric3d-community", "../escape")
+    with pytest.raises(InputError, match="known model"):
+        models.add(toy, "metric3d-community", "moge2-small")
+    added = models.add(toy, "metric3d-community", "toy")
+    again = ModelStore.open(tmp_path)
+    assert again.first_here("depth") == again.get("toy") == added
+    assert again.verify()["toy"] == "ok"
