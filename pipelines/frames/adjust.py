@@ -15,6 +15,7 @@ _CAUCHY_PX = 1.0
 _MAX_REPROJECTION_PX = 4.0
 _MIN_ANGLE_DEG = 1.0
 _MIN_KEYFRAMES_TO_SPLIT = 8
+_SPLIT_VIEWS = 60
 
 
 def adjust(model: pycolmap.Reconstruction, refine_camera: bool) -> float:
@@ -109,7 +110,8 @@ def _difference_of_halves(model: pycolmap.Reconstruction, images: Sequence[int])
     if len(images) < _MIN_KEYFRAMES_TO_SPLIT:
         return 0.0
     middle = len(images) // 2
-    return abs(_focal_of(model, images[:middle]) - _focal_of(model, images[middle:]))
+    first, second = images[:middle][:_SPLIT_VIEWS], images[middle:][-_SPLIT_VIEWS:]
+    return abs(_focal_of(model, first) - _focal_of(model, second))
 
 
 def _focal_of(model: pycolmap.Reconstruction, images: Sequence[int]) -> float:

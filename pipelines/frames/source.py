@@ -85,7 +85,7 @@ class VideoSource:
 
 @dataclass
 class FolderSource:
-    """The images directly in a folder, in natural order of their names."""
+    """The images directly in a folder, in natural order of their names; depth maps among them are left out."""
 
     path: Path
     width: int = field(init=False)
@@ -96,7 +96,7 @@ class FolderSource:
     _images: list[Path] = field(init=False)
 
     def __post_init__(self) -> None:
-        self._images = list_images(self.path)
+        self._images = _without_depth_maps(list_images(self.path))
         sizes = self._sizes()
         if not sizes:
             raise InputError(
@@ -152,6 +152,22 @@ class FolderSource:
             if path.name not in self.unreadable:
                 return exif_focal_px(path, self.width, self.height)
         return None
+
+
+def _without_depth_maps(images: list[Path]) -> list[Path]:
+    """The images but for those of one channel of 16 bits, where there are others: data sets keep depth beside colour."""
+    depth = {path for path in images if _is_depth_map(path)}
+    return images if len(depth) == len(images) else [path for path in images if path not in depth]
+
+
+def _is_depth_map(path: Path) -> bool:
+    if path.suffix.lower() not in (".png", ".tif", ".tiff"):
+        return False
+    try:
+        with Image.open(path) as image:
+            return image.mode.startswith("I")
+    except (OSError, SyntaxError, ValueError):
+        return False  # damaged: told of when it is read
 
 
 def open_source(path: Path) -> VideoSource | FolderSource:

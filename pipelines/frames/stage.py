@@ -46,15 +46,15 @@ def run(context: StageContext) -> dict[str, Any]:
     camera, origin = _known_camera(config, source)
     _require_reasonable(config, source)
     frames = _pick(context, source)
-    choice = _keyframes(context, frames)
-    structure = _structure(context, camera, origin == "given", frames, choice.keyframes)
+    keyframes = _keyframes(context, frames)
+    structure = _structure(context, camera, origin == "given", frames, keyframes)
     lens = make_lens(structure.model.cameras[1])
     calibration = _calibration(context, lens, origin, structure.focal_sd)
-    _write_backbone(context, structure, choice.keyframes, lens, frames)
+    _write_backbone(context, structure, keyframes, lens, frames)
     _write_frames(context, source, frames, lens)
     save_calibration(context.folder, calibration)
     save_frames(context.folder, frames)
-    return _figures(context, frames, choice, structure, calibration)
+    return _figures(frames, structure, calibration)
 
 
 def _known_camera(config: FramesConfig, source: VideoSource | FolderSource) -> tuple[pycolmap.Camera, str]:
@@ -85,7 +85,10 @@ def _require_reasonable(config: FramesConfig, source: VideoSource | FolderSource
 def _pick(context: StageContext, source: VideoSource | FolderSource) -> list[Frame]:
     table = context.snapshot / "picked.json"
     if table.exists():
-        return [Frame(**row) for row in read_json(table)]
+        stored = read_json(table)
+        for message in stored["warnings"]:
+            context.warn(message)
+        return [Frame(**row) for row in stored["frames"]]
     config = context.config.frames
     pictures = source.read(warn=context.warn)
     pictures = context.progress.track(pictures, "picking", source.expected_frames or None)
@@ -104,7 +107,7 @@ def _pick(context: StageContext, source: VideoSource | FolderSource) -> list[Fra
         _save_picked(context, source, picture, name)
     if len(frames) < 2:
         raise InputError(f"{source.path} gives one frame only; a reconstruction needs several views of a scene")
-    write_json(table, [asdict(f) for f in frames])
+    write_json(table, {"frames": [asdict(f) for f in frames], "warnings": context.warnings})
     return frames
 
 
@@ -134,8 +137,15 @@ def _copy(source: Path, target: Path) -> None:
 # keyframes and structure ----------------------------------------------------------------------------------------
 
 
-def _keyframes(context: StageContext, frames: list[Frame]) -> KeyframeChoice:
-    """Keyframes by parallax; of a short walk closer ones, so that there are enough for a reconstruction."""
+def _keyframes(context: StageContext, frames: list[Frame]) -> list[int]:
+    """Ids of keyframes by parallax; of a short walk closer ones, so that there are enough for a reconstruction."""
+    table = context.snapshot / "keyframes.json"
+    if not table.exists():
+        write_json(table, _choose(context, frames).keyframes)
+    return read_json(table)
+
+
+def _choose(context: StageContext, frames: list[Frame]) -> KeyframeChoice:
     parallax = context.config.frames.parallax
     while True:
         grays = (_gray(context, f) for f in context.progress.track(frames, "keyframes", len(frames)))
@@ -222,13 +232,11 @@ def _write_frames(context: StageContext, source: VideoSource | FolderSource, fra
         pass
 
 
-def _figures(
-    context: StageContext, frames: list[Frame], choice: KeyframeChoice, structure: Structure, calibration: Calibration
-) -> dict[str, Any]:
+def _figures(frames: list[Frame], structure: Structure, calibration: Calibration) -> dict[str, Any]:
     report = structure.report
     return {
         "frames": len(frames),
-        "keyframes": len(choice.keyframes),
+        "keyframes": report.total,
         "keyframes_placed": report.registered,
         "points": report.points,
         "reprojection_px": round(report.reprojection_px, 4),

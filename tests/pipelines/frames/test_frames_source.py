@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from formats.errors import InputError
-from formats.images import read_rgb, write_rgb
+from formats.images import read_rgb, write_grey_png, write_rgb
 from pipelines.frames.source import FolderSource, VideoSource, open_source
 from pipelines.frames.stage import run
 from pipelines.stages import StageContext
@@ -53,6 +53,14 @@ def test_a_folder_keeps_names_and_natural_order(tmp_path: Path) -> None:
     assert [source.name(k, k) for k in range(3)] == ["img2.jpg", "img9.jpg", "img10.jpg"]
     assert not source.has_times
     assert source.original(0) == tmp_path / "img2.jpg"
+
+
+def test_depth_maps_beside_the_images_are_left_out(tmp_path: Path) -> None:
+    for i in range(3):
+        write_rgb(tmp_path / f"{i}.color.jpg", _noise(i))
+        write_grey_png(tmp_path / f"{i}.depth.png", np.full((48, 64), 1000 + i, np.uint16))
+    source = open_source(tmp_path)
+    assert [source.name(i, i) for i in range(source.expected_frames)] == ["0.color.jpg", "1.color.jpg", "2.color.jpg"]
 
 
 def test_times_beside_the_images_are_used(tmp_path: Path) -> None:
