@@ -41,10 +41,11 @@ def adjust(model: pycolmap.Reconstruction, refine_camera: bool) -> float:
     with_second_radial(model.cameras[1])
     solve(model, images, refine_camera)
     _remove_wild(model)
-    adjuster = solve(model, images, refine_camera)
+    # Before points are removed: the adjuster keeps pointers into the model.
+    formal = _formal_sd(model, solve(model, images, refine_camera))
     _remove_wild(model)
     focal = float(model.cameras[1].focal_length)
-    return math.hypot(_formal_sd(model, adjuster), focal - simple_focal, _difference_of_halves(model, images) / 2)
+    return math.hypot(formal, focal - simple_focal, _difference_of_halves(model, images) / 2)
 
 
 def solve(model: pycolmap.Reconstruction, images: Sequence[int], refine_camera: bool) -> pycolmap.CeresBundleAdjuster:

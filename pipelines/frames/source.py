@@ -155,7 +155,7 @@ class FolderSource:
 
 
 def _without_depth_maps(images: list[Path]) -> list[Path]:
-    """The images but for those of one channel of 16 bits, where there are others: data sets keep depth beside colour."""
+    """All but images of 16 bits in one channel, if there are others: some data sets keep depth beside colour."""
     depth = {path for path in images if _is_depth_map(path)}
     return images if len(depth) == len(images) else [path for path in images if path not in depth]
 
