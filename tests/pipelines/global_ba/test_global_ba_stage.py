@@ -1,0 +1,194 @@
+"""The stage from what the stages before it left: the map follows a closed loop, an interruption changes nothing."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from pipelines.config import Config, load_config
+from pipelines.gaussians.map import GaussianMap
+from pipelines.geometry import se3
+from pipelines.geometry.alignment import align_points
+from pipelines.geometry.camera import unproject
+from pipelines.global_ba.stage import STAGE
+from pipelines.mapping.views import occurring_classes
+from pipelines.run_folder import (
+    RunFolder,
+    save_exposure,
+    save_map,
+    save_sparse_model,
+    save_trajectory,
+    write_json,
+)
+from pipelines.stages import StageContext
+from pipelines.types import SparseModel, Trajectory
+from pipelines.world.clip import WorldFrame
+from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames, small_motion
+
+__all__ = ["make_run", "open_stage", "room_frames"]
+Array = NDArray[np.float64]
+FIRST_AGAIN = 12
+"""From this keyframe on the points carry new numbers, as after a walk that came back without noticing."""
+CONFIG = load_config(
+    overrides=["global_ba.loop_gap=2", "global_ba.joint_passes=1", "mapping.max_side=160", "global_ba.joint=always"]
+)
+
+
+def finish_mapping(made: MadeRun, frames: list[WorldFrame]) -> None:
+    """What tracking and mapping would have left: a drifted second half, and a map of one Gaussian a sample."""
+    run = made.run
+    backbone = run.load_backbone()
+    assert backbone is not None
+    tracking, mapping = run.stage("tracking"), run.stage("mapping")
+    tracking.mkdir()
+    mapping.mkdir()
+    rng = np.random.default_rng(5)
+    slip = small_motion(rng, 0.006, 0.03)
+    # As after an adjustment: keyframes where they belong, but for the slip.
+    model = doubled(replace(backbone, cam_from_world=made.cam_from_world[backbone.frame_ids]), slip)
+    save_sparse_model(tracking / "sparse.npz", model)
+    poses = made.cam_from_world.copy()
+    poses[FIRST_AGAIN:] = poses[FIRST_AGAIN:] @ se3.inverse(slip)
+    ids = np.arange(len(frames))
+    trajectory = Trajectory(ids, ids / 10, poses, np.isin(ids, model.frame_ids), ("",) * len(frames))
+    save_trajectory(mapping, trajectory)
+    keyframes = model.frame_ids.tolist()
+    class_ids = occurring_classes([run.load_proxy(k).labels for k in keyframes])
+    save_map(mapping, seeded_map(frames, poses, keyframes, run, len(class_ids)))
+    save_exposure(
+        mapping, model.frame_ids, np.zeros((len(keyframes), 3), np.float32), np.zeros((len(keyframes), 3), np.float32)
+    )
+    write_json(mapping / "mapping.json", {"class_ids": list(class_ids)})
+
+
+def doubled(model: SparseModel, slip: Array) -> SparseModel:
+    """The model with the keyframes from FIRST_AGAIN on, and their own copies of the points, moved by `slip`."""
+    late = model.frame_ids >= FIRST_AGAIN
+    poses = model.cam_from_world.copy()
+    poses[late] = poses[late] @ se3.inverse(slip)
+    count = len(model.points_in_world)
+    points = np.concatenate([model.points_in_world, se3.transform(slip, model.points_in_world)])
+    numbers = model.obs_point + count * late[model.obs_frame]
+    colors = np.concatenate([model.colors, model.colors])
+    return SparseModel(model.frame_ids, poses, points, colors, model.obs_frame, numbers, model.obs_xy)
+
+
+def seeded_map(
+    frames: list[WorldFrame], poses: Array, keyframes: list[int], run: RunFolder, classes: int
+) -> GaussianMap:
+    intrinsics = run.load_calibration().intrinsics
+    means, colors, anchors = [], [], []
+    for k in keyframes:
+        rows, columns = (x.ravel() for x in np.mgrid[4:240:8, 4:320:8])
+        depth = frames[k].depth[rows, columns].astype(float)
+        in_cam = unproject(np.stack([columns, rows], 1) + 0.5, depth, intrinsics)
+        means.append(se3.transform(se3.inverse(poses[k]), in_cam))
+        colors.append(frames[k].rgb[rows, columns] / 255)
+        anchors.append(np.full(len(rows), k))
+    count = sum(len(m) for m in means)
+    return GaussianMap(
+        torch.tensor(np.concatenate(means), dtype=torch.float32),
+        torch.full((count,), -3.5),
+        torch.full((count,), 2.0),
+        torch.tensor(np.concatenate(colors), dtype=torch.float32),
+        torch.zeros(count, classes),
+        torch.tensor(np.concatenate(anchors)),
+    )
+
+
+@pytest.fixture
+def mapped(
+    tmp_path: Path, make_run: Callable[..., MadeRun], room_frames: tuple[object, list[WorldFrame]]
+) -> Callable[[str], MadeRun]:
+    """mapped(name): a run whose mapping is done."""
+
+    def make(name: str) -> MadeRun:
+        made = make_run(tmp_path / name, keyframes=tuple(range(0, 24, 2)), backbone_scale=1.0)
+        finish_mapping(made, room_frames[1])
+        return made
+
+    return make
+
+
+def finish(context: StageContext) -> dict:
+    figures = STAGE.run(context)
+    shutil.rmtree(context.folder / "snapshot", ignore_errors=True)
+    context.folder.rename(context.run.stage("global_ba"))
+    return figures
+
+
+def error(poses: Array, truth: Array) -> float:
+    centres, wanted = se3.inverse(poses)[:, :3, 3], se3.inverse(truth)[:, :3, 3]
+    moved = align_points(centres, wanted).apply(centres)
+    return float(np.sqrt(((moved - wanted) ** 2).sum(1).mean()))
+
+
+def test_a_loop_is_closed_and_the_map_goes_along(
+    mapped: Callable[[str], MadeRun], open_stage: Callable[..., StageContext]
+) -> None:
+    made = mapped("run")
+    before = error(made.run.load_trajectory("mapping").cam_from_world, made.cam_from_world)
+    config = load_config(overrides=["global_ba.loop_gap=2", "global_ba.joint=never", "global_ba.loop_appearance=-1.0"])
+    figures = finish(open_stage(made.run, "global_ba", config))
+    assert figures["loops"] >= 1
+    assert figures["moved_px"] > 0.5
+    after = made.run.load_trajectory("global_ba")
+    assert 0 < error(after.cam_from_world, made.cam_from_world) < 0.5 * before
+    assert all(e.inliers >= 25 for e in made.run.load_loops())
+    # The late keyframes' Gaussians are again where the early ones see the same surfaces.
+    old, new = made.run.load_map("mapping"), made.run.load_map("global_ba")
+    late = old.anchor_frame_ids >= FIRST_AGAIN
+    early_shift, late_shift = ((new.means - old.means)[x].norm(dim=1).median() for x in (~late, late))
+    assert abs(float(early_shift) - float(late_shift)) > 0.002
+    assert torch.equal(old.colors, new.colors)
+
+
+def test_without_loops_nothing_moves(mapped: Callable[[str], MadeRun], open_stage: Callable[..., StageContext]) -> None:
+    made = mapped("run")
+    config = load_config(overrides=["global_ba.use_loops=false", "global_ba.joint=moved"])
+    figures = finish(open_stage(made.run, "global_ba", config))
+    assert figures["loops"] == 0
+    assert figures["joint"] == "not run"
+    for name in ("trajectory.npz", "map.safetensors"):
+        assert (made.run.stage("global_ba") / name).read_bytes() == (made.run.stage("mapping") / name).read_bytes()
+
+
+def test_joint_refinement_is_kept_only_where_it_helps_and_survives_interruption(
+    mapped: Callable[[str], MadeRun], open_stage: Callable[..., StageContext]
+) -> None:
+    whole, broken = mapped("a"), mapped("b")
+    config: Config = load_config(
+        overrides=["mapping.snapshot_every=4"],
+        base=CONFIG,
+    )
+    figures = finish(open_stage(whole.run, "global_ba", config))
+    assert figures["joint"] in ("kept", "thrown away")
+    assert (figures["joint"] == "kept") == (figures["joint_psnr_after"] >= figures["joint_psnr_before"])
+    context = open_stage(broken.run, "global_ba", config)
+    with pytest.raises(KeyboardInterrupt):
+        STAGE.run(StageContext(context.run, context.source, config, context.folder, BreakOff("refining", 7)))
+    assert (context.snapshot / "loops.npz").exists()
+    assert (context.snapshot / "joint.safetensors").exists()
+    finish(open_stage(broken.run, "global_ba", config))
+    for name in ("trajectory.npz", "map.safetensors", "sparse.npz", "loops.json"):
+        assert (whole.run.stage("global_ba") / name).read_bytes() == (broken.run.stage("global_ba") / name).read_bytes()
+
+
+class BreakOff:
+    """Progress that stops in the middle of one piece of work."""
+
+    def __init__(self, label: str, after: int) -> None:
+        self.label, self.after = label, after
+
+    def track(self, items, label, total=None):  # type: ignore[no-untyped-def]
+        for n, item in enumerate(items):
+            if label == self.label and n == self.after:
+                raise KeyboardInterrupt
+            yield item
