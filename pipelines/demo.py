@@ -16,7 +16,7 @@ from pipelines.progress import Progress
 from pipelines.run_folder import RunFolder, read_json, write_json
 from pipelines.world import ClipOptions, iter_clip, make_world, write_sequence
 
-CLIP = ClipOptions(frames=45, width=320, height=240, fps=10.0, laps=0.45)
+CLIP = ClipOptions(frames=40, width=320, height=240, fps=10.0, laps=0.35)
 VIDEO, TRUTH, RUN = "room.mp4", "room_truth", "room.msgs"
 _TEXEL = 0.006
 

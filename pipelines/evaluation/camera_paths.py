@@ -39,7 +39,7 @@ def orbit(world_from_cam: Array, scene_depth: float, count: int) -> Array:
 
     scene_depth: the usual distance of the scene, which stands in where the cameras do not look at one place.
     """
-    up = _up(world_from_cam)
+    up = upward(world_from_cam)
     focus, radius, height = _focus(world_from_cam, up, scene_depth)
     start = world_from_cam[0, :3, 3] - focus
     first = start - (start @ up) * up
@@ -50,8 +50,8 @@ def orbit(world_from_cam: Array, scene_depth: float, count: int) -> Array:
     return _looking_at(centers, focus, up)
 
 
-def _up(world_from_cam: Array) -> Array:
-    """Across the cameras' right axes, which people hold level, and on the side of their mean upward axis."""
+def upward(world_from_cam: Array) -> Array:
+    """(3,) unit vector across the cameras' right axes, which people hold level, on the side of their upward axes."""
     right = world_from_cam[:, :3, 0]
     # Alone, the mean upward axis leans as the cameras look down; the little weight settles what one direction of view
     # leaves open.

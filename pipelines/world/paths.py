@@ -14,12 +14,13 @@ def room_walk(steps: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, 4, 4) world_from_cam of a walk round the table; `steps` (N,) counts laps, 1 = back at the start.
 
     The camera looks over the table at the other side of the room, so that near and far things move differently.
-    A second lap passes half a hand beside the first.
+    The hand goes up and down too: edges along the motion have no parallax of their own. A second lap passes a hand's
+    breadth beside the first.
     """
     angle = 2 * np.pi * steps
     swing = 1 + 0.05 * np.sin(2 * angle + 0.7) + 0.02 * np.sin(0.5 * angle)
     center = np.stack(
-        [1.85 * swing * np.cos(angle), 1.5 * swing * np.sin(angle), EYE_HEIGHT + 0.07 * np.sin(3 * angle)], axis=1
+        [1.85 * swing * np.cos(angle), 1.5 * swing * np.sin(angle), EYE_HEIGHT + 0.14 * np.sin(5 * angle)], axis=1
     )
     target = np.stack(
         [-0.35 * np.cos(angle + 0.5), -0.3 * np.sin(angle + 0.5), 0.95 + 0.14 * np.sin(2 * angle + 1.0)], axis=1

@@ -42,7 +42,7 @@ def test_smoothing_takes_tremble_out_and_leaves_the_walk(room_walk: NDArray) -> 
 
     assert roughness(calm) < 0.3 * roughness(shaken)
     inner = np.linalg.norm(calm[5:-5, :3, 3] - room_walk[5:-5, :3, 3], axis=1)
-    assert 0 < inner.max() < 0.06
+    assert 0 < inner.max() < 0.1
 
 
 def test_an_orbit_goes_round_what_the_cameras_look_at(room_walk: NDArray) -> None:

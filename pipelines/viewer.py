@@ -1,0 +1,162 @@
+"""An interactive view of a map in the browser, on viser (the optional extra `viewer`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from formats.errors import InputError
+from pipelines.viewer_scene import MODES, ViewerCamera, ViewerScene, load_scene
+
+_FRUSTUM = 0.09
+_PREVIEW_WIDTH = 480
+
+
+def open_viewer(path: Path, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
+    """Serve a run folder or a Gaussian PLY at http://host:port; returns at once.
+
+    Raises InputError without viser, for a path that cannot be shown, or a port that is taken.
+    """
+    scene = load_scene(path)
+    try:
+        import viser
+    except ImportError as error:
+        raise InputError("the viewer needs viser: pip install 'msgs-slam[viewer]'") from error
+    try:
+        server = viser.ViserServer(host=host, port=port, label=f"MSGS-SLAM {scene.title}", verbose=False)
+    except OSError as error:
+        raise InputError(f"port {port} cannot be used ({error.strerror}): choose another with --port") from error
+    return Viewer(server, scene)
+
+
+class Viewer:
+    """The map as splats, the camera path with a frustum a keyframe, the mesh, and the controls for them."""
+
+    def __init__(self, server: Any, scene: ViewerScene) -> None:
+        self.server, self.scene = server, scene
+        server.gui.configure_theme(show_logo=False)
+        server.scene.set_up_direction(scene.up)
+        self._splats: Any = None
+        self.show(MODES[0])
+        self._cameras = [self._add_camera(i, camera) for i, camera in enumerate(scene.cameras)]
+        self._path = self._add_path()
+        self._mesh = self._add_mesh()
+        self._add_controls()
+        self._place_clients()
+
+    @property
+    def url(self) -> str:
+        """Where to look."""
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def show(self, mode: str) -> None:
+        """Colour the Gaussians by "colour", "classes" or "distance"."""
+        s = self.scene
+        self._splats = self.server.scene.add_gaussian_splats(
+            "/map", s.centers, s.covariances, s.colors[mode].astype(np.float32) / 255, s.opacities
+        )
+
+    def wait(self) -> None:
+        """Until the process is interrupted."""
+        self.server.sleep_forever()
+
+    def stop(self) -> None:
+        """End the server."""
+        self.server.stop()
+
+    def _add_controls(self) -> None:
+        gui = self.server.gui
+        gui.add_markdown(f"**{self.scene.title}**: {len(self.scene.centers):,} Gaussians")
+        self.mode = gui.add_dropdown("Gaussians", tuple(m for m in MODES if m in self.scene.colors))
+        self.mode.on_update(lambda _: self.show(self.mode.value))
+        self._checkbox("Show Gaussians", True, lambda on: setattr(self._splats, "visible", on))
+        if self._cameras:
+            self._checkbox("Cameras", True, self._show_cameras)
+        if self._mesh is not None:
+            self._checkbox("Mesh", False, lambda on: setattr(self._mesh, "visible", on))
+        if self.scene.cameras:
+            blank = np.full((30, 40, 3), 235, np.uint8)
+            self._preview = gui.add_image(blank, label="frame (click a camera)", format="jpeg")
+
+    def _checkbox(self, name: str, start: bool, change: Callable[[bool], None]) -> None:
+        box = self.server.gui.add_checkbox(name, start)
+        box.on_update(lambda _: change(bool(box.value)))
+
+    def _show_cameras(self, on: bool) -> None:
+        for handle in [*self._cameras, *([self._path] if self._path is not None else [])]:
+            handle.visible = on
+
+    def _add_camera(self, number: int, camera: ViewerCamera) -> Any:
+        wxyz, position = self._pose(camera)
+        handle = self.server.scene.add_camera_frustum(
+            f"/cameras/{number:05d}", camera.fov, camera.aspect, scale=_FRUSTUM, color=(37, 99, 235),
+            thickness=1.5, thickness_units="screen", wxyz=wxyz, position=position,
+        )  # fmt: skip
+        handle.on_click(lambda event: self._visit(camera, event.client))
+        return handle
+
+    def _pose(self, camera: ViewerCamera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(wxyz, position) in the scene's size; viser's cameras look along +z with y down, as ours do."""
+        quat_xyzw = Rotation.from_matrix(camera.world_from_cam[:3, :3]).as_quat()
+        return quat_xyzw[[3, 0, 1, 2]], camera.world_from_cam[:3, 3] * self.scene.scale
+
+    def _visit(self, camera: ViewerCamera, client: Any) -> None:
+        """Look from the clicked camera, and show its frame."""
+        if client is not None:
+            self._move(client, camera)
+        if self.scene.run is not None:
+            self._preview.image = _reduced(self.scene.run.image(camera.frame))
+            self._preview.label = f"{camera.frame.name}, {camera.frame.timestamp:.2f} s"
+
+    def _move(self, client: Any, camera: ViewerCamera) -> None:
+        wxyz, position = self._pose(camera)
+        with client.atomic():
+            client.camera.wxyz, client.camera.position = wxyz, position
+            client.camera.fov = camera.fov
+
+    def _place_clients(self) -> None:
+        """Whoever opens the page starts behind and above the first camera, or outside a scene without cameras."""
+
+        def place(client: Any) -> None:
+            if self.scene.cameras:
+                _, position = self._pose(self.scene.cameras[0])
+                forward = self.scene.cameras[0].world_from_cam[:3, 2]
+                with client.atomic():
+                    client.camera.position = position - 0.9 * forward + 0.5 * self.scene.up
+                    client.camera.look_at = position + 1.5 * forward
+                return
+            middle = np.median(self.scene.centers, axis=0)
+            client.camera.position = middle + np.array([0.0, -2.0, -7.0])
+            client.camera.look_at = middle
+
+        self.server.on_client_connect(place)
+
+    def _add_path(self) -> Any:
+        if len(self.scene.path) < 2:
+            return None
+        pairs = np.stack([self.scene.path[:-1], self.scene.path[1:]], axis=1).astype(np.float32)
+        return self.server.scene.add_line_segments(
+            "/path", pairs, (234, 88, 12), thickness=2.0, thickness_units="screen"
+        )
+
+    def _add_mesh(self) -> Any:
+        if self.scene.mesh_file is None:
+            return None
+        mesh = trimesh.load(self.scene.mesh_file, force="mesh")
+        if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+            return None
+        return self.server.scene.add_mesh_trimesh("/mesh", mesh, scale=self.scene.scale, visible=False)
+
+
+def _reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    if picture.shape[1] <= _PREVIEW_WIDTH:
+        return picture
+    size = (_PREVIEW_WIDTH, round(_PREVIEW_WIDTH * picture.shape[0] / picture.shape[1]))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,0 +1,142 @@
+"""What the viewer shows, as plain arrays: from a run, or from a splat file by any program."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from formats.errors import InputError
+from formats.gaussian_ply import read_gaussian_ply
+from pipelines.evaluation.camera_paths import upward
+from pipelines.evaluation.measure import evenly
+from pipelines.evaluation.outcome import Outcome, load_outcome
+from pipelines.proxy.palette import class_colors
+from pipelines.run_folder import RunFolder
+from pipelines.types import Frame
+
+MODES = ("colour", "classes", "distance")
+MOST_CAMERAS = 60
+_USUAL_SIZE = 5.0
+"""The scene is shown this large: covariances travel in half precision, which has few digits for small numbers."""
+
+
+@dataclass(frozen=True)
+class ViewerCamera:
+    """world_from_cam (4, 4), vertical field of view in radians, width over height; frame of the run."""
+
+    frame: Frame
+    world_from_cam: NDArray[np.float64]
+    fov: float
+    aspect: float
+
+
+@dataclass(frozen=True)
+class ViewerScene:
+    """centers (M, 3), covariances (M, 3, 3), opacities (M, 1); colors: mode → (M, 3) uint8; `scale` multiplies the
+    run's lengths for show; up (3,); path (N, 3) camera centres; mesh_file of the run, if there is one."""
+
+    title: str
+    centers: NDArray[np.float32]
+    covariances: NDArray[np.float32]
+    opacities: NDArray[np.float32]
+    colors: dict[str, NDArray[np.uint8]]
+    scale: float
+    up: NDArray[np.float64]
+    cameras: list[ViewerCamera] = field(default_factory=list)
+    path: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    mesh_file: Path | None = None
+    run: RunFolder | None = None
+
+
+def load_scene(path: Path) -> ViewerScene:
+    """Of a run folder or a .ply of Gaussians. Raises InputError for anything else, or a run without a map."""
+    if path.is_file():
+        return _from_ply(path)
+    if not path.is_dir():
+        raise InputError(f"{path}: there is no such run folder or PLY file")
+    return _from_run(load_outcome(RunFolder(path)))
+
+
+def _from_run(outcome: Outcome) -> ViewerScene:
+    m = outcome.gaussian_map
+    if m is None:
+        raise InputError(f"{outcome.run.root}: there is no map yet. Type `msgs-slam resume {outcome.run.root}` first")
+    t, k = outcome.trajectory, outcome.calibration.intrinsics
+    means, radii = m.means.cpu().numpy(), m.radii.detach().cpu().numpy()
+    centers = t.centers[t.is_posed]
+    scale = _scale(means, centers)
+    fov, aspect = 2 * float(np.arctan(k.height / 2 / k.fy)), k.width / k.height
+    ids = evenly(t.frame_ids[t.is_keyframe].tolist(), MOST_CAMERAS)
+    world_from_cam = t.world_from_cam
+    labels = outcome.label_of_channel[m.class_logits.argmax(1).cpu().numpy()] if m.class_logits.shape[1] else None
+    mesh = outcome.run.stage("export") / "mesh.glb"
+    return ViewerScene(
+        title=outcome.run.root.name,
+        centers=(means * scale).astype(np.float32),
+        covariances=((radii * scale) ** 2)[:, None, None].astype(np.float32) * np.eye(3, dtype=np.float32),
+        opacities=m.opacities.detach().cpu().numpy()[:, None].astype(np.float32),
+        colors=_colors(m.colors.cpu().numpy(), labels, list(outcome.classes.colors), means, centers),
+        scale=scale,
+        up=upward(world_from_cam[t.is_posed]),
+        cameras=[
+            ViewerCamera(outcome.frames[row], world_from_cam[row], fov, aspect)
+            for row in (outcome.frame_row(i) for i in ids)
+        ],
+        path=centers * scale,
+        mesh_file=mesh if mesh.exists() else None,
+        run=outcome.run,
+    )
+
+
+def _from_ply(path: Path) -> ViewerScene:
+    cloud = read_gaussian_ply(path)
+    if len(cloud) == 0:
+        raise InputError(f"{path}: holds no Gaussians")
+    scale = _scale(cloud.means, np.zeros((0, 3)))
+    turn = Rotation.from_quat(cloud.quat_wxyz[:, [1, 2, 3, 0]]).as_matrix()
+    axes = turn * (np.exp(cloud.log_scales) * scale)[:, None, :]
+    classes = 0 if cloud.class_ids is None else int(cloud.class_ids.max()) + 1
+    middle = np.median(cloud.means, axis=0, keepdims=True).astype(np.float64)
+    return ViewerScene(
+        title=path.name,
+        centers=(cloud.means * scale).astype(np.float32),
+        covariances=(axes @ axes.transpose(0, 2, 1)).astype(np.float32),
+        opacities=(1 / (1 + np.exp(-cloud.opacity_logits)))[:, None].astype(np.float32),
+        colors=_colors(cloud.colors, cloud.class_ids, list(class_colors(classes)), cloud.means, middle),
+        scale=scale,
+        up=np.array([0.0, -1.0, 0.0]),
+    )
+
+
+def _scale(means: NDArray, centers: NDArray) -> float:
+    """So that most of the scene spans `_USUAL_SIZE`."""
+    points = np.concatenate([means.astype(np.float64), centers])
+    low, high = np.quantile(points, (0.05, 0.95), axis=0)
+    return _USUAL_SIZE / max(float((high - low).max()), 1e-9)
+
+
+def _colors(
+    rgb: NDArray,
+    labels: NDArray[np.uint8] | None,
+    palette: list[tuple[int, int, int]],
+    means: NDArray,
+    centers: NDArray,
+) -> dict[str, NDArray[np.uint8]]:
+    """(M, 3) for each of `MODES`; classes only where there are labels."""
+    colors = {"colour": np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)}
+    if labels is not None and palette:
+        table = np.full((256, 3), 128, np.uint8)
+        table[: len(palette)] = np.array(palette, np.uint8)
+        colors["classes"] = table[labels]
+    away = np.linalg.norm(means - centers.mean(axis=0), axis=1)
+    low, high = np.quantile(away, (0.02, 0.98))
+    share = np.clip((high - away) / max(float(high - low), 1e-9) * 255, 0, 255).astype(np.uint8)
+    colors["distance"] = np.asarray(cv2.applyColorMap(share[:, None], cv2.COLORMAP_TURBO), np.uint8).reshape(-1, 3)[
+        :, ::-1
+    ]
+    return colors

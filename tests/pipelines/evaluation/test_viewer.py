@@ -1,0 +1,138 @@
+"""The viewer's scene as arrays, and the viewer itself in a real browser."""
+
+import base64
+import json
+import shutil
+import subprocess
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from formats.errors import InputError
+from formats.gaussian_ply import read_gaussian_ply
+from pipelines.run_folder import RunFolder
+from pipelines.viewer_scene import load_scene
+
+OracleRun = Callable[..., RunFolder]
+
+
+def test_scene_of_a_run(oracle_run: OracleRun) -> None:
+    scene = load_scene(oracle_run().root)
+    m = len(scene.centers)
+    assert scene.covariances.shape == (m, 3, 3)
+    assert set(scene.colors) == {"colour", "classes", "distance"}
+    assert all(c.shape == (m, 3) and c.dtype == np.uint8 for c in scene.colors.values())
+    assert len(scene.cameras) == 8
+    # Half precision keeps ten bits above 6e-5; smaller covariances would fade.
+    assert np.median(scene.covariances[:, 0, 0]) > 6e-5
+    assert 4 < np.ptp(np.quantile(scene.centers, (0.05, 0.95), axis=0), axis=0).max() < 7
+    np.testing.assert_allclose(scene.up, (0, 0, 1), atol=0.1)  # the world's z axis
+
+
+def test_scene_of_a_splat_file_by_another_program(shared_data: Path) -> None:
+    folder = shared_data / "format_cases"
+    path = folder / "ply_other_writers" / "test-splat.3-points-from-train.ply"
+    scene, cloud = load_scene(path), read_gaussian_ply(path)
+    assert len(scene.centers) == 3
+    # The covariance's eigenvalues are the squared scales, however it is turned.
+    expected = np.sort(np.exp(2 * cloud.log_scales), axis=1) * scene.scale**2
+    np.testing.assert_allclose(np.linalg.eigvalsh(scene.covariances), expected, rtol=1e-3, atol=1e-9)
+    with pytest.raises(InputError, match="LFS"):
+        load_scene(folder / "lfs_pointer" / "point_cloud.ply")
+
+
+def test_what_cannot_be_shown_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such run"):
+        load_scene(tmp_path / "nowhere")
+    with pytest.raises(InputError):
+        load_scene(tmp_path)
+
+
+# in the browser -------------------------------------------------------------------------------------------------
+
+BROWSER = next((b for n in ("chromium", "chromium-browser", "google-chrome") if (b := shutil.which(n))), None)
+FLAGS = ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+
+
+class NotReady(Exception):
+    """The tab cannot answer now."""
+
+
+class Page:
+    """One tab, driven over the browser's own protocol."""
+
+    def __init__(self, socket: Any) -> None:
+        self._socket, self._number = socket, 0
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        self._number += 1
+        self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
+        while True:
+            answer = json.loads(self._socket.recv(timeout=60))
+            if answer.get("id") == self._number:
+                if "error" in answer:  # a tab between two documents has no picture
+                    raise NotReady(answer["error"])
+                return answer["result"]
+
+    def scene(self) -> NDArray[np.uint8]:
+        """The picture left of the controls and below the browser's notice, BGR."""
+        data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[160:540, :600]
+
+    def wait_for(self, seen: Callable[[NDArray[np.uint8]], bool], seconds: float = 90) -> NDArray[np.uint8]:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            with suppress(NotReady):
+                if seen(picture := self.scene()):
+                    return picture
+            time.sleep(1)
+        pytest.fail("the page did not come to show it")
+
+
+@contextmanager
+def browser(profile: Path) -> Iterator[Page]:
+    connect = pytest.importorskip("websockets.sync.client").connect
+    command = [str(BROWSER), *FLAGS, "--remote-debugging-port=0", "--remote-allow-origins=*"]
+    process = subprocess.Popen(
+        [*command, f"--user-data-dir={profile}", "--window-size=1000,700", "about:blank"], stderr=subprocess.DEVNULL
+    )
+    try:
+        port_file, end = profile / "DevToolsActivePort", time.monotonic() + 60
+        while not (port_file.exists() and port_file.read_text().strip()):
+            assert time.monotonic() < end, "the browser did not start"
+            time.sleep(0.2)
+        port = port_file.read_text().split()[0]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json") as answer:
+            tab = next(t for t in json.load(answer) if t["type"] == "page")
+        with connect(tab["webSocketDebuggerUrl"], max_size=None) as socket:
+            yield Page(socket)
+    finally:
+        process.terminate()
+        process.wait()
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+def test_page_shows_the_map_and_switching_to_classes_changes_it(oracle_run: OracleRun, tmp_path: Path) -> None:
+    pytest.importorskip("viser")
+    from pipelines.viewer import open_viewer
+
+    run = oracle_run(metric=False)
+    viewer = open_viewer(run.root, port=0)
+    try:
+        with browser(tmp_path / "profile") as page:
+            page.call("Page.enable")
+            page.call("Page.navigate", url=viewer.url)
+            colour = page.wait_for(lambda p: p.std() > 20 and (p < 240).mean() > 0.3)
+            viewer.mode.value = "classes"
+            classes = page.wait_for(lambda p: np.abs(p.astype(float) - colour).mean() > 10)
+            assert classes.std() > 20
+    finally:
+        viewer.stop()
