@@ -249,4 +249,4 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
     }
 
 
-STAGE = Stage("frames", 1, run, "pick frames, calibrate the camera, structure from motion over keyframes")
+STAGE = Stage("frames", 2, run, "pick frames, calibrate the camera, structure from motion over keyframes")

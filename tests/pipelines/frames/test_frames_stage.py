@@ -184,8 +184,10 @@ def test_an_unreadable_image_is_left_out_with_a_warning(
     folder = tmp_path / "damaged"
     shutil.copytree(bent_walk.folder, folder)
     (folder / "view_004.png").write_bytes(b"\x89PNG\r\n not really")
-    context = make_context(folder, "frames.intrinsics=280,280,160,120,-0.06,0,0,0")
+    context = make_context(folder, "frames.intrinsics=280,280,160,120,-0.06,0,0,0", "frames.mapper=incremental")
     figures = run(context)
     assert figures["frames"] == WALK_FRAMES - 1
+    assert figures["mapper"] == "incremental"
+    assert figures["keyframes_placed"] == figures["keyframes"]
     assert any("view_004.png" in w for w in context.warnings)
     assert not (context.folder / "view_004.png").exists()
