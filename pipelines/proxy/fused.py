@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.camera import project
 from pipelines.proxy.multiview import MultiviewDepth
 from pipelines.proxy.providers import DepthEstimate, DepthProvider
+from pipelines.proxy.scale import DepthScale, measure_scale
 from pipelines.proxy.sequence import Sequence
 from pipelines.proxy.stereo.fill import SURE
 from pipelines.types import Frame
@@ -35,8 +35,7 @@ class FusedDepth:
         self._learned, self._stereo, self._sequence = learned, stereo, sequence
         self.name = f"{learned.name}+multiview"
         self.metric = learned.metric
-        self._scales: dict[int, float] = {}
-        self._scale = 1.0
+        self._scale = DepthScale({})
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames that neither knows."""
@@ -46,44 +45,18 @@ class FusedDepth:
         """Both providers' passes, then the scale between them."""
         self._learned.prepare(frames)
         self._stereo.prepare(frames)
-        for frame in frames:
-            ratio = self._ratio(frame)
-            if ratio is not None:
-                self._scales[frame.id] = ratio
-        if self._scales:
-            self._scale = float(np.median(list(self._scales.values())))
-
-    def _ratio(self, frame: Frame) -> float | None:
-        """Learned depth over the depth of the sparse points that the frame observes; None with too few."""
-        model, camera = self._sequence.backbone, self._sequence.intrinsics
-        if model is None or frame.id not in self._sequence.cam_from_world:
-            return None
-        index = int(np.flatnonzero(model.frame_ids == frame.id)[0])
-        points = model.points_in_world[model.obs_point[model.obs_frame == index]]
-        cam_from_world = model.cam_from_world[index]
-        xy, z = project(points @ cam_from_world[:3, :3].T + cam_from_world[:3, 3], camera)
-        ok = (z > 0) & (xy > 0).all(1) & (xy < [camera.width, camera.height]).all(1)
-        column, row = np.floor(np.where(ok[:, None], xy, 0)).astype(np.int64).T
-        learned = self._learned.estimate(frame).depth[row, column]
-        ok &= learned > 0
-        return float(np.median(learned[ok] / z[ok])) if ok.sum() >= 20 else None
+        self._scale = measure_scale(self._sequence, frames, self._learned.estimate)
 
     def estimate(self, frame: Frame) -> DepthEstimate:
         """The fused depth."""
         learned = self._learned.estimate(frame)
         geometry = self._stereo.estimate(frame)
-        return fuse(learned, geometry, self._scale, self._scales.get(frame.id, self._scale))
+        run_scale = self._scale.value
+        return fuse(learned, geometry, run_scale, self._scale.of_frame.get(frame.id, run_scale))
 
     def figures(self) -> dict[str, Any]:
-        """Metres per unit of the backbone and its relative spread over the frames."""
-        values = np.array(list(self._scales.values()))
-        spread = 1.4826 * float(np.median(np.abs(values / self._scale - 1))) if len(values) else 0.0
-        return {
-            **self._learned.figures(),
-            **self._stereo.figures(),
-            "metres_per_unit": round(self._scale, 6),
-            "scale_spread": round(spread, 4),
-        }
+        """What both say."""
+        return {**self._learned.figures(), **self._stereo.figures()}
 
 
 def fuse(learned: DepthEstimate, geometry: DepthEstimate, scale: float, frame_scale: float) -> DepthEstimate:

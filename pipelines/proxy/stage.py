@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from pipelines.progress import log
 from pipelines.proxy.compact import compact
 from pipelines.proxy.providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider
 from pipelines.proxy.reliability import reliability, semantic_agreement, theta, warp_labels
+from pipelines.proxy.scale import DepthScale, measure_scale
 from pipelines.proxy.scratch import load_scratch, save_scratch
 from pipelines.proxy.selection import Surroundings, open_depth, open_semantics
 from pipelines.proxy.sequence import Sequence, map_intrinsics
@@ -41,12 +43,13 @@ def run(context: StageContext) -> dict[str, Any]:
     frames = _frames_to_do(context, sequence, config, depths)
     _warn_of_missing(context, frames, depths, semantics)
     _depth_pass(context, frames, depths)
-    semantics.prepare(frames, lambda frame: _load_depth(context.snapshot, frame))
+    scale = measure_scale(sequence, frames, lambda frame: _load_depth(context.snapshot, frame))
+    semantics.prepare(frames, lambda frame: _in_backbone_unit(_load_depth(context.snapshot, frame), scale))
     for message in semantics.warnings():
         context.warn(message)
     save_classes(context.folder, semantics.classes())
-    agreements = _maps_pass(context, sequence, frames, semantics)
-    report = _report(context, frames, depths, semantics, agreements)
+    agreements = _maps_pass(context, sequence, frames, semantics, scale)
+    report = {**_report(context, frames, depths, semantics, agreements), **_scale_figures(depths, scale)}
     write_json(context.folder / "proxy.json", report)
     return report
 
@@ -102,11 +105,16 @@ def _load_depth(snapshot: Path, frame: Frame) -> DepthEstimate:
     return DepthEstimate(stored["depth"], stored["confidence"], int(stored["invalid"]))
 
 
+def _in_backbone_unit(estimate: DepthEstimate, scale: DepthScale) -> DepthEstimate:
+    """The same depth in the unit of the backbone's poses."""
+    return replace(estimate, depth=(estimate.depth / np.float32(scale.value)).astype(np.float32))
+
+
 # maps -----------------------------------------------------------------------------------------------------------
 
 
 def _maps_pass(
-    context: StageContext, sequence: Sequence, frames: list[Frame], semantics: SemanticsProvider
+    context: StageContext, sequence: Sequence, frames: list[Frame], semantics: SemanticsProvider, scale: DepthScale
 ) -> list[float]:
     """Labels and reliability of every frame; returns the semantic agreement m_t of each with the one before it."""
     config = context.config.proxy
@@ -115,8 +123,9 @@ def _maps_pass(
     for frame in context.progress.track(frames, "classes", len(frames)):
         path = proxy_path(context.folder, frame.id)
         depth = _load_depth(context.snapshot, frame)
-        labels = semantics.estimate(frame, depth)
-        m = _agreement(context, sequence, frame, previous, depth, labels)
+        seen = _in_backbone_unit(depth, scale)
+        labels = semantics.estimate(frame, seen)
+        m = _agreement(context, sequence, frame, previous, seen, labels)
         agreements.append(m)
         if not path.exists():
             trust = theta(m, config.theta_slope, config.theta_middle)
@@ -182,4 +191,11 @@ def _report(
     }
 
 
-STAGE = Stage("proxy", 1, run, "depth, reliability and classes of the keyframes")
+def _scale_figures(depths: DepthProvider, scale: DepthScale) -> dict[str, Any]:
+    """Metric depth tells how long the backbone's unit is."""
+    if not depths.metric or not scale.of_frame:
+        return {}
+    return {"metres_per_unit": round(scale.value, 6), "scale_spread": round(scale.spread, 5)}
+
+
+STAGE = Stage("proxy", 2, run, "depth, reliability and classes of the keyframes")

@@ -13,6 +13,7 @@ from pipelines.proxy.fused import FusedDepth
 from pipelines.proxy.multiview import MultiviewDepth, StereoSettings
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.reliability import semantic_agreement, warp_labels
+from pipelines.proxy.scale import measure_scale
 from pipelines.proxy.segments import SegmentLabels
 from pipelines.proxy.sequence import Sequence
 from pipelines.types import VOID, Frame, Intrinsics
@@ -95,7 +96,7 @@ def test_fused_depth_is_metric_and_better_than_either(room: Room, stereo: Multiv
     fused = FusedDepth(learned, stereo, room.sequence())
     fused.prepare(room.frames)
     assert fused.metric
-    scale = fused.figures()["metres_per_unit"] * UNIT
+    scale = measure_scale(room.sequence(), room.frames, fused.estimate).value * UNIT
     assert scale == pytest.approx(1, abs=0.03)
     table = []
     for frame in room.frames[2:9:2]:

@@ -1,0 +1,54 @@
+"""How long the backbone's unit is in the unit of a depth: metres per unit when the depth is metric."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.geometry.camera import project
+from pipelines.proxy.providers import DepthEstimate
+from pipelines.proxy.sequence import Sequence
+from pipelines.types import Frame
+
+_LEAST_POINTS = 20
+
+
+@dataclass(frozen=True)
+class DepthScale:
+    """Depth over the depth of the backbone's points: of each frame, and their median over the run."""
+
+    of_frame: dict[int, float]
+
+    @property
+    def value(self) -> float:
+        """The scale of the run; 1 where nothing is known."""
+        return float(np.median(list(self.of_frame.values()))) if self.of_frame else 1.0
+
+    @property
+    def spread(self) -> float:
+        """Relative standard deviation over the frames, robust."""
+        values = np.array(list(self.of_frame.values()))
+        return 1.4826 * float(np.median(np.abs(values / self.value - 1))) if len(values) else 0.0
+
+
+def measure_scale(sequence: Sequence, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> DepthScale:
+    """Compare the depth of every frame with the points it observes; frames with too few points do not count."""
+    ratios = ((frame.id, _ratio(sequence, frame, depth_of)) for frame in frames if frame.id in sequence.cam_from_world)
+    return DepthScale({frame_id: ratio for frame_id, ratio in ratios if ratio is not None})
+
+
+def _ratio(sequence: Sequence, frame: Frame, depth_of: Callable[[Frame], DepthEstimate]) -> float | None:
+    model, camera = sequence.backbone, sequence.intrinsics
+    if model is None:
+        return None
+    index = int(np.flatnonzero(model.frame_ids == frame.id)[0])
+    points = model.points_in_world[model.obs_point[model.obs_frame == index]]
+    cam_from_world = model.cam_from_world[index]
+    xy, z = project(points @ cam_from_world[:3, :3].T + cam_from_world[:3, 3], camera)
+    ok = (z > 0) & (xy > 0).all(1) & (xy < [camera.width, camera.height]).all(1)
+    column, row = np.floor(np.where(ok[:, None], xy, 0)).astype(np.int64).T
+    depth = depth_of(frame).depth[row, column]
+    ok &= depth > 0
+    return float(np.median(depth[ok] / z[ok])) if ok.sum() >= _LEAST_POINTS else None
