@@ -180,7 +180,6 @@ def export(run_path: Path, only: str | None, to: Path | None, quiet: bool, verbo
     """Write the files for other programs: COLMAP model, Gaussian PLY, labelled mesh, TUM trajectory."""
     _set_up_logging(quiet, verbose)
     from pipelines.export.stage import export_run
-
     from pipelines.reconstruct import require_run
     from pipelines.run_folder import RunFolder
 

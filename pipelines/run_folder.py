@@ -19,12 +19,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
 from numpy.typing import NDArray
 
 from formats.atomic import atomic_path
 from formats.errors import InputError
 from formats.images import read_rgb
+from formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
 from pipelines.gaussians.map import GaussianMap
 from pipelines.types import Calibration, ClassTable, Frame, Intrinsics, LoopEdge, ProxyMaps, SparseModel, Trajectory
 
@@ -205,9 +205,9 @@ def load_proxy_maps(path: Path) -> ProxyMaps:
     inverse = arrays["inverse_depth"].astype(np.float32)
     return ProxyMaps(
         depth=np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse > 0),
-        confidence=arrays["confidence"].astype(np.float32) / 255,
+        confidence=arrays["confidence"].astype(np.float32) / np.float32(255),
         labels=arrays["labels"],
-        label_confidence=arrays["label_confidence"].astype(np.float32) / 255,
+        label_confidence=arrays["label_confidence"].astype(np.float32) / np.float32(255),
     )
 
 

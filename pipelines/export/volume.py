@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -75,7 +76,7 @@ def fuse(views: list[DepthView], voxel: float, truncation_voxels: float, max_blo
                     _integrate, blocks[a:b], distance[a:b], weight[a:b], view.depth, view.weight,
                     np.ascontiguousarray(view.cam_from_world), camera, voxel, truncation,
                 )
-                for a, b in zip(bounds[:-1], bounds[1:], strict=True)
+                for a, b in itertools.pairwise(bounds)
             ]  # fmt: skip
             for job in jobs:
                 job.result()
@@ -83,7 +84,7 @@ def fuse(views: list[DepthView], voxel: float, truncation_voxels: float, max_blo
 
 
 @kernel
-def _integrate(blocks, distance, weight, depth, depth_weight, pose, camera, voxel, truncation):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+def _integrate(blocks, distance, weight, depth, depth_weight, pose, camera, voxel, truncation):  # type: ignore[no-untyped-def]
     height, width = depth.shape
     fx, fy, cx, cy = camera
     radius = voxel * SIDE * 0.87

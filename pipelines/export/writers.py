@@ -82,7 +82,7 @@ def write_ply(result: Result, folder: Path) -> list[Path]:
 def _by_class(cloud: GaussianCloud, result: Result) -> GaussianCloud:
     if cloud.class_ids is None:
         return cloud
-    table = np.array(result.classes.colors, np.float32) / 255
+    table = (np.array(result.classes.colors) / 255).astype(np.float32)
     return replace(cloud, colors=table[cloud.class_ids])
 
 

@@ -1,4 +1,4 @@
-"""Where the map needs Gaussians (the three conditions of MSGS-SLAM 3.4, and plain error) and where it has useless ones."""
+"""Where the map needs Gaussians (the three conditions of MSGS-SLAM 3.4, and plain error) and which are useless."""
 
 from __future__ import annotations
 

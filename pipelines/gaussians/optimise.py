@@ -99,8 +99,8 @@ class OptimiserState:
         """The values without the optimiser's own."""
         values = {k: [t.values[k].detach().cpu() for t in self.view_tables] for k in VIEW_KEYS}
         poses = [se3.exp(t.double()) @ v.cam_from_world.cpu() for t, v in zip(values["twist"], views, strict=True)]
-        stacked = (torch.stack(values[k]).numpy() for k in ("log_gain", "offset"))
-        return OptimisedMap(self.parameters.to_map(), torch.stack(poses).numpy(), *stacked, iterations)
+        gains, offsets = (torch.stack(values[k]).numpy() for k in ("log_gain", "offset"))
+        return OptimisedMap(self.parameters.to_map(), torch.stack(poses).numpy(), gains, offsets, iterations)
 
 
 def _load_state(snapshot: Path | None, views: Sequence[View]) -> OptimiserState | None:
@@ -157,7 +157,7 @@ class MapOptimiser:
         with_labels = self._uses_labels(step.iteration) or step.grow
         rendering = self.draw(view, table, with_labels)
         loss = self._loss(view, table, rendering, with_labels) * step.weight
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         self.state.parameters.table.step(self._map_rates(step.rate))
         table.step(self._view_rates(step))
         if step.grow:
@@ -231,7 +231,9 @@ class MapOptimiser:
     def seed(self, index: int) -> None:
         """Fill the view's holes with Gaussians at its completed depth (eq. 17)."""
         view, s = self.views[index], self.settings
-        grid = torch.from_numpy(seed_grid(*view.depth.shape, s.seed_stride)).to(view.image.device)
+        grid = torch.from_numpy(seed_grid(view.depth.shape[0], view.depth.shape[1], s.seed_stride)).to(
+            view.image.device
+        )
         if len(self.state.parameters):
             rendering = self.draw(view, self.state.view_tables[index], with_classes=False)
             grid &= self._needed(view, rendering)
@@ -243,7 +245,9 @@ class MapOptimiser:
         view, s = self.views[index], self.settings
         needed = self._needed(view, rendering)
         needed |= densify.wrong_classes(rendering.features[..., 3:], view.channels, view.label_weight)
-        grid = torch.from_numpy(seed_grid(*view.depth.shape, s.seed_stride)).to(view.image.device)
+        grid = torch.from_numpy(seed_grid(view.depth.shape[0], view.depth.shape[1], s.seed_stride)).to(
+            view.image.device
+        )
         coarse = needed & grid
         colors = expose(rendering.features[..., :3], self.state.view_tables[index])
         fine = densify.color_errors(colors, view.colors, 1 - s.error_share) & ~grid

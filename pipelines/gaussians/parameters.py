@@ -82,7 +82,7 @@ class AdamTable:
 
 @dataclass
 class MapParameters:
-    """A Gaussian map under optimisation; `anchor_frame_ids` (M,) and `trust` (M,) 0..1 of the depth it was seeded at."""
+    """A Gaussian map being optimised; `anchor_frame_ids` (M,) and `trust` (M,) 0..1 of the depth it was seeded at."""
 
     table: AdamTable
     anchor_frame_ids: Tensor

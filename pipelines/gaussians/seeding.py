@@ -1,4 +1,4 @@
-"""New Gaussians from the pixels of a view, at the proxy depth or, where that is weak, at what its region says (eq. 17)."""
+"""New Gaussians from the pixels of a view, at the proxy depth or, where that is weak, at its region's depth (eq. 17)."""
 
 from __future__ import annotations
 
@@ -98,11 +98,12 @@ def _fit_plane(
 
 
 def fill_smoothly(values: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W) a smooth continuation of the values > 0: coarser and coarser weighted means until everything is covered."""
+    """(H, W) a smooth continuation of the values > 0: coarser and coarser weighted means until all is covered."""
     known = np.where(values > 0, np.maximum(weights, 1e-3), 0).astype(np.float32)
     levels = [(values * known, known)]
     while min(levels[-1][0].shape) > 2:
-        levels.append((cv2.pyrDown(levels[-1][0]), cv2.pyrDown(levels[-1][1])))
+        total, weight = (cv2.pyrDown(a).astype(np.float32) for a in levels[-1])
+        levels.append((total, weight))
     filled = np.full_like(levels[-1][0], float(levels[-1][0].sum() / max(levels[-1][1].sum(), 1e-12)))
     for total, weight in reversed(levels):
         coarse = cv2.resize(filled, total.shape[::-1], interpolation=cv2.INTER_LINEAR)

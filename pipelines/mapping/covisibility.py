@@ -34,7 +34,7 @@ def _sampled_points(view: View) -> NDArray[np.float64]:
     stride = max(view.intrinsics.width // _SAMPLES_ACROSS, 1)
     depth = view.depth[stride // 2 :: stride, stride // 2 :: stride].cpu().numpy().astype(np.float64)
     rows, columns = np.nonzero(depth > 0)
-    xy = np.stack([columns, rows], 1) * stride + stride // 2 + 0.5
+    xy = np.stack([columns, rows], 1).astype(np.float64) * stride + (stride // 2 + 0.5)
     in_cam = unproject(xy, depth[rows, columns], view.intrinsics)
     world_from_cam = np.linalg.inv(view.cam_from_world.cpu().numpy())
     return in_cam @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]

@@ -87,7 +87,7 @@ def _neighbours(views: Sequence[View]) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class _Samples:
-    """A grid of pixels with depth: xy (S, 2), depth, trust (S,), rays (S, 3) in the world, center (3,); and all of it."""
+    """A grid of pixels with depth: xy (S, 2), depth, trust (S,), rays (S, 3) in the world, center (3,); the maps."""
 
     xy: Array
     depth: Array
@@ -105,7 +105,7 @@ class _Samples:
         depth = depth_map[stride // 2 :: stride, stride // 2 :: stride].astype(np.float64)
         trust = trust_map[stride // 2 :: stride, stride // 2 :: stride].astype(np.float64)
         rows, columns = np.nonzero((depth > 0) & (trust > 0.1))
-        xy = np.stack([columns, rows], 1) * stride + stride // 2 + 0.5
+        xy = np.stack([columns, rows], 1).astype(np.float64) * stride + (stride // 2 + 0.5)
         world_from_cam = np.linalg.inv(view.cam_from_world.cpu().numpy())
         rays = unproject(xy, np.ones(len(xy)), view.intrinsics) @ world_from_cam[:3, :3].T
         basis = Basis.at(xy, view.intrinsics.width, view.intrinsics.height)
@@ -149,7 +149,7 @@ def _pair_equations(i: int, j: int, all_samples: list[_Samples], other: View, fi
     in_other = (samples.center + samples.rays * depth[:, None]) @ pose[:3, :3].T + pose[:3, 3]
     xy, z = project(in_other, other.intrinsics)
     size = (other.intrinsics.width, other.intrinsics.height)
-    inside = ((xy >= 0) & (xy < size)).all(1)
+    inside = np.asarray(((xy >= 0) & (xy < np.array(size))).all(axis=1), dtype=bool)
     place = np.where(inside[:, None], xy, 0).astype(int)
     seen = there_too.depth_map[place[:, 1], place[:, 0]].astype(np.float64)
     trust = there_too.trust_map[place[:, 1], place[:, 0]].astype(np.float64) * samples.trust

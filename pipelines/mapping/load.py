@@ -30,7 +30,7 @@ class MappingInput:
 def load_views(
     run: RunFolder, trajectory: Trajectory, settings: MappingConfig, device: torch.device | str = "cpu"
 ) -> MappingInput:
-    """The keyframes of `trajectory` with their images and proxies, in order; proxies scaled to the world of tracking."""
+    """The keyframes of `trajectory` with images and proxies, in order; proxies scaled to the world of tracking."""
     frames = {f.id: f for f in run.load_frames()}
     intrinsics = working_size(run.load_calibration().intrinsics, settings.max_side)
     scales = DepthScales.load(run)

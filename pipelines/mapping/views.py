@@ -65,7 +65,7 @@ def make_view(
     """A view of the size of `intrinsics`; `maps` None stands for a frame of which no provider said anything."""
     width, height = intrinsics.width, intrinsics.height
     if image.shape[:2] != (height, width):
-        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
     if maps is None:
         nothing = np.zeros((height, width), np.float32)
         maps = ProxyMaps(nothing, nothing, np.full((height, width), VOID, np.uint8), nothing)
