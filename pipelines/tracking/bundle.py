@@ -2,7 +2,8 @@
 
 An own solver, because pycolmap's Ceres interface has no residual for the depth of a point; without depths both reach
 the same minimum (the tests compare them). Points are eliminated (Schur complement), so the cost grows linearly with
-them; the reduced system over the cameras is solved densely.
+them; the reduced system over the cameras has a block for each pair that shares points, and is solved densely for few
+cameras, sparsely for many: along a walk its cost, too, grows linearly.
 """
 
 from __future__ import annotations
@@ -12,12 +13,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.sparse import bsr_matrix
+from scipy.sparse.linalg import splu
 
 from pipelines.geometry import se3
 from pipelines.tracking import bundle_kernels as kernels
 from pipelines.types import Intrinsics, require_shape
 
 Array = NDArray[np.float64]
+
+DENSE_CAMERAS = 250
+"""Up to so many a dense factorisation of the reduced system is faster than a sparse one."""
 
 
 @dataclass(frozen=True)
@@ -131,6 +137,9 @@ class _Problem:
         self.data = (camera, self.obs_cam, self.obs_point, b.obs_xy, 1 / b.obs_sd, log_depth, weight, width)
         self.starts = np.searchsorted(self.obs_point, np.arange(len(b.points) + 1))
         self.free = np.ones(len(b.cam_from_world), bool) if fixed is None else ~fixed
+        self.numbers, _ = kernels.number_blocks(self.starts, self.obs_cam, len(b.cam_from_world))
+        self.pairs = np.argwhere(self.numbers >= 0)
+        self.dense_cameras = DENSE_CAMERAS
 
     def cost(self, motions: Array, points: Array) -> float:
         return float(kernels.total_cost(motions, points, *self.data))
@@ -142,23 +151,54 @@ class _Problem:
         """Steps of cameras (N, 6) and points (P, 3); None where the system is not positive definite."""
         cam_block, cam_right, point_block, point_right, mixed = normal
         n = len(cam_block)
-        reduced, right = np.zeros((6 * n, 6 * n)), cam_right.ravel().copy()
+        blocks, right = np.zeros((len(self.pairs), 6, 6)), cam_right.ravel().copy()
         diagonal = np.einsum("nii->ni", cam_block)
-        for c in range(n):
-            reduced[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] = cam_block[c] + np.diag(damping * diagonal[c] + 1e-9)
+        blocks[np.diag(self.numbers)] = cam_block
+        for i in range(6):
+            blocks[np.diag(self.numbers), i, i] += damping * diagonal[:, i] + 1e-9
         inverse = kernels.invert_points(point_block, damping)
-        kernels.eliminate_points(self.starts, self.obs_cam, mixed, inverse, point_right, reduced, right)
-        free = np.repeat(self.free, 6)
+        kernels.eliminate_points(self.starts, self.obs_cam, mixed, inverse, point_right, self.numbers, blocks, right)
         step = np.zeros(6 * n)
+        free = np.repeat(self.free, 6)
         if free.any():
-            try:
-                factor = cho_factor(reduced if free.all() else reduced[np.ix_(free, free)], lower=False)
-            except LinAlgError:
+            solved = solve_blocks(blocks, self.pairs, n, right, free, self.dense_cameras)
+            if solved is None:
                 return None
-            step[free] = cho_solve(factor, right[free])
+            step[free] = solved
         cam_step = step.reshape(n, 6)
         shift = kernels.point_steps(self.obs_cam, self.obs_point, mixed, inverse, point_right, cam_step)
         return cam_step, shift
+
+
+def solve_blocks(
+    blocks: Array, pairs: NDArray[np.int64], count: int, right: Array, free: NDArray[np.bool_], dense_cameras: int
+) -> Array | None:
+    """Solve the symmetric system of upper blocks (B, 6, 6) at pairs (B, 2) for the free of its 6 * count unknowns.
+
+    Dense Cholesky for up to `dense_cameras` cameras, else sparse LU. None where it has no (positive definite) solution.
+    """
+    if count <= dense_cameras:
+        dense = np.zeros((count, 6, count, 6))
+        dense[pairs[:, 0], :, pairs[:, 1], :] = blocks
+        matrix = dense.reshape(6 * count, 6 * count)
+        try:
+            factor = cho_factor(matrix if free.all() else matrix[np.ix_(free, free)], lower=False)
+        except LinAlgError:
+            return None
+        return cho_solve(factor, right[free])
+    off = pairs[:, 0] != pairs[:, 1]
+    rows = np.concatenate([pairs[:, 0], pairs[off, 1]])
+    columns = np.concatenate([pairs[:, 1], pairs[off, 0]])
+    values = np.concatenate([blocks, np.swapaxes(blocks[off], 1, 2)])
+    order = np.lexsort((columns, rows))
+    starts = np.searchsorted(rows[order], np.arange(count + 1))
+    matrix = bsr_matrix((values[order], columns[order], starts), shape=(6 * count, 6 * count)).tocsc()
+    try:
+        return splu(matrix[free][:, free], permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(
+            right[free]
+        )
+    except RuntimeError:  # exactly singular
+        return None
 
 
 def adjust_pose(

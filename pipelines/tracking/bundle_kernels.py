@@ -118,10 +118,29 @@ def invert_points(point_block, damping):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def eliminate_points(starts, obs_cam, mixed, inverse_block, point_right, reduced, right):  # type: ignore[no-untyped-def]
-    """Subtract the points' share from the reduced camera system (6N, 6N; upper triangle) and its right side (6N,).
+def number_blocks(starts, obs_cam, count):  # type: ignore[no-untyped-def]
+    """numbers (N, N) of the pairs a <= b of cameras that share a point, row by row, -1 for others; their count."""
+    numbers = np.full((count, count), -1, np.int32)
+    for c in range(count):
+        numbers[c, c] = 0
+    for q in range(len(starts) - 1):
+        for a in range(starts[q], starts[q + 1]):
+            for b in range(a + 1, starts[q + 1]):
+                numbers[obs_cam[a], obs_cam[b]] = 0
+    used = 0
+    for a in range(count):
+        for b in range(a, count):
+            if numbers[a, b] == 0:
+                numbers[a, b] = used
+                used += 1
+    return numbers, used
 
-    Observations are sorted by point, then camera; starts (P + 1,) are their ranges.
+
+@njit(cache=True)
+def eliminate_points(starts, obs_cam, mixed, inverse_block, point_right, numbers, blocks, right):  # type: ignore[no-untyped-def]
+    """Subtract the points' share from the blocks (B, 6, 6) of the reduced camera system and its right side (6N,).
+
+    Observations are sorted by point, then camera; starts (P + 1,) are their ranges; `numbers` as of `number_blocks`.
     """
     left = np.empty((6, 3))
     for q in range(len(starts) - 1):
@@ -138,10 +157,10 @@ def eliminate_points(starts, obs_cam, mixed, inverse_block, point_right, reduced
                     total += value * point_right[q, j]
                 right[row + i] -= total
             for b in range(a, last):
-                column = 6 * obs_cam[b]
+                block = blocks[numbers[obs_cam[a], obs_cam[b]]]
                 for i in range(6):
                     for j in range(6):
-                        reduced[row + i, column + j] -= (
+                        block[i, j] -= (
                             left[i, 0] * mixed[b, j, 0] + left[i, 1] * mixed[b, j, 1] + left[i, 2] * mixed[b, j, 2]
                         )
 
