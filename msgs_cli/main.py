@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import sys
 from collections.abc import Callable
@@ -15,9 +14,17 @@ import click
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from formats.errors import InputError
+from msgs_cli import looking
+from msgs_cli.options import (
+    FOLDER,
+    RUN_ARGUMENT,
+    make_progress,
+    open_run,
+    set_up_logging,
+    settings_options,
+    verbosity_options,
+)
 from pipelines.run_folder_names import EXPORTS, STAGES
-
-FOLDER = click.Path(path_type=Path, file_okay=False)
 
 
 class FriendlyGroup(click.Group):
@@ -42,33 +49,12 @@ def main() -> None:
     msgs-slam resume video.msgs         go on after a stop
     msgs-slam status video.msgs         what is done, what was found
     msgs-slam export video.msgs         write the export files again, or elsewhere
+    msgs-slam report video.msgs         one HTML page: what was found, how good, what to film better
+    msgs-slam render video.msgs out.mp4 the map along its camera path
+    msgs-slam view video.msgs           the map in the browser
     msgs-slam evaluate video.msgs --truth DATASET    errors against a known truth
     msgs-slam config                    every setting with its default and meaning
     """
-
-
-def verbosity_options(command: Callable[..., None]) -> Callable[..., None]:
-    """-q and -v."""
-    command = click.option("-v", "--verbose", is_flag=True, help="Log what is decided and why.")(command)
-    return click.option("-q", "--quiet", is_flag=True, help="No bars and no table; only errors.")(command)
-
-
-def settings_options(command: Callable[..., None]) -> Callable[..., None]:
-    """--config and --set."""
-    command = click.option(
-        "--set",
-        "overrides",
-        multiple=True,
-        metavar="SECTION.KEY=VALUE",
-        help="Change one setting, e.g. --set frames.rate=5; may be repeated.",
-    )(command)
-    return click.option(
-        "--config",
-        "config_file",
-        type=click.Path(path_type=Path, dir_okay=False),
-        metavar="FILE",
-        help="Settings in TOML; `msgs-slam config` prints one to start from.",
-    )(command)
 
 
 UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], help="Stop after this stage.")
@@ -114,7 +100,7 @@ def reconstruct(
     No option is needed. Stopped at any moment, the same command, or `msgs-slam resume RUN`, goes on where it was; with
     a changed setting only the stages that depend on it run again.
     """
-    _set_up_logging(quiet, verbose)
+    set_up_logging(quiet, verbose)
     from pipelines.config import load_config
     from pipelines.reconstruct import default_run_folder, existing_config
     from pipelines.reconstruct import reconstruct as run_reconstruct
@@ -124,13 +110,13 @@ def reconstruct(
     named = {"run.device": device, "proxy.depth": depth, "proxy.semantics": semantics, "frames.intrinsics": intrinsics}
     texts = [f'{key}="{_toml_escape(value)}"' for key, value in named.items() if value is not None]
     config = load_config(config_file, [*overrides, *texts], base=existing_config(run))
-    records = _interruptible(lambda: run_reconstruct(source, run, config, _progress(quiet), until), run.root)
+    records = _interruptible(lambda: run_reconstruct(source, run, config, make_progress(quiet), until), run.root)
     if not quiet:
         _print_summary(run.root, records)
 
 
 @main.command()
-@click.argument("run_path", metavar="RUN", type=FOLDER)
+@RUN_ARGUMENT
 @settings_options
 @UNTIL
 @verbosity_options
@@ -138,7 +124,7 @@ def resume(
     run_path: Path, config_file: Path | None, overrides: tuple[str, ...], until: str, quiet: bool, verbose: bool
 ) -> None:
     """Go on with RUN where it stopped. Finished stages are kept unless one of their settings is changed."""
-    _set_up_logging(quiet, verbose)
+    set_up_logging(quiet, verbose)
     from pipelines.config import load_config
     from pipelines.reconstruct import existing_config, require_run
     from pipelines.reconstruct import resume as run_resume
@@ -147,13 +133,13 @@ def resume(
     run = RunFolder(run_path)
     require_run(run)
     config = load_config(config_file, overrides, base=existing_config(run))
-    records = _interruptible(lambda: run_resume(run, _progress(quiet), config, until), run.root)
+    records = _interruptible(lambda: run_resume(run, make_progress(quiet), config, until), run.root)
     if not quiet:
         _print_summary(run.root, records)
 
 
 @main.command()
-@click.argument("run_path", metavar="RUN", type=FOLDER)
+@RUN_ARGUMENT
 def status(run_path: Path) -> None:
     """Say which stages of RUN are done, what they found, and what was degraded."""
     from msgs_cli.tables import stage_table, warning_lines
@@ -172,56 +158,20 @@ def status(run_path: Path) -> None:
 
 
 @main.command()
-@click.argument("run_path", metavar="RUN", type=FOLDER)
+@RUN_ARGUMENT
 @click.option("--only", type=click.Choice(EXPORTS), help="Write one kind of file only. Default: all.")
 @click.option("--to", type=FOLDER, metavar="DIR", help="Where to write. Default: RUN/export.")
 @verbosity_options
 def export(run_path: Path, only: str | None, to: Path | None, quiet: bool, verbose: bool) -> None:
     """Write the files for other programs: COLMAP model, Gaussian PLY, labelled mesh, TUM trajectory."""
-    _set_up_logging(quiet, verbose)
+    set_up_logging(quiet, verbose)
     from pipelines.export.stage import export_run
-    from pipelines.reconstruct import require_run
-    from pipelines.run_folder import RunFolder
 
-    run = RunFolder(run_path)
-    require_run(run)
+    run = open_run(run_path)
     folder = to or run.stage("export")
-    for path in export_run(run, folder, only, _progress(quiet)):
+    for path in export_run(run, folder, only, make_progress(quiet)):
         if not quiet:
             click.echo(path)
-
-
-@main.command()
-@click.argument("run_path", metavar="RUN", type=FOLDER)
-@click.option(
-    "--truth",
-    required=True,
-    type=click.Path(path_type=Path, exists=True),
-    metavar="PATH",
-    help="A data set with true poses and, if it has them, depth and labels.",
-)
-@click.option("--format", "truth_format", default="auto", help="Layout of the truth; auto recognises it.")
-@click.option(
-    "--protocol",
-    type=click.Choice(["msgs", "splatam"]),
-    default="msgs",
-    help="splatam adds that code's figures, for comparison with papers.",
-)
-@verbosity_options
-def evaluate(run_path: Path, truth: Path, truth_format: str, protocol: str, quiet: bool, verbose: bool) -> None:
-    """Compare RUN with the truth: poses, images, depth, labels, mesh. Writes RUN/evaluation/."""
-    _set_up_logging(quiet, verbose)
-    from formats.datasets import open_sequence
-    from pipelines.evaluation.table import evaluation_table
-    from pipelines.evaluation.write import write_evaluation
-    from pipelines.reconstruct import require_run
-    from pipelines.run_folder import RunFolder
-
-    run = RunFolder(run_path)
-    require_run(run)
-    sequence = open_sequence(truth, truth_format)
-    figures = write_evaluation(run, sequence, _progress(quiet), legacy=protocol == "splatam")
-    click.echo(evaluation_table(figures))
 
 
 @main.command()
@@ -237,7 +187,7 @@ def evaluate(run_path: Path, truth: Path, truth_format: str, protocol: str, quie
 @verbosity_options
 def demo(out: Path, config_file: Path | None, overrides: tuple[str, ...], quiet: bool, verbose: bool) -> None:
     """Make a short synthetic room video with known truth, reconstruct it, print the errors and where to look."""
-    _set_up_logging(quiet, verbose)
+    set_up_logging(quiet, verbose)
     from pipelines.config import load_config
     from pipelines.demo import demo_summary, run_demo
     from pipelines.reconstruct import reconstruct as run_reconstruct
@@ -246,11 +196,11 @@ def demo(out: Path, config_file: Path | None, overrides: tuple[str, ...], quiet:
     config = load_config(config_file, overrides)
 
     def reconstruct_clip(video: Path, run: RunFolder) -> None:
-        records = _interruptible(lambda: run_reconstruct(video, run, config, _progress(quiet)), run.root)
+        records = _interruptible(lambda: run_reconstruct(video, run, config, make_progress(quiet)), run.root)
         if not quiet:
             _print_summary(run.root, records)
 
-    result = run_demo(out, reconstruct_clip, _progress(quiet))
+    result = run_demo(out, reconstruct_clip, make_progress(quiet))
     click.echo("\nAgainst the known truth:")
     for line in demo_summary(result):
         click.echo(f"  {line}")
@@ -267,20 +217,6 @@ def show_config(config_file: Path | None, overrides: tuple[str, ...]) -> None:
 
 def _toml_escape(text: str) -> str:
     return text.replace("\\", "\\\\").replace('"', '\\"')
-
-
-def _progress(quiet: bool) -> Any:
-    from msgs_cli.progress import BarProgress
-    from pipelines.progress import SilentProgress
-
-    return SilentProgress() if quiet else BarProgress()
-
-
-def _set_up_logging(quiet: bool, verbose: bool) -> None:
-    if quiet and verbose:
-        raise click.UsageError("-q and -v exclude each other")
-    level = logging.ERROR if quiet else logging.INFO if verbose else logging.WARNING
-    logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr, force=True)
 
 
 def _interruptible(work: Callable[[], Any], root: Path) -> Any:
@@ -300,6 +236,9 @@ def _print_summary(root: Path, records: dict[str, Any]) -> None:
     if "export" in records:
         click.echo(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")
 
+
+for command in (looking.evaluate, looking.report, looking.render, looking.view):
+    main.add_command(command)
 
 if __name__ == "__main__":
     main()

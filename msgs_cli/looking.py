@@ -1,0 +1,85 @@
+"""Commands that look at a finished run: evaluate, report, render, view."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from msgs_cli.options import RUN_ARGUMENT, make_progress, open_run, set_up_logging, verbosity_options
+
+
+@click.command()
+@RUN_ARGUMENT
+@click.option(
+    "--truth", required=True, type=click.Path(path_type=Path, exists=True), metavar="PATH",
+    help="A data set with true poses and, if it has them, depth and labels.",
+)  # fmt: skip
+@click.option("--format", "truth_format", default="auto", help="Layout of the truth; auto recognises it.")
+@click.option(
+    "--protocol", type=click.Choice(["msgs", "splatam"]), default="msgs",
+    help="splatam adds that code's figures, for comparison with papers.",
+)  # fmt: skip
+@verbosity_options
+def evaluate(run_path: Path, truth: Path, truth_format: str, protocol: str, quiet: bool, verbose: bool) -> None:
+    """Compare RUN with the truth: poses, images, depth, labels, mesh. Writes RUN/evaluation/."""
+    set_up_logging(quiet, verbose)
+    from formats.datasets import open_sequence
+    from pipelines.evaluation.table import evaluation_table
+    from pipelines.evaluation.write import write_evaluation
+
+    run = open_run(run_path)
+    sequence = open_sequence(truth, truth_format)
+    figures = write_evaluation(run, sequence, make_progress(quiet), legacy=protocol == "splatam")
+    click.echo(evaluation_table(figures))
+
+
+@click.command()
+@RUN_ARGUMENT
+@click.option(
+    "--to", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Default: report.html in the run."
+)
+@verbosity_options
+def report(run_path: Path, to: Path | None, quiet: bool, verbose: bool) -> None:
+    """Write one HTML file that says what was found, how good it is, and what to film better."""
+    set_up_logging(quiet, verbose)
+    from pipelines.evaluation.report import write_report
+
+    click.echo(write_report(open_run(run_path), to, make_progress(quiet)))
+
+
+@click.command()
+@RUN_ARGUMENT
+@click.argument("target", metavar="VIDEO|FOLDER", type=click.Path(path_type=Path))
+@click.option(
+    "--kind", default="side-by-side", type=click.Choice(["color", "depth", "labels", "side-by-side"]),
+    help="What is drawn.",
+)  # fmt: skip
+@click.option(
+    "--path", "camera_path", default="smooth", type=click.Choice(["own", "smooth", "orbit"]),
+    help="The run's own camera path, the same smoothed, or a circle about the scene.",
+)  # fmt: skip
+@click.option("--fps", default=30.0, type=click.FloatRange(0.1, 240), help="Frames a second.", show_default=True)
+@verbosity_options
+def render(run_path: Path, target: Path, kind: str, camera_path: str, fps: float, quiet: bool, verbose: bool) -> None:
+    """Draw the map of RUN along a camera path into a video (.mp4) or a folder of pictures."""
+    set_up_logging(quiet, verbose)
+    from pipelines.render_run import render_run
+
+    click.echo(render_run(open_run(run_path), target, kind, camera_path, fps, progress=make_progress(quiet)))
+
+
+@click.command()
+@click.argument("path", metavar="RUN|PLY", type=click.Path(path_type=Path, exists=True))
+@click.option("--port", default=8080, type=click.IntRange(1, 65535), show_default=True, help="Where to serve.")
+@click.option("--host", default="127.0.0.1", show_default=True, help="Which address to serve on.")
+def view(path: Path, port: int, host: str) -> None:
+    """Look at a run, or at any Gaussian PLY, in the browser (needs the extra: pip install 'msgs-slam[viewer]')."""
+    from pipelines.viewer import open_viewer
+
+    viewer = open_viewer(path, host, port)
+    click.echo(f"open {viewer.url} in a browser; Ctrl-C ends it", err=True)
+    try:
+        viewer.wait()
+    except KeyboardInterrupt:
+        viewer.stop()
