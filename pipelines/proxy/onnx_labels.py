@@ -39,7 +39,7 @@ class OnnxLabels:
         self._network = Network(card, threads, device)
         self._sequence, self._folder, self._progress = sequence, folder, progress
         self.name = f"onnx:{card.name}"
-        self._label_of = np.full(len(card.classes) + 1, VOID, np.uint8)
+        self._label_of = np.full(len(card.labels) + 1, VOID, np.uint8)
         self._classes = ClassTable((), ())
         self._votes: WorldVotes | None = None
 
@@ -53,7 +53,7 @@ class OnnxLabels:
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Run the network, settle the classes, and let all frames vote on the classes of the places they see."""
-        names = self._network.card.classes
+        names = self._network.card.labels
         counts = np.zeros(len(names) + 1, np.int64)
         for frame in self._progress.track(frames, "network", len(frames)):
             counts += np.bincount(self._raw(frame)[0].ravel() + 1, minlength=len(counts))
@@ -92,4 +92,4 @@ class OnnxLabels:
 
     def figures(self) -> dict[str, Any]:
         """How many classes the network knows."""
-        return {"network_classes": len(self._network.card.classes)}
+        return {"network_classes": len(self._network.card.labels)}

@@ -15,6 +15,7 @@ from formats.errors import DiskFullError, InputError
 from pipelines.progress import log
 
 _CHUNK = 1 << 18
+_MAX_UNKNOWN = 1 << 30
 _ATTEMPTS = 6
 _TIMEOUT = 30.0
 _SCHEMES = ("https://", "http://127.0.0.1", "http://localhost")
@@ -29,8 +30,8 @@ def file_sha256(path: Path) -> str:
 def fetch(urls: Sequence[str], target: Path, size: int, sha256: str, progress: Callable[[int, int], None]) -> str:
     """Download the first of `urls` that delivers `size` bytes of the right hash to `target`; returns the hash.
 
-    What a broken line has delivered stays in `<target>.part` and is continued, also by a later call. An empty
-    `sha256` accepts any content of that size. `progress(done, size)` is called as bytes arrive.
+    What a broken line has delivered stays in `<target>.part` and is continued, also by a later call. A `size`
+    of 0 is unknown, an empty `sha256` accepts any content. `progress(done, size)` is called as bytes arrive.
     Raises InputError when every mirror fails, with the reason of each.
     """
     part = target.with_name(target.name + ".part")
@@ -58,10 +59,10 @@ def _fetch_one(url: str, part: Path, size: int, progress: Callable[[int, int], N
     reason = ""
     for _ in range(_ATTEMPTS):
         before = _length(part)
-        if before == size:
+        if size and before == size:
             return ""
         try:
-            _continue(url, part, size, progress)
+            size = _continue(url, part, size, progress)
         except urllib.error.HTTPError as error:
             if error.code == 416 and before:  # the part is longer than the file: it belongs to another one
                 _discard(part)
@@ -81,15 +82,15 @@ def _fetch_one(url: str, part: Path, size: int, progress: Callable[[int, int], N
             return str(error)
         if _length(part) <= before:
             return reason or "it sends nothing"
-    return "" if _length(part) == size else reason or f"{_length(part)} of {size} bytes came"
+    return "" if size and _length(part) == size else reason or f"{_length(part)} of {size} bytes came"
 
 
 class _NotTheFile(Exception):
     """The server sends something of another size."""
 
 
-def _continue(url: str, part: Path, size: int, progress: Callable[[int, int], None]) -> None:
-    """One request: the rest of the file, or all of it when the server cannot send a part."""
+def _continue(url: str, part: Path, size: int, progress: Callable[[int, int], None]) -> int:
+    """One request: the rest of the file, or all of it when the server cannot send a part. Returns its full size."""
     start, tag = _length(part), _read_tag(part)
     request = urllib.request.Request(url, headers={"User-Agent": "msgs-slam", "Accept-Encoding": "identity"})
     if start:
@@ -100,16 +101,19 @@ def _continue(url: str, part: Path, size: int, progress: Callable[[int, int], No
         continues = answer.status == 206
         done = start if continues else 0
         announced = answer.headers.get("Content-Length")
-        if announced is not None and announced.isdecimal() and done + int(announced) != size:
-            raise _NotTheFile(f"the file there has {done + int(announced)} bytes, expected {size}")
+        total = done + int(announced) if announced is not None and announced.isdecimal() else size
+        if size not in (0, total):
+            raise _NotTheFile(f"the file there has {total} bytes, expected {size}")
+        size = total
         _write_tag(part, answer.headers.get("ETag") or "")
         with part.open("ab" if continues else "wb") as stream:
             while chunk := answer.read(_CHUNK):
                 done += len(chunk)
-                if done > size:
+                if done > (size or _MAX_UNKNOWN):
                     raise _NotTheFile(f"more than the expected {size} bytes came")
                 stream.write(chunk)
                 progress(done, size)
+    return size or done
 
 
 def _length(part: Path) -> int:

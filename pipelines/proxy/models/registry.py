@@ -18,11 +18,12 @@ from pipelines.proxy.models.download import fetch, file_sha256
 from pipelines.proxy.networks.card import Card, card_from_values
 
 _TABLE = Path(__file__).with_name("registry.toml")
+_ADE20K = Path(__file__).with_name("ade20k.toml")
 
 
 @dataclass(frozen=True)
 class Model:
-    """One row of the table. `sha256` is "" while it is unknown."""
+    """One row of the table. `sha256` is "" and `bytes` 0 while unknown; `needs` names another model it works with."""
 
     name: str
     family: str
@@ -31,6 +32,7 @@ class Model:
     sha256: str
     licence: str
     commercial: bool
+    needs: str = ""
 
 
 @dataclass(frozen=True)
@@ -55,12 +57,13 @@ class ModelStore:
 
     def path(self, model: Model) -> Path:
         """Where the model's file lies, or would lie."""
-        return self.cache / f"{model.name}.onnx"
+        return self.cache / f"{model.name}{'.pth' if model.family == 'head' else '.onnx'}"
 
     def is_here(self, model: Model) -> bool:
         """Whether the file is there with the right size (the content is checked when it is opened)."""
         path = self.path(model)
-        return path.is_file() and path.stat().st_size == model.bytes and bool(model.sha256)
+        whole = path.is_file() and path.stat().st_size == (model.bytes or path.stat().st_size) and bool(model.sha256)
+        return whole and (not model.needs or self.is_here(self.get(model.needs)))
 
     def get(self, name: str) -> Model:
         """Raises InputError for an unknown name."""
@@ -72,6 +75,8 @@ class ModelStore:
     def card(self, model: Model) -> Card:
         """The contract of the model's family, for its file in the cache."""
         values = {**self.families[model.family], "model": self.path(model), "sha256": model.sha256}
+        if model.needs:
+            values |= {"head": self.path(self.get(model.needs)), **_room_classes()}
         return card_from_values(values, _TABLE)
 
     def first_here(self, task: str) -> Model | None:
@@ -106,7 +111,7 @@ class ModelStore:
 
     def add(self, file: Path, family: str, name: str = "") -> Model:
         """Copy the user's own file into the cache as a model of `family`. InputError unless it fits the family."""
-        if family not in self.families:
+        if family not in self.families or family in ("head", "dinov2-ade20k"):
             raise InputError(f"there is no family {family!r}; known: {', '.join(self.families)}")
         if not file.is_file():
             raise InputError(f"{file}: there is no such file")
@@ -154,6 +159,13 @@ class ModelStore:
     def _save_own(self, own: dict[str, Any]) -> None:
         with atomic_path(self.cache / "own.json") as temporary:
             temporary.write_text(json.dumps(own, indent=1) + "\n", encoding="utf-8")
+
+
+def _room_classes() -> dict[str, list[str]]:
+    """ADE20K's classes and for each the kind of thing in a room that it counts for."""
+    values = tomllib.loads(_ADE20K.read_text(encoding="utf-8"))
+    kind_of = {name: kind for kind, names in values["groups"].items() for name in names}
+    return {"classes": values["classes"], "groups": [kind_of.get(name, "other") for name in values["classes"]]}
 
 
 def default_cache() -> Path:

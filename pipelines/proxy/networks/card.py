@@ -29,12 +29,15 @@ from pipelines.proxy.class_files import read_class_table
 
 _MAX_CARD_BYTES = 1 << 20
 _MAX_SIDE = 8192
-_KINDS = {"depth": ("plane", "points"), "segmentation": ("logits", "probabilities", "argmax")}
+_KINDS = {"depth": ("plane", "points"), "segmentation": ("logits", "probabilities", "argmax", "tokens")}
 
 
 @dataclass(frozen=True)
 class Card:
-    """See the module's text. `size` is (height, width), (0, 0) when any multiple will do."""
+    """See the module's text. `size` is (height, width), (0, 0) when any multiple will do.
+
+    groups: for every class the name of the group that it counts for; () when classes stay as they are.
+    """
 
     task: str
     model: Path
@@ -52,6 +55,8 @@ class Card:
     confidence: str = ""
     kind: str = ""
     classes: tuple[str, ...] = ()
+    groups: tuple[str, ...] = ()
+    head: Path | None = None
     void: tuple[int, ...] = ()
     tokens: str = ""
     mask: str = ""
@@ -61,6 +66,11 @@ class Card:
     @property
     def name(self) -> str:
         return self.model.stem
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The classes that come out: the groups, in the order of their first class, or the classes themselves."""
+        return tuple(dict.fromkeys(self.groups)) or self.classes
 
 
 def read_card(path: Path) -> Card:
@@ -74,6 +84,8 @@ def read_card(path: Path) -> Card:
         if not isinstance(values.get(key), str):
             raise InputError(f'{path}: the card lacks {key} = "…"')
     values["model"] = _beside(path, values["model"])
+    if isinstance(values.get("head"), str):
+        values["head"] = _beside(path, values["head"])
     if isinstance(values.get("classes"), str):
         table = read_class_table(_beside(path, values["classes"]))
         values["classes"] = [table[i].name if i in table else f"class {i}" for i in range(max(table) + 1)]
@@ -118,7 +130,7 @@ def _beside(path: Path, name: str) -> Path:
 
 
 def _converted(key: str, value: Any, kind: Any) -> Any:
-    if key == "model":
+    if key in ("model", "head"):
         return value
     if str(kind).startswith("tuple"):
         if not isinstance(value, list):
@@ -143,6 +155,8 @@ def _check(card: Card, path: Path) -> None:
         "pixels is 1000..10000000": 1000 <= card.pixels <= 10_000_000,
         "valid is [lowest, highest]": len(card.valid) == 2 and 0 <= card.valid[0] < card.valid[1],
         "canonical_focal is 0 or positive": card.canonical_focal >= 0,
+        "groups has one name for each class": len(card.groups) in (0, len(card.classes)),
+        "tokens needs a head": card.kind != "tokens" or card.head is not None,
         "segmentation needs classes": card.task == "depth" or 1 <= len(card.classes) <= 10_000,
     }
     for rule, holds in problems.items():

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
+from pipelines.proxy.networks.card import Card
 from pipelines.proxy.networks.letterbox import Letterbox
 from pipelines.proxy.networks.session import Network
 
@@ -21,25 +22,58 @@ def network_labels(network: Network, image: NDArray[np.uint8]) -> tuple[NDArray[
     output = network.run(image, box)[0]
     if card.kind == "argmax":
         return _from_ids(network, output, box)
-    classes = len(card.classes)
-    if output.ndim != 3 or output.shape[0] != classes:
-        raise InputError(f"{card.model}: gave {output.shape}; {classes} classes by height by width are expected")
-    scores = output.astype(np.float32).transpose(1, 2, 0)
+    scores = _scores(network, output, box)
     broken = np.asarray(~np.isfinite(scores).all(-1))
     if broken.all():
         raise InputError(f"{card.model}: gave no number but NaN. Is the input range of the card right?")
     scores = np.ascontiguousarray(np.where(broken[..., None], 0, scores))
+    if card.groups:
+        scores = _grouped(card, scores)
     # Interpolated before the softmax: boundaries between two classes then run through between the samples.
     scores = box.take(scores, card.align_corners)
     ids = scores.argmax(-1)
     best = scores.max(-1)
-    likely = 1 / np.exp(scores - best[..., None]).sum(-1) if card.kind != "probabilities" else np.clip(best, 0, 1)
+    is_probability = card.kind == "probabilities" or bool(card.groups)
+    likely = np.clip(best, 0, 1) if is_probability else 1 / np.exp(scores - best[..., None]).sum(-1)
     probability = np.asarray(likely, np.float32)
     ids = np.where(np.isin(ids, card.void), -1, ids)
     if broken.any():
         lost = box.take(broken.astype(np.float32), card.align_corners) > 0.5
         ids, probability = np.where(lost, -1, ids), np.where(lost, 0, probability)
     return ids, np.where(ids < 0, 0, probability).astype(np.float32)
+
+
+def _scores(network: Network, output: NDArray, box: Letterbox) -> NDArray[np.float32]:
+    """(h', w', C) scores of the classes."""
+    card = network.card
+    if card.kind == "tokens":
+        return _token_scores(network, output, box)
+    if output.ndim != 3 or output.shape[0] != len(card.classes):
+        raise InputError(
+            f"{card.model}: gave {output.shape}; {len(card.classes)} classes by height by width are expected"
+        )
+    return np.asarray(output.astype(np.float32).transpose(1, 2, 0))
+
+
+def _token_scores(network: Network, output: NDArray, box: Letterbox) -> NDArray[np.float32]:
+    """Scores of the patches of a transformer; the tokens before the patches (the class token) are left out."""
+    rows, columns = box.box_height // network.card.multiple, box.box_width // network.card.multiple
+    head = network.head
+    if head is None or output.ndim != 2 or output.shape[0] < rows * columns or output.shape[1] != head.weight.shape[1]:
+        raise InputError(f"{network.card.model}: gave {output.shape}, which does not fit the head or the size")
+    patches = output[output.shape[0] - rows * columns :].astype(np.float32)
+    return head.scores(patches).reshape(rows, columns, -1)
+
+
+def _grouped(card: Card, scores: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(h', w', G) probabilities of the groups: the sum over their classes."""
+    if card.kind != "probabilities":
+        scores = np.exp(scores - scores.max(-1, keepdims=True))
+        scores /= scores.sum(-1, keepdims=True)
+    labels = card.labels
+    member = np.zeros((len(card.classes), len(labels)), np.float32)
+    member[np.arange(len(card.classes)), [labels.index(g) for g in card.groups]] = 1
+    return (scores @ member).astype(np.float32)
 
 
 def _from_ids(network: Network, output: NDArray, box: Letterbox) -> tuple[NDArray[np.int64], NDArray[np.float32]]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from formats.errors import InputError
 from pipelines.progress import log
 from pipelines.proxy.networks.card import Card
+from pipelines.proxy.networks.head import load_linear_head
 from pipelines.proxy.networks.letterbox import Letterbox, choose_box
 from pipelines.proxy.networks.onnx_file import require_own_weights
 
@@ -30,6 +31,7 @@ class Network:
         self.card = card
         require_own_weights(card.model)
         _require_hash(card)
+        self.head = load_linear_head(card.head, len(card.classes)) if card.head is not None else None
         self._session = _open(card.model, threads, device)
         inputs = {i.name: i for i in self._session.get_inputs()}
         outputs = {o.name: o for o in self._session.get_outputs()}
@@ -126,7 +128,7 @@ def _require_bounded(path: Path, name: str, shape: Sequence[int | str | None]) -
 
 
 def _require_channels(card: Card, shape: Sequence[int | str | None]) -> None:
-    if card.task == "depth" or card.kind == "argmax" or len(shape) != 4 or not isinstance(shape[1], int):
+    if card.task == "depth" or card.kind in ("argmax", "tokens") or len(shape) != 4 or not isinstance(shape[1], int):
         return
     if shape[1] != len(card.classes):
         raise InputError(f"{card.model}: has {shape[1]} classes, the card names {len(card.classes)}. Correct the card")

@@ -174,10 +174,11 @@ def test_the_table_is_complete_and_every_family_makes_a_card(tmp_path: Path) -> 
     models = ModelStore.open(tmp_path)
     assert {"metric3d-small", "metric3d-large", "moge2-small"} <= {m.name for m in models.models}
     for model in models.models:
-        assert len(model.sha256) == 64
+        assert len(model.sha256) == 64 or model.family == "head"
         assert model.licence
         assert all(u.startswith("https://") for u in model.urls)
-        assert models.card(model).task == "depth"
+        if model.family != "head":
+            assert models.card(model).task in ("depth", "segmentation")
     with pytest.raises(InputError, match="known: metric3d"):
         models.get("metric4d")
 
@@ -195,3 +196,29 @@ def test_own_files_are_added_checked_and_used_first(shared_data: Path, tmp_path:
     again = ModelStore.open(tmp_path)
     assert again.first_here("depth") == again.get("toy") == added
     assert again.verify()["toy"] == "ok"
+
+
+def test_a_file_of_unknown_size_is_continued_too(server: tuple[str, Behaviour], tmp_path: Path) -> None:
+    url, behaviour = server
+    behaviour.cuts = [300_000]
+    assert fetch([f"{url}/m"], tmp_path / "head.pth", 0, "", silent) == SHA
+    assert [r for _, r in behaviour.requests] == ["", "bytes=300000-"]
+
+
+def test_a_model_that_needs_another_is_here_when_both_are(server: tuple[str, Behaviour], tmp_path: Path) -> None:
+    models = ModelStore.open(tmp_path)
+    dino = models.get("dinov2-small")
+    card = models.card(dino)
+    assert len(card.classes) == len(card.groups) == 150
+    assert card.classes[0] == "wall"
+    assert card.labels[0] == "wall"
+    assert {"floor", "ceiling", "seating", "table", "other"} <= set(card.labels)
+    assert len(card.labels) == 17
+    head = Model("head", "head", (f"{server[0]}/head",), 0, "", "MIT", True)
+    body = Model("net", "dinov2-ade20k", (f"{server[0]}/m",), len(DATA), SHA, "MIT", True, needs="head")
+    pair = ModelStore(tmp_path, (body, head), models.families)
+    pair.pull(body, silent)
+    assert pair.first_here("segmentation") is None
+    pair.pull(head, silent, trust=True)
+    pinned = Model("head", "head", head.urls, 0, SHA, "MIT", True)
+    assert ModelStore(tmp_path, (body, pinned), models.families).first_here("segmentation") == body

@@ -7,6 +7,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
+import torch
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
@@ -14,6 +15,7 @@ from formats.errors import InputError
 from formats.images import read_rgb
 from pipelines.proxy.networks.card import Card, read_card
 from pipelines.proxy.networks.depth import network_depth, solve_shift, solve_shift_and_focal
+from pipelines.proxy.networks.head import load_linear_head
 from pipelines.proxy.networks.labels import network_labels
 from pipelines.proxy.networks.letterbox import choose_box
 from pipelines.proxy.networks.onnx_file import external_locations, require_own_weights
@@ -402,3 +404,74 @@ def test_the_point_map_family_comes_back_as_metres(tmp_path: Path) -> None:
     known = depth > 0
     assert 0.85 < known.mean() < 0.95
     assert np.abs(depth / truth - 1)[known].max() < 1e-3
+
+
+def linear_head(path: Path, classes: int, features: int) -> torch.nn.Sequential:
+    """A head with random statistics, saved under the names of DINOv2's segmenters; returned unfolded."""
+    torch.manual_seed(0)
+    norm, conv = torch.nn.BatchNorm2d(features), torch.nn.Conv2d(features, classes, 1)
+    with torch.no_grad():
+        for tensor in (norm.weight, norm.bias, norm.running_mean):
+            tensor.copy_(torch.randn(features))
+        norm.running_var.copy_(torch.rand(features) + 0.1)
+    state = {f"decode_head.bn.{k}": v for k, v in norm.state_dict().items()}
+    state |= {f"decode_head.conv_seg.{k}": v for k, v in conv.state_dict().items()}
+    torch.save({"state_dict": state}, path)
+    return torch.nn.Sequential(norm, conv).eval()
+
+
+def test_the_folded_head_is_the_head(tmp_path: Path) -> None:
+    reference = linear_head(tmp_path / "head.pth", 7, 12)
+    head = load_linear_head(tmp_path / "head.pth", 7)
+    features = np.random.default_rng(0).normal(size=(3, 5, 12)).astype(np.float32)
+    with torch.no_grad():
+        expected = reference(torch.tensor(features).permute(2, 0, 1)[None])[0].permute(1, 2, 0).numpy()
+    np.testing.assert_allclose(head.scores(features), expected, rtol=1e-4, atol=1e-5)
+    with pytest.raises(InputError, match="names 8"):
+        load_linear_head(tmp_path / "head.pth", 8)
+
+
+class Evil:
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        return Path.touch, (Path("evil-was-here"),)  # type: ignore[return-value]
+
+
+def test_a_head_with_code_in_it_is_refused_and_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    torch.save({"state_dict": Evil()}, tmp_path / "head.pth")
+    for content in (None, b"text", b""):
+        if content is not None:
+            (tmp_path / "head.pth").write_bytes(content)
+        with pytest.raises(InputError, match="linear segmentation head"):
+            load_linear_head(tmp_path / "head.pth", 3)
+    assert not (tmp_path / "evil-was-here").exists()
+
+
+def test_tokens_go_through_the_head_into_groups(tmp_path: Path) -> None:
+    """A transformer's stand-in: a class token, then one token a patch that holds the mean colour of the patch."""
+    weights = [const("shape", [1, 3, -1], np.int64), const("class_token", np.full((1, 1, 3), 9.0))]
+    nodes = [
+        helper.make_node("AveragePool", ["x"], ["pooled"], kernel_shape=[14, 14], strides=[14, 14]),
+        helper.make_node("Reshape", ["pooled", "shape"], ["flat"]),
+        helper.make_node("Transpose", ["flat"], ["patches"], perm=[0, 2, 1]),
+        helper.make_node("Concat", ["class_token", "patches"], ["tokens"], axis=1),
+    ]
+    save(tmp_path / "net.onnx", nodes, weights, "tokens", [1, "n", 3])
+    state = {f"decode_head.bn.{k}": v for k, v in torch.nn.BatchNorm2d(3).state_dict().items()}
+    state |= {"decode_head.conv_seg.weight": 30 * torch.eye(3)[..., None, None]}
+    state |= {"decode_head.conv_seg.bias": torch.zeros(3)}
+    torch.save({"state_dict": state}, tmp_path / "head.pth")
+    card = write_card(
+        tmp_path / "c.toml", task="segmentation", model="net.onnx", input="x", white=1.0, multiple=14, pixels=50_000,
+        output="tokens", kind="tokens", head="head.pth", classes=["red", "green", "blue"],
+        groups=["warm", "cold", "cold"],
+    )  # fmt: skip
+    picture = np.zeros((240, 320, 3), np.uint8)
+    picture[:, :160, 0] = 255
+    picture[:120, 160:, 1] = 255
+    picture[120:, 160:, 2] = 255
+    ids, probability = network_labels(Network(card, 1, "cpu"), picture)
+    assert card.labels == ("warm", "cold")
+    assert (ids[:, :145] == 0).all()
+    assert (ids[:, 175:] == 1).all()
+    assert probability[:, :140].min() > 0.99
