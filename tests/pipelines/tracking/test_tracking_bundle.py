@@ -82,6 +82,16 @@ def test_fixed_cameras_stay(known_bundle: KnownBundle) -> None:
     assert result.cost < result.initial_cost
 
 
+def test_sparse_and_dense_solve_the_same_system(known_bundle: KnownBundle, monkeypatch: pytest.MonkeyPatch) -> None:
+    fixed = np.arange(12) == 3
+    dense = adjust_bundle(known_bundle.bundle, known_bundle.intrinsics, 4, fixed=fixed).bundle
+    monkeypatch.setattr("pipelines.tracking.bundle.DENSE_CAMERAS", 1)
+    sparse = adjust_bundle(known_bundle.bundle, known_bundle.intrinsics, 4, fixed=fixed).bundle
+    assert not np.array_equal(dense.points, sparse.points)
+    assert np.allclose(dense.cam_from_world, sparse.cam_from_world, atol=1e-7)
+    assert np.allclose(dense.points, sparse.points, atol=1e-7)
+
+
 def test_same_input_same_bytes_and_any_order(known_bundle: KnownBundle) -> None:
     once = adjust_bundle(known_bundle.bundle, known_bundle.intrinsics).bundle
     again = adjust_bundle(known_bundle.bundle, known_bundle.intrinsics).bundle

@@ -1,0 +1,42 @@
+"""Render-and-compare finds the way back to a near pose, and does not believe a picture of nothing."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.config import TrackingConfig
+from pipelines.geometry import se3
+from pipelines.tracking.pictures import Pictures
+from pipelines.tracking.refine import compare_frame
+from pipelines.tracking.state import TrackState
+from tests.pipelines.tracking.conftest import MadeRun
+
+
+def test_comparison_brings_a_pose_nearer(tmp_path: Path, make_run: Callable[..., MadeRun]) -> None:
+    made = make_run(tmp_path / "run", keyframes=(9, 12), backbone_scale=1.0, blank=(11,))
+    backbone = made.run.load_backbone()
+    assert backbone is not None
+    state = TrackState.from_backbone(backbone, 0.5)
+    for k in (9, 12):
+        state.poses[k] = made.cam_from_world[k]
+    pictures = Pictures(made.run, made.run.load_frames())
+    camera, settings = made.run.load_calibration().intrinsics, TrackingConfig()
+    truth = made.cam_from_world[10]
+    start = se3.exp(np.array([0.025, -0.02, 0.025, 0.008, -0.01, 0.005])) @ truth
+    found = compare_frame(10, start, [9, 12], state, pictures, camera, settings)
+    assert found is not None
+    assert found.is_better
+    assert 0 < found.loss_after < found.loss_before
+    before, after = (np.linalg.norm(se3.log(p @ se3.inverse(truth))) for p in (start, found.cam_from_world))
+    assert 0 < after < 0.5 * before
+    assert found.unexplained < settings.render_loss
+    nothing = compare_frame(11, made.cam_from_world[11], [9, 12], state, pictures, camera, settings)
+    assert nothing is None or nothing.unexplained > 1
+    # Without depth there is nothing to compare with.
+    assert compare_frame(10, start, [10], _with_keyframe(state, 10, truth), pictures, camera, settings) is None
+
+
+def _with_keyframe(state: TrackState, frame_id: int, pose: np.ndarray) -> TrackState:
+    state.add_frame(frame_id, pose, state.sightings[9].select(np.zeros(0, int)), True, 0)
+    return state
