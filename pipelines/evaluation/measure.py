@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from pipelines.evaluation.depth_error import DepthErrorSum
@@ -16,11 +17,12 @@ from pipelines.evaluation.outcome import Outcome
 from pipelines.evaluation.trajectory_error import AbsoluteError
 from pipelines.evaluation.truth import FramePixels, MatchedTruth
 from pipelines.evaluation.views import MapView, view_map
+from pipelines.gaussians.render import track_gn
 from pipelines.mapping.load import split_frames
 from pipelines.progress import Progress
 
 KEYFRAMES, BETWEEN, HELD_OUT = "keyframes", "between", "held out"
-AT_TRUE_POSES = " at true poses"
+AT_TRUE_POSES, AT_REFINED_POSES = " at true poses", " at refined poses"
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,8 @@ class Measured:
 def measure_views(
     outcome: Outcome, matched: MatchedTruth, alignment: AbsoluteError | None, progress: Progress, max_views: int
 ) -> Measured:
-    """Keyframes, held-out frames and frames between at the run's own poses; frames not used also at the true ones."""
+    """Keyframes, held-out frames and frames between at the run's own poses; held-out frames also at poses refined on
+    the map, and frames not used for the map at the true ones."""
     measured = Measured(outcome.classes.names, matched.sequence.class_names)
     pixels = FramePixels(outcome.calibration)
     jobs = _jobs(outcome, matched, alignment, max_views)
@@ -111,6 +114,7 @@ def _jobs(
     jobs = []
     for kind, ids in ((KEYFRAMES, keyframes), (HELD_OUT, held_out), (BETWEEN, between)):
         jobs += [(i, kind, poses[i]) for i in evenly(ids, max_views)]
+    jobs += [(i, HELD_OUT + AT_REFINED_POSES, refined_pose(outcome, i, poses[i])) for i in evenly(held_out, max_views)]
     if alignment is None:
         return jobs
     # The true cameras, carried into the run's world.
@@ -120,6 +124,25 @@ def _jobs(
     true_poses = alignment.alignment.inverse().apply_to_poses(np.linalg.inv(matched.world_from_cam[rows]))
     kind = (HELD_OUT if held_out else BETWEEN) + AT_TRUE_POSES
     return jobs + [(i, kind, pose) for i, pose in zip(chosen, true_poses, strict=True)]
+
+
+def refined_pose(outcome: Outcome, frame_id: int, cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) the pose from which the map looks most like the frame's picture, found without any truth.
+
+    The pose as it was where the fit does not converge. Raises ValueError for a run without a map.
+    """
+    m = outcome.gaussian_map
+    if m is None:
+        raise ValueError("the run has no map")
+    frame = outcome.frames[outcome.frame_row(frame_id)]
+    photo = (outcome.run.image(frame) / np.float32(255)).astype(np.float32)
+    if outcome.exposure is not None:
+        photo = outcome.exposure.remove(photo, frame.timestamp)
+    fit = track_gn(
+        m.means, m.radii, m.opacities, m.colors, torch.as_tensor(cam_from_world), outcome.calibration.intrinsics,
+        torch.as_tensor(photo),
+    )  # fmt: skip
+    return fit.cam_from_world.numpy() if fit.converged else cam_from_world
 
 
 def evenly(ids: list[int], most: int) -> list[int]:
@@ -142,8 +165,8 @@ def _measure(
     frame = outcome.frames[row]
     picture, photo = view.exposed(outcome.exposure, frame.timestamp), outcome.run.image(frame)
     depth_l1 = accuracy = float("nan")
-    # At true poses only the picture is compared: there the pixels of truth and frame part by the focal error.
-    if matched.image[row] >= 0 and not kind.endswith(AT_TRUE_POSES):
+    # At other poses only the picture is compared: depth and labels count once a frame.
+    if matched.image[row] >= 0 and not kind.endswith((AT_TRUE_POSES, AT_REFINED_POSES)):
         index = int(matched.image[row])
         if (depth := matched.sequence.depth(index)) is not None:
             depth_l1 = _add_depth(measured, view, pixels.sample(depth))

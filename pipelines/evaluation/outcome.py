@@ -32,11 +32,20 @@ class Exposure:
 
     def apply(self, color: NDArray[np.float32], time: float) -> NDArray[np.float32]:
         """(H, W, 3) colours 0..1 of the map as a camera at that time would have exposed them."""
-        gain, offset = (
+        log_gain, offset = self._at(time)
+        return np.clip(color * np.exp(log_gain) + offset, 0, 1)
+
+    def remove(self, photo: NDArray[np.float32], time: float) -> NDArray[np.float32]:
+        """(H, W, 3) the colours that a photo 0..1 of that time would have in the map: the inverse of `apply`."""
+        log_gain, offset = self._at(time)
+        return np.clip((photo - offset) * np.exp(-log_gain), 0, 1)
+
+    def _at(self, time: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        log_gain, offset = (
             np.array([np.interp(time, self.times, a[:, k]) for k in range(3)], np.float32)
             for a in (self.log_gains, self.offsets)
         )
-        return np.clip(color * np.exp(gain) + offset, 0, 1)
+        return log_gain, offset
 
 
 @dataclass(frozen=True)

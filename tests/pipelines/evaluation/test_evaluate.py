@@ -33,11 +33,14 @@ def test_every_cell_of_a_true_run(oracle_run: OracleRun, truth: Sequence) -> Non
         assert result["trajectory"][name]["scale"] == pytest.approx(1, abs=1e-6)
     assert abs(result["camera"]["focal error"]) < 1e-9
     assert 20 < result["images"]["keyframes"]["psnr"] < 40
-    assert 18 < result["images"]["held out"]["psnr"] <= result["images"]["keyframes"]["psnr"]
+    assert 18 < result["images"]["held out"]["psnr"] < result["images"]["keyframes"]["psnr"] + 1
     # Own poses are the true ones here.
     assert result["images"]["held out at true poses"]["psnr"] == pytest.approx(
         result["images"]["held out"]["psnr"], abs=0.01
     )
+    # The fit starts at the truth and may leave it for what the coarse map shows, but not for worse.
+    refined, own = (result["images"][k]["psnr"] for k in ("held out at refined poses", "held out"))
+    assert own - 0.1 < refined < own + 3
     # A Gaussian every third pixel: errors at the edges alone.
     assert 0.001 < result["depth"]["metric_l1"] < 0.1
     assert result["depth"]["scale"] == pytest.approx(1, abs=0.01)
