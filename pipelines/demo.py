@@ -16,7 +16,7 @@ from pipelines.progress import Progress
 from pipelines.run_folder import RunFolder, read_json, write_json
 from pipelines.world import ClipOptions, iter_clip, make_world, write_sequence
 
-CLIP = ClipOptions(frames=40, width=320, height=240, fps=10.0, laps=0.35)
+CLIP = ClipOptions(frames=36, width=320, height=240, fps=10.0, laps=0.32)
 VIDEO, TRUTH, RUN = "room.mp4", "room_truth", "room.msgs"
 _TEXEL = 0.006
 
@@ -61,7 +61,7 @@ def run_demo(
     video, truth = make_demo_clip(folder, progress, options)
     run = RunFolder(folder / RUN)
     reconstruct(video, run)
-    figures = write_evaluation(run, open_sequence(truth), progress, max_views=20)
+    figures = write_evaluation(run, open_sequence(truth), progress, max_views=10)
     return DemoResult(video, truth, run, figures, evaluation_table(figures))
 
 
