@@ -1,4 +1,4 @@
-"""New Gaussians from the pixels of a view, at the proxy depth or, where that is weak, at its region's depth (eq. 17)."""
+"""New Gaussians from the pixels of a view: at the proxy depth or, where that is weak, at the region's depth (17)."""
 
 from __future__ import annotations
 
