@@ -20,11 +20,8 @@ def learn_vocabulary(descriptors: Float, words: int, seed: int, iterations: int 
     centres = descriptors[np.sort(rng.permutation(len(descriptors))[:words])].copy()
     for _ in range(iterations):
         nearest = assign(descriptors, centres)
-        counts = np.bincount(nearest, minlength=len(centres))
-        sums = np.zeros_like(centres, dtype=np.float64)
-        np.add.at(sums, nearest, descriptors)
-        filled = counts > 0
-        centres[filled] = (sums[filled] / counts[filled, None]).astype(np.float32)
+        for word in np.unique(nearest):
+            centres[word] = descriptors[nearest == word].mean(0, dtype=np.float64)
     return centres
 
 
@@ -38,7 +35,8 @@ def vlad(descriptors: Float, centres: Float) -> Float:
     """(words * D,) unit vector of a picture's descriptors (Q, D); zero when it has none."""
     sums = np.zeros_like(centres)
     nearest = assign(descriptors, centres)
-    np.add.at(sums, nearest, descriptors - centres[nearest])
+    for word in np.unique(nearest):
+        sums[word] = (descriptors[nearest == word] - centres[word]).sum(0)
     # Each word counts the same, however much texture of its kind there is.
     sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-6)
     flat = sums.ravel()
