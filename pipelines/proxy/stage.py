@@ -42,6 +42,7 @@ def run(context: StageContext) -> dict[str, Any]:
     log.info("proxy: depth by %s, classes by %s", depths.name, semantics.name)
     frames = _frames_to_do(context, sequence, config, depths)
     _warn_of_missing(context, frames, depths, semantics)
+    _warn_of_distortion(context, sequence, depths, semantics)
     _depth_pass(context, frames, depths)
     scale = measure_scale(sequence, frames, lambda frame: _load_depth(context.snapshot, frame))
     semantics.prepare(frames, lambda frame: _in_backbone_unit(_load_depth(context.snapshot, frame), scale))
@@ -81,6 +82,18 @@ def _warn_of_missing(
             raise InputError(f"{provider.name}: no {kind} map belongs to any keyframe. Check the names of the files")
         if missing:
             context.warn(f"{len(missing)} of {len(frames)} frames have no {kind} map, the first is {missing[0].name}")
+
+
+def _warn_of_distortion(
+    context: StageContext, sequence: Sequence, depths: DepthProvider, semantics: SemanticsProvider
+) -> None:
+    """Files show the source; the frames have had their distortion removed."""
+    strongest = max(map(abs, sequence.calibration.distortion))
+    if strongest > 0.005 and any(p.name.startswith("files:") for p in (depths, semantics)):
+        context.warn(
+            f"the frames were undistorted (coefficients up to {strongest:.3f}), but map files are taken as they are: "
+            "towards the borders they lie some pixels off. Give maps of undistorted pictures"
+        )
 
 
 # depth ----------------------------------------------------------------------------------------------------------

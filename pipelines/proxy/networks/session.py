@@ -99,6 +99,8 @@ def _open(path: Path, threads: int, device: str) -> ort.InferenceSession:
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3
+    # Threads that spin while they wait steal the cores of whatever else runs.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     providers = [wanted] if wanted == "CPUExecutionProvider" else [wanted, "CPUExecutionProvider"]
     try:
         session = ort.InferenceSession(str(path), options, providers=providers)
