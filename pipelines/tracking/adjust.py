@@ -27,7 +27,8 @@ ROUNDS = 3
 class DepthTies:
     """Proxy depths at the observations of a bundle, and the log scale fields (N, rows, columns) of its cameras.
 
-    depth (O,) as the provider gave it, 0 = none; reliability (O,); has_depth (N,) bool.
+    depth (O,) as the provider gave it, 0 = none; reliability (O,); has_depth (N,) bool; `factor` is what the world has
+    been scaled by so far.
     """
 
     depth: Array
@@ -36,6 +37,7 @@ class DepthTies:
     fields: Array
     metric: bool
     world: WorldScale | None = None
+    factor: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ def adjust_state(
     bundle = set_scale(bundle, ties, intrinsics, settings)
     errors = bundle.reprojection_errors(intrinsics)
     write_back(state, bundle, frame_ids)
-    follow_others(state, intrinsics, set(frame_ids))
+    follow_others(state, intrinsics, set(frame_ids), ties.factor)
     figures = {
         "adjusted_frames": len(frame_ids),
         "points": len(np.unique(bundle.obs_point)),
@@ -143,6 +145,7 @@ def set_scale(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics, settings:
         return bundle
     ties.world = depth_scales.world_scale(middles[ties.has_depth])
     factor = ties.world.factor
+    ties.factor *= factor
     ties.fields[ties.has_depth] += np.log(factor)
     poses = bundle.cam_from_world.copy()
     poses[:, :3, 3] *= factor
@@ -185,12 +188,14 @@ def write_back(state: TrackState, bundle: Bundle, frame_ids: list[int]) -> None:
         state.sightings[frame_id] = seen.select(np.isin(seen.point, bundle.obs_point[mine]))
 
 
-def follow_others(state: TrackState, intrinsics: Intrinsics, adjusted: set[int]) -> None:
-    """Frames outside the adjustment settle on the adjusted points they see."""
+def follow_others(state: TrackState, intrinsics: Intrinsics, adjusted: set[int], factor: float) -> None:
+    """Frames outside the adjustment take the world's new scale and settle on the adjusted points they see."""
     alive = np.zeros(len(state.points), bool)
     for frame_id in adjusted:
         alive[state.sightings[frame_id].point] = True
     for frame_id in sorted(set(state.poses) - adjusted):
+        state.poses[frame_id] = state.poses[frame_id].copy()
+        state.poses[frame_id][:3, 3] *= factor
         seen = state.sightings[frame_id]
         seen = seen.select(alive[seen.point])
         state.sightings[frame_id] = seen

@@ -78,6 +78,16 @@ def test_scale_free_proxies_leave_the_world_as_it_is(
     assert np.allclose(scales["scales"], 0.4, atol=0.01)
 
 
+def test_frames_outside_the_adjustment_follow_it(
+    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
+) -> None:
+    made = make_run(tmp_path / "run", backbone_scale=0.4)
+    figures = finish(open_stage(made.run, "tracking", load_config(overrides=["tracking.adjust_frames=12"])))
+    assert figures["adjusted_frames"] == 9
+    assert figures["posed"] == 24
+    assert 0 < trajectory_error(made, scale=False) < 0.01
+
+
 def test_a_frame_without_picture_is_lost_and_named(
     tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
 ) -> None:
