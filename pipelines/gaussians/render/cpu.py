@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipelines.gaussians.render.cpu_backward import backward_band, merge_gradients
-from pipelines.gaussians.render.cpu_bands import bin_gaussians
+from pipelines.gaussians.render.cpu_bands import split_into_bands
 from pipelines.gaussians.render.cpu_forward import forward_band
 from pipelines.gaussians.render.cpu_inspect import inspect
 from pipelines.gaussians.render.threads import for_each
@@ -40,40 +40,42 @@ def composite(
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        tensors, (width, height, proxy_depth, kappa, near) = arguments[:6], arguments[6:]
-        inputs = [_array(tensor) for tensor in tensors]
-        if proxy_depth is None:
-            kappa = 0.0
-        proxy = np.zeros((1, 1), F32) if kappa == 0 else _array(proxy_depth)
-        reach, starts, entries, slots = bin_gaussians(*inputs[:5], width, height, F32(near))
-        features = np.empty((height, width, inputs[5].shape[1]), F32)
-        images = [features, *(np.empty((height, width), F32) for _ in range(3))]
-        vectors = channel_vectors(features.shape[2])
-        job = (starts, entries, reach, *inputs, proxy, F32(kappa))
-        for_each(lambda band: forward_band(vectors, band, *job, *images), len(starts) - 1)
-        outputs = tuple(torch.from_numpy(image) for image in images)
-        ctx.save_for_backward(*tensors, *outputs)
-        ctx.job, ctx.slots = (starts, entries, reach, proxy, F32(kappa)), slots
+        *projected, values = (_array(tensor) for tensor in arguments[:6])
+        width, height, proxy_depth, kappa, near = arguments[6:]
+        if proxy_depth is None or kappa == 0:
+            proxy, kappa = np.zeros((1, 1), F32), 0.0
+        else:
+            proxy = _array(proxy_depth)
+        vectors = channel_vectors(values.shape[1])
+        bands = split_into_bands(tuple(projected), values, 16 * len(vectors), width, height, near)
+        features, planes = np.empty((height, width, values.shape[1]), F32), np.empty((3, height, width), F32)
+        guide = (proxy, F32(kappa))
+        for_each(lambda b: forward_band(vectors, b, *bands.prepared[b], *guide, features, planes), len(bands))
+        outputs = (torch.from_numpy(features), *torch.from_numpy(planes).unbind(0))
+        ctx.save_for_backward(outputs[0])
+        ctx.state = (bands, vectors, guide, planes)
         ctx.set_materialize_grads(False)
         return outputs
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        saved = [_array(tensor) for tensor in ctx.saved_tensors]
-        inputs, images = saved[:6], saved[6:]
+        bands, vectors, guide, planes = ctx.state
+        features = _array(ctx.saved_tensors[0])
+        images = (features, *planes)
         upstream = [
             np.zeros_like(image) if gradient is None else _array(gradient)
             for image, gradient in zip(images, gradients, strict=True)
         ]
-        starts, entries, reach, proxy, kappa = ctx.job
-        d_geometry, d_features = np.empty((5, len(inputs[0])), F32), np.empty_like(inputs[5])
-        shared = np.empty((int(ctx.slots[-1]), 5 + inputs[5].shape[1]), F32)
-        vectors = channel_vectors(inputs[5].shape[1])
-        job = (starts, entries, reach, ctx.slots, *inputs, proxy, kappa, *images, *upstream)
-        results = (d_geometry, d_features, shared)
-        for_each(lambda band: backward_band(vectors, band, *job, *results), len(starts) - 1)
+        job = (*guide, features, planes, upstream[0], np.stack(upstream[1:]))
+        count, channels = len(bands.reach), features.shape[2]
+        d_geometry, d_features = np.empty((5, count), F32), np.empty((count, channels), F32)
+        results = (d_geometry, d_features, np.empty((int(bands.slots[-1]), 5 + channels), F32))
+        for_each(
+            lambda b: backward_band(vectors, b, bands.own(b), bands.slots, *bands.prepared[b], *job, *results),
+            len(bands),
+        )
         chunks = 16
-        for_each(lambda chunk: merge_gradients(chunk, chunks, reach, ctx.slots, *results), chunks)
+        for_each(lambda chunk: merge_gradients(chunk, chunks, bands.reach, bands.slots, *results), chunks)
         return (*torch.from_numpy(d_geometry).unbind(0), torch.from_numpy(d_features), *[None] * 5)
 
 

@@ -16,11 +16,9 @@ from pipelines.gaussians.render.cpu_bands import (
     RECORD,
     TILE,
     first_pixel,
-    gather_band,
     last_pixel,
-    list_tiles,
 )
-from pipelines.gaussians.render.cpu_forward import CHECK_EVERY, PIXELS, is_opaque
+from pipelines.gaussians.render.cpu_forward import CHECK_EVERY, PIXELS, clear, is_opaque
 from pipelines.gaussians.render.jit import kernel
 from pipelines.gaussians.render.lanes import (
     at_most,
@@ -59,41 +57,37 @@ def open_tile(
     proxy: NDArray[np.float32],
     kappa: np.float32,
     features: NDArray[np.float32],
-    depth: NDArray[np.float32],
-    depth_silhouette: NDArray[np.float32],
-    silhouette: NDArray[np.float32],
+    planes: NDArray[np.float32],
     d_features: NDArray[np.float32],
-    d_depth: NDArray[np.float32],
-    d_depth_silhouette: NDArray[np.float32],
-    d_silhouette: NDArray[np.float32],
+    d_planes: NDArray[np.float32],
 ) -> None:
     """Loads the gradients of the pixels of a tile and everything that will be blended into them."""
-    state[:] = _ZERO
+    clear(state)
     used = features.shape[2]
     for y in range(rows):
         for x in range(columns):
             pixel, row, column = TILE * y + x, top + y, left + x
-            behind = d_silhouette[row, column] * silhouette[row, column]
+            d_depth, d_depth_seen, d_seen = d_planes[0, row, column], d_planes[1, row, column], d_planes[2, row, column]
+            behind = d_seen * planes[2, row, column]
             gradients, values = d_features[row, column], features[row, column]
             for c in range(used):
                 image[pixel * channels + c] = gradients[c]
                 behind += gradients[c] * values[c]
             state[LIGHT + pixel] = _ONE
-            state[D_DEPTH + pixel] = d_depth[row, column]
-            depth_behind = d_depth[row, column] * depth[row, column]
-            depth_behind += d_depth_silhouette[row, column] * depth_silhouette[row, column]
+            state[D_DEPTH + pixel] = d_depth
+            depth_behind = d_depth * planes[0, row, column] + d_depth_seen * planes[1, row, column]
             if kappa > _ZERO:
                 state[DEPTH_LIGHT + pixel] = _ONE
                 state[DEPTH_BEHIND + pixel] = depth_behind
                 state[BEHIND + pixel] = behind
-                state[D_DEPTH_SEEN + pixel] = d_depth_silhouette[row, column]
-                state[D_SEEN + pixel] = d_silhouette[row, column]
+                state[D_DEPTH_SEEN + pixel] = d_depth_seen
+                state[D_SEEN + pixel] = d_seen
                 if proxy[row, column] > _ZERO:
                     state[PROXY + pixel] = proxy[row, column]
                     state[KAPPA + pixel] = kappa
             else:
                 state[BEHIND + pixel] = behind + depth_behind
-                state[D_SEEN + pixel] = d_silhouette[row, column] + d_depth_silhouette[row, column]
+                state[D_SEEN + pixel] = d_seen + d_depth_seen
 
 
 @kernel
@@ -179,40 +173,32 @@ def pull_rows_by_proxy(
 def backward_band(
     vectors: tuple[int, ...],
     band: int,
-    starts: NDArray[np.int64],
-    entries: NDArray[np.int32],
-    reach: NDArray[np.float32],
+    own: NDArray[np.int32],
     slots: NDArray[np.int64],
-    u: NDArray[np.float32],
-    v: NDArray[np.float32],
-    sigma_px: NDArray[np.float32],
-    z: NDArray[np.float32],
-    opacity: NDArray[np.float32],
-    features: NDArray[np.float32],
+    records: NDArray[np.float32],
+    padded: NDArray[np.float32],
+    tile_starts: NDArray[np.int64],
+    members: NDArray[np.int32],
     proxy: NDArray[np.float32],
     kappa: np.float32,
-    image_features: NDArray[np.float32],
-    image_depth: NDArray[np.float32],
-    image_depth_silhouette: NDArray[np.float32],
-    image_silhouette: NDArray[np.float32],
-    d_image_features: NDArray[np.float32],
-    d_image_depth: NDArray[np.float32],
-    d_image_depth_silhouette: NDArray[np.float32],
-    d_image_silhouette: NDArray[np.float32],
+    features: NDArray[np.float32],
+    planes: NDArray[np.float32],
+    d_image: NDArray[np.float32],
+    d_planes: NDArray[np.float32],
     d_geometry: NDArray[np.float32],
     d_features: NDArray[np.float32],
     shared: NDArray[np.float32],
 ) -> None:
     """Gradients of the Gaussians seen in a band: of u, v, sigma_px, z, opacity to d_geometry (5, M) and of the features
-    to d_features (M, C), or, where other bands add to them too, to their row of `shared` (S, 5 + C)."""
-    height, width = image_depth.shape
-    channels, used = 16 * len(vectors), features.shape[1]
-    own = entries[starts[band] : starts[band + 1]]
-    records, padded = gather_band(own, u, v, sigma_px, z, opacity, reach, features, channels)
+    to d_features (M, C), or, where other bands add to them too, to their row of `shared` (S, 5 + C).
+
+    features and planes are the images of the forward pass, d_image and d_planes their gradients.
+    """
+    height, width, used = features.shape
+    channels = 16 * len(vectors)
     d_padded = np.zeros(len(padded), np.float32)
-    d_records = np.zeros((len(own), 5), np.float32)
+    d_records = np.zeros(5 * len(own), np.float32)
     band_top = band * BAND_ROWS
-    tile_starts, members = list_tiles(records, band_top, width, min(BAND_ROWS, height - band_top))
     across = (width + TILE - 1) // TILE
     image = np.zeros(PIXELS * channels, np.float32)
     state = np.empty(PIXELS * PLANES, np.float32)
@@ -223,8 +209,7 @@ def backward_band(
         columns, rows = min(TILE, width - left), min(TILE, height - top)
         open_tile(
             state, image, channels, left, top, columns, rows, proxy, kappa,
-            image_features, image_depth, image_depth_silhouette, image_silhouette,
-            d_image_features, d_image_depth, d_image_depth_silhouette, d_image_silhouette,
+            features, planes, d_image, d_planes,
         )  # fmt: skip
         for k in range(tile_starts[tile], tile_starts[tile + 1]):
             i = members[k]
@@ -252,25 +237,26 @@ def backward_band(
                 pull, pull_y, pull_y2, d_z = pull_rows_by_proxy(state, depth, v_tile, y0, y1)
             else:
                 pull, pull_y, pull_y2, d_z = pull_rows(state, depth, v_tile, y0, y1)
-            d_records[i, 0] += total(pull * dx) * precision
-            d_records[i, 1] += total(pull_y) * precision
-            d_records[i, 2] += total(pull * dx2 + pull_y2) * precision / records[at + 2]
-            d_records[i, 3] += total(d_z)
-            d_records[i, 4] += total(pull) / records[at + 4]
+            d_records[5 * i + 0] += total(pull * dx) * precision
+            d_records[5 * i + 1] += total(pull_y) * precision
+            d_records[5 * i + 2] += total(pull * dx2 + pull_y2) * precision / records[at + 2]
+            d_records[5 * i + 3] += total(d_z)
+            d_records[5 * i + 4] += total(pull) / records[at + 4]
             if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, decisive):
                 break
     for k in range(len(own)):
         i = own[k]
         if slots[i + 1] > slots[i]:
             # Its first band writes its first slot, and so on.
-            row = shared[slots[i] + band - first_pixel(v[i] - reach[i]) // BAND_ROWS]
+            first = first_pixel(records[RECORD * k + 1] - records[RECORD * k + 5]) // BAND_ROWS
+            row = shared[slots[i] + band - first]
             for j in range(5):
-                row[j] = d_records[k, j]
+                row[j] = d_records[5 * k + j]
             for c in range(used):
                 row[5 + c] = d_padded[k * channels + c]
         else:
             for j in range(5):
-                d_geometry[j, i] = d_records[k, j]
+                d_geometry[j, i] = d_records[5 * k + j]
             for c in range(used):
                 d_features[i, c] = d_padded[k * channels + c]
 

@@ -6,6 +6,7 @@ Everything is sized by a first counting pass, so a Gaussian may cover any number
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from pipelines.gaussians.render import rules
 from pipelines.gaussians.render.jit import kernel
 from pipelines.gaussians.render.lanes import bits
+from pipelines.gaussians.render.threads import for_each
 
 F32 = np.float32
 TILE = 16
@@ -39,19 +41,55 @@ def last_pixel(high: np.float32, size: int) -> int:
     return math.floor(high - _HALF) if high >= _HALF else -1
 
 
-@kernel
-def bin_gaussians(
-    u: NDArray[np.float32],
-    v: NDArray[np.float32],
-    sigma_px: NDArray[np.float32],
-    z: NDArray[np.float32],
-    opacity: NDArray[np.float32],
+@dataclass(frozen=True)
+class Bands:
+    """What the bands of an image see. Band b sees the Gaussians entries[starts[b]:starts[b + 1]], near to far.
+
+    reach (M,) pixels, 0 where a Gaussian is not seen; slots (M + 1,): Gaussians in several bands own the places
+    slots[i]:slots[i + 1] for what each of them has to say; prepared: per band the results of `prepare_band`.
+    """
+
+    reach: NDArray[np.float32]
+    starts: NDArray[np.int64]
+    entries: NDArray[np.int32]
+    slots: NDArray[np.int64]
+    prepared: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64], NDArray[np.int32]]]
+
+    def __len__(self) -> int:
+        return len(self.prepared)
+
+    def own(self, band: int) -> NDArray[np.int32]:
+        """Indices of the Gaussians of a band, in the order of its records."""
+        return self.entries[self.starts[band] : self.starts[band + 1]]
+
+
+def split_into_bands(
+    projected: tuple[NDArray[np.float32], ...],
+    features: NDArray[np.float32],
+    channels: int,
     width: int,
     height: int,
-    near: np.float32,
+    near: float,
+) -> Bands:
+    """Everything about the Gaussians u, v, sigma_px, z, opacity (M,) and features (M, C) that bands need to know."""
+    reach, starts, entries, slots = bin_gaussians(projected, width, height, F32(near))
+    bands = Bands(reach, starts, entries, slots, [None] * (len(starts) - 1))  # type: ignore[list-item]
+
+    def prepare(band: int) -> None:
+        top = band * BAND_ROWS
+        size = (width, min(BAND_ROWS, height - top))
+        bands.prepared[band] = prepare_band(bands.own(band), projected, reach, features, channels, top, *size)
+
+    for_each(prepare, len(bands))
+    return bands
+
+
+@kernel
+def bin_gaussians(
+    projected: tuple[NDArray[np.float32], ...], width: int, height: int, near: np.float32
 ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
-    """reach (M,) pixels, 0 where nothing is seen; the entries of band b: indices entries[starts[b]:starts[b + 1]];
-    and slots (M + 1,): Gaussians in several bands own the places slots[i]:slots[i + 1] for a gradient from each."""
+    """The first four fields of `Bands`, entries in the order of their indices."""
+    u, v, sigma_px, z, opacity = projected
     count = len(u)
     bands = (height + BAND_ROWS - 1) // BAND_ROWS
     reach = np.empty(count, np.float32)
@@ -122,18 +160,33 @@ def sort_by_digit(
 
 
 @kernel
+def prepare_band(
+    entries: NDArray[np.int32],
+    projected: tuple[NDArray[np.float32], ...],
+    reach: NDArray[np.float32],
+    features: NDArray[np.float32],
+    channels: int,
+    top: int,
+    width: int,
+    rows: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64], NDArray[np.int32]]:
+    """Sorts the entries by depth; gives their records and features, and for each tile where in them to look."""
+    sort_by_depth(entries, projected[3])
+    records, padded = gather_band(entries, projected, reach, features, channels)
+    starts, members = list_tiles(records, top, width, rows)
+    return records, padded, starts, members
+
+
+@kernel
 def gather_band(
     entries: NDArray[np.int32],
-    u: NDArray[np.float32],
-    v: NDArray[np.float32],
-    sigma_px: NDArray[np.float32],
-    z: NDArray[np.float32],
-    opacity: NDArray[np.float32],
+    projected: tuple[NDArray[np.float32], ...],
     reach: NDArray[np.float32],
     features: NDArray[np.float32],
     channels: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The band's Gaussians side by side: records (n * RECORD,) and features padded with 0 to (n * channels,)."""
+    u, v, sigma_px, z, opacity = projected
     records = np.empty(len(entries) * RECORD, np.float32)
     padded = np.empty(len(entries) * channels, np.float32)
     used = features.shape[1]
@@ -161,13 +214,13 @@ def list_tiles(
     count = len(records) // RECORD
     across = (width + TILE - 1) // TILE
     tiles = across * ((rows + TILE - 1) // TILE)
-    boxes = np.empty((count, 4), np.int32)
+    boxes = np.empty(4 * count, np.int32)
     ends = np.zeros(tiles + 2, np.int64)
     for k in range(count):
         x, y, r = records[k * RECORD], records[k * RECORD + 1] - F32(top), records[k * RECORD + 5]
         x0, x1 = first_pixel(x - r) // TILE, last_pixel(x + r, width) // TILE
         y0, y1 = first_pixel(y - r) // TILE, last_pixel(y + r, rows) // TILE
-        boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3] = x0, x1, y0, y1
+        boxes[4 * k], boxes[4 * k + 1], boxes[4 * k + 2], boxes[4 * k + 3] = x0, x1, y0, y1
         for y_tile in range(y0, y1 + 1):
             for x_tile in range(x0, x1 + 1):
                 ends[y_tile * across + x_tile + 2] += 1
@@ -175,8 +228,8 @@ def list_tiles(
         ends[tile + 2] += ends[tile + 1]
     members = np.empty(ends[tiles + 1], np.int32)
     for k in range(count):
-        for y_tile in range(boxes[k, 2], boxes[k, 3] + 1):
-            for x_tile in range(boxes[k, 0], boxes[k, 1] + 1):
+        for y_tile in range(boxes[4 * k + 2], boxes[4 * k + 3] + 1):
+            for x_tile in range(boxes[4 * k], boxes[4 * k + 1] + 1):
                 place = y_tile * across + x_tile + 1
                 members[ends[place]] = k
                 ends[place] += 1

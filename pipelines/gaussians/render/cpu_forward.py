@@ -15,10 +15,7 @@ from pipelines.gaussians.render.cpu_bands import (
     RECORD,
     TILE,
     first_pixel,
-    gather_band,
     last_pixel,
-    list_tiles,
-    sort_by_depth,
 )
 from pipelines.gaussians.render.jit import kernel
 from pipelines.gaussians.render.lanes import (
@@ -48,6 +45,13 @@ _TINY = F32(1e-30)
 
 
 @kernel
+def clear(numbers: NDArray[np.float32]) -> None:
+    """Zeros. A slice assignment does the same but takes long to compile."""
+    for i in range(len(numbers)):
+        numbers[i] = _ZERO
+
+
+@kernel
 def open_tile(
     state: NDArray[np.float32],
     proxy: NDArray[np.float32],
@@ -58,7 +62,7 @@ def open_tile(
     rows: int,
 ) -> None:
     """Full light for the pixels of the image, none for the rest of the tile, so that nothing is blended there."""
-    state[:] = _ZERO
+    clear(state)
     for y in range(rows):
         for x in range(columns):
             pixel = TILE * y + x
@@ -141,31 +145,19 @@ def blend_rows_by_proxy(
 def forward_band(
     vectors: tuple[int, ...],
     band: int,
-    starts: NDArray[np.int64],
-    entries: NDArray[np.int32],
-    reach: NDArray[np.float32],
-    u: NDArray[np.float32],
-    v: NDArray[np.float32],
-    sigma_px: NDArray[np.float32],
-    z: NDArray[np.float32],
-    opacity: NDArray[np.float32],
-    features: NDArray[np.float32],
+    records: NDArray[np.float32],
+    padded: NDArray[np.float32],
+    tile_starts: NDArray[np.int64],
+    members: NDArray[np.int32],
     proxy: NDArray[np.float32],
     kappa: np.float32,
     out_features: NDArray[np.float32],
-    out_depth: NDArray[np.float32],
-    out_depth_silhouette: NDArray[np.float32],
-    out_silhouette: NDArray[np.float32],
+    out_planes: NDArray[np.float32],
 ) -> None:
-    """Sorts the band's entries by depth and fills its rows of the four images."""
-    height, width = out_depth.shape
-    channels, used = 16 * len(vectors), features.shape[1]
-    own = entries[starts[band] : starts[band + 1]]
-    sort_by_depth(own, z)
-    records, padded = gather_band(own, u, v, sigma_px, z, opacity, reach, features, channels)
+    """Fills the band's rows of the feature image (H, W, C) and of depth sum, depth silhouette, silhouette (3, H, W)."""
+    height, width, used = out_features.shape
+    channels = 16 * len(vectors)
     band_top = band * BAND_ROWS
-    band_rows = min(BAND_ROWS, height - band_top)
-    tile_starts, members = list_tiles(records, band_top, width, band_rows)
     across = (width + TILE - 1) // TILE
     image = np.empty(PIXELS * channels, np.float32)
     state = np.empty(PIXELS * PLANES, np.float32)
@@ -175,7 +167,7 @@ def forward_band(
         left, top = TILE * (tile % across), band_top + TILE * (tile // across)
         columns, rows = min(TILE, width - left), min(TILE, height - top)
         open_tile(state, proxy, kappa, left, top, columns, rows)
-        image[:] = _ZERO
+        clear(image)
         for k in range(tile_starts[tile], tile_starts[tile + 1]):
             i = members[k]
             at = RECORD * i
@@ -207,7 +199,7 @@ def forward_band(
                 row = out_features[top + y, left + x]
                 for c in range(used):
                     row[c] = image[pixel * channels + c]
-                out_depth[top + y, left + x] = state[DEPTH_SUM + pixel]
                 seen = _ONE - state[LIGHT + pixel]
-                out_silhouette[top + y, left + x] = seen
-                out_depth_silhouette[top + y, left + x] = state[DEPTH_SILHOUETTE + pixel] if kappa > _ZERO else seen
+                out_planes[0, top + y, left + x] = state[DEPTH_SUM + pixel]
+                out_planes[1, top + y, left + x] = state[DEPTH_SILHOUETTE + pixel] if kappa > _ZERO else seen
+                out_planes[2, top + y, left + x] = seen

@@ -11,12 +11,9 @@ from pipelines.gaussians.render.cpu_bands import (
     BAND_ROWS,
     RECORD,
     TILE,
-    bin_gaussians,
     first_pixel,
-    gather_band,
     last_pixel,
-    list_tiles,
-    sort_by_depth,
+    split_into_bands,
 )
 from pipelines.gaussians.render.cpu_forward import (
     CHECK_EVERY,
@@ -24,6 +21,7 @@ from pipelines.gaussians.render.cpu_forward import (
     PIXELS,
     PLANES,
     blend_rows,
+    clear,
     is_opaque,
     open_tile,
 )
@@ -39,31 +37,26 @@ def inspect(
     u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, width: int, height: int, near: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Median depth (H, W), and summed and largest blending weight of each Gaussian, (M,) each; float32 CPU tensors."""
-    inputs = [tensor.detach().contiguous().numpy() for tensor in (u, v, sigma_px, z, opacity)]
-    reach, starts, entries, slots = bin_gaussians(*inputs, width, height, F32(near))
+    projected = tuple(tensor.detach().contiguous().numpy() for tensor in (u, v, sigma_px, z, opacity))
+    no_features = np.zeros((len(u), 0), F32)
+    bands = split_into_bands(projected, no_features, 0, width, height, near)
     median = np.empty((height, width), F32)
-    sums, most = np.zeros(len(reach), F32), np.zeros(len(reach), F32)
-    shared = np.zeros((int(slots[-1]), 2), F32)
-    no_features = np.zeros((len(reach), 0), F32)
-    job = (starts, entries, reach, slots, *inputs, no_features, median, sums, most, shared)
-    for_each(lambda band: inspect_band(band, *job), len(starts) - 1)
-    merge_statistics(slots, sums, most, shared)
+    sums, most = np.zeros(len(u), F32), np.zeros(len(u), F32)
+    results = (median, sums, most, np.zeros((int(bands.slots[-1]), 2), F32))
+    for_each(lambda b: inspect_band(b, bands.own(b), bands.slots, *bands.prepared[b], *results), len(bands))
+    merge_statistics(bands.slots, *results[1:])
     return torch.from_numpy(median), torch.from_numpy(sums), torch.from_numpy(most)
 
 
 @kernel
 def inspect_band(
     band: int,
-    starts: NDArray[np.int64],
-    entries: NDArray[np.int32],
-    reach: NDArray[np.float32],
+    own: NDArray[np.int32],
     slots: NDArray[np.int64],
-    u: NDArray[np.float32],
-    v: NDArray[np.float32],
-    sigma_px: NDArray[np.float32],
-    z: NDArray[np.float32],
-    opacity: NDArray[np.float32],
-    no_features: NDArray[np.float32],
+    records: NDArray[np.float32],
+    padded: NDArray[np.float32],
+    tile_starts: NDArray[np.int64],
+    members: NDArray[np.int32],
     median: NDArray[np.float32],
     sums: NDArray[np.float32],
     most: NDArray[np.float32],
@@ -71,12 +64,8 @@ def inspect_band(
 ) -> None:
     """Fills the band's rows of `median`, and `sums` and `most` (or the row of `shared`) of the Gaussians seen in it."""
     height, width = median.shape
-    own = entries[starts[band] : starts[band + 1]]
-    sort_by_depth(own, z)
-    records, _ = gather_band(own, u, v, sigma_px, z, opacity, reach, no_features, 0)
     seen = np.zeros((len(own), 2), np.float32)
     band_top = band * BAND_ROWS
-    tile_starts, members = list_tiles(records, band_top, width, min(BAND_ROWS, height - band_top))
     across = (width + TILE - 1) // TILE
     state, weights = np.empty(PIXELS * PLANES, np.float32), np.zeros(PIXELS, np.float32)
     falloff_y, medians = np.empty(TILE, np.float32), np.empty(PIXELS, np.float32)
@@ -84,7 +73,7 @@ def inspect_band(
         left, top = TILE * (tile % across), band_top + TILE * (tile // across)
         columns, rows = min(TILE, width - left), min(TILE, height - top)
         open_tile(state, median, _ZERO, left, top, columns, rows)
-        medians[:] = _ZERO
+        clear(medians)
         for k in range(tile_starts[tile], tile_starts[tile + 1]):
             i = members[k]
             at = RECORD * i
@@ -115,7 +104,8 @@ def inspect_band(
     for k in range(len(own)):
         i = own[k]
         if slots[i + 1] > slots[i]:
-            slot = slots[i] + band - first_pixel(v[i] - reach[i]) // BAND_ROWS
+            first = first_pixel(records[RECORD * k + 1] - records[RECORD * k + 5]) // BAND_ROWS
+            slot = slots[i] + band - first
             shared[slot, 0], shared[slot, 1] = seen[k, 0], seen[k, 1]
         else:
             sums[i], most[i] = seen[k, 0], seen[k, 1]

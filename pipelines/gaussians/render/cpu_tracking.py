@@ -15,14 +15,11 @@ from pipelines.gaussians.render.cpu_bands import (
     BAND_ROWS,
     RECORD,
     TILE,
-    bin_gaussians,
     first_pixel,
-    gather_band,
     last_pixel,
-    list_tiles,
-    sort_by_depth,
+    split_into_bands,
 )
-from pipelines.gaussians.render.cpu_forward import CHECK_EVERY, LIGHT, PIXELS, is_opaque
+from pipelines.gaussians.render.cpu_forward import CHECK_EVERY, LIGHT, PIXELS, clear, is_opaque
 from pipelines.gaussians.render.jit import kernel
 from pipelines.gaussians.render.lanes import add_products, counting, exp, halves, load, load_twice, store
 from pipelines.gaussians.render.threads import for_each
@@ -56,12 +53,11 @@ def normal_equations(
     a silhouette below `min_silhouette` do not count. The same bytes for any number of threads.
     """
     height, width = depth.shape
-    reach, starts, entries, _ = bin_gaussians(*projected, width, height, F32(near))
-    sums = np.zeros((len(starts) - 1, 6, 8))
-    costs = np.zeros((len(starts) - 1, 2))
-    job = (starts, entries, reach, *projected, points_in_cam, colors, image, depth, depth_weights)
+    bands = split_into_bands(projected, colors, 3, width, height, near)
+    sums, costs = np.zeros((len(bands), 6, 8)), np.zeros((len(bands), 2))
     settings = (F32(focal[0]), F32(focal[1]), F32(color_weight), F32(floor), F32(min_silhouette))
-    for_each(lambda band: normal_equations_of_band(band, *job, *settings, sums, costs), len(starts) - 1)
+    job = (points_in_cam, image, depth, depth_weights, *settings, sums, costs)
+    for_each(lambda b: normal_equations_of_band(b, bands.own(b), *bands.prepared[b], *job), len(bands))
     total, (cost, pixels) = sums.sum(axis=0), costs.sum(axis=0)
     return total[:, :6], total[:, VALUE], float(cost), int(pixels)
 
@@ -78,7 +74,7 @@ def fill_jacobian(
 
     A left twist (ρ, φ) moves a point P of the camera by ρ + φ x P.
     """
-    jacobian[:] = _ZERO
+    clear(jacobian)
     x, y, z = point[0], point[1], point[2]
     scale = _ONE / (z * sigma_px * sigma_px)
     du, dv, ds, dz = jacobian[0:8], jacobian[8:16], jacobian[16:24], jacobian[24:32]
@@ -159,16 +155,12 @@ def add_pixel(
 @kernel
 def normal_equations_of_band(
     band: int,
-    starts: NDArray[np.int64],
-    entries: NDArray[np.int32],
-    reach: NDArray[np.float32],
-    u: NDArray[np.float32],
-    v: NDArray[np.float32],
-    sigma_px: NDArray[np.float32],
-    z: NDArray[np.float32],
-    opacity: NDArray[np.float32],
-    points_in_cam: NDArray[np.float32],
+    own: NDArray[np.int32],
+    records: NDArray[np.float32],
     colors: NDArray[np.float32],
+    tile_starts: NDArray[np.int64],
+    members: NDArray[np.int32],
+    points_in_cam: NDArray[np.float32],
     target: NDArray[np.float32],
     depth: NDArray[np.float32],
     depth_weights: NDArray[np.float32],
@@ -182,15 +174,11 @@ def normal_equations_of_band(
 ) -> None:
     """Adds the pixels of one band to sums[band] (6, 8) and costs[band] (2,)."""
     height, width = depth.shape
-    own = entries[starts[band] : starts[band + 1]]
-    sort_by_depth(own, z)
-    records, padded = gather_band(own, u, v, sigma_px, z, opacity, reach, colors, 3)
     jacobians = np.empty(len(own) * _JACOBIAN, np.float32)
     for k in range(len(own)):
         jacobian = jacobians[k * _JACOBIAN : (k + 1) * _JACOBIAN]
-        fill_jacobian(jacobian, points_in_cam[own[k]], fx, fy, sigma_px[own[k]])
+        fill_jacobian(jacobian, points_in_cam[own[k]], fx, fy, records[RECORD * k + 2])
     band_top = band * BAND_ROWS
-    tile_starts, members = list_tiles(records, band_top, width, min(BAND_ROWS, height - band_top))
     across = (width + TILE - 1) // TILE
     state, falloff_y = np.empty(PIXELS * PLANES, np.float32), np.empty(TILE, np.float32)
     duals, normal = np.empty(PIXELS * _DUAL, np.float32), np.empty(6 * 16, np.float32)
@@ -211,11 +199,11 @@ def normal_equations_of_band(
             dx2 = dx * dx
             store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
             weigh_rows(state, LIGHT, falloff_y, exp(dx2 * sharpness), dx2, v_tile, r * r, y0, y1)
-            jacobian, color = jacobians[i * _JACOBIAN : (i + 1) * _JACOBIAN], padded[3 * i : 3 * i + 3]
+            jacobian, color = jacobians[i * _JACOBIAN : (i + 1) * _JACOBIAN], colors[3 * i : 3 * i + 3]
             blend_duals(duals, state, jacobian, color, u_tile, v_tile, records[at + 3], y0, y1, x0, x1)
             if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, LIGHT):
                 break
-        normal[:] = _ZERO
+        clear(normal)
         for y in range(rows):
             for x in range(columns):
                 pixel, row, column = TILE * y + x, top + y, left + x
@@ -235,8 +223,8 @@ def normal_equations_of_band(
 @kernel
 def open_tile(state: NDArray[np.float32], duals: NDArray[np.float32], columns: int, rows: int) -> None:
     """Full light without derivatives for the pixels of the image, none for the rest of the tile."""
-    state[:] = _ZERO
-    duals[:] = _ZERO
+    clear(state)
+    clear(duals)
     for y in range(rows):
         for x in range(columns):
             pixel = TILE * y + x
