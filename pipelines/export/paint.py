@@ -15,7 +15,7 @@ from pipelines.types import VOID
 
 @dataclass(frozen=True)
 class PaintedView:
-    """A depth view with its colors (H, W, 3) float32 0..1 and class channels (H, W) int64."""
+    """A depth view with its colors (H, W, 3) float32 0..1 and class channels (H, W) int64, -1 = none."""
 
     depth_view: DepthView
     colors: NDArray[np.float32]
@@ -38,7 +38,8 @@ def paint(
         total[rows] += view.colors[place] * share[:, None]
         weight[rows] += share
         if view.channels is not None and class_ids:
-            votes[rows, view.channels[place]] += share
+            channel = view.channels[place]
+            votes[rows[channel >= 0], channel[channel >= 0]] += share[channel >= 0]
     colors = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-9)[:, None], 0.5)
     table = np.array([*class_ids, VOID] if class_ids else [VOID, VOID], np.uint8)
     labels = np.where(votes.max(1) > 0, votes.argmax(1), len(table) - 1)

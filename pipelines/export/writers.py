@@ -83,7 +83,7 @@ def _by_class(cloud: GaussianCloud, result: Result) -> GaussianCloud:
     if cloud.class_ids is None:
         return cloud
     table = (np.array(result.classes.colors) / 255).astype(np.float32)
-    return replace(cloud, colors=table[cloud.class_ids])
+    return replace(cloud, colors=table[cloud.class_ids].astype(np.float32))
 
 
 def write_trajectory(result: Result, folder: Path) -> list[Path]:

@@ -18,7 +18,7 @@ from pipelines.gaussians import densify, losses
 from pipelines.gaussians.map import GaussianMap
 from pipelines.gaussians.parameters import AdamTable, MapParameters, empty_map
 from pipelines.gaussians.render import Rendering, render
-from pipelines.gaussians.schedule import Schedule, Step
+from pipelines.gaussians.schedule import Schedule, Seeding, Step
 from pipelines.gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_grid
 from pipelines.geometry import se3
 from pipelines.mapping.views import View, halved
@@ -29,6 +29,8 @@ GROWN_OPACITY, ERROR_OPACITY = 0.3, 0.1
 """Of Gaussians added to a map that is already there: opaque ones would hide what has been learnt."""
 _LOW_RELIABILITY = 0.35
 _HIGH_RELIABILITY = 0.85
+_SOLID = 0.8
+"""Silhouette above which the map knows the depth of a pixel."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,6 @@ class MapOptimiser:
     state: OptimiserState
     halves: list[View] = field(init=False)
     unit: float = field(init=False)
-    completed: dict[int, SeedDepth] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.halves = [halved(v) for v in self.views]
@@ -149,8 +150,8 @@ class MapOptimiser:
     def visit(self, step: Step) -> None:
         """Do what the schedule says: seed, compare, grow, prune."""
         view = (self.halves if step.coarse else self.views)[step.view]
-        if step.seed:
-            self.seed(step.view)
+        if step.seed is not Seeding.NOTHING:
+            self.seed(step.view, step.seed)
         if len(self.state.parameters) == 0:
             return
         table = self.state.view_tables[step.view]
@@ -228,16 +229,28 @@ class MapOptimiser:
         }
 
     @torch.no_grad()
-    def seed(self, index: int) -> None:
-        """Fill the view's holes with Gaussians at its completed depth (eq. 17)."""
+    def seed(self, index: int, what: Seeding) -> None:
+        """Fill the view's holes with Gaussians at its completed depth (eq. 17): the trusted ones, or the rest."""
         view, s = self.views[index], self.settings
-        grid = torch.from_numpy(seed_grid(view.depth.shape[0], view.depth.shape[1], s.seed_stride)).to(
-            view.image.device
-        )
-        if len(self.state.parameters):
+        pixels = self._grid(view)
+        if len(self.state.parameters) == 0:
+            completed = self._completed(index)
+        else:
             rendering = self.draw(view, self.state.view_tables[index], with_classes=False)
-            grid &= self._needed(view, rendering)
-        self._append(index, grid, s.seed_stride, None)
+            pixels &= self._needed(view, rendering) if what is Seeding.TRUSTED else self._holes(rendering)
+            completed = self._completed(index) if what is Seeding.TRUSTED else self._completed_by_map(view, rendering)
+        depth, trust = (torch.from_numpy(x).to(view.image.device) for x in (completed.depth, completed.trust))
+        if what is Seeding.TRUSTED:
+            pixels &= trust > _LOW_RELIABILITY
+        self._append(index, pixels, depth, trust, s.seed_stride, SEED_OPACITY)
+
+    def _grid(self, view: View) -> Tensor:
+        height, width = view.depth.shape
+        return torch.from_numpy(seed_grid(height, width, self.settings.seed_stride)).to(view.image.device)
+
+    def _holes(self, rendering: Rendering) -> Tensor:
+        """Condition (a)."""
+        return densify.holes(rendering.silhouette, self.settings.silhouette_threshold)
 
     @torch.no_grad()
     def grow(self, index: int, rendering: Rendering) -> None:
@@ -245,58 +258,54 @@ class MapOptimiser:
         view, s = self.views[index], self.settings
         needed = self._needed(view, rendering)
         needed |= densify.wrong_classes(rendering.features[..., 3:], view.channels, view.label_weight)
-        grid = torch.from_numpy(seed_grid(view.depth.shape[0], view.depth.shape[1], s.seed_stride)).to(
-            view.image.device
-        )
-        coarse = needed & grid
+        grid = self._grid(view)
         colors = expose(rendering.features[..., :3], self.state.view_tables[index])
-        fine = densify.color_errors(colors, view.colors, 1 - s.error_share) & ~grid
-        self._append(index, coarse, s.seed_stride, rendering, GROWN_OPACITY)
-        self._append(index, fine, 1.0, rendering, ERROR_OPACITY)
+        wrong = densify.color_errors(colors, view.colors, 1 - s.error_share) & ~grid
+        depth, trust = self._grown_depth(view, rendering)
+        self._append(index, needed & grid, depth, trust, s.seed_stride, GROWN_OPACITY)
+        self._append(index, wrong, depth, trust, 1.0, ERROR_OPACITY)
 
     def _needed(self, view: View, rendering: Rendering) -> Tensor:
         """Conditions (a) and (b)."""
-        needed = densify.holes(rendering.silhouette, self.settings.silhouette_threshold)
+        needed = self._holes(rendering)
         if self.settings.use_proxy_depth:
             tolerance = self.settings.depth_tolerance
             needed = needed | densify.hidden_surfaces(rendering.depth, view.depth, view.trust, tolerance)
         return needed
 
-    def _append(
-        self, index: int, pixels: Tensor, spacing: float, rendering: Rendering | None, opacity: float = SEED_OPACITY
-    ) -> None:
+    def _grown_depth(self, view: View, rendering: Rendering) -> tuple[Tensor, Tensor]:
+        """(H, W) depth and trust: the proxy where it is reliable, else the map's own; 0 where neither knows."""
+        # A trusted proxy is sharp at depth edges, where the map's blended depth lies between the surfaces.
+        nearer = densify.hidden_surfaces(rendering.depth, view.depth, view.trust, self.settings.depth_tolerance)
+        use_map = (rendering.silhouette > _SOLID) & ~nearer & (view.trust < _HIGH_RELIABILITY)
+        proxy = torch.where(view.trust > _LOW_RELIABILITY, view.depth, 0.0)
+        return torch.where(use_map, rendering.depth, proxy), torch.where(use_map, _LOW_RELIABILITY, view.trust)
+
+    def _completed(self, index: int) -> SeedDepth:
+        view = self.views[index]
+        return self._complete(view, view.depth, view.trust)
+
+    def _completed_by_map(self, view: View, rendering: Rendering) -> SeedDepth:
+        """The view's depth, completed from what the other views have put into the map around its holes."""
+        known = (rendering.silhouette > _SOLID) & (view.trust < _HIGH_RELIABILITY)
+        trust = torch.where(known, view.trust.clamp(min=2 * _LOW_RELIABILITY), view.trust)
+        return self._complete(view, torch.where(known, rendering.depth, view.depth), trust)
+
+    def _complete(self, view: View, depth: Tensor, trust: Tensor) -> SeedDepth:
+        channels, prior = view.channels.cpu().numpy(), self.settings.region_prior
+        return complete_depth(depth.cpu().numpy(), trust.cpu().numpy(), channels, _LOW_RELIABILITY, prior)
+
+    def _append(self, index: int, pixels: Tensor, depth: Tensor, trust: Tensor, spacing: float, opacity: float) -> None:
         parameters, view = self.state.parameters, self.views[index]
+        pixels = pixels & (depth > 0)
         if not pixels.any() or len(parameters) >= self.settings.max_gaussians:
             return
-        depth, trust = self._seed_depth(index, rendering)
         pose = se3.exp(self.state.view_tables[index].values["twist"].detach().double()) @ view.cam_from_world
         seeds = seed_gaussians(
             pixels, depth, view.colors, view.channels, spacing, self.classes, pose, view.intrinsics, view.frame_id
         )
         seeds.opacity_logits.fill_(math.log(opacity / (1 - opacity)))
-        parameters.append(seeds, trust[pixels & (depth > 0)])
-
-    def _completed(self, index: int) -> SeedDepth:
-        """`complete_depth` of a view, kept: it does not change."""
-        if index not in self.completed:
-            view = self.views[index]
-            self.completed[index] = complete_depth(
-                view.depth.cpu().numpy(), view.trust.cpu().numpy(), view.channels.cpu().numpy(), _LOW_RELIABILITY,
-                self.settings.region_prior,
-            )  # fmt: skip
-        return self.completed[index]
-
-    def _seed_depth(self, index: int, rendering: Rendering | None) -> tuple[Tensor, Tensor]:
-        """(H, W) depth and trust: the completed proxy; where that is weak and the map is there, the map's."""
-        view = self.views[index]
-        completed = self._completed(index)
-        depth, trust = (torch.from_numpy(x).to(view.image.device) for x in (completed.depth, completed.trust))
-        if rendering is None:
-            return depth, trust
-        # A trusted proxy is sharp at depth edges, where the map's blended depth lies between the surfaces.
-        nearer = densify.hidden_surfaces(rendering.depth, view.depth, view.trust, self.settings.depth_tolerance)
-        use_map = (rendering.silhouette > 0.8) & ~nearer & (trust < _HIGH_RELIABILITY)
-        return torch.where(use_map, rendering.depth, depth), trust
+        parameters.append(seeds, trust[pixels])
 
     @torch.no_grad()
     def prune(self) -> None:

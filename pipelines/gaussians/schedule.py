@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,14 @@ from numpy.typing import NDArray
 from pipelines.config import MappingConfig
 from pipelines.mapping.covisibility import keyframe_weights, overlaps
 from pipelines.mapping.views import View
+
+
+class Seeding(Enum):
+    """What a step seeds before it draws: nothing, the pixels of trusted depth, or whatever is still a hole."""
+
+    NOTHING = 0
+    TRUSTED = 1
+    REST = 2
 
 
 @dataclass(frozen=True)
@@ -22,7 +31,7 @@ class Step:
     weight: float
     rate: float
     coarse: bool
-    seed: bool
+    seed: Seeding
     grow: bool
     prune: bool
     refine_pose: bool
@@ -30,7 +39,10 @@ class Step:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Seeding steps first (`window_steps` for each view in order), then `visits` over all views, shuffled each pass."""
+    """Seeding steps first, then `visits` over all views, shuffled each pass.
+
+    Seeding goes along the views twice: what is trusted first, for a guess that one view has to make another may know.
+    """
 
     settings: MappingConfig
     seed: int
@@ -48,7 +60,7 @@ class Schedule:
         visits = round(passes * len(views)) if passes is not None else round(settings.passes * len(views))
         if passes is None:
             visits = max(visits, settings.min_iterations)
-        steps = max(settings.window_steps, 1) * len(views) if seeding else 0
+        steps = (max(settings.window_steps, 1) + 1) * len(views) if seeding else 0
         reliability = np.array([float(v.trust.mean()) for v in views])
         return Schedule(settings, seed, len(views), steps, visits, overlaps(views), reliability)
 
@@ -64,13 +76,20 @@ class Schedule:
     def _seeding_step(self, iteration: int) -> Step:
         """The new keyframe first, then in turn one that sees the same and one of all past ones."""
         per_view = max(self.settings.window_steps, 1)
+        if iteration >= per_view * self.views:
+            return self._filling_step(iteration, iteration - per_view * self.views)
         now, nth = divmod(iteration, per_view)
         rng = np.random.default_rng([self.seed, 1, iteration])
         view = now
         if nth > 0 and now > 0:
             view = self._covisible(now, rng) if nth % 2 else int(rng.integers(now))
         weights = keyframe_weights(now, self.reliability, self.settings.time_decay, self.settings.reliability_decay)
-        return Step(iteration, view, float(weights[view]), 1.0, True, nth == 0, False, False, False)
+        seed = Seeding.TRUSTED if nth == 0 else Seeding.NOTHING
+        return Step(iteration, view, float(weights[view]), 1.0, True, seed, False, False, False)
+
+    def _filling_step(self, iteration: int, view: int) -> Step:
+        weights = keyframe_weights(0, self.reliability, 0.0, self.settings.reliability_decay)
+        return Step(iteration, view, float(weights[view]), 1.0, True, Seeding.REST, False, False, False)
 
     def _covisible(self, now: int, rng: np.random.Generator) -> int:
         overlap = self.overlap[now, :now]
@@ -95,7 +114,7 @@ class Schedule:
             weight=float(weights[view] / weights.mean()),
             rate=s.rate_decay**share,
             coarse=coarse,
-            seed=False,
+            seed=Seeding.NOTHING,
             grow=grows,
             prune=grows and place == self.views - 1,
             refine_pose=view != 0,

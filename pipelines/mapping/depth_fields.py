@@ -65,7 +65,7 @@ def fit_fields(views: Sequence[View], anchors: Mapping[int, Anchors]) -> Array:
     """(N, ROWS, COLUMNS) log scales by robust least squares, re-linearised at every round."""
     fields = np.zeros((len(views), ROWS * COLUMNS))
     samples = [_Samples.of(v) for v in views]
-    near = _neighbours(views)
+    near = neighbours(views)
     for _ in range(ROUNDS):
         parts = [
             _point_equations(n, v, anchors[v.frame_id], fields) for n, v in enumerate(views) if v.frame_id in anchors
@@ -75,7 +75,7 @@ def fit_fields(views: Sequence[View], anchors: Mapping[int, Anchors]) -> Array:
     return fields.reshape(-1, ROWS, COLUMNS)
 
 
-def _neighbours(views: Sequence[View]) -> list[tuple[int, int]]:
+def neighbours(views: Sequence[View]) -> list[tuple[int, int]]:
     """Ordered pairs of views that see the same; of many, a spread over near and far ones."""
     overlap = overlaps(views)
     pairs = []

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 
 from formats.errors import InputError
+from pipelines.config import MappingConfig
 from pipelines.gaussians.optimise import OptimisedMap, optimise_map
+from pipelines.mapping.consistency import without_contradicted_depth
 from pipelines.mapping.depth_fields import agree_on_depth
 from pipelines.mapping.load import MappingInput, load_views
 from pipelines.mapping.measure import ViewFigures, mean_figures, measure_view
@@ -25,7 +27,7 @@ def run(context: StageContext) -> dict[str, Any]:
     given = load_views(context.run, trajectory, settings, "cpu" if device == "auto" else device)
     _require_views(given, context)
 
-    views = agree_on_depth(given.views, given.anchors) if settings.depth_fields else given.views
+    views = prepare_depth(given, settings)
     result = optimise_map(
         views, len(given.class_ids), settings, seed,
         progress=context.progress, snapshot=context.snapshot / "state.safetensors",
@@ -39,6 +41,12 @@ def run(context: StageContext) -> dict[str, Any]:
     figures = _figures(context, given, views, result, moved)
     write_json(context.folder / "mapping.json", {**figures, "class_ids": list(given.class_ids)})
     return figures
+
+
+def prepare_depth(given: MappingInput, settings: MappingConfig) -> list[View]:
+    """The views with proxy depths that agree with each other, as far as the settings ask for it."""
+    views = agree_on_depth(given.views, given.anchors) if settings.depth_fields else given.views
+    return without_contradicted_depth(views) if settings.depth_check else views
 
 
 def _require_views(given: MappingInput, context: StageContext) -> None:

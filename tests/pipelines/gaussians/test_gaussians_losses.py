@@ -1,0 +1,111 @@
+"""The terms of the mapping loss: known values, gradients, units, and what they must ignore."""
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+
+from pipelines.gaussians import losses
+from pipelines.gaussians.ssim import similarity, ssim_map
+from pipelines.types import VOID
+
+
+def pictures(dtype: torch.dtype = torch.float32, size: tuple[int, int] = (24, 31)) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    a, b = (torch.rand(*size, 3, generator=generator, dtype=torch.float64).to(dtype) for _ in range(2))
+    return a, (0.7 * a + 0.3 * b)
+
+
+def test_ssim_of_a_picture_with_itself_is_one() -> None:
+    a, b = pictures()
+    assert ssim_map(a, a).min() > 0.9999
+    assert 0.1 < ssim_map(a, b).mean() < 0.99
+
+
+def test_ssim_agrees_with_scikit_image_inside() -> None:
+    a, b = pictures(torch.float64)
+    _, truth = structural_similarity(
+        a.numpy(), b.numpy(), channel_axis=2, data_range=1.0, gaussian_weights=True, sigma=1.5,
+        use_sample_covariance=False, full=True,
+    )  # fmt: skip
+    inside = (slice(6, -6), slice(6, -6))
+    assert np.abs(ssim_map(a, b).numpy() - truth)[inside].max() < 1e-9
+
+
+def test_compiled_ssim_equals_the_plain_one() -> None:
+    a, b = pictures()
+    fast = a.clone().requires_grad_()
+    plain = a.double().requires_grad_()
+    value, truth = ssim_map(fast, b), ssim_map(plain, b.double())
+    weight = torch.rand_like(truth)
+    (value * weight.float()).sum().backward()
+    (truth * weight).sum().backward()
+    assert (value - truth).abs().max() < 2e-5
+    assert fast.grad is not None
+    assert plain.grad is not None
+    assert 0 < (fast.grad - plain.grad).norm() / plain.grad.norm() < 1e-4
+    assert (similarity(a, b)[0] - value).abs().max() < 2e-5
+
+
+def test_ssim_gradient() -> None:
+    a, b = pictures(torch.float64, (7, 8))
+    assert torch.autograd.gradcheck(lambda x: ssim_map(x, b), (a.requires_grad_(),))
+
+
+def test_image_loss_weighs_its_two_parts() -> None:
+    a, b = pictures()
+    plain, mixed = losses.image_loss(a, b, 0.0), losses.image_loss(a, b, 0.2)
+    assert torch.isclose(plain, (a - b).abs().mean())
+    assert torch.isclose(mixed, 0.8 * plain + 0.2 * (1 - ssim_map(a, b).mean()))
+    assert losses.image_loss(a, a, 0.2) < 1e-6
+
+
+def test_depth_loss_has_no_unit_and_ignores_unknown_depth() -> None:
+    proxy = torch.tensor([[1.0, 2.0], [0.0, 4.0]])
+    rendered = proxy + torch.tensor([[0.1, 0.0], [9.0, -0.2]])
+    weight = torch.tensor([[1.0, 1.0], [1.0, 0.5]])
+    loss = losses.depth_loss(rendered, proxy, weight, 2.0)
+    assert torch.isclose(loss, torch.tensor((0.1 + 0.2 * 0.5) / 4 / 2.0))
+    assert torch.isclose(losses.depth_loss(100 * rendered, 100 * proxy, weight, 200.0), loss)
+    assert losses.depth_weight(torch.tensor([0.5, 1.0]), 1.5).tolist() == [0.75, 1.0]
+
+
+@pytest.mark.parametrize("image", [False, True])
+def test_label_losses_ignore_void_and_fall_with_the_right_logit(image: bool) -> None:
+    labels = torch.tensor([[0, 1], [2, VOID]], dtype=torch.uint8)
+    weight = torch.ones(2, 2)
+
+    def loss(logits: torch.Tensor) -> torch.Tensor:
+        return (
+            losses.label_image_loss(logits, labels, weight, 0.2) if image else losses.label_loss(logits, labels, weight)
+        )
+
+    good = torch.nn.functional.one_hot(torch.tensor([[0, 1], [2, 0]]), 3) * 9.0
+    other_void = good.clone()
+    other_void[1, 1] = torch.tensor([0.0, 0.0, 9.0])
+    assert torch.isclose(loss(good), loss(other_void))
+    assert 0 <= loss(good) < 0.02 < loss(torch.zeros(2, 2, 3))
+    gradient = torch.zeros(2, 2, 3, requires_grad=True)
+    loss(gradient).backward()
+    assert gradient.grad is not None
+    assert gradient.grad[1, 1].abs().max() == 0
+    assert gradient.grad[0, 1, 1] < 0
+
+
+def test_edge_loss_wants_steps_at_class_edges_and_nowhere_else() -> None:
+    labels = torch.tensor([[0, 0, 1, 1]] * 4, dtype=torch.uint8)
+    step_at_edge = torch.tensor([[1.0, 1.0, 2.0, 2.0]] * 4)
+    step_inside = torch.tensor([[1.0, 2.0, 2.0, 2.0]] * 4)
+    right, flat, wrong = (
+        losses.edge_loss(d, labels, 100.0, 1.0) for d in (step_at_edge, torch.ones(4, 4), step_inside)
+    )
+    assert right < 1e-6 < flat < wrong
+    void = torch.full((4, 4), VOID, dtype=torch.uint8)
+    assert losses.edge_loss(step_inside, void, 100.0, 1.0) == 0
+
+
+def test_size_and_silhouette() -> None:
+    radii = torch.log(torch.tensor([0.01, 0.1, 0.2]))
+    assert losses.size_loss(radii, 0.3) == 0
+    assert torch.isclose(losses.size_loss(radii, 0.1), torch.log(torch.tensor(2.0)) ** 2 / 3)
+    assert torch.isclose(losses.silhouette_loss(torch.tensor([1.0, 0.5])), torch.tensor(0.25))

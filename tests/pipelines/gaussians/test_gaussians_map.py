@@ -1,0 +1,167 @@
+"""Parameters under optimisation, seeding, and the masks of densification."""
+
+import numpy as np
+import pytest
+import torch
+
+from pipelines.gaussians import densify
+from pipelines.gaussians.parameters import KEYS, AdamTable, MapParameters, empty_map
+from pipelines.gaussians.seeding import complete_depth, fill_smoothly, seed_gaussians, seed_grid
+from pipelines.geometry.camera import project
+from pipelines.types import VOID, Intrinsics
+
+CAMERA = Intrinsics(40, 30, 35.0, 35.0, 20.0, 15.0)
+
+
+def seeds(count: int = 12, frame_id: int = 3):
+    generator = torch.Generator().manual_seed(count)
+    pixels = torch.zeros(30, 40, dtype=torch.bool)
+    pixels.view(-1)[torch.randperm(1200, generator=generator)[:count]] = True
+    depth = 1 + torch.rand(30, 40, generator=generator)
+    colors = torch.rand(30, 40, 3, generator=generator)
+    channels = torch.full((30, 40), 1, dtype=torch.uint8)
+    return (
+        seed_gaussians(pixels, depth, colors, channels, 2.0, 3, torch.eye(4).double(), CAMERA, frame_id),
+        pixels,
+        depth,
+    )
+
+
+def test_adam_is_torchs_adam() -> None:
+    start = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
+    table = AdamTable({"x": start})
+    reference = start.clone().requires_grad_()
+    optimiser = torch.optim.Adam([reference], lr=0.01, eps=1e-15)
+    for _ in range(7):
+        for x in (table.values["x"], reference):
+            (x.sin() ** 2).sum().backward()
+        table.step({"x": 0.01})
+        optimiser.step()
+        optimiser.zero_grad()
+    assert (reference - start).abs().max() > 0
+    assert torch.allclose(table.values["x"], reference, atol=1e-7)
+
+
+def test_moments_stay_with_their_gaussians() -> None:
+    parameters = MapParameters.from_map(seeds(12)[0])
+    for key in KEYS:
+        parameters[key].sum().backward()
+    parameters.table.step(dict.fromkeys(KEYS, 0.1))
+    before = {k: (parameters[k].detach().clone(), parameters.table.first[k].clone()) for k in KEYS}
+    parameters.append(seeds(5, frame_id=8)[0], torch.full((5,), 0.5))
+    assert len(parameters) == 17
+    kept = torch.tensor([0, 13, 4])
+    parameters.keep(kept)
+    assert parameters.anchor_frame_ids.tolist() == [3, 8, 3]
+    assert parameters.trust.tolist() == [1.0, 0.5, 1.0]
+    for key, (value, moment) in before.items():
+        assert torch.equal(parameters[key][[0, 2]], value[[0, 4]])
+        assert torch.equal(parameters.table.first[key][[0, 2]], moment[[0, 4]])
+        assert parameters.table.first[key][1].abs().max() == 0
+        assert parameters[key].requires_grad
+
+
+def test_snapshot_gives_everything_back() -> None:
+    parameters = MapParameters.from_map(seeds()[0])
+    parameters["means"].square().sum().backward()
+    parameters.table.step({"means": 0.1})
+    again = MapParameters.from_tensors(parameters.to_tensors())
+    tensors, others = parameters.to_tensors(), again.to_tensors()
+    assert tensors.keys() == others.keys()
+    assert all(torch.equal(tensors[k], others[k]) for k in tensors)
+
+
+def test_seeds_project_onto_their_pixels() -> None:
+    gaussians, pixels, depth = seeds()
+    xy, z = project(gaussians.means.double().numpy(), CAMERA)
+    rows, columns = np.nonzero(pixels.numpy())
+    assert np.abs(xy - np.stack([columns, rows], 1) - 0.5).max() < 1e-4
+    assert np.abs(z - depth.numpy()[rows, columns]).max() < 1e-6
+    assert torch.allclose(gaussians.radii / torch.from_numpy(z).float() * 35, torch.tensor(2 * 0.7))
+    assert (gaussians.class_logits.argmax(1) == 1).all()
+
+
+def test_a_void_pixel_seeds_no_class() -> None:
+    pixels, depth = torch.ones(30, 40, dtype=torch.bool), torch.ones(30, 40)
+    channels = torch.full((30, 40), VOID, dtype=torch.uint8)
+    gaussians = seed_gaussians(
+        pixels, depth, torch.zeros(30, 40, 3), channels, 1.0, 3, torch.eye(4).double(), CAMERA, 0
+    )
+    assert gaussians.class_logits.shape == (1200, 3)
+    assert gaussians.class_logits.abs().max() == 0
+    assert len(empty_map(4)) == 0
+
+
+def slanted() -> np.ndarray:
+    y, x = np.mgrid[:60, :80]
+    return (1 / (0.4 + 0.002 * x + 0.001 * y)).astype(np.float32)
+
+
+def test_region_prior_corrects_unreliable_pixels() -> None:
+    truth = slanted()
+    noise = np.random.default_rng(0)
+    weak = np.zeros(truth.shape, bool)
+    weak[20:40, 30:60] = True
+    depth = np.where(weak, truth * noise.uniform(0.7, 1.4, truth.shape), truth).astype(np.float32)
+    reliability = np.where(weak, 0.1, 0.95).astype(np.float32)
+    channels = np.zeros(truth.shape, np.uint8)
+    with_prior = complete_depth(depth, reliability, channels, 0.35, prior=True)
+    without = complete_depth(depth, reliability, channels, 0.35, prior=False)
+    error = [np.abs(d.depth / truth - 1)[weak].mean() for d in (with_prior, without)]
+    assert 0 < error[0] < 0.02 < 0.1 < error[1]
+    assert np.array_equal(with_prior.depth[~weak] > 0, np.ones((~weak).sum(), bool))
+    assert np.abs(with_prior.depth / depth - 1)[~weak].max() < 1e-5
+
+
+def test_unknown_depth_is_filled_and_not_trusted() -> None:
+    truth = slanted()
+    depth = truth.copy()
+    depth[25:35, 35:50] = 0
+    void = np.full(truth.shape, VOID, np.uint8)
+    completed = complete_depth(depth, np.ones_like(depth), void, 0.35, prior=True)
+    hole = depth == 0
+    assert completed.trust[hole].max() == 0
+    assert 0 < np.abs(completed.depth / truth - 1)[hole].max() < 0.1
+    nothing = complete_depth(depth * 0, np.ones_like(depth), void, 0.35, prior=True)
+    assert nothing.depth.max() == 0
+
+
+def test_fill_keeps_a_constant_and_the_range() -> None:
+    values = np.zeros((33, 47), np.float32)
+    values[::9, ::11] = 3.0
+    filled = fill_smoothly(values, np.ones_like(values))
+    assert np.abs(filled - 3).max() < 1e-3
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3])
+def test_grid_spacing(stride: int) -> None:
+    grid = seed_grid(30, 41, stride)
+    assert grid.sum() == len(range(stride // 2, 30, stride)) * len(range(stride // 2, 41, stride))
+
+
+def test_conditions_of_densification() -> None:
+    assert densify.holes(torch.tensor([0.3, 0.9]), 0.55).tolist() == [True, False]
+    rendered, proxy = torch.tensor([2.0, 2.0, 2.0, 2.0]), torch.tensor([1.0, 3.0, 0.0, 1.7])
+    trust = torch.tensor([1.0, 1.0, 1.0, 0.1])
+    assert densify.hidden_surfaces(rendered, proxy, trust, 0.05).tolist() == [True, False, False, False]
+    logits = torch.tensor([[[2.0, 0.0], [0.0, 2.0], [2.0, 0.0]]])
+    channels = torch.tensor([[0, 0, VOID]], dtype=torch.uint8)
+    assert densify.wrong_classes(logits, channels, torch.ones(1, 3)).tolist() == [[False, True, False]]
+
+
+def test_color_errors_are_the_worst_share() -> None:
+    image = torch.zeros(40, 50, 3)
+    rendered = image.clone()
+    rendered[10:15, 20:25] = 0.8
+    worst = densify.color_errors(rendered, image, 0.98)
+    assert worst[12, 22]
+    assert 0 < worst.float().mean() <= 0.02
+    assert not densify.color_errors(image + 0.001, image, 0.98).any()
+
+
+def test_useless_gaussians() -> None:
+    gaussians, _, _ = seeds(4)
+    gaussians.opacity_logits[0] = -9
+    gaussians.log_radii[1] = 3
+    gaussians.means[2, 0] = float("nan")
+    assert densify.useless(gaussians, 0.02, 1.0).tolist() == [True, True, True, False]

@@ -1,0 +1,22 @@
+"""The synthetic room as a run folder and as views."""
+
+from pathlib import Path
+
+import pytest
+
+from pipelines.config import MappingConfig
+from pipelines.mapping.load import MappingInput, load_views
+from pipelines.run_folder import RunFolder
+from tests.pipelines.mapping.small_run import make_run
+
+
+@pytest.fixture(scope="session")
+def small_run(tmp_path_factory: pytest.TempPathFactory, world_sequence: Path) -> RunFolder:
+    """16 keyframes of 80 x 60."""
+    return make_run(tmp_path_factory.mktemp("mapping") / "run", world_sequence)
+
+
+@pytest.fixture(scope="session")
+def room(small_run: RunFolder) -> MappingInput:
+    """Its views, with every eighth frame held out."""
+    return load_views(small_run, small_run.load_trajectory("tracking"), MappingConfig(hold_out=8))

@@ -1,0 +1,124 @@
+"""The map of the synthetic room: as good as it must be, the same bytes after an interruption, poses put right."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipelines.config import MappingConfig
+from pipelines.gaussians.optimise import OptimisedMap, optimise_map
+from pipelines.geometry import se3
+from pipelines.mapping.load import MappingInput
+from pipelines.mapping.measure import ViewFigures, measure_view
+from pipelines.mapping.views import View
+
+SETTINGS = MappingConfig(passes=6.0, min_iterations=0, snapshot_every=20, seed_stride=1)
+
+
+def figures(result: OptimisedMap, views: list[View]) -> list[ViewFigures]:
+    zero = np.zeros(3, np.float32)
+    return [measure_view(result.gaussian_map, v, v.cam_from_world.numpy(), zero, zero) for v in views]
+
+
+def mean(result: OptimisedMap, views: list[View], name: str) -> float:
+    return float(np.mean([getattr(f, name) for f in figures(result, views)]))
+
+
+@pytest.fixture(scope="module")
+def mapped(room: MappingInput) -> OptimisedMap:
+    return optimise_map(room.views, len(room.class_ids), SETTINGS, seed=0)
+
+
+def test_the_map_shows_what_the_frames_show(room: MappingInput, mapped: OptimisedMap) -> None:
+    assert 27 < mean(mapped, room.views, "psnr") < 45
+    assert 24 < mean(mapped, room.held_out, "psnr") < mean(mapped, room.views, "psnr")
+    assert 0.88 < mean(mapped, room.views, "ssim") < 1
+    assert 0 < mean(mapped, room.views, "depth_l1") < 0.1
+    assert 0.92 < mean(mapped, room.views, "label_agreement") <= 1
+
+
+def test_the_map_is_sound(mapped: OptimisedMap, room: MappingInput) -> None:
+    m = mapped.gaussian_map
+    assert all(torch.isfinite(getattr(m, n)).all() for n in ("means", "log_radii", "opacity_logits", "colors"))
+    assert m.opacities.min() >= SETTINGS.prune_opacity
+    assert set(m.anchor_frame_ids.tolist()) <= {v.frame_id for v in room.views}
+    assert mapped.iterations == (3 + 6) * len(room.views)
+
+
+class Killed(Exception):
+    """Stands for the end of the process."""
+
+
+class KillAt:
+    """A progress bar that ends the process at its n-th item."""
+
+    def __init__(self, at: int) -> None:
+        self.at = at
+
+    def track(self, items, label, total=None):
+        for n, item in enumerate(items):
+            if n == self.at:
+                raise Killed
+            yield item
+
+
+@pytest.mark.parametrize("at", [9, 75])
+def test_an_interrupted_map_ends_with_the_same_bytes(
+    room: MappingInput, tmp_path: Path, at: int, quick: tuple[MappingConfig, OptimisedMap]
+) -> None:
+    settings, unbroken = quick
+    snapshot = tmp_path / "state.safetensors"
+    arguments = (room.views, len(room.class_ids), settings, 0)
+    with pytest.raises(Killed):
+        optimise_map(*arguments, snapshot=snapshot, progress=KillAt(at))
+    assert snapshot.exists() == (at >= settings.snapshot_every)
+    result = optimise_map(*arguments, snapshot=snapshot)
+    for name, value in vars(unbroken.gaussian_map).items():
+        assert torch.equal(getattr(result.gaussian_map, name), value), name
+    assert result.cam_from_world.tobytes() == unbroken.cam_from_world.tobytes()
+    assert result.log_gains.tobytes() == unbroken.log_gains.tobytes()
+
+
+@pytest.fixture(scope="module")
+def quick(room: MappingInput) -> tuple[MappingConfig, OptimisedMap]:
+    settings = replace(SETTINGS, passes=4.0, seed_stride=3, coarse_share=0.3, densify_every=1, densify_until=0.8)
+    return settings, optimise_map(room.views, len(room.class_ids), settings, seed=0)
+
+
+def test_wrong_poses_are_put_right(room: MappingInput, mapped: OptimisedMap) -> None:
+    """Views moved off a good map come back to it; the first one is held."""
+    rng = np.random.default_rng(0)
+    off = [torch.from_numpy(np.r_[rng.normal(0, 0.012, 3), rng.normal(0, 0.005, 3)]) for _ in room.views]
+    moved = [
+        replace(v, cam_from_world=se3.exp(t) @ v.cam_from_world) if i else v
+        for i, (v, t) in enumerate(zip(room.views, off, strict=True))
+    ]
+    settings = replace(SETTINGS, pose_rate=5e-4, mean_rate=0.0, densify_every=0, rate_decay=0.3)
+    result = optimise_map(moved, len(room.class_ids), settings, seed=0, initial=mapped.gaussian_map, passes=10.0)
+    truth = np.stack([v.cam_from_world.numpy() for v in room.views])
+    before = np.abs(np.stack([v.cam_from_world.numpy() for v in moved]) - truth)[1:, :3, 3].mean()
+    after = np.abs(result.cam_from_world - truth)[1:, :3, 3].mean()
+    assert 0 < after < 0.7 * before
+    assert np.array_equal(result.cam_from_world[0], truth[0])
+
+
+def test_exposure_is_found(room: MappingInput, mapped: OptimisedMap) -> None:
+    """One view darkened by a third: its gain says so, those of the others stay near 0."""
+    dark = [
+        replace(v, image=(v.image.float() * 0.7).round().to(torch.uint8)) if i == 5 else v
+        for i, v in enumerate(room.views)
+    ]
+    settings = replace(SETTINGS, exposure_rate=4e-2, densify_every=0, refine_poses=False, color_rate=1e-3)
+    result = optimise_map(dark, len(room.class_ids), settings, seed=0, initial=mapped.gaussian_map, passes=8.0)
+    brightness = np.exp(result.log_gains).mean(1) + result.offsets.mean(1) / 0.4
+    others = np.delete(brightness, 5)
+    assert brightness[5] < 0.85 < others.min()
+
+
+def test_views_without_classes_can_be_mapped(room: MappingInput) -> None:
+    settings = replace(SETTINGS, passes=1.0, seed_stride=3)
+    result = optimise_map(room.views[:4], 0, settings, seed=0)
+    assert result.gaussian_map.class_logits.shape == (len(result.gaussian_map), 0)
+    assert mean(result, room.views[:4], "psnr") > 15

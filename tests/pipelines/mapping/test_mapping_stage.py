@@ -1,0 +1,125 @@
+"""The stages mapping and export on a run folder, their files opened by other programs."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pycolmap
+import pytest
+import trimesh
+
+from formats.errors import InputError
+from formats.trajectory import read_tum
+from pipelines.config import Config, ExportConfig, MappingConfig, RunConfig
+from pipelines.export import stage as export_stage
+from pipelines.export.stage import export_run
+from pipelines.mapping import stage as mapping_stage
+from pipelines.progress import SilentProgress
+from pipelines.run_folder import RunFolder
+from pipelines.stages import StageContext
+from pipelines.types import VOID
+from tests.pipelines.mapping.small_run import make_run
+
+CONFIG = Config(
+    run=RunConfig(device="cpu"),
+    mapping=MappingConfig(passes=3.0, min_iterations=0, seed_stride=1, hold_out=8),
+    export=ExportConfig(voxel=0.02),
+)
+
+
+def context(run: RunFolder, stage: str, config: Config = CONFIG) -> StageContext:
+    folder = run.stage(stage)
+    folder.mkdir(exist_ok=True)
+    return StageContext(run, run.root, config, folder, SilentProgress())
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory, world_sequence: Path) -> tuple[RunFolder, dict, dict]:
+    run = make_run(tmp_path_factory.mktemp("finished") / "run", world_sequence)
+    mapped = mapping_stage.run(context(run, "mapping"))
+    return run, mapped, export_stage.run(context(run, "export"))
+
+
+def test_mapping_says_how_good_it_is(finished: tuple[RunFolder, dict, dict]) -> None:
+    run, figures, _ = finished
+    assert 22 < figures["held_out_psnr"] < figures["keyframe_psnr"] < 60
+    assert figures["gaussians"] == len(run.load_map("mapping"))
+    assert figures["keyframes"] == 14
+    stored = json.loads((run.stage("mapping") / "mapping.json").read_text())
+    assert len(stored["class_ids"]) == figures["classes"] == run.load_map("mapping").class_logits.shape[1]
+    before, after = run.load_trajectory("tracking"), run.load_trajectory("mapping")
+    assert 0 < np.abs(before.cam_from_world - after.cam_from_world).max() < 0.02
+    exposure = run.load_exposure()
+    assert exposure["log_gains"].shape == (14, 3)
+
+
+def test_colmap_takes_the_model(finished: tuple[RunFolder, dict, dict]) -> None:
+    folder = finished[0].stage("export")
+    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
+    assert model.num_reg_images() == 16
+    assert 0 < model.compute_mean_reprojection_error() < 2
+    assert model.num_points3D() > 100
+    assert all((folder / "frames" / image.name).exists() for image in model.images.values())
+    times, poses = read_tum(folder / "trajectory.txt")
+    assert len(times) == 16
+    first = model.images[min(model.images)].cam_from_world().inverse().matrix()
+    assert np.abs(poses[0][:3] - first).max() < 1e-6
+
+
+def test_splat_viewers_take_the_map(finished: tuple[RunFolder, dict, dict]) -> None:
+    run = finished[0]
+    vertex = plyfile.PlyData.read(run.stage("export") / "point_cloud.ply")["vertex"]
+    names = [p.name for p in vertex.properties]
+    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert names[9:18] == ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "class_id"]
+    gaussian_map = run.load_map("mapping")
+    assert len(vertex) == len(gaussian_map)
+    assert np.allclose(vertex["x"], gaussian_map.means[:, 0])
+    assert np.allclose(vertex["scale_2"], gaussian_map.log_radii)
+    ids = json.loads((run.stage("mapping") / "mapping.json").read_text())["class_ids"]
+    assert np.array_equal(vertex["class_id"], np.array(ids)[gaussian_map.class_logits.argmax(1)])
+
+
+def test_the_mesh_is_the_room(finished: tuple[RunFolder, dict, dict]) -> None:
+    run, _, figures = finished
+    mesh = trimesh.load(run.stage("export") / "mesh.ply", process=False)
+    assert len(mesh.vertices) == figures["vertices"] > 1000
+    labels = mesh.metadata["_ply_raw"]["vertex"]["data"]["label"]
+    assert set(np.unique(labels)) <= {*range(len(run.load_classes())), VOID}
+    assert (labels != VOID).mean() > 0.9
+    glb = trimesh.load(run.stage("export") / "mesh.glb", force="mesh")
+    assert len(glb.faces) == len(mesh.faces)
+    # Every triangulated point is exact and lies on a surface that two keyframes see.
+    points = run.load_sparse("tracking").points_in_world[::9]
+    distance = np.linalg.norm(points[:, None] - np.asarray(mesh.vertices)[None, ::7], axis=2).min(1)
+    assert 0 < np.median(distance) < 0.1
+
+
+def test_one_kind_of_file_elsewhere(finished: tuple[RunFolder, dict, dict], tmp_path: Path) -> None:
+    run = finished[0]
+    for kind, name in (("tum", "trajectory.txt"), ("colmap", "sparse"), ("ply", "point_cloud_semantic.ply")):
+        written = export_run(run, tmp_path / kind, kind)
+        assert all(p.exists() for p in written)
+        assert (tmp_path / kind / name).exists()
+        assert not (tmp_path / kind / "mesh.ply").exists()
+    assert (tmp_path / "tum" / "trajectory.txt").read_bytes() == (run.stage("export") / "trajectory.txt").read_bytes()
+
+
+def test_a_finished_mesh_is_not_made_again(finished: tuple[RunFolder, dict, dict]) -> None:
+    run, _, figures = finished
+    before = (run.stage("export") / "mesh.ply").stat().st_mtime_ns
+    assert export_stage.run(context(run, "export")) == figures
+    assert (run.stage("export") / "mesh.ply").stat().st_mtime_ns == before
+
+
+def test_a_run_without_a_map_says_what_to_do(small_run: RunFolder, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="msgs-slam resume"):
+        export_run(small_run, tmp_path, "ply")
+
+
+def test_no_keyframe_left_is_refused(small_run: RunFolder, tmp_path: Path) -> None:
+    config = Config(run=RunConfig(device="cpu"), mapping=MappingConfig(hold_out=1))
+    given = StageContext(small_run, small_run.root, config, tmp_path, SilentProgress())
+    with pytest.raises(InputError, match="hold_out"):
+        mapping_stage.run(given)
