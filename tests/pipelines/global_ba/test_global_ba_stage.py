@@ -37,7 +37,13 @@ Array = NDArray[np.float64]
 FIRST_AGAIN = 12
 """From this keyframe on the points carry new numbers, as after a walk that came back without noticing."""
 CONFIG = load_config(
-    overrides=["global_ba.loop_gap=2", "global_ba.joint_passes=1", "mapping.max_side=160", "global_ba.joint=always"]
+    overrides=[
+        "global_ba.loop_gap=2",
+        "global_ba.joint_passes=1",
+        "mapping.max_side=128",
+        "global_ba.joint=always",
+        "mapping.densify_every=0",
+    ]
 )
 
 
