@@ -14,6 +14,7 @@ import click
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from formats.errors import InputError
+from msgs_cli.models import models
 from msgs_cli import looking
 from msgs_cli.options import (
     FOLDER,
@@ -53,6 +54,7 @@ def main() -> None:
     msgs-slam render video.msgs out.mp4 the map along its camera path
     msgs-slam view video.msgs           the map in the browser
     msgs-slam evaluate video.msgs --truth DATASET    errors against a known truth
+    msgs-slam models list               learned models for metric depth and named classes
     msgs-slam config                    every setting with its default and meaning
     """
 
@@ -140,7 +142,8 @@ def resume(
 
 @main.command()
 @RUN_ARGUMENT
-def status(run_path: Path) -> None:
+@click.option("-v", "--verbose", is_flag=True, help="Every figure of every stage.")
+def status(run_path: Path, verbose: bool) -> None:
     """Say which stages of RUN are done, what they found, and what was degraded."""
     from msgs_cli.tables import stage_table, warning_lines
     from pipelines.reconstruct import require_run
@@ -152,7 +155,7 @@ def status(run_path: Path) -> None:
     records = load_records(run)
     interrupted = [name for name in STAGES if run.partial(name).exists()]
     click.echo(f"{run.root}: made from {load_source(run)['path']}\n")
-    click.echo(stage_table(records, STAGES, interrupted))
+    click.echo(stage_table(records, STAGES, interrupted, verbose))
     for line in warning_lines(records):
         click.echo(line)
 

@@ -9,6 +9,17 @@ if TYPE_CHECKING:
     from pipelines.stages import StageRecord
 
 
+KEY_FIGURES = {
+    "frames": ("frames", "keyframes_placed", "calibration", "focal_px", "focal_sd_px"),
+    "proxy": ("depth", "semantics", "metric", "classes"),
+    "tracking": ("posed", "keyframes", "lost", "scale"),
+    "mapping": ("gaussians", "keyframe_psnr"),
+    "global_ba": ("loops",),
+    "export": ("images", "vertices", "faces"),
+}
+"""What a person wants to know first; `status -v` says all."""
+
+
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Left-aligned columns under a rule."""
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
@@ -19,14 +30,17 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([lines[0], "  ".join("-" * width for width in widths), *lines[1:]])
 
 
-def stage_table(records: dict[str, StageRecord], stages: Sequence[str], interrupted: Sequence[str] = ()) -> str:
-    """One row a stage: state, seconds, peak memory, key figures."""
+def stage_table(
+    records: dict[str, StageRecord], stages: Sequence[str], interrupted: Sequence[str] = (), everything: bool = False
+) -> str:
+    """One row a stage: state, seconds, peak memory, key figures or all of them."""
     rows = []
     for name in stages:
         if (record := records.get(name)) is None:
             rows.append([name, "interrupted" if name in interrupted else "not yet", "", "", ""])
             continue
-        figures = ", ".join(f"{key} {format_figure(value)}" for key, value in record.figures.items())
+        wanted = record.figures if everything else [k for k in KEY_FIGURES[name] if k in record.figures]
+        figures = ", ".join(f"{key} {format_figure(record.figures[key])}" for key in wanted)
         rows.append([name, "done", f"{record.seconds:.1f}", f"{record.peak_memory_mb:.0f}", figures])
     return format_table(["stage", "state", "seconds", "peak MB", "figures"], rows)
 
@@ -35,6 +49,8 @@ def format_figure(value: Any) -> str:
     """Short text of a figure."""
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: "-"}[value]
+    if isinstance(value, dict):
+        return " ".join(f"{key} {format_figure(v)}" for key, v in value.items()) or "none"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 

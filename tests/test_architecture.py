@@ -60,6 +60,7 @@ def test_files_stay_readable(path: Path) -> None:
     assert len(lines) <= 420, f"{len(lines)} lines: split it by noun"
     for node in ast.walk(ast.parse("\n".join(lines))):
         if isinstance(node, ast.FunctionDef):
-            assert (node.end_lineno or 0) - node.lineno < 90, (
-                f"{node.name} is {(node.end_lineno or 0) - node.lineno} lines"
-            )
+            # A compiled kernel is one nest of loops: what it calls would have to be compiled and inlined with it.
+            most = 110 if any(ast.unparse(d) == "kernel" for d in node.decorator_list) else 80
+            length = (node.end_lineno or 0) - node.lineno
+            assert length < most, f"{node.name} is {length} lines"
