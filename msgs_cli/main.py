@@ -14,8 +14,8 @@ import click
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from formats.errors import InputError
-from msgs_cli.models import models
 from msgs_cli import looking
+from msgs_cli.models import models
 from msgs_cli.options import (
     FOLDER,
     RUN_ARGUMENT,
@@ -242,6 +242,7 @@ def _print_summary(root: Path, records: dict[str, Any]) -> None:
 
 for command in (looking.evaluate, looking.report, looking.render, looking.view):
     main.add_command(command)
+main.add_command(models)
 
 if __name__ == "__main__":
     main()

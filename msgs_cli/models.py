@@ -22,7 +22,8 @@ def list_models() -> None:
         here = "here" if store.is_here(model) else "-"
         use = "commercial use allowed" if model.commercial else "ask before commercial use"
         task = store.families[model.family]["task"]
-        click.echo(f"{model.name:16} {task:13} {here:5} {model.bytes / 1e6:7.1f} MB  {model.licence} ({use})")
+        size = f"{model.bytes / 1e6:.1f} MB" if model.bytes else "size unknown"
+        click.echo(f"{model.name:18} {task:13} {here:5} {size:>12}  {model.licence} ({use})")
     click.echo(f"cache: {store.cache}")
 
 
