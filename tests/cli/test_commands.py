@@ -90,3 +90,17 @@ def test_no_gpu_is_said(tmp_path: Path) -> None:
     source = tmp_path / "video.mp4"
     source.write_text("x")
     assert "no CUDA device" in refused(source, tmp_path / "run", "--device", "cuda")
+
+
+def test_run_of_another_source_is_not_touched(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    manifest = '{"source": {"path": "other.mp4", "digest": "0"}, "stages": {}}'
+    (out / "manifest.json").write_text(manifest)
+    (out / "run.toml").write_text("")
+    source = tmp_path / "video.mp4"
+    source.write_text("x")
+    message = refused(source, out)
+    assert "another source" in message
+    assert "--out" in message
+    assert (out / "manifest.json").read_text() == manifest
