@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.gaussians.render.cpu_backward import backward_band, merge_gradients
+from pipelines.gaussians.render.cpu_backward import backward_band
 from pipelines.gaussians.render.cpu_bands import split_into_bands
 from pipelines.gaussians.render.cpu_forward import forward_band
 from pipelines.gaussians.render.cpu_inspect import inspect
@@ -68,14 +68,17 @@ class _Composite(torch.autograd.Function):
         ]
         job = (*guide, features, planes, upstream[0], np.stack(upstream[1:]))
         count, channels = len(bands.reach), features.shape[2]
-        d_geometry, d_features = np.empty((5, count), F32), np.empty((count, channels), F32)
-        results = (d_geometry, d_features, np.empty((int(bands.slots[-1]), 5 + channels), F32))
+        d_geometry, d_features = np.zeros((5, count), F32), np.zeros((count, channels), F32)
+        shared = np.empty((int(bands.slots[-1]), 5 + channels), F32)
+        results = (d_geometry, d_features, shared)
         for_each(
             lambda b: backward_band(vectors, b, bands.own(b), bands.slots, *bands.prepared[b], *job, *results),
             len(bands),
         )
-        chunks = 16
-        for_each(lambda chunk: merge_gradients(chunk, chunks, bands.reach, bands.slots, *results), chunks)
+        straddling = np.flatnonzero(np.diff(bands.slots))
+        if len(straddling):
+            sums = np.add.reduceat(shared, bands.slots[straddling])
+            d_geometry[:, straddling], d_features[straddling] = sums[:, :5].T, sums[:, 5:]
         return (*torch.from_numpy(d_geometry).unbind(0), torch.from_numpy(d_features), *[None] * 5)
 
 

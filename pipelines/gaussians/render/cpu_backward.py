@@ -259,29 +259,3 @@ def backward_band(
                 d_geometry[j, i] = d_records[5 * k + j]
             for c in range(used):
                 d_features[i, c] = d_padded[k * channels + c]
-
-
-@kernel
-def merge_gradients(
-    chunk: int,
-    chunks: int,
-    reach: NDArray[np.float32],
-    slots: NDArray[np.int64],
-    d_geometry: NDArray[np.float32],
-    d_features: NDArray[np.float32],
-    shared: NDArray[np.float32],
-) -> None:
-    """For one chunk of the Gaussians: 0 where unseen, the sum over bands, top to bottom, where several saw it."""
-    count, used = d_features.shape
-    for i in range(count * chunk // chunks, count * (chunk + 1) // chunks):
-        if reach[i] > _ZERO and slots[i + 1] == slots[i]:
-            continue
-        for j in range(5):
-            d_geometry[j, i] = _ZERO
-        for c in range(used):
-            d_features[i, c] = _ZERO
-        for slot in range(slots[i], slots[i + 1]):
-            for j in range(5):
-                d_geometry[j, i] += shared[slot, j]
-            for c in range(used):
-                d_features[i, c] += shared[slot, 5 + c]

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from pipelines.gaussians.render import rules
 from pipelines.gaussians.render.jit import kernel
-from pipelines.gaussians.render.lanes import bits
 from pipelines.gaussians.render.threads import for_each
 
 F32 = np.float32
@@ -24,7 +23,6 @@ RECORD = 6
 
 _ALPHA_MIN, _CUT2 = F32(rules.ALPHA_MIN), F32(rules.CUT_SIGMAS**2)
 _HALF, _ZERO, _ONE, _TWO = F32(0.5), F32(0), F32(1), F32(2)
-DIGIT = 11  # bits sorted in one pass; three passes cover a float32
 
 
 @kernel
@@ -46,7 +44,8 @@ class Bands:
     """What the bands of an image see. Band b sees the Gaussians entries[starts[b]:starts[b + 1]], near to far.
 
     reach (M,) pixels, 0 where a Gaussian is not seen; slots (M + 1,): Gaussians in several bands own the places
-    slots[i]:slots[i + 1] for what each of them has to say; prepared: per band the results of `prepare_band`.
+    slots[i]:slots[i + 1] for what each of them has to say; prepared: per band its records and padded features
+    (`gather_band`) and where its tiles look in them (`list_tiles`).
     """
 
     reach: NDArray[np.float32]
@@ -77,8 +76,10 @@ def split_into_bands(
 
     def prepare(band: int) -> None:
         top = band * BAND_ROWS
-        size = (width, min(BAND_ROWS, height - top))
-        bands.prepared[band] = prepare_band(bands.own(band), projected, reach, features, channels, top, *size)
+        own = bands.own(band)
+        own[:] = near_to_far(own, projected[3])
+        records, padded = gather_band(own, projected, reach, features, channels)
+        bands.prepared[band] = (records, padded, *list_tiles(records, top, width, min(BAND_ROWS, height - top)))
 
     for_each(prepare, len(bands))
     return bands
@@ -122,62 +123,17 @@ def bin_gaussians(
     return reach, ends[: bands + 1], entries, slots
 
 
-@kernel
-def sort_by_depth(entries: NDArray[np.int32], z: NDArray[np.float32]) -> None:
-    """Sorts indices by z > 0 in place; equal depths stay in order."""
-    count = len(entries)
-    keys, spare_keys = np.empty(count, np.uint32), np.empty(count, np.uint32)
-    spare = np.empty(count, np.int32)
-    for k in range(count):
-        keys[k] = bits(z[entries[k]])
-    sort_by_digit(keys, entries, spare_keys, spare, 0)
-    sort_by_digit(spare_keys, spare, keys, entries, DIGIT)
-    sort_by_digit(keys, entries, spare_keys, spare, 2 * DIGIT)
-    for k in range(count):
-        entries[k] = spare[k]
+def near_to_far(entries: NDArray[np.int32], z: NDArray[np.float32]) -> NDArray[np.int32]:
+    """The indices sorted by z > 0, equal depths in the order of their indices.
+
+    The bits of positive floats sort as the floats do: with the index behind them all keys differ, and numpy's fastest
+    sort, which is not stable, gives one result.
+    """
+    keys = z[entries].view(np.uint32).astype(np.uint64) << np.uint64(32) | entries.astype(np.uint64)
+    keys.sort()
+    return keys.astype(np.uint32).view(np.int32)
 
 
-@kernel
-def sort_by_digit(
-    keys: NDArray[np.uint32],
-    values: NDArray[np.int32],
-    keys_out: NDArray[np.uint32],
-    values_out: NDArray[np.int32],
-    shift: int,
-) -> None:
-    """One pass of a radix sort: by the DIGIT bits of the keys from bit `shift` on, equal ones in their old order."""
-    places = np.zeros((1 << DIGIT) + 1, np.int64)
-    digits = np.uint32((1 << DIGIT) - 1)
-    for k in range(len(keys)):
-        places[np.intp((keys[k] >> np.uint32(shift)) & digits) + 1] += 1
-    for j in range(1 << DIGIT):
-        places[j + 1] += places[j]
-    for k in range(len(keys)):
-        digit = np.intp((keys[k] >> np.uint32(shift)) & digits)
-        keys_out[places[digit]] = keys[k]
-        values_out[places[digit]] = values[k]
-        places[digit] += 1
-
-
-@kernel
-def prepare_band(
-    entries: NDArray[np.int32],
-    projected: tuple[NDArray[np.float32], ...],
-    reach: NDArray[np.float32],
-    features: NDArray[np.float32],
-    channels: int,
-    top: int,
-    width: int,
-    rows: int,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64], NDArray[np.int32]]:
-    """Sorts the entries by depth; gives their records and features, and for each tile where in them to look."""
-    sort_by_depth(entries, projected[3])
-    records, padded = gather_band(entries, projected, reach, features, channels)
-    starts, members = list_tiles(records, top, width, rows)
-    return records, padded, starts, members
-
-
-@kernel
 def gather_band(
     entries: NDArray[np.int32],
     projected: tuple[NDArray[np.float32], ...],
@@ -186,24 +142,10 @@ def gather_band(
     channels: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The band's Gaussians side by side: records (n * RECORD,) and features padded with 0 to (n * channels,)."""
-    u, v, sigma_px, z, opacity = projected
-    records = np.empty(len(entries) * RECORD, np.float32)
-    padded = np.empty(len(entries) * channels, np.float32)
-    used = features.shape[1]
-    for k in range(len(entries)):
-        i, at = entries[k], k * RECORD
-        records[at] = u[i]
-        records[at + 1] = v[i]
-        records[at + 2] = sigma_px[i]
-        records[at + 3] = z[i]
-        records[at + 4] = opacity[i]
-        records[at + 5] = reach[i]
-        row = padded[k * channels : (k + 1) * channels]
-        for c in range(used):
-            row[c] = features[i, c]
-        for c in range(used, channels):
-            row[c] = _ZERO
-    return records, padded
+    records = np.stack([numbers.take(entries) for numbers in (*projected, reach)], axis=1)
+    padded = np.zeros((len(entries), channels), F32)
+    padded[:, : features.shape[1]] = features.take(entries, axis=0)
+    return records.ravel(), padded.ravel()
 
 
 @kernel

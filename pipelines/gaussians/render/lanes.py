@@ -288,16 +288,6 @@ def exp(typing_context: Any, value: Any) -> Any:
     return lanes(lanes), emit
 
 
-@intrinsic
-def bits(typing_context: Any, value: Any) -> Any:
-    """The bit pattern of a float32; for numbers >= 0 it sorts as they do."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return builder.bitcast(args[0], _I32)
-
-    return types.uint32(types.float32), emit
-
-
 def _fold(builder: ir.IRBuilder, value: ir.Value, join: Callable[[ir.Value, ir.Value], ir.Value]) -> ir.Value:
     """Halves onto halves: a fixed order, four steps for sixteen lanes."""
     undefined = ir.Constant(_vector(), ir.Undefined)

@@ -1,0 +1,125 @@
+"""How the map gets its Gaussians: seeds where a view finds holes, later more where it is wrong, fewer where useless."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pipelines.config import MappingConfig
+from pipelines.gaussians import densify
+from pipelines.gaussians.render import Rendering
+from pipelines.gaussians.schedule import Seeding
+from pipelines.gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_grid
+from pipelines.gaussians.state import OptimiserState, expose
+from pipelines.mapping.views import View
+
+GROWN_OPACITY, ERROR_OPACITY = 0.3, 0.1
+"""Of Gaussians added to a map that is already there: opaque ones would hide what has been learnt."""
+_LOW_RELIABILITY = 0.35
+_HIGH_RELIABILITY = 0.85
+_SOLID = 0.8
+"""Silhouette above which the map knows the depth of a pixel."""
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Adds to and takes from the map of `state`; `unit`: the scene's median depth."""
+
+    views: Sequence[View]
+    classes: int
+    settings: MappingConfig
+    state: OptimiserState
+    unit: float
+
+    @torch.no_grad()
+    def seed(self, index: int, what: Seeding, rendering: Rendering | None) -> None:
+        """Fill the view's holes with Gaussians at its completed depth (eq. 17): the trusted ones, or the rest.
+
+        `rendering`: the map as the view sees it, None while there is none.
+        """
+        view, s = self.views[index], self.settings
+        pixels = self._grid(view)
+        if rendering is None:
+            completed = self._completed(index)
+        else:
+            pixels &= self._needed(view, rendering) if what is Seeding.TRUSTED else self._holes(rendering)
+            completed = self._completed(index) if what is Seeding.TRUSTED else self._completed_by_map(view, rendering)
+        depth, trust = (torch.from_numpy(x).to(view.image.device) for x in (completed.depth, completed.trust))
+        if what is Seeding.TRUSTED:
+            pixels &= trust > _LOW_RELIABILITY
+        self._append(index, pixels, depth, trust, s.seed_stride, SEED_OPACITY)
+
+    @torch.no_grad()
+    def grow(self, index: int, rendering: Rendering) -> None:
+        """Add Gaussians by the three conditions of the article, and where the colours are most wrong."""
+        view, s = self.views[index], self.settings
+        needed = self._needed(view, rendering)
+        needed |= densify.wrong_classes(rendering.features[..., 3:], view.channels, view.label_weight)
+        grid = self._grid(view)
+        colors = expose(rendering.features[..., :3], self.state.view_tables[index])
+        wrong = densify.color_errors(colors, view.colors, 1 - s.error_share) & ~grid
+        depth, trust = self._grown_depth(view, rendering)
+        self._append(index, needed & grid, depth, trust, s.seed_stride, GROWN_OPACITY)
+        self._append(index, wrong, depth, trust, 1.0, ERROR_OPACITY)
+
+    @torch.no_grad()
+    def prune(self) -> None:
+        """Drop the Gaussians nobody sees."""
+        parameters, s = self.state.parameters, self.settings
+        bad = densify.useless(parameters.to_map(), s.prune_opacity, s.prune_radius * self.unit)
+        if bad.any():
+            parameters.keep(~bad)
+
+    def _grid(self, view: View) -> Tensor:
+        height, width = view.depth.shape
+        return torch.from_numpy(seed_grid(height, width, self.settings.seed_stride)).to(view.image.device)
+
+    def _holes(self, rendering: Rendering) -> Tensor:
+        """Condition (a)."""
+        return densify.holes(rendering.silhouette, self.settings.silhouette_threshold)
+
+    def _needed(self, view: View, rendering: Rendering) -> Tensor:
+        """Conditions (a) and (b)."""
+        needed = self._holes(rendering)
+        if self.settings.use_proxy_depth:
+            tolerance = self.settings.depth_tolerance
+            needed = needed | densify.hidden_surfaces(rendering.depth, view.depth, view.trust, tolerance)
+        return needed
+
+    def _grown_depth(self, view: View, rendering: Rendering) -> tuple[Tensor, Tensor]:
+        """(H, W) depth and trust: the proxy where it is reliable, else the map's own; 0 where neither knows."""
+        # A trusted proxy is sharp at depth edges, where the map's blended depth lies between the surfaces.
+        nearer = densify.hidden_surfaces(rendering.depth, view.depth, view.trust, self.settings.depth_tolerance)
+        use_map = (rendering.silhouette > _SOLID) & ~nearer & (view.trust < _HIGH_RELIABILITY)
+        proxy = torch.where(view.trust > _LOW_RELIABILITY, view.depth, 0.0)
+        return torch.where(use_map, rendering.depth, proxy), torch.where(use_map, _LOW_RELIABILITY, view.trust)
+
+    def _completed(self, index: int) -> SeedDepth:
+        view = self.views[index]
+        return self._complete(view, view.depth, view.trust)
+
+    def _completed_by_map(self, view: View, rendering: Rendering) -> SeedDepth:
+        """The view's depth, completed from what the other views have put into the map around its holes."""
+        known = (rendering.silhouette > _SOLID) & (view.trust < _HIGH_RELIABILITY)
+        trust = torch.where(known, view.trust.clamp(min=2 * _LOW_RELIABILITY), view.trust)
+        return self._complete(view, torch.where(known, rendering.depth, view.depth), trust)
+
+    def _complete(self, view: View, depth: Tensor, trust: Tensor) -> SeedDepth:
+        channels, prior = view.channels.cpu().numpy(), self.settings.region_prior
+        return complete_depth(depth.cpu().numpy(), trust.cpu().numpy(), channels, _LOW_RELIABILITY, prior)
+
+    def _append(self, index: int, pixels: Tensor, depth: Tensor, trust: Tensor, spacing: float, opacity: float) -> None:
+        parameters, view = self.state.parameters, self.views[index]
+        pixels = pixels & (depth > 0)
+        if not pixels.any() or len(parameters) >= self.settings.max_gaussians:
+            return
+        pose = self.state.cam_from_world(index, view)
+        seeds = seed_gaussians(
+            pixels, depth, view.colors, view.channels, spacing, self.classes, pose, view.intrinsics, view.frame_id
+        )
+        seeds.opacity_logits.fill_(math.log(opacity / (1 - opacity)))
+        parameters.append(seeds, trust[pixels])

@@ -1,0 +1,95 @@
+"""Everything that changes while the map is optimised, as a snapshot holds it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from formats.tensors import load_tensors, save_tensors
+from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussians.parameters import AdamTable, MapParameters, empty_map
+from pipelines.geometry import se3
+from pipelines.mapping.views import View
+
+VIEW_KEYS = ("twist", "log_gain", "offset")
+
+Exposures = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Log gains and offsets, (N, 3) each."""
+
+
+@dataclass(frozen=True)
+class OptimisedMap:
+    """The map, and per view the refined cam_from_world (N, 4, 4), log_gains (N, 3) and offsets (N, 3)."""
+
+    gaussian_map: GaussianMap
+    cam_from_world: NDArray[np.float64]
+    log_gains: NDArray[np.float32]
+    offsets: NDArray[np.float32]
+    iterations: int
+
+
+@dataclass
+class OptimiserState:
+    """The map's parameters, each view's twist and exposure, and the number of steps done."""
+
+    parameters: MapParameters
+    view_tables: list[AdamTable]
+    iteration: int = 0
+
+    @staticmethod
+    def fresh(
+        views: Sequence[View], classes: int, initial: GaussianMap | None, exposure: Exposures | None
+    ) -> OptimiserState:
+        """No step done: the given map or an empty one, the views where they are."""
+        device = views[0].image.device
+        gains, offsets = exposure or (np.zeros((len(views), 3), np.float32), np.zeros((len(views), 3), np.float32))
+        tables = [
+            AdamTable(
+                {
+                    "twist": torch.zeros(6, device=device),
+                    "log_gain": torch.as_tensor(g, dtype=torch.float32, device=device),
+                    "offset": torch.as_tensor(o, dtype=torch.float32, device=device),
+                }
+            )
+            for g, o in zip(gains, offsets, strict=True)
+        ]
+        return OptimiserState(MapParameters.from_map(initial or empty_map(classes, device)), tables)
+
+    @staticmethod
+    def load(snapshot: Path | None, views: Sequence[View]) -> OptimiserState | None:
+        """What `save` has written, None where there is no such file."""
+        if snapshot is None or not snapshot.exists():
+            return None
+        tensors = {k: v.to(views[0].image.device) for k, v in load_tensors(snapshot).items()}
+        tables = [AdamTable.from_tensors(tensors, f"view{i}", VIEW_KEYS) for i in range(len(views))]
+        return OptimiserState(MapParameters.from_tensors(tensors), tables, int(tensors["iteration"]))
+
+    def save(self, snapshot: Path) -> None:
+        """Into one file, whole or not at all."""
+        out = {**self.parameters.to_tensors(), "iteration": torch.tensor(self.iteration)}
+        for i, table in enumerate(self.view_tables):
+            out |= table.to_tensors(f"view{i}")
+        save_tensors(snapshot, out)
+
+    def cam_from_world(self, index: int, view: View) -> Tensor:
+        """(4, 4) float64 the view's pose as it is refined by now."""
+        return se3.exp(self.view_tables[index].values["twist"].detach().double()) @ view.cam_from_world
+
+    def result(self, views: Sequence[View], iterations: int) -> OptimisedMap:
+        """The values without the optimiser's own."""
+        poses = [self.cam_from_world(i, v).cpu() for i, v in enumerate(views)]
+        gains, offsets = (
+            torch.stack([t.values[k].detach().cpu() for t in self.view_tables]).numpy() for k in VIEW_KEYS[1:]
+        )
+        return OptimisedMap(self.parameters.to_map(), torch.stack(poses).numpy(), gains, offsets, iterations)
+
+
+def expose(colors: Tensor, table: AdamTable) -> Tensor:
+    """(H, W, 3) colours of the map as this view's exposure shows them."""
+    return colors * torch.exp(table.values["log_gain"]) + table.values["offset"]
