@@ -71,6 +71,7 @@ class ProxyConfig:
     stereo_side: int = setting(320, "multiview matches images of this many pixels on the long side")
     stereo_planes: int = setting(96, "multiview tries this many depths")
     max_classes: int = setting(16, "segments makes at most this many classes")
+    symmetry: bool = setting(True, "look for mirror symmetry and pair the pixels of its two halves")
 
 
 @dataclass(frozen=True)
@@ -198,6 +199,8 @@ class ExportConfig:
     max_views: int = setting(200, "keyframes the mesh is fused from, evenly spread")
     mesh_side: int = setting(640, "pixels on the long side of their depth images")
     least_weight: float = setting(1.5, "a voxel seen with less weight, in views at the median depth, has no surface")
+    spz: bool = setting(False, "write the map as point_cloud.spz too")
+    sh_degree: int = setting(0, "degree that the splat PLYs state; 3 for readers that insist on it, the rest is zeros")
     least_piece: float = setting(0.01, "connected pieces smaller than this share of the largest one are removed")
 
 

@@ -26,7 +26,17 @@ from formats.errors import InputError
 from formats.images import read_rgb
 from formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
 from pipelines.gaussians.map import GaussianMap
-from pipelines.types import Calibration, ClassTable, Frame, Intrinsics, LoopEdge, ProxyMaps, SparseModel, Trajectory
+from pipelines.types import (
+    Calibration,
+    ClassTable,
+    Frame,
+    Intrinsics,
+    LoopEdge,
+    MirrorPairs,
+    ProxyMaps,
+    SparseModel,
+    Trajectory,
+)
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -104,6 +114,11 @@ class RunFolder:
     def load_proxy(self, frame_id: int) -> ProxyMaps:
         """Proxy maps of one frame; InputError when it has none."""
         return load_proxy_maps(proxy_path(self.stage("proxy"), frame_id))
+
+    def load_symmetry(self) -> dict[int, MirrorPairs]:
+        """Frame id → pairs of pixels that show each other's mirror image; {} where no symmetry was found."""
+        path = self.stage("proxy") / "symmetry.npz"
+        return load_mirror_pairs(path) if path.exists() else {}
 
     # tracking, mapping, global_ba -------------------------------------------------------------------------------
 
@@ -209,6 +224,26 @@ def load_proxy_maps(path: Path) -> ProxyMaps:
         labels=arrays["labels"],
         label_confidence=arrays["label_confidence"].astype(np.float32) / np.float32(255),
     )
+
+
+def save_mirror_pairs(folder: Path, pairs_of: dict[int, MirrorPairs]) -> None:
+    """One npz of all frames that have any; nothing where none has."""
+    kept = {i: p for i, p in pairs_of.items() if len(p)}
+    if not kept:
+        return
+    arrays = {n: np.concatenate([getattr(p, n) for p in kept.values()]) for n in _PAIR_ARRAYS}
+    of_frame = np.repeat(np.array(list(kept), np.int64), [len(p) for p in kept.values()])
+    save_arrays(folder / "symmetry.npz", {"of_frame": of_frame, **arrays})
+
+
+def load_mirror_pairs(path: Path) -> dict[int, MirrorPairs]:
+    """Inverse of `save_mirror_pairs`."""
+    arrays = load_arrays(path)
+    of_frame = arrays["of_frame"]
+    return {int(i): MirrorPairs(*(arrays[n][of_frame == i] for n in _PAIR_ARRAYS)) for i in np.unique(of_frame)}
+
+
+_PAIR_ARRAYS = ("pairs", "confidence", "gain", "offset")
 
 
 def save_trajectory(folder: Path, trajectory: Trajectory) -> None:

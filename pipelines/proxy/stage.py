@@ -19,7 +19,15 @@ from pipelines.proxy.scale import DepthScale, measure_scale
 from pipelines.proxy.scratch import load_scratch, save_scratch
 from pipelines.proxy.selection import Surroundings, open_depth, open_semantics
 from pipelines.proxy.sequence import Sequence, map_intrinsics
-from pipelines.run_folder import load_proxy_maps, proxy_path, save_classes, save_proxy_maps, write_json
+from pipelines.proxy.symmetry import find_mirror_planes, mirror_pairs
+from pipelines.run_folder import (
+    load_proxy_maps,
+    proxy_path,
+    save_classes,
+    save_mirror_pairs,
+    save_proxy_maps,
+    write_json,
+)
 from pipelines.stages import Stage, StageContext
 from pipelines.types import VOID, Frame, ProxyMaps
 
@@ -50,7 +58,8 @@ def run(context: StageContext) -> dict[str, Any]:
         context.warn(message)
     save_classes(context.folder, semantics.classes())
     agreements = _maps_pass(context, sequence, frames, semantics, scale)
-    report = {**_report(context, frames, depths, semantics, agreements), **_scale_figures(depths, scale)}
+    mirrors = _symmetry_pass(context, sequence, frames, scale) if context.config.proxy.symmetry else {}
+    report = {**_report(context, frames, depths, semantics, agreements), **_scale_figures(depths, scale), **mirrors}
     write_json(context.folder / "proxy.json", report)
     return report
 
@@ -167,6 +176,27 @@ def _agreement(
     return 1.0 if m is None else m
 
 
+def _symmetry_pass(context: StageContext, sequence: Sequence, frames: list[Frame], scale: DepthScale) -> dict[str, Any]:
+    """Mirror planes of the scene, and the pixels they pair in every frame; says how many it found."""
+    planes = find_mirror_planes(
+        sequence,
+        frames,
+        lambda frame: _in_backbone_unit(_load_depth(context.snapshot, frame), scale),
+        context.progress,
+    )
+    pairs_of = {}
+    for frame in frames if planes else []:
+        if (pose := sequence.cam_from_world.get(frame.id)) is not None:
+            maps = load_proxy_maps(proxy_path(context.folder, frame.id))
+            # The planes are in the backbone's unit, the maps in the depth's.
+            in_cam = [(p.in_cam(pose) * [1, 1, 1, scale.value], p.confidence) for p in planes]
+            pairs = mirror_pairs(sequence.image(frame), maps.depth, maps.confidence, sequence.intrinsics, in_cam)
+            enlarge = np.float32(sequence.calibration.intrinsics.width / sequence.intrinsics.width)
+            pairs_of[frame.id] = replace(pairs, pairs=pairs.pairs * enlarge)
+    save_mirror_pairs(context.folder, pairs_of)
+    return {"mirror_planes": len(planes), "mirror_pairs": sum(map(len, pairs_of.values()))}
+
+
 # report ---------------------------------------------------------------------------------------------------------
 
 
@@ -211,4 +241,4 @@ def _scale_figures(depths: DepthProvider, scale: DepthScale) -> dict[str, Any]:
     return {"metres_per_unit": round(scale.value, 6), "scale_spread": round(scale.spread, 5)}
 
 
-STAGE = Stage("proxy", 2, run, "depth, reliability and classes of the keyframes")
+STAGE = Stage("proxy", 3, run, "depth, reliability and classes of the keyframes")
