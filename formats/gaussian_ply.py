@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ SH_C0 = 0.28209479177387814
 _REST_COUNTS = {0: 0, 1: 9, 2: 24, 3: 45}
 _MEANS, _NORMALS, _DC = ["x", "y", "z"], ["nx", "ny", "nz"], ["f_dc_0", "f_dc_1", "f_dc_2"]
 _SCALES, _ROTATION = ["scale_0", "scale_1", "scale_2"], ["rot_0", "rot_1", "rot_2", "rot_3"]
+_PROB = "class_prob_"
 
 
 def write_gaussian_ply(
@@ -28,7 +30,8 @@ def write_gaussian_ply(
 
     The properties are those of the original code in its order: x y z, nx ny nz (0), f_dc_0..2, f_rest_* (as many as
     `sh_degree` has, all 0), opacity (logit), scale_0..2 (log), rot_0..3 (w x y z); after them class_id (uchar) and
-    class_prob_0.. (float) where the cloud has classes. Degree 0, the default, is what the original writes when it
+    class_prob_<class> (float) where the cloud has classes, of those that are anywhere above 0: tables of 100 classes
+    would otherwise fill most of the file with zeros. Degree 0, the default, is what the original writes when it
     trains without view-dependent colour; 3 is for readers that insist on 45 of them. Class names go to comments.
 
     Raises ValueError for another degree or a value that is not finite, InputError when the disk refuses.
@@ -40,8 +43,8 @@ def write_gaussian_ply(
     dtype: list[tuple[str, str]] = [(name, "<f4") for name in fields]
     if cloud.class_ids is not None:
         dtype.append(("class_id", "u1"))
-    if cloud.class_probs is not None:
-        dtype += [(f"class_prob_{i}", "<f4") for i in range(cloud.class_probs.shape[1])]
+    occurring = [] if cloud.class_probs is None else np.flatnonzero((cloud.class_probs != 0).any(axis=0)).tolist()
+    dtype += [(f"{_PROB}{i}", "<f4") for i in occurring]
     vertex = np.zeros(len(cloud), dtype=dtype)
     _fill(vertex, _MEANS, cloud.means)
     _fill(vertex, _DC, (cloud.colors - np.float32(0.5)) / np.float32(SH_C0))
@@ -51,7 +54,7 @@ def write_gaussian_ply(
     if cloud.class_ids is not None:
         vertex["class_id"] = cloud.class_ids
     if cloud.class_probs is not None:
-        _fill(vertex, [f"class_prob_{i}" for i in range(cloud.class_probs.shape[1])], cloud.class_probs)
+        _fill(vertex, [f"{_PROB}{i}" for i in occurring], cloud.class_probs[:, occurring])
     write_ply(path, {"vertex": vertex}, [f"class {i} {name}" for i, name in enumerate(class_names)])
 
 
@@ -76,7 +79,7 @@ def read_gaussian_ply(path: Path) -> GaussianCloud:
         opacity_logits=columns(vertex, ["opacity"], path)[:, 0],
         colors=columns(vertex, _DC, path) * np.float32(SH_C0) + np.float32(0.5),
         class_ids=vertex["class_id"].astype(np.uint8) if "class_id" in names else None,
-        class_probs=_class_probs(vertex, path),
+        class_probs=_class_probs(vertex, ply.comments, path),
         dropped_sh_degree=_rest_degree(names),
     )
 
@@ -105,9 +108,19 @@ def _unit(quat_wxyz: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(length > 1e-12, quat_wxyz / np.maximum(length, np.float32(1e-12)), identity).astype(np.float32)
 
 
-def _class_probs(vertex: NDArray[Any], path: Path) -> NDArray[np.float32] | None:
-    count = sum(name.startswith("class_prob_") for name in vertex.dtype.names or ())
-    return columns(vertex, [f"class_prob_{i}" for i in range(count)], path) if count else None
+def _class_probs(vertex: NDArray[Any], comments: list[str], path: Path) -> NDArray[np.float32] | None:
+    """(M, C) for as many classes as the comments name, or as are there; those without a property are 0."""
+    names = [n for n in vertex.dtype.names or () if n.startswith(_PROB) and n[len(_PROB) :].isdecimal()]
+    if not names:
+        return None
+    classes = [int(n[len(_PROB) :]) for n in names]
+    named = [int(found[1]) for c in comments if (found := re.match(r"class (\d+) ", c + " "))]
+    count = max(*classes, *named, 0) + 1
+    if count > 255:
+        raise InputError(f"{path} has a class {count - 1}: class numbers end at 254")
+    out = np.zeros((len(vertex), count), np.float32)
+    out[:, classes] = columns(vertex, names, path)
+    return out
 
 
 def _rest_degree(names: tuple[str, ...]) -> int:

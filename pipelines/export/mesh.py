@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from formats.mesh import write_mesh_glb, write_mesh_ply
 from pipelines.config import ExportConfig
 from pipelines.export.paint import PaintedView, paint
-from pipelines.export.result import Result
 from pipelines.export.surface import extract_surface, without_floaters
 from pipelines.export.volume import DepthView, fuse
 from pipelines.gaussians.map import GaussianMap
 from pipelines.gaussians.render import get_threads, median_depth, render
+from pipelines.outcome import Outcome
 from pipelines.progress import Progress
 from pipelines.types import VOID, Intrinsics, SemanticMesh
 
@@ -24,18 +24,18 @@ _LEAST_LOGIT = 1.0
 """A pixel whose best class leads the mean of the others by less has none; a seed of a known class leads by 3."""
 
 
-def make_mesh(result: Result, settings: ExportConfig, progress: Progress) -> SemanticMesh:
+def make_mesh(outcome: Outcome, settings: ExportConfig, progress: Progress) -> SemanticMesh:
     """The surface of the map as the keyframes see it; without a vertex where nothing is seen twice."""
-    poses = _spread([pose for _, pose in sorted(result.keyframe_poses.items())], settings.max_views)
-    camera = _camera(result.calibration.intrinsics, settings.mesh_side)
-    gaussian_map = result.gaussian_map
+    trajectory, gaussian_map = outcome.trajectory, outcome.require_map()
+    poses = _spread(list(trajectory.cam_from_world[trajectory.is_keyframe]), settings.max_views)
+    camera = _camera(outcome.calibration.intrinsics, settings.mesh_side)
     views = [depth_view(gaussian_map, p, camera) for p in progress.track(poses, "depth views", len(poses))]
     voxel = settings.voxel * _median_depth(views)
     volume = fuse(views, voxel, settings.truncation, settings.max_blocks, get_threads())
     least = settings.least_weight if len(views) >= 4 else 0.5
     vertices, faces = without_floaters(*extract_surface(volume, least), settings.least_piece)
     painted = progress.track(_painted(gaussian_map, views), "painting", len(views))
-    colors, labels = paint(vertices, painted, result.class_ids, 2 * volume.truncation)
+    colors, labels = paint(vertices, painted, tuple(outcome.label_of_channel.tolist()), 2 * volume.truncation)
     return SemanticMesh(vertices, faces, colors, labels)
 
 

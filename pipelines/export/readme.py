@@ -9,9 +9,11 @@ frames/                   the undistorted frames that the model names.
 transforms.json           the same cameras for nerfstudio.
 trajectory.txt            poses in TUM format: timestamp tx ty tz qx qy qz qw (camera in the world); evo reads it.
 point_cloud.ply           the map: Gaussians in the layout of the original 3D Gaussian splatting, with class_id and
-                          class_prob_* after it. Splat viewers (SuperSplat and others) open it.
-point_cloud_semantic.ply  the same, coloured by class.
+                          class_prob_<class> of the classes that occur after it. Splat viewers (SuperSplat and
+                          others) open it.
+point_cloud_semantic.ply  the same, coloured by class, without the probabilities.
 point_cloud_compact.safetensors   the same in a fraction of the space.
+point_cloud.spz           only with --set export.spz=true: the colours of the map, small, for viewers on the web.
 mesh.ply, mesh.glb        the surface with a colour and a label (PLY: property label, GLB: attribute _LABEL) at each
                           vertex. MeshLab, Blender, trimesh.
 classes.json              number, name and colour of each class; 255 is "unknown".

@@ -1,4 +1,4 @@
-"""The files for other programs, each written from a `Result`."""
+"""The files for other programs, each written from what the run ended with."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from formats.atomic import atomic_path, write_text
@@ -16,22 +17,24 @@ from formats.compact_gaussians import write_compact
 from formats.gaussian_ply import write_gaussian_ply
 from formats.gaussians import GaussianCloud, isotropic_cloud
 from formats.nerfstudio import write_transforms
+from formats.spz import write_spz
 from formats.trajectory import write_tum
 from pipelines.export.readme import README
-from pipelines.export.result import Result
-from pipelines.run_folder import RunFolder, save_classes
+from pipelines.outcome import Outcome
+from pipelines.run_folder import save_classes
 from pipelines.types import SparseModel
 
 
-def write_colmap(run: RunFolder, result: Result, folder: Path) -> list[Path]:
+def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
     """`sparse/0` (binary and text) and transforms.json, with the posed frames beside them in `frames/`."""
-    trajectory, k = result.trajectory, result.calibration.intrinsics
+    trajectory, k = outcome.trajectory, outcome.calibration.intrinsics
     posed = np.flatnonzero(trajectory.is_posed)
-    names = tuple(result.frames[int(trajectory.frame_ids[r])].name for r in posed)
+    name_of = {f.id: f.name for f in outcome.frames}
+    names = tuple(name_of[int(i)] for i in trajectory.frame_ids[posed])
     camera = (k.width, k.height, k.fx, k.fy, k.cx, k.cy)
     for name in names:
-        place_image(run.stage("frames") / name, folder / "frames" / name)
-    points = seen_points(result.sparse, trajectory.frame_ids[posed])
+        place_image(outcome.run.stage("frames") / name, folder / "frames" / name)
+    points = seen_points(outcome.load_sparse(), trajectory.frame_ids[posed])
     write_colmap_model(folder / "sparse" / "0", *camera, names, trajectory.cam_from_world[posed], *points)
     paths = [f"frames/{name}" for name in names]
     write_transforms(folder / "transforms.json", *camera, paths, trajectory.world_from_cam[posed])
@@ -39,9 +42,12 @@ def write_colmap(run: RunFolder, result: Result, folder: Path) -> list[Path]:
 
 
 def seen_points(
-    model: SparseModel, image_ids: NDArray[np.int64]
+    model: SparseModel | None, image_ids: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """points, colors, and obs_image, obs_point, obs_xy of the points that at least two of the images see."""
+    if model is None:
+        none = np.zeros(0, np.int64)
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8), none, none, np.zeros((0, 2))
     row = {int(i): n for n, i in enumerate(image_ids)}
     image = np.array([row.get(int(i), -1) for i in model.frame_ids], dtype=np.int64)[model.obs_frame]
     kept = image >= 0
@@ -65,36 +71,50 @@ def place_image(source: Path, target: Path) -> None:
             shutil.copyfile(source, temporary)
 
 
-def write_ply(result: Result, folder: Path) -> list[Path]:
+def map_cloud(outcome: Outcome) -> GaussianCloud:
+    """The map as a splat cloud, class probabilities in the order of the run's classes where it has any."""
+    m, channels = outcome.require_map(), outcome.label_of_channel
+    probabilities = None
+    if len(channels):
+        probabilities = np.zeros((len(m), len(outcome.classes)), np.float32)
+        probabilities[:, channels] = torch.softmax(m.class_logits, dim=1).numpy()
+    return isotropic_cloud(
+        m.means.numpy(), m.log_radii.numpy(), m.opacity_logits.numpy(), m.colors.numpy(), probabilities
+    )
+
+
+def write_ply(outcome: Outcome, sh_rest: bool, folder: Path) -> list[Path]:
     """The map as splat PLYs, in its own colours and in those of the classes, and as a compact file."""
-    m, names = result.gaussian_map, result.classes.names
-    cloud = isotropic_cloud(
-        m.means.numpy(), m.log_radii.numpy(), m.opacity_logits.numpy(), m.colors.numpy(),
-        result.class_probabilities if result.class_ids else None,
-    )  # fmt: skip
+    cloud, names = map_cloud(outcome), outcome.classes.names
     paths = [folder / n for n in ("point_cloud.ply", "point_cloud_semantic.ply", "point_cloud_compact.safetensors")]
-    write_gaussian_ply(paths[0], cloud, names)
-    write_gaussian_ply(paths[1], _by_class(cloud, result), names)
+    write_gaussian_ply(paths[0], cloud, names, sh_degree=3 * sh_rest)
+    write_gaussian_ply(paths[1], _by_class(cloud, outcome), names, sh_degree=3 * sh_rest)
     write_compact(paths[2], cloud, names)
     return paths
 
 
-def _by_class(cloud: GaussianCloud, result: Result) -> GaussianCloud:
+def write_spz_file(outcome: Outcome, folder: Path) -> list[Path]:
+    """The map's colours in a tenth of the space of the PLY, without classes: the format has no room for them."""
+    write_spz(folder / "point_cloud.spz", map_cloud(outcome))
+    return [folder / "point_cloud.spz"]
+
+
+def _by_class(cloud: GaussianCloud, outcome: Outcome) -> GaussianCloud:
     if cloud.class_ids is None:
         return cloud
-    table = (np.array(result.classes.colors) / 255).astype(np.float32)
+    table = (np.array(outcome.classes.colors) / 255).astype(np.float32)
     return replace(cloud, colors=table[cloud.class_ids].astype(np.float32))
 
 
-def write_trajectory(result: Result, folder: Path) -> list[Path]:
+def write_trajectory(outcome: Outcome, folder: Path) -> list[Path]:
     """The poses of all posed frames."""
-    posed = result.trajectory.is_posed
-    write_tum(folder / "trajectory.txt", result.trajectory.timestamps[posed], result.trajectory.world_from_cam[posed])
+    t = outcome.trajectory
+    write_tum(folder / "trajectory.txt", t.timestamps[t.is_posed], t.world_from_cam[t.is_posed])
     return [folder / "trajectory.txt"]
 
 
-def write_notes(result: Result, folder: Path) -> list[Path]:
+def write_notes(outcome: Outcome, folder: Path) -> list[Path]:
     """The class table and what each file is for."""
-    save_classes(folder, result.classes)
+    save_classes(folder, outcome.classes)
     write_text(folder / "README.txt", README)
     return [folder / "classes.json", folder / "README.txt"]

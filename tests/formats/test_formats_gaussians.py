@@ -105,6 +105,21 @@ def test_other_files_are_explained(shared_data: Path, tmp_path: Path) -> None:
         read_gaussian_ply(tmp_path / "huge.ply")
 
 
+def test_a_long_class_table_costs_only_the_classes_that_occur(tmp_path: Path) -> None:
+    names = tuple(f"thing {i}" for i in range(102))
+    cloud = _cloud(50, 102)
+    assert cloud.class_probs is not None
+    cloud.class_probs[:] = 0
+    cloud.class_probs[:, 7], cloud.class_probs[:, 90] = 0.75, 0.25
+    write_gaussian_ply(tmp_path / "g.ply", cloud, names)
+    properties = [p.name for p in plyfile.PlyData.read(str(tmp_path / "g.ply"))["vertex"].properties]
+    assert [n for n in properties if n.startswith("class_prob")] == ["class_prob_7", "class_prob_90"]
+    back = read_gaussian_ply(tmp_path / "g.ply").class_probs
+    assert back is not None
+    assert back.shape == (50, 102)
+    assert (back == cloud.class_probs).all()
+
+
 def test_values_that_are_not_finite_are_not_written(tmp_path: Path) -> None:
     cloud = _cloud(5)
     cloud.means[2, 1] = np.nan
