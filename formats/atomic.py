@@ -58,9 +58,7 @@ def _flush_to_disk(path: Path) -> None:
 
 def _explained(error: OSError, path: Path) -> Exception:
     """The same failure in the user's words, where the user can do something about it."""
-    # numpy's tofile reports a short write without an errno; the disk itself tells what happened.
-    full = error.errno in _NO_ROOM or (error.errno is None and _free_bytes(path.parent) < _NEARLY_FULL_BYTES)
-    if full:
+    if is_disk_full(error, path.parent):
         return DiskFullError(
             f"disk full while writing {path.name}, {_free_bytes(path.parent) / 1e6:.0f} MB are free in {path.parent}: "
             "free some space (or point the output at another disk), then run the same command again"
@@ -70,6 +68,12 @@ def _explained(error: OSError, path: Path) -> Exception:
     if error.errno in (errno.ENOTDIR, errno.EEXIST):
         return InputError(f"cannot write {path}, a part of that path is a file: choose another output folder")
     return error
+
+
+def is_disk_full(error: OSError, folder: Path) -> bool:
+    """Whether a write below `folder` failed for want of room (or of quota, or of the largest file allowed)."""
+    # numpy's tofile reports a short write without an errno; the disk itself tells what happened.
+    return error.errno in _NO_ROOM or (error.errno is None and _free_bytes(folder) < _NEARLY_FULL_BYTES)
 
 
 def _free_bytes(folder: Path) -> int:

@@ -1,4 +1,4 @@
-"""JSON files whose shape is checked before anyone relies on it."""
+"""JSON files: written whole or not at all, and checked before anyone relies on what they hold."""
 
 from __future__ import annotations
 
@@ -6,8 +6,14 @@ import json
 from pathlib import Path
 from typing import Any
 
+from formats.atomic import write_text
 from formats.errors import InputError
 from formats.textfile import read_text
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Atomically write indented JSON. Raises ValueError for NaN, InputError when the disk refuses."""
+    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
 def read_json_object(path: Path) -> dict[str, Any]:

@@ -164,15 +164,32 @@ def status(run_path: Path, verbose: bool) -> None:
 @RUN_ARGUMENT
 @click.option("--only", type=click.Choice(EXPORTS), help="Write one kind of file only. Default: all.")
 @click.option("--to", type=FOLDER, metavar="DIR", help="Where to write. Default: RUN/export.")
+@settings_options
 @verbosity_options
-def export(run_path: Path, only: str | None, to: Path | None, quiet: bool, verbose: bool) -> None:
-    """Write the files for other programs: COLMAP model, Gaussian PLY, labelled mesh, TUM trajectory."""
+def export(
+    run_path: Path,
+    only: str | None,
+    to: Path | None,
+    config_file: Path | None,
+    overrides: tuple[str, ...],
+    quiet: bool,
+    verbose: bool,
+) -> None:
+    """Write the files for other programs: COLMAP model, Gaussian PLY or SPZ, labelled mesh, TUM trajectory.
+
+    Other settings than the run's own (--set export.voxel=0.02, --set export.spz=true) need --to; `msgs-slam resume RUN
+    --set ...` changes them in the run itself.
+    """
     set_up_logging(quiet, verbose)
+    if (config_file or overrides) and to is None:
+        raise click.UsageError("with --set or --config, say where to write with --to")
+    from pipelines.config import load_config
     from pipelines.export.stage import export_run
+    from pipelines.reconstruct import existing_config
 
     run = open_run(run_path)
-    folder = to or run.stage("export")
-    for path in export_run(run, folder, only, make_progress(quiet)):
+    settings = load_config(config_file, overrides, base=existing_config(run)).export
+    for path in export_run(run, to or run.stage("export"), only, make_progress(quiet), settings):
         if not quiet:
             click.echo(path)
 

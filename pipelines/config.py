@@ -200,7 +200,7 @@ class ExportConfig:
     mesh_side: int = setting(640, "pixels on the long side of their depth images")
     least_weight: float = setting(1.5, "a voxel seen with less weight, in views at the median depth, has no surface")
     spz: bool = setting(False, "write the map as point_cloud.spz too")
-    sh_degree: int = setting(0, "degree that the splat PLYs state; 3 for readers that insist on it, the rest is zeros")
+    sh_rest: bool = setting(False, "the splat PLYs hold f_rest_0 to 44 too, all zero, for readers that insist on them")
     least_piece: float = setting(0.01, "connected pieces smaller than this share of the largest one are removed")
 
 
@@ -232,6 +232,17 @@ def load_config(file: Path | None = None, overrides: Iterable[str] = (), base: C
             raise InputError(f"--set {text}: expected section.key=value, for example --set frames.rate=5")
         config = merge_settings(config, {section: {name: _parse_value(value.strip())}}, where=f"--set {text}")
     return config
+
+
+def load_saved_config(file: Path) -> Config:
+    """The settings that a run was made with. Raises InputError that says how to go on where they no longer fit."""
+    try:
+        return load_config(file)
+    except InputError as error:
+        raise InputError(
+            f"{error}\nThe run's settings were written by another version of this program, or edited: remove that line "
+            "from the file (its default then holds), or reconstruct into a new folder"
+        ) from error
 
 
 def merge_settings(config: Config, changes: Mapping[str, Any], where: str) -> Config:

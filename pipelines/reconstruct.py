@@ -12,9 +12,10 @@ from pathlib import Path
 
 from formats.atomic import atomic_path
 from formats.errors import DiskFullError, InputError
-from pipelines.config import Config, config_to_toml, load_config
+from formats.jsonfile import write_json
+from pipelines.config import Config, config_to_toml, load_saved_config
 from pipelines.progress import Progress, log
-from pipelines.run_folder import RunFolder, write_json
+from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
 from pipelines.stages import Stage, StageRecord, file_digest, load_records, load_source, run_stages
 
@@ -39,7 +40,7 @@ def default_run_folder(source: Path) -> RunFolder:
 
 def existing_config(run: RunFolder) -> Config | None:
     """The settings a run was made with, or None where there is no run."""
-    return load_config(run.settings_file) if run.settings_file.exists() else None
+    return load_saved_config(run.settings_file) if run.settings_file.exists() else None
 
 
 def reconstruct(
@@ -82,7 +83,7 @@ def resume(
         raise InputError(
             f"{source} has changed since {run.root} was begun. Reconstruct it into another folder: --out NEW"
         )
-    config = _with_device(config or load_config(run.settings_file))
+    config = _with_device(config or load_saved_config(run.settings_file))
     with _only_one_process(run):
         with atomic_path(run.settings_file) as temporary:
             temporary.write_text(config_to_toml(config), encoding="utf-8")

@@ -13,8 +13,8 @@ from formats.images import write_rgb
 from formats.video_writer import CODECS, write_video
 from pipelines.evaluation.camera_paths import orbit, resampled, smoothed
 from pipelines.evaluation.measure import render_outcome
-from pipelines.evaluation.outcome import Outcome, load_outcome
 from pipelines.evaluation.pictures import Picture, depth_picture, depth_range, label_picture
+from pipelines.outcome import Outcome, load_outcome
 from pipelines.progress import Progress, SilentProgress
 from pipelines.run_folder import RunFolder
 
@@ -42,8 +42,7 @@ def render_run(
     if target.suffix.lower() not in CODECS and target.is_file():
         raise InputError(f"{target} is a file. Name a folder for pictures, or a video ending in {', '.join(CODECS)}")
     outcome = load_outcome(run)
-    if outcome.gaussian_map is None:
-        raise InputError(f"{run.root}: there is no map yet. Type `msgs-slam resume {run.root}` first")
+    outcome.require_map()
     near, far = _depth_range(outcome)
     world_from_cam = _path(outcome, path, fps, frames, (near * far) ** 0.5)
     steps = (progress or SilentProgress()).track(range(len(world_from_cam)), "rendering", len(world_from_cam))

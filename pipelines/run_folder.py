@@ -12,7 +12,6 @@ A reader (`load_*`) looks in finished stages. A writer (`save_*`) is given the f
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 from formats.atomic import atomic_path
 from formats.errors import InputError
 from formats.images import read_rgb
+from formats.jsonfile import write_json
 from formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
 from pipelines.gaussians.map import GaussianMap
 from pipelines.types import (
@@ -37,12 +37,6 @@ from pipelines.types import (
     SparseModel,
     Trajectory,
 )
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Atomically write indented JSON."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def read_json(path: Path) -> Any:
@@ -278,8 +272,3 @@ def resize_maps(maps: ProxyMaps, width: int, height: int) -> ProxyMaps:
         return cv2.resize(array, (width, height), interpolation=cv2.INTER_NEAREST)
 
     return ProxyMaps(*(nearest(getattr(maps, n)) for n in ("depth", "confidence", "labels", "label_confidence")))
-
-
-def iter_proxied(run: RunFolder, frames: list[Frame]) -> Iterator[Frame]:
-    """The frames that have proxy maps, in order."""
-    return (f for f in frames if run.has_proxy(f.id))

@@ -14,10 +14,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from formats.atomic import is_disk_full
 from formats.errors import DiskFullError
+from formats.jsonfile import write_json
 from pipelines.config import Config, config_to_dict
 from pipelines.progress import Progress, log
-from pipelines.run_folder import RunFolder, read_json, write_json
+from pipelines.run_folder import RunFolder, read_json
 from pipelines.run_folder_names import STAGES
 
 
@@ -142,7 +144,7 @@ def _run_one(
     try:
         figures = stage.run(context)
     except OSError as error:
-        if error.errno in (28, 122):  # ENOSPC, EDQUOT
+        if is_disk_full(error, run.root):
             raise DiskFullError(
                 f"{run.root}: the disk is full. Free some space and type `msgs-slam resume {run.root}`"
             ) from error

@@ -14,7 +14,7 @@ from formats.errors import InputError
 from formats.gaussian_ply import read_gaussian_ply
 from pipelines.evaluation.camera_paths import upward
 from pipelines.evaluation.measure import evenly
-from pipelines.evaluation.outcome import Outcome, load_outcome
+from pipelines.outcome import Outcome, load_outcome
 from pipelines.proxy.palette import class_colors
 from pipelines.run_folder import RunFolder
 from pipelines.types import Frame
@@ -63,9 +63,7 @@ def load_scene(path: Path) -> ViewerScene:
 
 
 def _from_run(outcome: Outcome) -> ViewerScene:
-    m = outcome.gaussian_map
-    if m is None:
-        raise InputError(f"{outcome.run.root}: there is no map yet. Type `msgs-slam resume {outcome.run.root}` first")
+    m = outcome.require_map()
     t, k = outcome.trajectory, outcome.calibration.intrinsics
     means, radii = m.means.cpu().numpy(), m.radii.detach().cpu().numpy()
     centers = t.centers[t.is_posed]

@@ -13,9 +13,9 @@ from formats.errors import InputError
 from pipelines.evaluation.legacy import legacy_cells
 from pipelines.evaluation.measure import Measured, measure_views
 from pipelines.evaluation.mesh_cells import mesh_cells
-from pipelines.evaluation.outcome import Outcome, load_outcome
 from pipelines.evaluation.trajectory_error import AbsoluteError, ErrorStatistics, absolute_error, relative_error
 from pipelines.evaluation.truth import MatchedTruth, match_truth
+from pipelines.outcome import Outcome, load_outcome
 from pipelines.progress import Progress, SilentProgress
 from pipelines.run_folder import RunFolder
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.evaluation.outcome import Outcome
+from pipelines.outcome import Outcome
 from pipelines.types import LoopEdge, SparseModel
 
 _BLURRED = 0.35

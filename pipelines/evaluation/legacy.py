@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from pipelines.evaluation.measure import KEYFRAMES, Measured
-from pipelines.evaluation.outcome import Outcome
 from pipelines.evaluation.trajectory_error import absolute_error
 from pipelines.evaluation.truth import MatchedTruth
+from pipelines.outcome import Outcome
 
 NOTE = (
     'legacy figures, comparable with papers that use SplaTAM\'s script and with nothing else: its "ATE RMSE" is the '

@@ -13,12 +13,12 @@ from pipelines.evaluation.depth_error import DepthErrorSum
 from pipelines.evaluation.image_quality import psnr, ssim
 from pipelines.evaluation.label_cells import label_cells
 from pipelines.evaluation.label_score import Counts, count_labels, indices_by_name, renamed
-from pipelines.evaluation.outcome import Outcome
 from pipelines.evaluation.trajectory_error import AbsoluteError
 from pipelines.evaluation.truth import FramePixels, MatchedTruth
 from pipelines.evaluation.views import MapView, view_map
 from pipelines.gaussians.render import track_gn
 from pipelines.mapping.load import split_frames
+from pipelines.outcome import Outcome
 from pipelines.progress import Progress
 
 KEYFRAMES, BETWEEN, HELD_OUT = "keyframes", "between", "held out"
@@ -97,10 +97,8 @@ def measure_views(
 
 
 def render_outcome(outcome: Outcome, cam_from_world: NDArray[np.float64]) -> MapView:
-    """The run's map at the size of its frames. Raises ValueError for a run without a map."""
-    if outcome.gaussian_map is None:
-        raise ValueError("the run has no map")
-    return view_map(outcome.gaussian_map, outcome.label_of_channel, outcome.calibration.intrinsics, cam_from_world)
+    """The run's map at the size of its frames. Raises InputError for a run without a map."""
+    return view_map(outcome.require_map(), outcome.label_of_channel, outcome.calibration.intrinsics, cam_from_world)
 
 
 def _jobs(
@@ -129,11 +127,9 @@ def _jobs(
 def refined_pose(outcome: Outcome, frame_id: int, cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """(4, 4) the pose from which the map looks most like the frame's picture, found without any truth.
 
-    The pose as it was where the fit does not converge. Raises ValueError for a run without a map.
+    The pose as it was where the fit does not converge. Raises InputError for a run without a map.
     """
-    m = outcome.gaussian_map
-    if m is None:
-        raise ValueError("the run has no map")
+    m = outcome.require_map()
     frame = outcome.frames[outcome.frame_row(frame_id)]
     photo = (outcome.run.image(frame) / np.float32(255)).astype(np.float32)
     if outcome.exposure is not None:

@@ -10,7 +10,6 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from pipelines.evaluation.outcome import Outcome
 from pipelines.evaluation.surface_error import (
     depth_points,
     sample_surface,
@@ -20,6 +19,7 @@ from pipelines.evaluation.surface_error import (
 )
 from pipelines.evaluation.trajectory_error import AbsoluteError
 from pipelines.evaluation.truth import MatchedTruth
+from pipelines.outcome import Outcome
 
 SAMPLES = 200_000
 VIEWS = 60

@@ -12,12 +12,12 @@ from formats.atomic import write_text
 from pipelines.config import Config, config_to_dict, config_to_toml
 from pipelines.evaluation.facts import Capture, advice, lost_stretches, read_capture
 from pipelines.evaluation.html import bullets, chips, page, section, table
-from pipelines.evaluation.outcome import Outcome, load_outcome
 from pipelines.evaluation.plots import RED, Line, plot
 from pipelines.evaluation.report_views import RenderedViews, class_section, quality_section, render_views
 from pipelines.evaluation.table import evaluation_table
 from pipelines.evaluation.write import evaluation_file, trajectory_plots
 from pipelines.export.readme import README
+from pipelines.outcome import Outcome, load_outcome
 from pipelines.progress import Progress, SilentProgress
 from pipelines.run_folder import RunFolder, read_json
 from pipelines.stages import load_source
@@ -33,7 +33,7 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
     Raises InputError for a run without poses.
     """
     outcome = load_outcome(run)
-    sparse, loops = _load_sparse(outcome), _load_loops(outcome)
+    sparse, loops = outcome.load_sparse(), _load_loops(outcome)
     capture = read_capture(outcome, sparse)
     views = None if outcome.gaussian_map is None else render_views(outcome, progress or SilentProgress())
     evaluation = read_json(evaluation_file(run)) if evaluation_file(run).exists() else None
@@ -55,13 +55,6 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
     target = path or run.root / "report.html"
     write_text(target, page(f"{run.root.name} – report", body))
     return target
-
-
-def _load_sparse(outcome: Outcome) -> SparseModel | None:
-    for stage in (outcome.pose_stage, "tracking"):
-        if (outcome.run.stage(stage) / "sparse.npz").exists():
-            return outcome.run.load_sparse(stage)
-    return None
 
 
 def _load_loops(outcome: Outcome) -> list[LoopEdge]:

@@ -13,9 +13,9 @@ from pipelines.evaluation.facts import Capture
 from pipelines.evaluation.html import image, section
 from pipelines.evaluation.image_quality import psnr
 from pipelines.evaluation.measure import evenly, render_outcome
-from pipelines.evaluation.outcome import Outcome
 from pipelines.evaluation.pictures import depth_picture, depth_range, labels_on_photo
 from pipelines.evaluation.plots import BLUE, GREEN, GREY, ORANGE, RED, Line, Marks, bars, plot
+from pipelines.outcome import Outcome
 from pipelines.progress import Progress
 from pipelines.types import VOID
 

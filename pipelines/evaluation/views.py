@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipelines.evaluation.outcome import Exposure, labels_of_channels
 from pipelines.gaussians.map import GaussianMap
 from pipelines.gaussians.render import median_depth, render
+from pipelines.outcome import Exposure, labels_of_channels
 from pipelines.types import Intrinsics
 
 _SEEN = 0.5

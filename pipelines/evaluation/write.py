@@ -10,9 +10,9 @@ import numpy as np
 from formats.atomic import write_text
 from formats.datasets import Sequence
 from formats.images import write_rgb
+from formats.jsonfile import write_json
 from pipelines.evaluation.evaluate import evaluate_outcome
 from pipelines.evaluation.measure import evenly, render_outcome
-from pipelines.evaluation.outcome import Outcome, load_outcome
 from pipelines.evaluation.pictures import (
     Picture,
     class_colors_by_name,
@@ -26,8 +26,9 @@ from pipelines.evaluation.plots import BLUE, GREY, Line, plot
 from pipelines.evaluation.table import evaluation_table
 from pipelines.evaluation.truth import FramePixels, MatchedTruth, match_truth
 from pipelines.geometry.alignment import Similarity, align_points
+from pipelines.outcome import Outcome, load_outcome
 from pipelines.progress import Progress
-from pipelines.run_folder import RunFolder, write_json
+from pipelines.run_folder import RunFolder
 
 FOLDER = "evaluation"
 SHEET_VIEWS = 6

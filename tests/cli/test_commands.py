@@ -104,3 +104,23 @@ def test_run_of_another_source_is_not_touched(tmp_path: Path) -> None:
     assert "another source" in message
     assert "--out" in message
     assert (out / "manifest.json").read_text() == manifest
+
+
+def test_settings_of_an_older_version_are_explained(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "manifest.json").write_text('{"source": {"path": "other.mp4", "digest": "0"}, "stages": {}}')
+    (out / "run.toml").write_text("[mapping]\npasses = 3.0\ndepht_weight = 0.5\n")
+    for command in ("resume", "report", "render", "export"):
+        more = [tmp_path / "out.mp4"] if command == "render" else []
+        result = invoke(command, out, *more)
+        assert result.exit_code == 1, (command, result.output)
+        assert isinstance(result.exception, SystemExit)
+        assert "there is no setting mapping.depht_weight; did you mean mapping.depth_weight?" in result.stderr
+        assert "remove that line" in result.stderr
+
+
+def test_export_with_other_settings_must_say_where_to(tmp_path: Path) -> None:
+    result = invoke("export", tmp_path, "--set", "export.voxel=0.02")
+    assert result.exit_code == 2
+    assert "--to" in result.stderr

@@ -12,10 +12,10 @@ import pytest
 from formats.datasets import Sequence
 from formats.errors import InputError
 from pipelines.evaluation.facts import Capture, advice, lost_stretches
-from pipelines.evaluation.outcome import load_outcome
 from pipelines.evaluation.plots import Line, plot, ticks
 from pipelines.evaluation.report import write_report
 from pipelines.evaluation.write import write_evaluation
+from pipelines.outcome import load_outcome
 from pipelines.run_folder import RunFolder, save_trajectory
 from pipelines.types import LoopEdge, SparseModel
 

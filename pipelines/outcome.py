@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from formats.errors import InputError
 from formats.tensors import load_arrays
-from pipelines.config import Config, load_config
+from pipelines.config import Config, load_saved_config
 from pipelines.gaussians.map import GaussianMap
 from pipelines.mapping.load import load_class_ids
 from pipelines.run_folder import RunFolder
 from pipelines.stages import StageRecord, load_records, load_source
-from pipelines.types import VOID, Calibration, ClassTable, Frame, Trajectory
+from pipelines.types import VOID, Calibration, ClassTable, Frame, SparseModel, Trajectory
 
 _MAP_STAGES = ("global_ba", "mapping")
 _POSE_STAGES = ("global_ba", "mapping", "tracking")
@@ -74,6 +74,19 @@ class Outcome:
         source = Path(load_source(self.run)["path"])
         return source.is_dir() or source.suffix == ""
 
+    def require_map(self) -> GaussianMap:
+        """The map. Raises InputError before mapping is done."""
+        if self.gaussian_map is None:
+            raise InputError(f"{self.run.root}: there is no map yet. Type `msgs-slam resume {self.run.root}` first")
+        return self.gaussian_map
+
+    def load_sparse(self) -> SparseModel | None:
+        """Points and their observations as the last stage that has any left them."""
+        for stage in (self.pose_stage, "tracking"):
+            if (self.run.stage(stage) / "sparse.npz").exists():
+                return self.run.load_sparse(stage)
+        return None
+
     def frame_row(self, frame_id: int) -> int:
         """Row of a frame in the trajectory."""
         return int(np.flatnonzero(self.trajectory.frame_ids == frame_id)[0])
@@ -81,6 +94,7 @@ class Outcome:
 
 def load_outcome(run: RunFolder) -> Outcome:
     """Raises InputError for a run whose tracking is not done."""
+    config = load_saved_config(run.settings_file)
     records = load_records(run)
     pose_stage = _latest(run, records, _POSE_STAGES, "trajectory.npz")
     if not pose_stage:
@@ -93,7 +107,7 @@ def load_outcome(run: RunFolder) -> Outcome:
     return Outcome(
         run=run,
         records=records,
-        config=load_config(run.settings_file),
+        config=config,
         frames=run.load_frames(),
         calibration=run.load_calibration(),
         pose_stage=pose_stage,

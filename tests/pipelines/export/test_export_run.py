@@ -1,0 +1,98 @@
+"""The exported files of a run, read by other programs' libraries."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pycolmap
+import pytest
+import trimesh
+from evo.tools import file_interface
+
+from formats.datasets import open_sequence
+from formats.errors import InputError
+from formats.spz import read_spz
+from pipelines.config import ExportConfig
+from pipelines.export.stage import export_run
+from pipelines.outcome import load_outcome
+from pipelines.run_folder import RunFolder
+from pipelines.run_folder_names import EXPORTS
+
+OracleRun = Callable[..., RunFolder]
+
+
+@pytest.fixture(scope="module")
+def run(oracle_run: OracleRun) -> RunFolder:
+    return oracle_run(video=True)
+
+
+@pytest.fixture(scope="module")
+def folder(run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("exported")
+    paths = export_run(run, folder, settings=ExportConfig(spz=True, voxel=0.03))
+    assert all(p.exists() for p in paths)
+    return folder
+
+
+def test_poses_are_the_same_everywhere(run: RunFolder, folder: Path) -> None:
+    t = load_outcome(run).trajectory
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    names = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
+    assert len(names) == len(t.frame_ids)
+    for frame, pose in zip(run.load_frames(), t.cam_from_world, strict=True):
+        np.testing.assert_allclose(names[frame.name], pose[:3], atol=1e-9)
+        assert (folder / "frames" / frame.name).exists()
+    tum = file_interface.read_tum_trajectory_file(str(folder / "trajectory.txt"))
+    np.testing.assert_allclose(tum.timestamps, t.timestamps, atol=1e-6)
+    np.testing.assert_allclose(tum.positions_xyz, t.centers, atol=1e-6)
+    nerfstudio = open_sequence(folder / "transforms.json")
+    np.testing.assert_allclose(nerfstudio.world_from_cam, t.world_from_cam, atol=1e-6)
+
+
+def test_map_is_the_same_everywhere(run: RunFolder, folder: Path) -> None:
+    m = load_outcome(run).require_map()
+    vertex = plyfile.PlyData.read(str(folder / "point_cloud.ply"))["vertex"]
+    np.testing.assert_allclose(vertex["scale_0"], m.log_radii, atol=1e-6)
+    np.testing.assert_allclose(vertex["opacity"], m.opacity_logits, atol=1e-6)
+    small = read_spz(folder / "point_cloud.spz")
+    np.testing.assert_allclose(small.means, m.means, atol=1e-3)
+    assert 0 < np.abs(small.log_scales[:, 0] - m.log_radii.numpy()).max() <= 1 / 32 + 1e-6
+    assert (folder / "point_cloud.spz").stat().st_size < 0.2 * (folder / "point_cloud.ply").stat().st_size
+
+
+def test_mesh_lies_on_the_map(run: RunFolder, folder: Path) -> None:
+    mesh = trimesh.load(folder / "mesh.glb", force="mesh")
+    means = load_outcome(run).require_map().means.numpy()
+    assert len(mesh.faces) > 1000
+    extent = np.ptp(means, axis=0).max()
+    low, high = means.min(axis=0) - 0.05 * extent, means.max(axis=0) + 0.05 * extent
+    assert ((mesh.vertices > low) & (mesh.vertices < high)).all()
+
+
+def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
+    expected = {
+        "colmap": "transforms.json",
+        "ply": "point_cloud.ply",
+        "spz": "point_cloud.spz",
+        "tum": "trajectory.txt",
+    }
+    for only in set(EXPORTS) - {"mesh"}:
+        export_run(run, tmp_path / only, only)
+        assert (tmp_path / only / expected[only]).exists()
+        assert not (tmp_path / only / "README.txt").exists()
+
+
+def test_rest_coefficients_on_request(run: RunFolder, tmp_path: Path) -> None:
+    export_run(run, tmp_path, "ply", settings=ExportConfig(sh_rest=True))
+    vertex = plyfile.PlyData.read(str(tmp_path / "point_cloud.ply"))["vertex"]
+    assert sum(p.name.startswith("f_rest_") for p in vertex.properties) == 45
+    assert not vertex["f_rest_44"].any()
+
+
+def test_a_run_without_a_map_is_refused(oracle_run: OracleRun, tmp_path: Path) -> None:
+    run = oracle_run()
+    (run.stage("mapping") / "map.safetensors").unlink()
+    with pytest.raises(InputError, match="msgs-slam resume"):
+        export_run(run, tmp_path / "out", "ply")
+    assert not (tmp_path / "out").exists()
