@@ -10,12 +10,12 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from formats.atomic import is_disk_full
-from formats.errors import DiskFullError
+from formats.errors import DiskFullError, InputError
 from formats.jsonfile import write_json
 from pipelines.config import Config, config_to_dict
 from pipelines.progress import Progress, log
@@ -64,12 +64,19 @@ class StageContext:
 
 @dataclass(frozen=True)
 class Stage:
-    """`run` does the work and returns its key figures; raise `version` whenever its result changes."""
+    """`run` does the work and returns its key figures; raise `version` whenever its result changes.
+
+    A stage that reads more than the stages before it says so by `inputs`: plain values that change with what it reads
+    (files, models). `check` refuses what it could not use. Both see (source, config) before the first stage runs, so
+    that a mistake is told of before anything slow.
+    """
 
     name: str
     version: int
     run: Callable[[StageContext], dict[str, Any]]
     summary: str
+    inputs: Callable[[Path, Config], Any] | None = None
+    check: Callable[[Path, Config], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -83,6 +90,7 @@ class StageRecord:
     figures: dict[str, Any]
     warnings: list[str]
     content: str
+    inputs: Any = None
 
     @staticmethod
     def from_json(value: dict[str, Any]) -> StageRecord:
@@ -113,26 +121,59 @@ def run_stages(
 ) -> dict[str, StageRecord]:
     """Bring every stage up to `until` up to date; returns their records.
 
-    A stage is up to date when its fingerprint (version, own settings, seed, content of the stages before it) and
-    its files are unchanged. Raises InputError as the stages do.
+    A stage is up to date when its fingerprint (version, own settings, seed, own inputs, content of the stages before
+    it) and its files are unchanged. Raises InputError as the stages do.
     """
     records = load_records(run)
     upstream = source_digest
-    for stage in stages[: STAGES.index(until) + 1]:
-        fingerprint = _fingerprint(stage, config, upstream)
+    wanted = stages[: STAGES.index(until) + 1]
+    inputs = _check_inputs(wanted, source, config, records, source_digest)
+    for stage in wanted:
+        fingerprint = _fingerprint(stage, config, upstream, inputs[stage.name])
         record = records.get(stage.name)
         if record is None or record.fingerprint != fingerprint or not _intact(run.stage(stage.name), record):
             for later in STAGES[STAGES.index(stage.name) :]:
                 records.pop(later, None)
-            record = _run_one(stage, run, source, config, progress, fingerprint)
+            record = replace(_run_one(stage, run, source, config, progress, fingerprint), inputs=inputs[stage.name])
             records[stage.name] = record
             for later in STAGES[STAGES.index(stage.name) + 1 :]:  # made from what is no longer there
                 shutil.rmtree(run.stage(later), ignore_errors=True)
             _save_manifest(run, source, source_digest, records)
         else:
             log.info("%s: up to date", stage.name)
-        upstream = hashlib.sha256((upstream + record.content).encode()).hexdigest()
+        upstream = _next_upstream(upstream, record)
     return records
+
+
+def _check_inputs(
+    stages: list[Stage], source: Path, config: Config, records: dict[str, StageRecord], upstream: str
+) -> dict[str, Any]:
+    """What each stage reads beside the stages before it; raises InputError where one has work to do and cannot.
+
+    A finished stage whose inputs are gone (files deleted, a model removed) stays as it is.
+    """
+    inputs = {}
+    settled = True
+    for stage in stages:
+        record = records.get(stage.name)
+        settled &= record is not None and record.fingerprint == _fingerprint(stage, config, upstream, record.inputs)
+        kept = record.inputs if record is not None and settled else None
+        upstream = _next_upstream(upstream, record) if record else upstream
+        try:
+            inputs[stage.name] = stage.inputs(source, config) if stage.inputs else None
+        except InputError as error:
+            if not settled:
+                raise
+            log.warning("%s: keeps what it was made from (%s)", stage.name, error)
+            inputs[stage.name] = kept
+        settled &= inputs[stage.name] == kept
+        if stage.check and not settled:
+            stage.check(source, config)
+    return inputs
+
+
+def _next_upstream(upstream: str, record: StageRecord) -> str:
+    return hashlib.sha256((upstream + record.content).encode()).hexdigest()
 
 
 def _run_one(
@@ -181,9 +222,10 @@ def _flush_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _fingerprint(stage: Stage, config: Config, upstream: str) -> str:
+def _fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) -> str:
     own = config_to_dict(getattr(config, stage.name))
-    text = json.dumps([stage.name, stage.version, own, config.run.seed, upstream], sort_keys=True)
+    beside = [] if inputs is None else [inputs]
+    text = json.dumps([stage.name, stage.version, own, config.run.seed, upstream, *beside], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -27,13 +27,10 @@ class NamedClass:
         return self.name.strip().lower() in VOID_NAMES
 
 
-def find_class_table(label_folder: Path) -> dict[int, NamedClass] | None:
-    """The table in the label folder or the one above it; None when there is none. InputError when it is damaged."""
-    for folder in (label_folder, label_folder.parent):
-        for name in _FILES:
-            if (folder / name).is_file():
-                return read_class_table(folder / name)
-    return None
+def find_class_table(label_folder: Path) -> Path | None:
+    """The table in the label folder or the one above it; None when there is none."""
+    candidates = (folder / name for folder in (label_folder, label_folder.parent) for name in _FILES)
+    return next((path for path in candidates if path.is_file()), None)
 
 
 def read_class_table(path: Path) -> dict[int, NamedClass]:

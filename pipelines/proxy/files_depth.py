@@ -66,6 +66,10 @@ class FilesDepth:
             confidence *= resample_nearest(given, camera.height, camera.width)
         return DepthEstimate(depth, confidence, invalid)
 
+    def files(self) -> list[Path]:
+        """Every file that it may read."""
+        return [*self._files.values(), *self._confidences.values()]
+
     def figures(self) -> dict[str, Any]:
         """Whether the folder had confidences too."""
         return {"confidence_files": len(self._confidences)}

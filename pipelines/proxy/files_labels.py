@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from formats.errors import InputError
 from formats.images import read_label_png
 from pipelines.progress import Progress
-from pipelines.proxy.class_files import MAX_ID, NamedClass, find_class_table
+from pipelines.proxy.class_files import MAX_ID, NamedClass, find_class_table, read_class_table
 from pipelines.proxy.files_depth import require_aspect
 from pipelines.proxy.matching_files import find_folder, match_files
 from pipelines.proxy.palette import class_colors
@@ -37,7 +37,8 @@ class FilesLabels:
         self.name = f"files:{path}"
         self._sequence, self._progress = sequence, progress
         self._files = match_files(path, _SUFFIXES, _NAMES, sequence.frames, source.is_file())
-        self._table = find_class_table(path)
+        self._table_file = find_class_table(path)
+        self._table = read_class_table(self._table_file) if self._table_file else None
         self._label_of = np.full(MAX_ID + 1, VOID, np.uint8)
         self._classes = ClassTable((), ())
         self._outside: dict[int, int] = {}
@@ -88,6 +89,10 @@ class FilesLabels:
     def classes(self) -> ClassTable:
         """The classes that occur, in the order of their ids."""
         return self._classes
+
+    def files(self) -> list[Path]:
+        """Every file that it may read."""
+        return [*self._files.values(), *([self._table_file] if self._table_file else [])]
 
     def figures(self) -> dict[str, Any]:
         """Pixels whose id is not in the table, by id."""

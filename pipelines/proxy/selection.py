@@ -45,28 +45,63 @@ def split_choice(text: str, setting: str, kinds: tuple[str, ...]) -> tuple[str, 
     return kind, rest
 
 
+@dataclass(frozen=True)
+class Choice:
+    """A provider as the settings ask for it: the folder of `files`, or the card of a network."""
+
+    kind: str
+    folder: str = ""
+    card: Card | None = None
+
+
+def choose_depth(config: ProxyConfig) -> Choice:
+    """Raises InputError for a provider that does not exist or a card that is none."""
+    return _choose(config.depth, "proxy.depth", "multiview", "depth")
+
+
+def choose_semantics(config: ProxyConfig) -> Choice:
+    """Raises InputError for a provider that does not exist or a card that is none."""
+    return _choose(config.semantics, "proxy.semantics", "segments", "segmentation")
+
+
+def _choose(text: str, setting: str, embedded: str, task: str) -> Choice:
+    kind, rest = split_choice(text, setting, ("auto", embedded, "files", "onnx"))
+    card = _cached(task) if kind == "auto" else read_card(Path(rest)) if kind == "onnx" else None
+    if card is not None:
+        return Choice("onnx", card=card)
+    return Choice("files", rest) if kind == "files" else Choice(embedded)
+
+
 def open_depth(around: Surroundings) -> DepthProvider:
     """Raises InputError when the provider cannot work on this video."""
-    kind, rest = split_choice(around.config.depth, "proxy.depth", ("auto", "multiview", "files", "onnx"))
-    card = _cached("depth") if kind == "auto" else read_card(Path(rest)) if kind == "onnx" else None
-    if kind == "files":
-        files = FilesDepth(rest, around.source, around.sequence, around.config.depth_scale)
-        return _fused(around, files) if around.config.fuse == "always" else files
-    if card is not None:
-        network = OnnxDepth(around.sequence, card, *_surroundings(around, "network_depth"))
-        return _fused(around, network) if around.config.fuse != "never" else network
-    return _multiview(around)
+    choice = choose_depth(around.config)
+    if choice.kind == "multiview":
+        return _multiview(around)
+    learned = open_learned_depth(around, choice)
+    fuse = around.config.fuse == "always" or (around.config.fuse == "learned" and choice.card is not None)
+    return _fused(around, learned) if fuse else learned
+
+
+def open_learned_depth(around: Surroundings, choice: Choice) -> FilesDepth | OnnxDepth:
+    """The provider of `files` or of a network, by itself."""
+    if choice.card is None:
+        return FilesDepth(choice.folder, around.source, around.sequence, around.config.depth_scale)
+    return OnnxDepth(around.sequence, choice.card, *_surroundings(around, "network_depth"))
 
 
 def open_semantics(around: Surroundings) -> SemanticsProvider:
     """Raises InputError when the provider cannot work on this video."""
-    kind, rest = split_choice(around.config.semantics, "proxy.semantics", ("auto", "segments", "files", "onnx"))
-    card = _cached("segmentation") if kind == "auto" else read_card(Path(rest)) if kind == "onnx" else None
-    if kind == "files":
-        return FilesLabels(rest, around.source, around.sequence, around.progress)
-    if card is not None:
-        return OnnxLabels(around.sequence, card, *_surroundings(around, "network_labels"))
-    return SegmentLabels(around.sequence, around.config.max_classes, around.progress)
+    choice = choose_semantics(around.config)
+    if choice.kind == "segments":
+        return SegmentLabels(around.sequence, around.config.max_classes, around.progress)
+    return open_learned_semantics(around, choice)
+
+
+def open_learned_semantics(around: Surroundings, choice: Choice) -> FilesLabels | OnnxLabels:
+    """The provider of `files` or of a network, by itself."""
+    if choice.card is None:
+        return FilesLabels(choice.folder, around.source, around.sequence, around.progress)
+    return OnnxLabels(around.sequence, choice.card, *_surroundings(around, "network_labels"))
 
 
 def _cached(task: str) -> Card | None:

@@ -13,6 +13,7 @@ from formats.errors import InputError
 from pipelines.config import ProxyConfig
 from pipelines.progress import log
 from pipelines.proxy.compact import compact
+from pipelines.proxy.inputs import check_proxy, proxy_inputs
 from pipelines.proxy.providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider
 from pipelines.proxy.reliability import reliability, semantic_agreement, theta, warp_labels
 from pipelines.proxy.scale import DepthScale, measure_scale
@@ -241,4 +242,6 @@ def _scale_figures(depths: DepthProvider, scale: DepthScale) -> dict[str, Any]:
     return {"metres_per_unit": round(scale.value, 6), "scale_spread": round(scale.spread, 5)}
 
 
-STAGE = Stage("proxy", 3, run, "depth, reliability and classes of the keyframes")
+STAGE = Stage(
+    "proxy", 3, run, "depth, reliability and classes of the keyframes", inputs=proxy_inputs, check=check_proxy
+)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from formats.errors import DiskFullError
+from formats.errors import DiskFullError, InputError
 from pipelines.config import Config, MappingConfig, load_config
 from pipelines.progress import SilentProgress
 from pipelines.run_folder import RunFolder
@@ -129,3 +129,41 @@ def test_full_disk_is_said_and_can_be_resumed(recorder: Recorder, tmp_path: Path
         bring_up_to_date(recorder, tmp_path / "r")
     recorder.fail_in = ""
     assert bring_up_to_date(recorder, tmp_path / "r") == ["tracking", "mapping", "global_ba", "export"]
+
+
+def test_inputs_of_a_stage_are_looked_at_first_and_rerun_it_when_they_change(
+    recorder: Recorder, tmp_path: Path
+) -> None:
+    maps = tmp_path / "maps.txt"
+    checked: list[str] = []
+
+    def inputs(source: Path, config: Config) -> str:
+        if not maps.exists():
+            raise InputError(f"{maps} is not there")
+        return maps.read_text()
+
+    def bring(config: Config | None = None) -> list[str]:
+        recorder.ran.clear()
+        stages = recorder.stages()
+        stages[1] = replace(stages[1], inputs=inputs, check=lambda source, config: checked.append(maps.read_text()))
+        root = tmp_path / "r"
+        root.mkdir(exist_ok=True)
+        run_stages(stages, RunFolder(root), Path("video.mp4"), "d", config or Config(), SilentProgress())
+        return list(recorder.ran)
+
+    with pytest.raises(InputError, match="is not there"):
+        bring()
+    assert recorder.ran == []
+    maps.write_text("one")
+    assert bring() == list(STAGES)
+    assert bring() == []
+    assert checked == ["one"]
+    maps.write_text("two")
+    assert bring() == list(STAGES[1:])
+    assert checked == ["one", "two"]
+    # What is finished stays when its inputs are gone, but nothing else can be made of them.
+    maps.unlink()
+    assert bring() == []
+    with pytest.raises(InputError, match="is not there"):
+        bring(load_config(overrides=["frames.rate=1"]))
+    assert recorder.ran == []

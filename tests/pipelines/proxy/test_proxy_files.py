@@ -185,7 +185,9 @@ def test_only_void_or_too_many_classes_are_refused(source: Path, room: Room) -> 
 )
 def test_class_tables_of_all_kinds(tmp_path: Path, name: str, text: str, expected: dict[int, str]) -> None:
     (tmp_path / name).write_text(text)
-    table = find_class_table(tmp_path / "labels")
+    found = find_class_table(tmp_path / "labels")
+    assert found is not None
+    table = read_class_table(found)
     assert table is not None
     assert {k: v.name for k, v in table.items()} == expected
 

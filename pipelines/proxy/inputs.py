@@ -1,0 +1,87 @@
+"""What the stage reads beside the frames: the user's files and networks, looked at before anything slow begins."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence as Rows
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pipelines.config import Config
+from pipelines.frames.source import open_source
+from pipelines.progress import SilentProgress
+from pipelines.proxy.files_depth import FilesDepth
+from pipelines.proxy.files_labels import FilesLabels
+from pipelines.proxy.networks.card import Card
+from pipelines.proxy.networks.onnx_file import external_locations, require_own_weights
+from pipelines.proxy.selection import (
+    Surroundings,
+    choose_depth,
+    choose_semantics,
+    open_learned_depth,
+    open_learned_semantics,
+)
+from pipelines.proxy.sequence import Sequence, map_intrinsics
+from pipelines.stages import file_digest
+from pipelines.types import Calibration, Frame, Intrinsics
+
+
+def proxy_inputs(source: Path, config: Config) -> dict[str, Any]:
+    """Values that change with what the providers read: the files' names and contents, the network and its card.
+
+    Raises InputError for folders and files that do not fit the source, and for a card that is none.
+    """
+    depth, semantics = choose_depth(config.proxy), choose_semantics(config.proxy)
+    chosen = {"depth": depth, "labels": semantics}
+    identities = {k: c.kind if c.card is None else _card_identity(c.card) for k, c in chosen.items()}
+    if "files" in (depth.kind, semantics.kind):
+        around = _before_frames(source, config)
+        if depth.kind == "files":
+            maps = FilesDepth(depth.folder, source, around.sequence, config.proxy.depth_scale)
+            identities["depth"] = _files_identity(maps.files())
+        if semantics.kind == "files":
+            labels = FilesLabels(semantics.folder, source, around.sequence, around.progress)
+            identities["labels"] = _files_identity(labels.files())
+    return identities
+
+
+def check_proxy(source: Path, config: Config) -> None:
+    """Open the networks, so that InputError tells of one that is not what its card says."""
+    depth, semantics = choose_depth(config.proxy), choose_semantics(config.proxy)
+    if depth.card is not None:
+        open_learned_depth(_before_frames(source, config), depth)
+    if semantics.card is not None:
+        open_learned_semantics(_before_frames(source, config), semantics)
+
+
+def _before_frames(source: Path, config: Config) -> Surroundings:
+    """As if every picture of the source were a frame; none of them is decoded."""
+    pictures = open_source(source)
+    width, height = pictures.width, pictures.height
+    camera = Intrinsics(width, height, width, width, width / 2, height / 2)
+    names = [Frame(i, pictures.name(i, i), 0.0, i, 0.0) for i in range(pictures.expected_frames)]
+    calibration = Calibration(camera, "given", 0.0, (0.0, 0.0, 0.0, 0.0))
+    small = map_intrinsics(camera, config.proxy.max_side)
+
+    def nothing(_: Any) -> Any:
+        raise AssertionError("providers are only opened here")
+
+    sequence = Sequence(names, calibration, small, None, nothing)
+    return Surroundings(source, sequence, config.proxy, nothing, 1, "cpu", SilentProgress())
+
+
+def _files_identity(files: Rows[Path]) -> str:
+    digest = hashlib.sha256()
+    for path in files:
+        digest.update(f"{path.name}\0{file_digest(path)}\n".encode())
+    return digest.hexdigest()
+
+
+def _card_identity(card: Card) -> str:
+    """The contract and the bytes of the network and of all that it loads, wherever they lie."""
+    require_own_weights(card.model)
+    beside = [card.model.parent / name for name in external_locations(card.model)]
+    files = [card.model, *([card.head] if card.head else []), *beside]
+    contract = repr(replace(card, model=Path(card.model.name), head=None))
+    return hashlib.sha256((contract + _files_identity(files)).encode()).hexdigest()

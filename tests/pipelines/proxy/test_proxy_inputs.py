@@ -1,0 +1,136 @@
+"""What the stage reads beside the frames: refused before anything slow, and seen when it changes."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+from proxy_room import Room, write_source
+
+from formats.errors import InputError
+from formats.images import write_grey_png
+from pipelines.config import Config, load_config
+from pipelines.progress import SilentProgress
+from pipelines.proxy.inputs import check_proxy, proxy_inputs
+from pipelines.proxy.models.registry import ModelStore
+from pipelines.reconstruct import reconstruct
+from pipelines.run_folder import RunFolder
+
+
+@pytest.fixture
+def source(room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("MSGS_SLAM_CACHE", str(tmp_path / "cache"))
+    return write_source(room, tmp_path / "source")
+
+
+def settings(depth: str, semantics: str = "auto") -> Config:
+    return load_config(overrides=[f'proxy.depth="{depth}"', f'proxy.semantics="{semantics}"', "run.device=cpu"])
+
+
+def write_network(path: Path, gain: float, x: str = "x", y: str = "y") -> None:
+    nodes = [
+        helper.make_node("ReduceMean", [x], ["m"], axes=[1], keepdims=1),
+        helper.make_node("Mul", ["m", "gain"], [y]),
+    ]
+    weight = helper.make_tensor("gain", TensorProto.FLOAT, [1], [gain])
+    graph = helper.make_graph(
+        nodes, "net",
+        [helper.make_tensor_value_info(x, TensorProto.FLOAT, [1, 3, "h", "w"])],
+        [helper.make_tensor_value_info(y, TensorProto.FLOAT, [1, 1, "h", "w"])],
+        [weight],
+    )  # fmt: skip
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
+
+
+def test_changed_files_are_seen(source: Path) -> None:
+    config = settings("files", "files")
+    before = proxy_inputs(source, config)
+    assert proxy_inputs(source, config) == before
+    depth = sorted((source.parent / "depth").iterdir())[4]
+    image = cv2.imread(str(depth), cv2.IMREAD_UNCHANGED)
+    image[5, 5] += 1
+    write_grey_png(depth, image)
+    changed = proxy_inputs(source, config)
+    assert changed["depth"] != before["depth"]
+    assert changed["labels"] == before["labels"]
+    table = source.parent / "classes.json"
+    table.write_text(table.read_text().replace("kind 1", "sort 1"))
+    assert proxy_inputs(source, config)["labels"] != before["labels"]
+    sorted((source.parent / "labels").iterdir())[-1].unlink()
+    assert len({before["labels"], changed["labels"], proxy_inputs(source, config)["labels"]}) == 2
+
+
+def test_a_pulled_or_changed_model_is_seen_under_auto(source: Path, tmp_path: Path) -> None:
+    before = proxy_inputs(source, settings("auto"))
+    assert before == {"depth": "multiview", "labels": "segments"}
+    for gain in (1.0, 2.0):
+        write_network(tmp_path / "net.onnx", gain, "pixel_values", "predicted_depth")
+        ModelStore.open().add(tmp_path / "net.onnx", "metric3d-community")
+        after = proxy_inputs(source, settings("auto"))
+        assert after["depth"] != before["depth"]
+        assert after["labels"] == "segments"
+        check_proxy(source, settings("auto"))
+        before = after
+    card = tmp_path / "card.toml"
+    seen = []
+    for gain, multiple in ((1.0, 14), (2.0, 14), (2.0, 28)):
+        write_network(tmp_path / "net.onnx", gain)
+        card.write_text(f'task="depth"\nmodel="net.onnx"\ninput="x"\noutput="y"\nmultiple={multiple}\n')
+        seen.append(proxy_inputs(source, settings(f"onnx:{card}"))["depth"])
+    assert len({*seen, before["depth"]}) == 4
+
+
+def no_folder(folder: Path) -> str:
+    return f"files:{folder / 'nowhere'}"
+
+
+def another_shape(folder: Path) -> str:
+    for path in (folder / "depth").iterdir():
+        write_grey_png(path, np.ones((100, 100), np.uint16))
+    return "files"
+
+
+def eight_bits(folder: Path) -> str:
+    for path in (folder / "depth").iterdir():
+        cv2.imwrite(str(path), np.ones((192, 256, 3), np.uint8))
+    return "files"
+
+
+def no_card(folder: Path) -> str:
+    return f"onnx:{folder / 'card.toml'}"
+
+
+def no_weights(folder: Path) -> str:
+    (folder / "card.toml").write_text('task="depth"\nmodel="net.onnx"\ninput="x"\noutput="y"\n')
+    return no_card(folder)
+
+
+def wrong_weights(folder: Path) -> str:
+    write_network(folder / "net.onnx", 1.0)
+    (folder / "card.toml").write_text('task="depth"\nmodel="net.onnx"\ninput="pixels"\noutput="y"\n')
+    return no_card(folder)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (no_folder, "no folder with depth files"),
+        (another_shape, "not the shape of the frames"),
+        (eight_bits, "depth"),
+        (no_card, "cannot read the card"),
+        (no_weights, r"no net\.onnx beside the card"),
+        (wrong_weights, "its inputs are x"),
+        (lambda folder: "radar", "no provider 'radar'"),
+    ],
+)
+def test_bad_input_is_refused_before_the_frames_are_picked(
+    source: Path, tmp_path: Path, spoil: Callable[[Path], str], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipelines.stages._run_one", lambda *_: pytest.fail("a stage was run"))
+    config = settings(spoil(source.parent))
+    with pytest.raises(InputError, match=said):
+        reconstruct(source, RunFolder(tmp_path / "run"), config, SilentProgress(), "proxy")
+    assert not (tmp_path / "run").exists()
