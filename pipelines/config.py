@@ -27,6 +27,7 @@ class RunConfig:
 
     seed: int = setting(0, "seed of every random choice")
     threads: int = setting(0, "CPU threads, 0 = all cores; the same count gives the same bytes")
+    format: str = setting("auto", "layout of the source: a data set's; images = a video or plain images; auto looks")
     device: str = setting("auto", "where dense work runs; auto takes a GPU if there is one", ("auto", "cpu", "cuda"))
 
 

@@ -14,6 +14,7 @@ from formats.atomic import atomic_path
 from formats.errors import DiskFullError, InputError
 from formats.jsonfile import write_json
 from pipelines.config import Config, config_to_toml, load_saved_config
+from pipelines.frames.recording import open_recording
 from pipelines.progress import Progress, log
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
@@ -51,7 +52,7 @@ def reconstruct(
     Raises InputError for a source that cannot be used and for a folder that holds something else; a folder made by
     this call is removed again when the source turns out to be unusable.
     """
-    digest = _source_digest(source)
+    digest = _source_digest(source, config.run.format)
     is_new = not run.root.exists()
     if not is_new:
         _require_same_source(run, source, digest)
@@ -79,11 +80,12 @@ def resume(
     require_run(run)
     origin = load_source(run)
     source = Path(origin["path"])
-    if "frames" not in load_records(run) and _source_digest(source) != origin["digest"]:
+    config = config or load_saved_config(run.settings_file)
+    if "frames" not in load_records(run) and _source_digest(source, config.run.format) != origin["digest"]:
         raise InputError(
             f"{source} has changed since {run.root} was begun. Reconstruct it into another folder: --out NEW"
         )
-    config = _with_device(config or load_saved_config(run.settings_file))
+    config = _with_device(config)
     with _only_one_process(run):
         with atomic_path(run.settings_file) as temporary:
             temporary.write_text(config_to_toml(config), encoding="utf-8")
@@ -105,15 +107,21 @@ def _run(
     return run_stages(all_stages(), run, source, digest, config, progress, until)
 
 
-def _source_digest(source: Path) -> str:
-    """Identity of a source: its bytes, or for a folder the names and bytes of its files."""
-    if source.is_file():
-        if source.stat().st_size == 0:
-            raise InputError(f"{source} is empty (0 bytes). Copy the video again")
-        return file_digest(source)
-    if not source.is_dir():
+def _source_digest(source: Path, format: str) -> str:
+    """Identity of a source: its bytes; for a folder the names and bytes of its files, for a data set of its images."""
+    if source.is_file() and source.stat().st_size == 0:
+        raise InputError(f"{source} is empty (0 bytes). Copy the video again")
+    if not source.exists():
         raise InputError(f"{source}: there is no such file or folder. Give a video or a folder of images")
     digest = hashlib.sha256()
+    recording = open_recording(source, format)
+    if recording is not None and recording.image_paths:
+        digest.update(f"{recording.format} {recording.camera}".encode() + recording.timestamps.tobytes())
+        for name, path in zip(recording.names, recording.image_paths, strict=True):
+            digest.update(f"{name}\0{file_digest(path)}\n".encode())
+        return digest.hexdigest()
+    if source.is_file():
+        return file_digest(source)
     for path in sorted(p for p in source.iterdir() if p.is_file()):
         digest.update(f"{path.name}\0{file_digest(path)}\n".encode())
     return digest.hexdigest()

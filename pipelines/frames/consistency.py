@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pycolmap
@@ -11,9 +12,9 @@ from numpy.typing import NDArray
 
 from pipelines.frames.adjust import reprojection_errors
 from pipelines.frames.matching import VerifiedPair
+from pipelines.frames.seams import PairCheck, Seam, find_parts, find_seams, tracks_of, worst_contradictions
 
 _AGREE_PX = 4.0
-_PAIR_AGREES = 0.5
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,8 @@ class ModelReport:
 
     `agreement`: share of the verified matches between registered keyframes that lie within 4 px of the epipolar line
     of the final poses; `pairs_agreeing`: share of the pairs of which more than half of the matches do. A folded
-    trajectory leaves whole pairs that disagree, however small its reprojection error is.
+    trajectory leaves whole pairs that disagree, however small its reprojection error is. `seams` and `parts`: see
+    `find_seams` and `find_parts`; they see one bad place among many good ones.
     """
 
     registered: int
@@ -31,27 +33,60 @@ class ModelReport:
     reprojection_px: float
     agreement: float
     pairs_agreeing: float
+    seams: tuple[Seam, ...]
+    parts: tuple[tuple[int, ...], ...]
+
+    @property
+    def contradicted(self) -> list[Seam]:
+        """Where the path may be folded."""
+        return worst_contradictions(self.seams)
 
     @property
     def score(self) -> float:
         """To choose between models of the same matches: larger is better."""
-        return self.registered / self.total * self.agreement * self.pairs_agreeing
+        cuts = [s.after for s in self.contradicted]
+        runs = [sum(1 for k in self.parts[0] if a <= k < b) for a, b in pairwise([0, *cuts, self.total])]
+        return max(runs) / self.total * self.agreement * self.pairs_agreeing
 
     @property
     def is_sound(self) -> bool:
         """Whether the other mapper need not be asked."""
-        return self.registered >= 0.95 * self.total and self.pairs_agreeing >= 0.9
+        whole = len(self.parts[0]) >= 0.95 * self.total
+        return whole and self.pairs_agreeing >= 0.9 and not self.contradicted
 
 
 def judge(
-    model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], xy: Sequence[NDArray[np.float64]], total: int
+    model: pycolmap.Reconstruction,
+    pairs: Sequence[VerifiedPair],
+    xy: Sequence[NDArray[np.float64]],
+    total: int,
+    reach: int,
 ) -> ModelReport:
-    """Report on a model; `pairs` are indices i of keyframes whose image id is i + 1, `xy` their features' pixels."""
+    """Report on a model; `pairs` are indices i of keyframes whose image id is i + 1, `xy` their features' pixels.
+
+    `reach`: keyframes at most so many places apart are neighbours.
+    """
+    checks = check_pairs(model, pairs, xy)
+    matches, agreeing = sum(c.matches for c in checks), sum(c.agreeing for c in checks)
+    placed, tracks = sorted(i - 1 for i in model.reg_image_ids()), tracks_of(model)
+    seams = find_seams(placed, checks, tracks, reach)
+    parts = find_parts(placed, seams, tracks)
+    return ModelReport(
+        len(placed), total, model.num_points3D(), float(np.median(reprojection_errors(model))),
+        agreeing / max(matches, 1), sum(c.agrees for c in checks) / max(len(checks), 1),
+        tuple(seams), tuple(map(tuple, parts)),
+    )  # fmt: skip
+
+
+def check_pairs(
+    model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], xy: Sequence[NDArray[np.float64]]
+) -> list[PairCheck]:
+    """How far the matches of each pair of placed keyframes agree with their poses."""
     camera = model.cameras[1]
     rays = {i - 1: np.asarray(camera.cam_from_img(xy[i - 1])) for i in model.reg_image_ids()}
     poses = {i: model.images[i + 1].cam_from_world().matrix() for i in rays}
     focal = camera.mean_focal_length()
-    agreeing, matches, good_pairs, seen = 0, 0, 0, 0
+    checks = []
     for pair in pairs:
         if pair.first not in rays or pair.second not in rays:
             continue
@@ -59,13 +94,8 @@ def judge(
             poses[pair.first], poses[pair.second],
             rays[pair.first][pair.matches[:, 0]], rays[pair.second][pair.matches[:, 1]],
         )  # fmt: skip
-        agree = int((error * focal < _AGREE_PX).sum())
-        agreeing, matches = agreeing + agree, matches + len(error)
-        good_pairs, seen = good_pairs + (agree > _PAIR_AGREES * len(error)), seen + 1
-    return ModelReport(
-        model.num_reg_images(), total, model.num_points3D(), float(np.median(reprojection_errors(model))),
-        agreeing / max(matches, 1), good_pairs / max(seen, 1),
-    )  # fmt: skip
+        checks.append(PairCheck(pair.first, pair.second, len(error), int((error * focal < _AGREE_PX).sum())))
+    return checks
 
 
 def epipolar_error(

@@ -173,17 +173,30 @@ def _structure(
         threads=_threads(context),
         seed=context.config.run.seed,
     ).run(keyframes)
+    _warn_of_structure(context, structure, [frames[k].id for k in keyframes])
+    return structure
+
+
+def _warn_of_structure(context: StageContext, structure: Structure, ids: list[int]) -> None:
+    """What is missing in the structure, and where it contradicts the pictures; ids[k] is the frame of keyframe k."""
     report = structure.report
     if report.registered < report.total:
         context.warn(
             f"structure from motion could not place {report.total - report.registered} of {report.total} keyframes"
         )
-    if not report.is_sound:
+    if len(report.parts) > 1:
+        parts = ", ".join(f"{ids[p[0]]}-{ids[p[-1]]}" for p in report.parts)
         context.warn(
-            f"the camera's path may be folded: {report.pairs_agreeing:.0%} of the matched pairs of views agree with it "
-            f"(mapper: {structure.mapper})"
+            f"structure from motion fell into {len(report.parts)} parts that nothing holds together (frames {parts}): "
+            "tracking joins what it recognises"
         )
-    return structure
+    folds = ", ".join(f"{ids[s.before]}-{ids[s.after]}" for s in report.contradicted)
+    if folds or report.pairs_agreeing < 0.9:
+        where = f" between frames {folds}, where neighbouring pictures contradict it" if folds else ""
+        context.warn(
+            f"the camera's path may be folded{where}: {report.pairs_agreeing:.0%} of the matched pairs of views agree "
+            f"with it (mapper: {structure.mapper})"
+        )
 
 
 def _threads(context: StageContext) -> int:
@@ -241,6 +254,8 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
         "points": report.points,
         "reprojection_px": round(report.reprojection_px, 4),
         "pairs_agreeing": round(report.pairs_agreeing, 4),
+        "parts": len(report.parts),
+        "contradicted_seams": len(report.contradicted),
         "mapper": structure.mapper,
         "calibration": calibration.origin,
         "focal_px": round(calibration.intrinsics.fx, 3),
@@ -249,4 +264,4 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
     }
 
 
-STAGE = Stage("frames", 2, run, "pick frames, calibrate the camera, structure from motion over keyframes")
+STAGE = Stage("frames", 3, run, "pick frames, calibrate the camera, structure from motion over keyframes")

@@ -24,6 +24,7 @@ from pipelines.frames.mapping import calibrate_focal, map_globally, map_incremen
 from pipelines.frames.matching import MatchOptions, VerifiedPair, match_pair
 from pipelines.frames.parallax import HOW_TO_FILM, require_parallax
 from pipelines.frames.retrieval import frame_descriptors, loop_pairs, sequential_pairs
+from pipelines.frames.seams import cut
 from pipelines.frames.snapshots import Snapshots
 from pipelines.progress import Progress
 
@@ -36,7 +37,10 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Structure:
-    """An adjusted reconstruction (image i + 1 is keyframe i, camera 1 is the only one) and how good it is."""
+    """An adjusted reconstruction (image i + 1 is keyframe i, camera 1 is the only one) and how good it is.
+
+    No point is seen from two of the report's parts: nothing tells how these lie to each other.
+    """
 
     model: pycolmap.Reconstruction
     report: ModelReport
@@ -67,7 +71,9 @@ class StructureFromMotion:
         require_parallax(pairs, xy, (self.camera.width, self.camera.height), known_focal)
         model, mapper, _ = self._map(features, pairs)
         focal_sd = adjust(model, refine_camera=not self.is_fixed)
-        return Structure(model, judge(model, pairs, xy, len(features)), mapper, focal_sd)
+        report = judge(model, pairs, xy, len(features), self.config.overlap)
+        cut(model, report.parts)
+        return Structure(model, report, mapper, focal_sd)
 
     def _features(self, keyframe_ids: Sequence[int]) -> list[Features]:
         local = threading.local()
@@ -117,7 +123,7 @@ class StructureFromMotion:
             model = self.snapshots.model(name, lambda work, n=name: self._run_mapper(n, work, features, pairs))  # type: ignore[misc]
             if model is None:
                 continue
-            report = judge(model, pairs, xy, len(features))
+            report = judge(model, pairs, xy, len(features), self.config.overlap)
             if best is None or report.score > best[2].score:
                 best = model, name, report
         if best is None or best[2].registered < min(_MIN_KEYFRAMES, len(features)) or best[2].points < _MIN_POINTS:

@@ -6,6 +6,8 @@ from collections import Counter
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from pipelines.config import TrackingConfig
 from pipelines.geometry import se3
@@ -39,6 +41,26 @@ def join_segments(
                 joined, again = joined + 1, True
                 break
     return joined
+
+
+def split_segments(state: TrackState) -> None:
+    """Number the segments of the backbone, in place: keyframes that no chain of common points joins are of different
+    ones, larger ones first. A keyframe without points is none: it will be tracked like any other frame."""
+    for frame_id in [k for k in state.keyframes if len(state.sightings[k]) == 0]:
+        state.keyframes.remove(frame_id)
+        for table in (state.poses, state.sightings, state.segment):
+            del table[frame_id]
+    rows = [state.sightings[k].point for k in state.keyframes]
+    keyframe = np.repeat(np.arange(len(rows)), [len(r) for r in rows])
+    point = np.concatenate([np.zeros(0, np.int64), *rows])
+    size = len(rows) + len(state.points)
+    seen = coo_matrix((np.ones(len(point), np.int8), (keyframe, len(rows) + point)), (size, size))
+    _, label = connected_components(seen, directed=False)
+    of_keyframe = label[: len(rows)].tolist()
+    counts = Counter(of_keyframe)
+    order = sorted(counts, key=lambda c: (-counts[c], of_keyframe.index(c)))
+    for frame_id, component in zip(state.keyframes, of_keyframe, strict=True):
+        state.segment[frame_id] = order.index(component)
 
 
 def _join(

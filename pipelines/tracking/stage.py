@@ -16,7 +16,7 @@ from pipelines.tracking.front_end import FrontEnd
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.refine import compare_frame
 from pipelines.tracking.result import normalise, to_sparse_model, to_trajectory
-from pipelines.tracking.segments import join_segments
+from pipelines.tracking.segments import join_segments, split_segments
 from pipelines.tracking.state import TrackState
 from pipelines.types import Frame
 
@@ -71,9 +71,13 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
 
 
 def start_state(context: StageContext, settings: TrackingConfig) -> TrackState:
-    """The backbone, or nothing yet."""
+    """The backbone, its parts as segments, or nothing yet."""
     backbone = context.run.load_backbone()
-    return TrackState() if backbone is None else TrackState.from_backbone(backbone, settings.feature_sd)
+    if backbone is None:
+        return TrackState()
+    state = TrackState.from_backbone(backbone, settings.feature_sd)
+    split_segments(state)
+    return state
 
 
 def compare_all(context: StageContext, state: TrackState, pictures: Pictures) -> dict[str, Any]:
@@ -139,4 +143,4 @@ def stretches(ids: list[int]) -> str:
     return ", ".join(f"{r[0]}-{r[-1]}" if len(r) > 1 else str(r[0]) for r in runs)
 
 
-STAGE = Stage("tracking", 1, run, "a pose for every frame, by correspondences and bundle adjustment")
+STAGE = Stage("tracking", 2, run, "a pose for every frame, by correspondences and bundle adjustment")

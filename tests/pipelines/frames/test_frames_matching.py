@@ -218,12 +218,14 @@ def _known_model(bend: float) -> tuple[pycolmap.Reconstruction, list[VerifiedPai
 
 
 def test_a_folded_model_is_recognised() -> None:
-    straight, folded = (judge(*_known_model(bend), total=10) for bend in (0.0, 0.5))
+    straight, folded = (judge(*_known_model(bend), total=10, reach=3) for bend in (0.0, 0.5))
     assert straight.is_sound
     assert straight.agreement > 0.99
     assert not folded.is_sound
     assert 0.2 < folded.pairs_agreeing < 0.8  # the pairs within either half still agree
     assert folded.score < 0.7 * straight.score
+    assert [(s.before, s.after) for s in folded.contradicted] == [(4, 5)]
+    assert not straight.contradicted
 
 
 def test_pycolmap_reads_the_database(tmp_path: Path) -> None:

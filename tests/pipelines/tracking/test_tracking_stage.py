@@ -2,18 +2,21 @@
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from formats.errors import InputError
+from formats.images import read_rgb, write_rgb
 from pipelines.config import Config, load_config
 from pipelines.geometry import se3
 from pipelines.geometry.alignment import align_points
-from pipelines.run_folder import load_sparse_model
+from pipelines.run_folder import load_sparse_model, save_sparse_model
 from pipelines.stages import StageContext
 from pipelines.tracking.stage import STAGE, stretches
+from pipelines.types import SparseModel
 from tests.pipelines.tracking.conftest import MadeRun
 
 
@@ -147,6 +150,56 @@ def test_goes_on_where_structure_from_motion_ends(
     assert figures["posed"] == 24
     assert figures["segments"] == 1
     assert 0 < trajectory_error(made, scale=False) < 0.02
+
+
+def in_two_parts(model: SparseModel, first_of_second: int) -> SparseModel:
+    """Keyframes from `first_of_second` on in a world of their own, moved and 1.6 times as large; no common points."""
+    late = model.frame_ids >= first_of_second
+    owner = np.zeros(len(model.points_in_world))
+    np.add.at(owner, model.obs_point, np.where(late[model.obs_frame], 1, -1))
+    second = owner > 0
+    keep = late[model.obs_frame] == second[model.obs_point]
+    motion = se3.exp(np.array([0.5, -0.3, 0.8, 0.2, -0.4, 0.1]))
+    points, poses = model.points_in_world.copy(), model.cam_from_world.copy()
+    points[second] = 1.6 * se3.transform(motion, points[second])
+    poses[late] = poses[late] @ se3.inverse(motion)
+    poses[late, :3, 3] *= 1.6
+    return replace(
+        model, cam_from_world=poses, points_in_world=points, obs_frame=model.obs_frame[keep],
+        obs_point=model.obs_point[keep], obs_xy=model.obs_xy[keep],
+    )  # fmt: skip
+
+
+def test_parts_of_structure_from_motion_are_joined_where_they_recognise_each_other(
+    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
+) -> None:
+    made = make_run(tmp_path / "run", metric=False)
+    model = made.run.load_backbone()
+    assert model is not None
+    save_sparse_model(made.run.stage("frames") / "backbone" / "model.npz", in_two_parts(model, 12))
+    context = open_stage(made.run, "tracking")
+    figures = finish(context)
+    assert figures["posed"] == 24
+    assert figures["segments"] == 1
+    assert 0 < trajectory_error(made, scale=True) < 0.02
+
+
+def test_a_part_that_shows_another_place_is_not_glued_on(
+    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
+) -> None:
+    made = make_run(tmp_path / "run", metric=False)
+    model = made.run.load_backbone()
+    assert model is not None
+    save_sparse_model(made.run.stage("frames") / "backbone" / "model.npz", in_two_parts(model, 15))
+    for frame in made.run.load_frames()[14:]:  # upside down and mirrored, as good as another room
+        path = made.run.stage("frames") / frame.name
+        write_rgb(path, np.ascontiguousarray(read_rgb(path)[::-1]))
+    context = open_stage(made.run, "tracking")
+    figures = finish(context)
+    assert figures["posed"] == 14
+    assert set(figures["lost"]) == {str(i) for i in range(14, 24)}
+    assert any("14-23" in w for w in context.warnings)
+    assert 0 < trajectory_error(made, scale=True) < 0.01
 
 
 def test_without_new_segments_what_cannot_be_reached_is_lost(

@@ -1,0 +1,134 @@
+"""Where a path is torn: neighbouring keyframes whose pictures do not hold the two sides together.
+
+The share of agreeing pairs over a whole model hides one bad place among hundreds of good ones. A seam looks only at
+what crosses between one keyframe and the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+_LEAST_POINTS = 12
+_LEAST_PAIRS = 3
+_PAIR_AGREES = 0.5
+
+
+@dataclass(frozen=True)
+class PairCheck:
+    """How many matches of two keyframes (indices, first < second) there are, and how many agree with their poses."""
+
+    first: int
+    second: int
+    matches: int
+    agreeing: int
+
+    @property
+    def agrees(self) -> bool:
+        """Whether more than half of them do."""
+        return self.agreeing > _PAIR_AGREES * self.matches
+
+
+@dataclass(frozen=True)
+class Seam:
+    """Between a placed keyframe and the next placed one (indices).
+
+    points: seen on both sides by keyframes near each other; pairs: of keyframes near each other, one on each side, that
+    match; agreeing: how many of those agree with the poses.
+    """
+
+    before: int
+    after: int
+    points: int
+    pairs: int
+    agreeing: int
+
+    @property
+    def is_loose(self) -> bool:
+        """Too few points for a pose and a scale of one side from the other."""
+        return self.points < _LEAST_POINTS
+
+    @property
+    def is_contradicted(self) -> bool:
+        """The pictures on the two sides match, and say that they lie otherwise."""
+        return self.pairs >= _LEAST_PAIRS and self.agreeing < _PAIR_AGREES * self.pairs
+
+
+def find_seams(
+    placed: Sequence[int], checks: Iterable[PairCheck], tracks: Iterable[Sequence[int]], reach: int
+) -> list[Seam]:
+    """All seams of the placed keyframes (sorted indices); what lies more than `reach` places apart is no neighbour.
+
+    `tracks` are the keyframes (sorted indices) that see a point, for every point.
+    """
+    place = {k: n for n, k in enumerate(placed)}
+    points, pairs, agreeing = (np.zeros(len(placed) + 1, np.int64) for _ in range(3))
+
+    def cross(counts: NDArray[np.int64], first: int, last: int) -> None:
+        counts[first] += 1
+        counts[last] -= 1
+
+    for track in tracks:
+        seen = [place[k] for k in track]
+        for a, b in pairwise(seen):
+            if b - a <= reach:
+                cross(points, a, b)
+    for check in checks:
+        a, b = place[check.first], place[check.second]
+        if b - a <= reach:
+            cross(pairs, a, b)
+            if check.agrees:
+                cross(agreeing, a, b)
+    crossing = [np.cumsum(c)[: len(placed) - 1].tolist() for c in (points, pairs, agreeing)]
+    return [Seam(*row) for row in zip(placed[:-1], placed[1:], *crossing, strict=True)]
+
+
+def worst_contradictions(seams: Iterable[Seam]) -> list[Seam]:
+    """Of every run of contradicted seams the worst one: most pairs that cross a seam cross those beside it too."""
+    runs = [list(run) for bad, run in groupby(seams, key=lambda s: s.is_contradicted) if bad]
+    return [min(run, key=lambda s: s.agreeing / s.pairs) for run in runs]
+
+
+def find_parts(placed: Sequence[int], seams: Iterable[Seam], tracks: Iterable[Sequence[int]]) -> list[list[int]]:
+    """Placed keyframes in parts, largest first: runs between loose seams, joined where a loop holds them together."""
+    run = dict.fromkeys(placed, 0)
+    loose = {s.after for s in seams if s.is_loose}
+    number = 0
+    for k in placed:
+        number += k in loose
+        run[k] = number
+    shared = np.zeros((number + 1, number + 1), np.int64)
+    for track in tracks:
+        runs = sorted({run[k] for k in track})
+        shared[np.ix_(runs, runs)] += 1
+    label = list(range(number + 1))
+    for a, b in np.argwhere(np.triu(shared, 1) >= 2 * _LEAST_POINTS).tolist():
+        label = [label[a] if x == label[b] else x for x in label]
+    parts: dict[int, list[int]] = {}
+    for k in placed:
+        parts.setdefault(label[run[k]], []).append(k)
+    return sorted(parts.values(), key=lambda p: (-len(p), p[0]))
+
+
+def tracks_of(model: pycolmap.Reconstruction) -> list[list[int]]:
+    """For every point the keyframes that see it, sorted; image i + 1 is keyframe i."""
+    return [sorted({e.image_id - 1 for e in p.track.elements}) for p in model.points3D.values()]
+
+
+def cut(model: pycolmap.Reconstruction, parts: Sequence[Sequence[int]]) -> None:
+    """Take the observations away by which a point is seen from more than one part, in place; the larger part keeps
+    it."""
+    part = {k: n for n, members in enumerate(parts) for k in members}
+    for point_id in sorted(model.point3D_ids()):
+        elements = model.points3D[point_id].track.elements
+        owners = [part[e.image_id - 1] for e in elements]
+        keeper = min(set(owners), key=lambda o: (-owners.count(o), o))
+        stray = [(e.image_id, e.point2D_idx) for e, o in zip(elements, owners, strict=True) if o != keeper]
+        for image_id, index in stray:
+            if point_id in model.points3D:  # the last but one observation takes the point with it
+                model.delete_observation(image_id, index)

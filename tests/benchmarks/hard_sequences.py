@@ -1,0 +1,156 @@
+"""Recordings that break trackers, made from the synthetic world and from those at hand, each with its truth.
+
+Every one is a folder of pictures `rgb/` named by number with `traj.txt` beside it, one world_from_cam 4x4 a row, nan
+where it is not known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+SIZE = (480, 360)
+
+
+def write_hard(name: str, folder: Path, data: Path) -> Path:
+    """Write the sequence unless it is there; `data` is the folder of the recordings at hand."""
+    if not (folder / "traj.txt").exists():
+        (folder / "rgb").mkdir(parents=True, exist_ok=True)
+        poses = HARD[name](folder / "rgb", data)
+        np.savetxt(folder / "traj.txt", poses.reshape(-1, 16))
+    return folder / "rgb"
+
+
+def turn(folder: Path, data: Path) -> Array:
+    """A full turn on the spot in 60 frames; the hand shakes by two centimetres."""
+    return draw(folder, standing(np.linspace(0, 2 * np.pi, 60, endpoint=False), 0.02))
+
+
+def walk_turn_walk(folder: Path, data: Path) -> Array:
+    """A walk, half a turn forth and back on the spot in its middle, and the walk goes on."""
+    from pipelines.world.paths import room_walk
+
+    there = room_walk(np.linspace(0, 0.3, 40))
+    away = np.radians(90) * np.sin(np.linspace(0, np.pi, 26)[1:-1])
+    turning = np.tile(there[-1], (len(away), 1, 1))
+    turning[:, :3, :3] = [about_z(a) @ there[-1, :3, :3] for a in away]
+    turning[:, :3, 3] += 0.01 * np.random.default_rng(0).standard_normal((len(away), 3))
+    on = room_walk(np.linspace(0.3, 0.6, 41)[1:])
+    return draw(folder, np.concatenate([there, turning, on]))
+
+
+def fast(folder: Path, data: Path) -> Array:
+    """Two laps round the table in steps of 10 to 17 degrees, blurred and noisy."""
+    from pipelines.world.paths import room_walk
+
+    steps = np.cumsum(np.random.default_rng(1).uniform(10, 17, 54)) / 360
+    return draw(folder, room_walk(steps), blurred=room_walk, steps=steps, noise=3.0)
+
+
+def fast_blank(folder: Path, data: Path) -> Array:
+    """The same without texture on the walls."""
+    from pipelines.world.paths import room_walk
+
+    steps = np.cumsum(np.random.default_rng(2).uniform(10, 17, 54)) / 360
+    return draw(folder, room_walk(steps), blurred=room_walk, steps=steps, noise=3.0, blank_walls=True)
+
+
+def exposure(folder: Path, data: Path) -> Array:
+    """The white room with automatic exposure at its worst: gain and gamma swing, and jump twelve times."""
+    rng = np.random.default_rng(3)
+    pictures = sorted((data / "whiteroom/rgb").iterdir())
+    jumps = np.repeat(rng.uniform(-0.5, 0.5, 13), 12)[: len(pictures)]
+    swing = 0.5 * np.sin(np.arange(len(pictures)) / 6)
+    for i, path in enumerate(pictures):
+        image = cv2.imread(str(path)).astype(np.float64) / 255
+        changed = image ** np.exp(0.4 * swing[i]) * np.exp(jumps[i]) + 0.03 * swing[i]
+        save(folder, i, np.clip(changed * 255 + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8))
+    poses = np.loadtxt(data / "whiteroom/traj.txt").reshape(-1, 4, 4)
+    return poses[[int(p.stem) for p in pictures]]
+
+
+def kitchen_twice(folder: Path, data: Path) -> Array:
+    """The kitchen forth, and back between the frames of the way there: every place is seen again."""
+    wanted = [*range(0, 300, 4), *range(298, 0, -4)]
+    poses = np.array([np.loadtxt(data / f"kitchen/frame-{i:06d}.pose.txt") for i in wanted])
+    for row, i in enumerate(wanted):
+        save(folder, row, cv2.imread(str(data / f"kitchen/frame-{i:06d}.color.jpg")))
+    return poses
+
+
+def replica_fast(folder: Path, data: Path) -> Array:
+    """Every second frame of the office: 12 degrees a step at the median, up to 30."""
+    pictures = sorted((data / "replica_office0/rgb").iterdir())
+    poses = np.loadtxt(data / "replica_office0/traj_derived_c2w.txt").reshape(-1, 4, 4)
+    for row, path in enumerate(pictures[::2]):
+        save(folder, row, cv2.imread(str(path)))
+    return poses[::2]
+
+
+def whiteroom_fast(folder: Path, data: Path) -> Array:
+    """The white room in steps of 10 to 17 degrees; most of it has hardly any texture."""
+    from formats.video import iter_video
+
+    steps = np.cumsum(np.random.default_rng(4).integers(12, 17, 40))
+    poses = np.loadtxt(data / "whiteroom/traj.txt").reshape(-1, 4, 4)
+    steps = steps[steps < len(poses)]
+    wanted = {int(i): row for row, i in enumerate(steps)}
+    for frame in iter_video(data / "whiteroom/video.mp4", wanted):
+        save(folder, wanted[frame.source_index], frame.rgb[..., ::-1])
+    return poses[steps]
+
+
+HARD: dict[str, Callable[[Path, Path], Array]] = {
+    f.__name__: f
+    for f in (turn, walk_turn_walk, fast, fast_blank, exposure, kitchen_twice, replica_fast, whiteroom_fast)
+}
+
+
+def standing(angles: Array, shake: float) -> Array:
+    """(N, 4, 4) world_from_cam of someone who stands beside the table and turns; `shake` in metres."""
+    from pipelines.world.paths import look_at
+
+    rng = np.random.default_rng(0)
+    center = np.array([1.6, 1.3, 1.45]) + shake * rng.standard_normal((len(angles), 3))
+    ahead = np.stack([np.cos(angles), np.sin(angles), -0.15 + 0.1 * np.sin(3 * angles)], axis=1)
+    return look_at(center, center + ahead, roll=0.03 * np.sin(4 * angles))
+
+
+def about_z(angle: float) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def draw(
+    folder: Path,
+    poses: Array,
+    blurred: Callable[[Array], Array] | None = None,
+    steps: Array | None = None,
+    noise: float = 1.0,
+    blank_walls: bool = False,
+) -> Array:
+    """Pictures of the room from world_from_cam (N, 4, 4), which are returned; with motion blur over a tenth of a step
+    where the walk and its steps are given."""
+    from pipelines.world.clip import ClipOptions, make_world, render_view
+
+    world = make_world("room", texel=0.006, blank_walls=blank_walls)
+    options = ClipOptions(width=SIZE[0], height=SIZE[1])
+    rng = np.random.default_rng(0)
+    for i, pose in enumerate(poses):
+        views = [pose]
+        if blurred is not None and steps is not None:
+            views = list(blurred(steps[i] + np.array([-0.05, 0.0, 0.05]) * 13 / 360))
+        light = np.mean([render_view(world, options, view)[0] for view in views], axis=0)
+        grey = 255 * np.clip(light, 0, 1) ** (1 / 2.2) + noise * rng.standard_normal(light.shape)
+        save(folder, i, np.clip(np.round(grey), 0, 255).astype(np.uint8)[..., ::-1])
+    return poses
+
+
+def save(folder: Path, number: int, bgr: NDArray[np.uint8]) -> None:
+    """One picture without loss."""
+    cv2.imwrite(str(folder / f"{number:06d}.png"), bgr)

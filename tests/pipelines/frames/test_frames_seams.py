@@ -1,0 +1,77 @@
+"""Places where a path is torn are found, however good the rest is, and what they leave apart is cut."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+import pytest
+
+from pipelines.frames.seams import PairCheck, Seam, cut, find_parts, find_seams, tracks_of, worst_contradictions
+
+COUNT, REACH = 40, 4
+
+
+def _checks(torn_at: int) -> list[PairCheck]:
+    """Pairs of neighbours that agree, but for those across one place."""
+    pairs = [(i, j) for i in range(COUNT) for j in range(i + 1, min(i + REACH + 1, COUNT))]
+    return [PairCheck(i, j, 100, 20 if i < torn_at <= j else 95) for i, j in pairs]
+
+
+def _tracks(torn_at: int = 0, loop: tuple[int, int] | None = None) -> list[list[int]]:
+    """Points seen by four neighbours each, none across `torn_at`; fifty more by both ends of a loop."""
+    rows = [[i + k for k in range(4) if i + k < COUNT] for i in range(COUNT) for _ in range(20)]
+    split = [[k for k in row if (k < torn_at) == (row[0] < torn_at)] for row in rows]
+    return [row for row in split if len(row) > 1] + ([[*loop]] * 50 if loop else [])
+
+
+def test_one_contradicted_seam_among_many_good_ones() -> None:
+    seams = find_seams(range(COUNT), _checks(torn_at=25), _tracks(), REACH)
+    assert len(seams) == COUNT - 1
+    assert [(s.before, s.after) for s in worst_contradictions(seams)] == [(24, 25)]
+    assert not any(s.is_loose for s in seams)
+
+
+def test_far_pairs_say_nothing_of_a_seam() -> None:
+    far = [PairCheck(5, 35, 400, 0)] * 50
+    assert not any(s.is_contradicted for s in find_seams(range(COUNT), _checks(0) + far, _tracks(), REACH))
+
+
+def test_keyframes_that_were_not_placed_leave_a_gap() -> None:
+    placed = [k for k in range(COUNT) if not 10 <= k < 13]
+    checks = [c for c in _checks(0) if c.first in placed and c.second in placed]
+    tracks = [t for row in _tracks() if len(t := [k for k in row if k in placed]) > 1]
+    seams = find_seams(placed, checks, tracks, REACH)
+    assert Seam(9, 13, 20, 4, 4) not in seams  # points of four neighbours reach 12 at most
+    assert next(s for s in seams if s.before == 9).is_loose
+    assert find_parts(placed, seams, tracks) == [list(range(13, COUNT)), list(range(10))]
+
+
+def test_a_loop_holds_two_runs_together() -> None:
+    for loop, parts in ((None, [25, 15]), ((2, 38), [COUNT])):
+        tracks = _tracks(25, loop)
+        found = find_parts(range(COUNT), find_seams(range(COUNT), _checks(0), tracks, REACH), tracks)
+        assert [len(p) for p in found] == parts
+
+
+@pytest.fixture
+def made_model() -> pycolmap.Reconstruction:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, 10, 120
+    pycolmap.set_random_seed(0)
+    return pycolmap.synthesize_dataset(options)
+
+
+def test_after_the_cut_no_point_is_seen_from_two_parts(made_model: pycolmap.Reconstruction) -> None:
+    parts = [[0, 1, 2, 3, 4, 5], [6, 7, 8, 9]]
+    assert any(min(t) < 6 <= max(t) for t in tracks_of(made_model))
+    cut(made_model, parts)
+    tracks = tracks_of(made_model)
+    assert len(tracks) > 50
+    assert all(max(t) < 6 or min(t) >= 6 for t in tracks)
+    assert np.bincount([t[0] >= 6 for t in tracks])[0] > 50
+
+
+def test_a_whole_model_is_not_touched(made_model: pycolmap.Reconstruction) -> None:
+    before = tracks_of(made_model)
+    cut(made_model, [list(range(10))])
+    assert tracks_of(made_model) == before
