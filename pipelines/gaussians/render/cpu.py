@@ -42,15 +42,12 @@ class _Composite(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         *projected, values = (_array(tensor) for tensor in arguments[:6])
         width, height, proxy_depth, kappa, near = arguments[6:]
-        if proxy_depth is None or kappa == 0:
-            proxy, kappa = np.zeros((1, 1), F32), 0.0
-        else:
-            proxy = _array(proxy_depth)
+        # The type of the guide, not its value, chooses the depth chain: who uses only one compiles only one.
+        guide = None if proxy_depth is None or kappa == 0 else (_array(proxy_depth), F32(kappa))
         vectors = channel_vectors(values.shape[1])
         bands = split_into_bands(tuple(projected), values, 16 * len(vectors), width, height, near)
         features, planes = np.empty((height, width, values.shape[1]), F32), np.empty((3, height, width), F32)
-        guide = (proxy, F32(kappa))
-        for_each(lambda b: forward_band(vectors, b, *bands.prepared[b], *guide, features, planes), len(bands))
+        for_each(lambda b: forward_band(vectors, b, *bands.prepared[b], guide, features, planes), len(bands))
         outputs = (torch.from_numpy(features), *torch.from_numpy(planes).unbind(0))
         ctx.save_for_backward(outputs[0])
         ctx.state = (bands, vectors, guide, planes)
@@ -66,17 +63,16 @@ class _Composite(torch.autograd.Function):
             np.zeros_like(image) if gradient is None else _array(gradient)
             for image, gradient in zip(images, gradients, strict=True)
         ]
-        job = (*guide, features, planes, upstream[0], np.stack(upstream[1:]))
-        count, channels = len(bands.reach), features.shape[2]
+        job = (guide, features, planes, upstream[0], np.stack(upstream[1:]))
+        count, channels = len(bands.first), features.shape[2]
         d_geometry, d_features = np.zeros((5, count), F32), np.zeros((count, channels), F32)
         shared = np.empty((int(bands.slots[-1]), 5 + channels), F32)
         results = (d_geometry, d_features, shared)
+        places = (bands.first, bands.slots)
         for_each(
-            lambda b: backward_band(vectors, b, bands.own(b), bands.slots, *bands.prepared[b], *job, *results),
-            len(bands),
+            lambda b: backward_band(vectors, b, bands.own(b), *places, *bands.prepared[b], *job, *results), len(bands)
         )
-        straddling = np.flatnonzero(np.diff(bands.slots))
-        if len(straddling):
+        if len(straddling := bands.straddling):
             sums = np.add.reduceat(shared, bands.slots[straddling])
             d_geometry[:, straddling], d_features[straddling] = sums[:, :5].T, sums[:, 5:]
         return (*torch.from_numpy(d_geometry).unbind(0), torch.from_numpy(d_features), *[None] * 5)

@@ -18,8 +18,8 @@ from pipelines.gaussians.render.cpu_bands import (
     first_pixel,
     last_pixel,
 )
-from pipelines.gaussians.render.cpu_forward import CHECK_EVERY, PIXELS, clear, is_opaque
-from pipelines.gaussians.render.jit import kernel
+from pipelines.gaussians.render.cpu_forward import CHECK_EVERY, PIXELS, Guide, clear, is_opaque
+from pipelines.gaussians.render.jit import inner, kernel
 from pipelines.gaussians.render.lanes import (
     at_most,
     counting,
@@ -45,7 +45,7 @@ _HALF, _ZERO, _ONE, _TWO = F32(0.5), F32(0), F32(1), F32(2)
 _TINY = F32(1e-30)
 
 
-@kernel
+@inner
 def open_tile(
     state: NDArray[np.float32],
     image: NDArray[np.float32],
@@ -54,8 +54,7 @@ def open_tile(
     top: int,
     columns: int,
     rows: int,
-    proxy: NDArray[np.float32],
-    kappa: np.float32,
+    guide: Guide,
     features: NDArray[np.float32],
     planes: NDArray[np.float32],
     d_features: NDArray[np.float32],
@@ -76,7 +75,8 @@ def open_tile(
             state[LIGHT + pixel] = _ONE
             state[D_DEPTH + pixel] = d_depth
             depth_behind = d_depth * planes[0, row, column] + d_depth_seen * planes[1, row, column]
-            if kappa > _ZERO:
+            if guide is not None:
+                proxy, kappa = guide
                 state[DEPTH_LIGHT + pixel] = _ONE
                 state[DEPTH_BEHIND + pixel] = depth_behind
                 state[BEHIND + pixel] = behind
@@ -90,7 +90,7 @@ def open_tile(
                 state[D_SEEN + pixel] = d_seen + d_depth_seen
 
 
-@kernel
+@inner
 def weigh_rows(
     state: NDArray[np.float32],
     decisive: int,
@@ -113,7 +113,7 @@ def weigh_rows(
         store(state, WEIGHT + row, alpha * load(state, LIGHT + row))
 
 
-@kernel
+@inner
 def pull_rows(
     state: NDArray[np.float32], z: np.float32, y_center: np.float32, first: int, last: int
 ) -> tuple[object, object, object, object]:
@@ -136,7 +136,7 @@ def pull_rows(
     return pull, pull_y, pull_y2, d_z
 
 
-@kernel
+@inner
 def pull_rows_by_proxy(
     state: NDArray[np.float32], z: np.float32, y_center: np.float32, first: int, last: int
 ) -> tuple[object, object, object, object]:
@@ -174,13 +174,13 @@ def backward_band(
     vectors: tuple[int, ...],
     band: int,
     own: NDArray[np.int32],
+    first: NDArray[np.int32],
     slots: NDArray[np.int64],
     records: NDArray[np.float32],
     padded: NDArray[np.float32],
     tile_starts: NDArray[np.int64],
     members: NDArray[np.int32],
-    proxy: NDArray[np.float32],
-    kappa: np.float32,
+    guide: Guide,
     features: NDArray[np.float32],
     planes: NDArray[np.float32],
     d_image: NDArray[np.float32],
@@ -203,12 +203,12 @@ def backward_band(
     image = np.zeros(PIXELS * channels, np.float32)
     state = np.empty(PIXELS * PLANES, np.float32)
     falloff_y = np.empty(TILE, np.float32)
-    decisive = DEPTH_LIGHT if kappa > _ZERO else LIGHT
+    decisive = LIGHT if guide is None else DEPTH_LIGHT
     for tile in range(len(tile_starts) - 1):
         left, top = TILE * (tile % across), band_top + TILE * (tile // across)
         columns, rows = min(TILE, width - left), min(TILE, height - top)
         open_tile(
-            state, image, channels, left, top, columns, rows, proxy, kappa,
+            state, image, channels, left, top, columns, rows, guide,
             features, planes, d_image, d_planes,
         )  # fmt: skip
         for k in range(tile_starts[tile], tile_starts[tile + 1]):
@@ -233,10 +233,10 @@ def backward_band(
                 state, WEIGHT + corner, state, PRODUCT + corner, y1 - y0 + 1, quads, vectors,
             )  # fmt: skip
             depth = records[at + 3]
-            if kappa > _ZERO:
-                pull, pull_y, pull_y2, d_z = pull_rows_by_proxy(state, depth, v_tile, y0, y1)
-            else:
+            if guide is None:
                 pull, pull_y, pull_y2, d_z = pull_rows(state, depth, v_tile, y0, y1)
+            else:
+                pull, pull_y, pull_y2, d_z = pull_rows_by_proxy(state, depth, v_tile, y0, y1)
             d_records[5 * i + 0] += total(pull * dx) * precision
             d_records[5 * i + 1] += total(pull_y) * precision
             d_records[5 * i + 2] += total(pull * dx2 + pull_y2) * precision / records[at + 2]
@@ -247,9 +247,7 @@ def backward_band(
     for k in range(len(own)):
         i = own[k]
         if slots[i + 1] > slots[i]:
-            # Its first band writes its first slot, and so on.
-            first = first_pixel(records[RECORD * k + 1] - records[RECORD * k + 5]) // BAND_ROWS
-            row = shared[slots[i] + band - first]
+            row = shared[slots[i] + band - first[i]]
             for j in range(5):
                 row[j] = d_records[5 * k + j]
             for c in range(used):

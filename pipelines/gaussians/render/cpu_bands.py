@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.gaussians.render import rules
-from pipelines.gaussians.render.jit import kernel
+from pipelines.gaussians.render.jit import inner, kernel
 from pipelines.gaussians.render.threads import for_each
 
 F32 = np.float32
@@ -25,13 +25,13 @@ _ALPHA_MIN, _CUT2 = F32(rules.ALPHA_MIN), F32(rules.CUT_SIGMAS**2)
 _HALF, _ZERO, _ONE, _TWO = F32(0.5), F32(0), F32(1), F32(2)
 
 
-@kernel
+@inner
 def first_pixel(low: np.float32) -> int:
     """The first pixel whose centre is >= low, if low > -1/2; else 0."""
     return math.ceil(low - _HALF) if low > _HALF else 0
 
 
-@kernel
+@inner
 def last_pixel(high: np.float32, size: int) -> int:
     """The last pixel below `size` whose centre is <= high; -1 if there is none."""
     if high >= F32(size):
@@ -43,12 +43,12 @@ def last_pixel(high: np.float32, size: int) -> int:
 class Bands:
     """What the bands of an image see. Band b sees the Gaussians entries[starts[b]:starts[b + 1]], near to far.
 
-    reach (M,) pixels, 0 where a Gaussian is not seen; slots (M + 1,): Gaussians in several bands own the places
-    slots[i]:slots[i + 1] for what each of them has to say; prepared: per band its records and padded features
-    (`gather_band`) and where its tiles look in them (`list_tiles`).
+    first (M,): the first band of a Gaussian; slots (M + 1,): Gaussians in several bands own the places
+    slots[i]:slots[i + 1], one a band, for what each of them has to say; prepared: per band its records and padded
+    features (`gather_band`) and where its tiles look in them (`list_tiles`).
     """
 
-    reach: NDArray[np.float32]
+    first: NDArray[np.int32]
     starts: NDArray[np.int64]
     entries: NDArray[np.int32]
     slots: NDArray[np.int64]
@@ -61,6 +61,11 @@ class Bands:
         """Indices of the Gaussians of a band, in the order of its records."""
         return self.entries[self.starts[band] : self.starts[band + 1]]
 
+    @property
+    def straddling(self) -> NDArray[np.int64]:
+        """Indices of the Gaussians in several bands."""
+        return np.flatnonzero(np.diff(self.slots))
+
 
 def split_into_bands(
     projected: tuple[NDArray[np.float32], ...],
@@ -71,8 +76,9 @@ def split_into_bands(
     near: float,
 ) -> Bands:
     """Everything about the Gaussians u, v, sigma_px, z, opacity (M,) and features (M, C) that bands need to know."""
-    reach, starts, entries, slots = bin_gaussians(projected, width, height, F32(near))
-    bands = Bands(reach, starts, entries, slots, [None] * (len(starts) - 1))  # type: ignore[list-item]
+    reach = reach_of(projected, width, height, F32(near))
+    first, starts, entries, slots = bin_gaussians(projected[1], reach, height)
+    bands = Bands(first, starts, entries, slots, [None] * (len(starts) - 1))  # type: ignore[list-item]
 
     def prepare(band: int) -> None:
         top = band * BAND_ROWS
@@ -85,42 +91,35 @@ def split_into_bands(
     return bands
 
 
-@kernel
-def bin_gaussians(
+def reach_of(
     projected: tuple[NDArray[np.float32], ...], width: int, height: int, near: np.float32
-) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
-    """The first four fields of `Bands`, entries in the order of their indices."""
+) -> NDArray[np.float32]:
+    """How far from its centre a Gaussian is seen, in pixels (M,); 0 where it is not seen at all."""
     u, v, sigma_px, z, opacity = projected
-    count = len(u)
+    contrast = np.maximum(opacity, _ALPHA_MIN) / _ALPHA_MIN
+    reach = sigma_px * np.sqrt(np.minimum(_CUT2, _TWO * np.log(contrast)))
+    seen = (z > near) & (reach > 0)
+    for center, size in ((u, width), (v, height)):
+        seen &= (center + reach >= _HALF) & (center - reach <= F32(size - 0.5))
+    return np.where(seen, reach, _ZERO)
+
+
+def bin_gaussians(
+    v: NDArray[np.float32], reach: NDArray[np.float32], height: int
+) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
+    """The first four fields of `Bands`, entries in the order of their indices."""
     bands = (height + BAND_ROWS - 1) // BAND_ROWS
-    reach = np.empty(count, np.float32)
-    slots = np.zeros(count + 1, np.int64)
-    ends = np.zeros(bands + 2, np.int64)
-    for i in range(count):
-        reach[i] = _ZERO
-        slots[i + 1] = slots[i]
-        if not (z[i] > near and opacity[i] > _ALPHA_MIN and sigma_px[i] > _ZERO):
-            continue
-        r = sigma_px[i] * math.sqrt(min(_CUT2, _TWO * math.log(opacity[i] / _ALPHA_MIN)))
-        top, bottom = first_pixel(v[i] - r), last_pixel(v[i] + r, height)
-        if top > bottom or first_pixel(u[i] - r) > last_pixel(u[i] + r, width):
-            continue
-        reach[i] = r
-        first, last = top // BAND_ROWS, bottom // BAND_ROWS
-        for band in range(first, last + 1):
-            ends[band + 2] += 1
-        if last > first:
-            slots[i + 1] += last - first + 1
-    for band in range(bands):
-        ends[band + 2] += ends[band + 1]
-    entries = np.empty(ends[bands + 1], np.int32)
-    for i in range(count):
-        if reach[i] > _ZERO:
-            first = first_pixel(v[i] - reach[i]) // BAND_ROWS
-            for band in range(first, last_pixel(v[i] + reach[i], height) // BAND_ROWS + 1):
-                entries[ends[band + 1]] = i
-                ends[band + 1] += 1
-    return reach, ends[: bands + 1], entries, slots
+    # Bands of the pixel rows from ceil(v - reach - 1/2) to floor(v + reach - 1/2). Unseen ones may be anywhere.
+    top, bottom = (np.clip(edge - _HALF, _ZERO, F32(height - 1)) for edge in (v - reach, v + reach))
+    first, last = (row.astype(np.int32) // BAND_ROWS for row in (np.ceil(top), bottom))
+    spans = np.where(reach > 0, np.maximum(last - first + 1, 0), 0)
+    several = np.where(spans > 1, spans, 0)
+    slots = np.concatenate([[0], np.cumsum(several)])
+    index = np.repeat(np.arange(len(v), dtype=np.int32), spans)
+    step = np.arange(len(index)) - np.repeat(np.cumsum(spans) - spans, spans)
+    band = (first[index] + step).astype(np.uint16)
+    order = np.argsort(band, kind="stable")  # of 16-bit numbers a radix sort
+    return first, np.searchsorted(band[order], np.arange(bands + 1)), index[order], slots
 
 
 def near_to_far(entries: NDArray[np.int32], z: NDArray[np.float32]) -> NDArray[np.int32]:

@@ -6,6 +6,8 @@ one per row. A tile's pixels keep their state in planes of one flat array, see t
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +19,7 @@ from pipelines.gaussians.render.cpu_bands import (
     first_pixel,
     last_pixel,
 )
-from pipelines.gaussians.render.jit import kernel
+from pipelines.gaussians.render.jit import inner, kernel
 from pipelines.gaussians.render.lanes import (
     add_to_box,
     any_of,
@@ -37,6 +39,8 @@ LIGHT, DEPTH_LIGHT, DEPTH_SUM, DEPTH_SILHOUETTE, PROXY, KAPPA = (PIXELS * i for 
 """Where the planes of the tile's state start: transmittance of the plain and of the depth chain, the two sums of the
 depth chain, the proxy depth and the κ of the pixel (0 where the proxy is unknown)."""
 PLANES = 6
+Guide: TypeAlias = tuple[NDArray[np.float32], np.float32] | None
+"""The proxy depth (H, W), 0 where unknown, and κ of eq. (7); None for κ = 0, where both chains are one."""
 CHECK_EVERY = 32  # Gaussians between two looks at whether the whole tile is opaque
 
 _ALPHA_MAX, _LIGHT_MIN = F32(rules.ALPHA_MAX), F32(rules.TRANSMITTANCE_MIN)
@@ -44,18 +48,17 @@ _HALF, _ZERO, _ONE = F32(0.5), F32(0), F32(1)
 _TINY = F32(1e-30)
 
 
-@kernel
+@inner
 def clear(numbers: NDArray[np.float32]) -> None:
     """Zeros. A slice assignment does the same but takes long to compile."""
     for i in range(len(numbers)):
         numbers[i] = _ZERO
 
 
-@kernel
+@inner
 def open_tile(
     state: NDArray[np.float32],
-    proxy: NDArray[np.float32],
-    kappa: np.float32,
+    guide: Guide,
     left: int,
     top: int,
     columns: int,
@@ -68,12 +71,14 @@ def open_tile(
             pixel = TILE * y + x
             state[LIGHT + pixel] = _ONE
             state[DEPTH_LIGHT + pixel] = _ONE
-            if kappa > _ZERO and proxy[top + y, left + x] > _ZERO:
-                state[PROXY + pixel] = proxy[top + y, left + x]
-                state[KAPPA + pixel] = kappa
+            if guide is not None:
+                proxy, kappa = guide
+                if proxy[top + y, left + x] > _ZERO:
+                    state[PROXY + pixel] = proxy[top + y, left + x]
+                    state[KAPPA + pixel] = kappa
 
 
-@kernel
+@inner
 def is_opaque(state: NDArray[np.float32], plane: int) -> bool:
     """Whether no pixel of the tile takes any more light."""
     most = load(state, plane)
@@ -82,7 +87,7 @@ def is_opaque(state: NDArray[np.float32], plane: int) -> bool:
     return not any_of(most >= _LIGHT_MIN)
 
 
-@kernel
+@inner
 def blend_rows(
     state: NDArray[np.float32],
     weights: NDArray[np.float32],
@@ -108,7 +113,7 @@ def blend_rows(
         store(state, DEPTH_SUM + row, load(state, DEPTH_SUM + row) + weight * z)
 
 
-@kernel
+@inner
 def blend_rows_by_proxy(
     state: NDArray[np.float32],
     weights: NDArray[np.float32],
@@ -149,8 +154,7 @@ def forward_band(
     padded: NDArray[np.float32],
     tile_starts: NDArray[np.int64],
     members: NDArray[np.int32],
-    proxy: NDArray[np.float32],
-    kappa: np.float32,
+    guide: Guide,
     out_features: NDArray[np.float32],
     out_planes: NDArray[np.float32],
 ) -> None:
@@ -162,11 +166,11 @@ def forward_band(
     image = np.empty(PIXELS * channels, np.float32)
     state = np.empty(PIXELS * PLANES, np.float32)
     weights, falloff_y = np.zeros(PIXELS, np.float32), np.empty(TILE, np.float32)
-    decisive = DEPTH_LIGHT if kappa > _ZERO else LIGHT
+    decisive = LIGHT if guide is None else DEPTH_LIGHT
     for tile in range(len(tile_starts) - 1):
         left, top = TILE * (tile % across), band_top + TILE * (tile // across)
         columns, rows = min(TILE, width - left), min(TILE, height - top)
-        open_tile(state, proxy, kappa, left, top, columns, rows)
+        open_tile(state, guide, left, top, columns, rows)
         clear(image)
         for k in range(tile_starts[tile], tile_starts[tile + 1]):
             i = members[k]
@@ -183,10 +187,10 @@ def forward_band(
             falloff_x = exp(dx2 * sharpness)
             store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
             depth = records[at + 3]
-            if kappa > _ZERO:
-                blend_rows_by_proxy(state, weights, falloff_y, falloff_x, dx2, v_tile, r * r, depth, y0, y1)
-            else:
+            if guide is None:
                 blend_rows(state, weights, falloff_y, falloff_x, dx2, v_tile, r * r, depth, y0, y1)
+            else:
+                blend_rows_by_proxy(state, weights, falloff_y, falloff_x, dx2, v_tile, r * r, depth, y0, y1)
             corner = TILE * y0 + x0
             add_to_box(
                 image, corner * channels, padded, i * channels, weights, corner, y1 - y0 + 1, x1 - x0 + 1, vectors
@@ -201,5 +205,5 @@ def forward_band(
                     row[c] = image[pixel * channels + c]
                 seen = _ONE - state[LIGHT + pixel]
                 out_planes[0, top + y, left + x] = state[DEPTH_SUM + pixel]
-                out_planes[1, top + y, left + x] = state[DEPTH_SILHOUETTE + pixel] if kappa > _ZERO else seen
+                out_planes[1, top + y, left + x] = seen if guide is None else state[DEPTH_SILHOUETTE + pixel]
                 out_planes[2, top + y, left + x] = seen

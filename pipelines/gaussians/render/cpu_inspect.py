@@ -42,9 +42,14 @@ def inspect(
     bands = split_into_bands(projected, no_features, 0, width, height, near)
     median = np.empty((height, width), F32)
     sums, most = np.zeros(len(u), F32), np.zeros(len(u), F32)
-    results = (median, sums, most, np.zeros((int(bands.slots[-1]), 2), F32))
-    for_each(lambda b: inspect_band(b, bands.own(b), bands.slots, *bands.prepared[b], *results), len(bands))
-    merge_statistics(bands.slots, *results[1:])
+    shared = np.empty((int(bands.slots[-1]), 2), F32)
+    results = (median, sums, most, shared)
+    places = (bands.first, bands.slots)
+    for_each(lambda b: inspect_band(b, bands.own(b), *places, *bands.prepared[b], *results), len(bands))
+    if len(straddling := bands.straddling):
+        starts = bands.slots[straddling]
+        sums[straddling] = np.add.reduceat(shared[:, 0], starts)
+        most[straddling] = np.maximum.reduceat(shared[:, 1], starts)
     return torch.from_numpy(median), torch.from_numpy(sums), torch.from_numpy(most)
 
 
@@ -52,6 +57,7 @@ def inspect(
 def inspect_band(
     band: int,
     own: NDArray[np.int32],
+    first: NDArray[np.int32],
     slots: NDArray[np.int64],
     records: NDArray[np.float32],
     padded: NDArray[np.float32],
@@ -72,7 +78,7 @@ def inspect_band(
     for tile in range(len(tile_starts) - 1):
         left, top = TILE * (tile % across), band_top + TILE * (tile // across)
         columns, rows = min(TILE, width - left), min(TILE, height - top)
-        open_tile(state, median, _ZERO, left, top, columns, rows)
+        open_tile(state, None, left, top, columns, rows)
         clear(medians)
         for k in range(tile_starts[tile], tile_starts[tile + 1]):
             i = members[k]
@@ -104,19 +110,7 @@ def inspect_band(
     for k in range(len(own)):
         i = own[k]
         if slots[i + 1] > slots[i]:
-            first = first_pixel(records[RECORD * k + 1] - records[RECORD * k + 5]) // BAND_ROWS
-            slot = slots[i] + band - first
+            slot = slots[i] + band - first[i]
             shared[slot, 0], shared[slot, 1] = seen[k, 0], seen[k, 1]
         else:
             sums[i], most[i] = seen[k, 0], seen[k, 1]
-
-
-@kernel
-def merge_statistics(
-    slots: NDArray[np.int64], sums: NDArray[np.float32], most: NDArray[np.float32], shared: NDArray[np.float32]
-) -> None:
-    """Over the bands of the Gaussians that several bands saw, top to bottom."""
-    for i in range(len(sums)):
-        for slot in range(slots[i], slots[i + 1]):
-            sums[i] += shared[slot, 0]
-            most[i] = max(most[i], shared[slot, 1])

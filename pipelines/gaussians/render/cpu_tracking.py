@@ -20,7 +20,7 @@ from pipelines.gaussians.render.cpu_bands import (
     split_into_bands,
 )
 from pipelines.gaussians.render.cpu_forward import CHECK_EVERY, LIGHT, PIXELS, clear, is_opaque
-from pipelines.gaussians.render.jit import kernel
+from pipelines.gaussians.render.jit import inner, kernel
 from pipelines.gaussians.render.lanes import add_products, counting, exp, halves, load, load_twice, store
 from pipelines.gaussians.render.threads import for_each
 
@@ -62,7 +62,7 @@ def normal_equations(
     return total[:, :6], total[:, VALUE], float(cost), int(pixels)
 
 
-@kernel
+@inner
 def fill_jacobian(
     jacobian: NDArray[np.float32],
     point: NDArray[np.float32],
@@ -87,7 +87,7 @@ def fill_jacobian(
         ds[p] = -scale * dz[p]
 
 
-@kernel
+@inner
 def blend_duals(
     duals: NDArray[np.float32],
     state: NDArray[np.float32],
@@ -124,7 +124,7 @@ def blend_duals(
             state[LIGHT + pixel] = light - alpha * light
 
 
-@kernel
+@inner
 def add_pixel(
     normal: NDArray[np.float32],
     duals: NDArray[np.float32],
@@ -220,7 +220,7 @@ def normal_equations_of_band(
                 sums[band, p, q] += normal[16 * p + q] + normal[16 * p + 8 + q]
 
 
-@kernel
+@inner
 def open_tile(state: NDArray[np.float32], duals: NDArray[np.float32], columns: int, rows: int) -> None:
     """Full light without derivatives for the pixels of the image, none for the rest of the tile."""
     clear(state)

@@ -81,8 +81,9 @@ def test_the_name_follows_the_sources(monkeypatch, tmp_path):
 
 
 def test_kernels_run_and_are_cached_without_a_home(tmp_path):
-    code = "import numpy as np; from pipelines.gaussians.render.cpu_bands import first_pixel; "
-    code += "assert first_pixel(np.float32(2.7)) == 3; print(sum(first_pixel.stats.cache_hits.values()))"
+    code = "import numpy as np; from pipelines.gaussians.render.cpu_bands import list_tiles; "
+    code += "starts, members = list_tiles(np.array([20, 5, 1, 1, 0.5, 3], np.float32), 0, 40, 16); "
+    code += "assert starts.tolist() == [0, 0, 1, 1]; print(sum(list_tiles.stats.cache_hits.values()))"
     environment = {**os.environ, "HOME": "/dev/null", "TMPDIR": str(tmp_path)}
     for hits in ("0", "1"):
         done = subprocess.run([sys.executable, "-c", code], env=environment, cwd=ROOT, capture_output=True, text=True)

@@ -110,25 +110,28 @@ def test_full_size_room():
 
 
 def test_map_and_pose_gradients_through_the_projection():
+    """The judge is given the centres as float32 rounds them: 1e-5 pixel is enough to move a pixel over the edge of a
+    Gaussian, and how float32 rounds is the machine's own affair. Its gradients go through its own projection."""
     scene = room(160, 120, 12_000, 1)
+    rounded: list[Tensor] = []
     results = []
     for backend, dtype in (("cpu", torch.float32), ("reference", torch.float64)):
         tensors = (scene.means, scene.radii, scene.opacities, scene.colors)
         tensors = [x.clone().to(dtype).requires_grad_() for x in tensors]
         twist = torch.zeros(6, dtype=dtype, requires_grad=True)
-        image = render(*tensors, MOVED, scene.intrinsics, twist=twist, backend=backend)
-        outputs = (image.features, image.depth, image.silhouette)
+        projected = project_map(*tensors[:2], MOVED, scene.intrinsics, twist)
+        rounded = rounded or [x.detach() for x in projected]
+        projected = [x + (value.to(dtype) - x).detach() for x, value in zip(projected, rounded, strict=True)]
+        image = composite(*projected, *tensors[2:], 160, 120, backend=backend)
+        outputs = (image.features, image.depth_sum, image.silhouette)
         generator = torch.Generator().manual_seed(1)
         upstream = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(dtype) for x in outputs]
         torch.autograd.backward(outputs, upstream)
         results.append([*(x.detach() for x in outputs), *(x.grad for x in (*tensors, twist))])
-    names = ("image", "depth", "silhouette", "means", "radii", "opacities", "colors", "twist")
-    for name, ours, exact in zip(names[:3], *results, strict=False):
-        worst = ((ours - exact).abs() / max(1.0, float(exact.max()))).reshape(120 * 160, -1).amax(1)
-        # A centre projected in float32 is off by 1e-5 pixel: now and then a pixel falls off the edge of a Gaussian.
-        assert (worst > 1e-4).double().mean() < 1e-3, name
-        assert worst.max() < 2e-2, name
-    for name, ours, exact in zip(names[3:], results[0][3:], results[1][3:], strict=True):
+    for name, ours, exact in zip(("image", "depth sum", "silhouette"), *results, strict=False):
+        assert (ours - exact).abs().max() < 1e-4 * max(1.0, float(exact.max())), name
+    names = ("means", "radii", "opacities", "colors", "twist")
+    for name, ours, exact in zip(names, results[0][3:], results[1][3:], strict=True):
         assert (ours - exact).norm() < 1e-3 * exact.norm(), name
 
 
