@@ -59,6 +59,11 @@ def main() -> None:
     """
 
 
+SOURCE_FORMAT_HELP = (
+    "What SOURCE is: auto, images (a video or plain images, whatever lies beside them), or a data set: 7scenes, "
+    "replica, tum, euroc, scannet, sens, nerfstudio, colmap, folder. Default: auto. A data set gives its times and "
+    "camera, and with --depth files --semantics files its depth and labels."
+)
 UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], help="Stop after this stage.")
 
 
@@ -66,6 +71,7 @@ UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], h
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option("--out", type=FOLDER, metavar="RUN", help="The run folder. Default: the source's name + .msgs, here.")
 @settings_options
+@click.option("--format", "layout", metavar="NAME", help=SOURCE_FORMAT_HELP)
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), help="Where dense work runs. Default: auto.")
 @UNTIL
 @click.option(
@@ -83,21 +89,27 @@ UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], h
     metavar="FX,FY,CX,CY[,K1,K2,P1,P2]|FILE",
     help="The camera, in pixels of the source (first pixel's centre at 0.5, 0.5). Default: EXIF, else self-calibrated.",
 )
+@click.option(
+    "--hold-out", type=click.IntRange(0), metavar="N",
+    help="Keep every N-th frame out of the map, to measure it there (evaluate). Default: 0, use all.",
+)  # fmt: skip
 @verbosity_options
 def reconstruct(
     source: Path,
     out: Path | None,
     config_file: Path | None,
     overrides: tuple[str, ...],
+    layout: str | None,
     device: str | None,
     until: str,
     depth: str | None,
     semantics: str | None,
     intrinsics: str | None,
+    hold_out: int | None,
     quiet: bool,
     verbose: bool,
 ) -> None:
-    """Reconstruct SOURCE, a video or a folder of images, into a run folder.
+    """Reconstruct SOURCE, a video, a folder of images or a data set, into a run folder.
 
     No option is needed. Stopped at any moment, the same command, or `msgs-slam resume RUN`, goes on where it was; with
     a changed setting only the stages that depend on it run again.
@@ -109,8 +121,15 @@ def reconstruct(
     from pipelines.run_folder import RunFolder
 
     run = RunFolder(out) if out else default_run_folder(source)
-    named = {"run.device": device, "proxy.depth": depth, "proxy.semantics": semantics, "frames.intrinsics": intrinsics}
+    named = {
+        "run.format": layout,
+        "run.device": device,
+        "proxy.depth": depth,
+        "proxy.semantics": semantics,
+        "frames.intrinsics": intrinsics,
+    }
     texts = [f'{key}="{_toml_escape(value)}"' for key, value in named.items() if value is not None]
+    texts += [f"mapping.hold_out={hold_out}"] if hold_out is not None else []
     config = load_config(config_file, [*overrides, *texts], base=existing_config(run))
     records = _interruptible(lambda: run_reconstruct(source, run, config, make_progress(quiet), until), run.root)
     if not quiet:

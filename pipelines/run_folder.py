@@ -162,8 +162,8 @@ def save_calibration(folder: Path, calibration: Calibration) -> None:
 
 def calibration_from_json(value: dict[str, Any]) -> Calibration:
     """Inverse of `asdict(calibration)` after JSON."""
-    k1, k2, p1, p2 = value["distortion"]
-    return Calibration(Intrinsics(**value["intrinsics"]), value["origin"], value["focal_sd"], (k1, k2, p1, p2))
+    distortion = tuple(value["distortion"])
+    return Calibration(Intrinsics(**value["intrinsics"]), value["origin"], value["focal_sd"], distortion)
 
 
 def save_sparse_model(path: Path, model: SparseModel) -> None:

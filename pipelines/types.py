@@ -75,13 +75,13 @@ class Calibration:
     """The camera of the (undistorted) frames and how it came to be known.
 
     `origin` is "given", "exif" or "self-calibrated"; `focal_sd` its standard deviation in pixels (0 when given);
-    `distortion` the (k1, k2, p1, p2) that was removed from the frames.
+    `distortion` the (k1, k2, p1, p2[, k3]) that was removed from the frames.
     """
 
     intrinsics: Intrinsics
     origin: str
     focal_sd: float
-    distortion: tuple[float, float, float, float]
+    distortion: tuple[float, ...]
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,16 @@
 """Readers of the data sets that the field uses, all giving the same `Sequence`."""
 
 from formats.datasets.camera import Camera
-from formats.datasets.opening import FORMATS, open_sequence, recognise
+from formats.datasets.opening import FORMATS, open_sequence, recognise, recognise_source
 from formats.datasets.sequence import VOID_LABEL, LabelClass, Sequence
 
-__all__ = ["FORMATS", "VOID_LABEL", "Camera", "LabelClass", "Sequence", "open_sequence", "recognise"]
+__all__ = [
+    "FORMATS",
+    "VOID_LABEL",
+    "Camera",
+    "LabelClass",
+    "Sequence",
+    "open_sequence",
+    "recognise",
+    "recognise_source",
+]

@@ -44,14 +44,16 @@ def open_colmap(path: Path) -> Sequence:
     found = [i for i in order if inside(root, model.names[i], folder).is_file()]
     images = [root / model.names[i] for i in found]
     camera, notes = _shared_camera(model)
+    times, timed = times_or_frame_numbers(images)
     if len(found) < len(order):
         notes += (f"{len(order) - len(found)} of the model's {len(order)} images are missing in {root}",)
     return Sequence(
         format="colmap",
         root=path,
         names=tuple(model.names[i].replace("/", "_") for i in found),
-        timestamps=times_or_frame_numbers(images),
+        timestamps=times,
         image_paths=tuple(images),
+        timed=timed,
         camera=camera,
         world_from_cam=np.asarray(np.linalg.inv(model.cam_from_world[found]), dtype=np.float64),
         metric=False,

@@ -48,7 +48,7 @@ def open_folder(path: Path) -> Sequence:
         raise InputError(f"no images in {path}: give the folder that holds the images, or one above rgb/ or images/")
     images = list_images(folder)
     root = path if folder != path else _root_of(folder)
-    times = times_or_frame_numbers(images)
+    times, timed = times_or_frame_numbers(images)
     camera, depth_scale = _camera(root)
     depth_paths = _first(images, root, _DEPTH_FOLDERS)
     label_paths = _first(images, root, _LABEL_FOLDERS)
@@ -58,6 +58,7 @@ def open_folder(path: Path) -> Sequence:
         names=tuple(p.name for p in images),
         timestamps=times,
         image_paths=tuple(images),
+        timed=timed,
         camera=camera,
         world_from_cam=_poses(images, times, root),
         depth_paths=depth_paths,

@@ -82,15 +82,16 @@ def nearest_index(sorted_times: NDArray[np.float64], times: NDArray[np.float64])
     return np.where(closer, before, after).astype(np.int64)
 
 
-def times_or_frame_numbers(images: list[Path], rate: float = ASSUMED_RATE) -> NDArray[np.float64]:
-    """(N,) seconds: the images' own times, else their frame numbers (or else their order) over `rate`."""
+def times_or_frame_numbers(images: list[Path], rate: float = ASSUMED_RATE) -> tuple[NDArray[np.float64], bool]:
+    """(N,) seconds: the images' own times, else their frame numbers (or else their order) over `rate`; and whether
+    they are the images' own."""
     times = read_image_times(images)
     if times is not None:
-        return times
+        return times, True
     numbers = [frame_number(p) for p in images]
     usable = all(a is not None and b is not None and a < b for a, b in itertools.pairwise(numbers))
     counts = numbers if usable and numbers[0] is not None else list(range(len(images)))
-    return np.array(counts, dtype=np.float64) / rate
+    return np.array(counts, dtype=np.float64) / rate, False
 
 
 def classes_found(paths: tuple[Path | None, ...], void_ids: tuple[int, ...] = (0,)) -> tuple[LabelClass, ...]:

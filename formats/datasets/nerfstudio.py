@@ -51,12 +51,14 @@ def open_nerfstudio(path: Path) -> Sequence:
     depth_paths = tuple(_depth(file, frame) for frame in kept)
     camera, notes = _camera(table, kept, file, paths[0])
     missing = len(frames) - len(kept)
+    times, timed = times_or_frame_numbers(paths)
     return Sequence(
         format="nerfstudio",
         root=path,
         names=_names(file, paths),
-        timestamps=times_or_frame_numbers(paths),
+        timestamps=times,
         image_paths=tuple(paths),
+        timed=timed,
         camera=camera,
         world_from_cam=clean_poses(poses, str(file)),
         metric=any(depth_paths),

@@ -20,6 +20,7 @@ from formats.datasets import (
 )
 from formats.datasets.sequence import Sequence
 from formats.errors import InputError
+from formats.images import IMAGE_SUFFIXES
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,18 @@ def recognise(path: Path) -> str | None:
     """The format of a data set by what lies in it, "folder" for plain images, None for anything else."""
     found = _recognise(Path(path))
     return found[0] if found else None
+
+
+def recognise_source(path: Path) -> str | None:
+    """The format of a recording to reconstruct; None for a video, and for a folder that holds images directly.
+
+    Other than `recognise`, it takes what a user points at literally: a folder of images is no data set because of what
+    lies above it, nor because somebody has left a COLMAP model in it.
+    """
+    path = Path(path)
+    names = [name for name, reader in _READERS.items() if path.exists() and reader.recognises(path)]
+    holds_images = path.is_dir() and any(p.suffix.lower() in IMAGE_SUFFIXES for p in path.iterdir())
+    return next((name for name in names if not (holds_images and name in _NOT_FROM_INSIDE)), None)
 
 
 def _recognise(path: Path) -> tuple[str, Path] | None:

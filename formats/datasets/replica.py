@@ -54,6 +54,7 @@ def _open_nice_slam(path: Path) -> Sequence:
     images = [p for p in list_images(path / "results") if p.name.startswith("frame")]
     parameters = next((p / "cam_params.json" for p in (path, path.parent) if (p / "cam_params.json").is_file()), None)
     camera, scale = _wide_camera(images[0]), 6553.5
+    times, timed = times_or_frame_numbers(images)
     if parameters is not None:
         camera, given = read_intrinsics_json(parameters, integer_centres=True)
         scale = given or scale
@@ -61,8 +62,9 @@ def _open_nice_slam(path: Path) -> Sequence:
         format="replica",
         root=path,
         names=tuple(p.name for p in images),
-        timestamps=times_or_frame_numbers(images),
+        timestamps=times,
         image_paths=tuple(images),
+        timed=timed,
         camera=camera,
         world_from_cam=poses_for_images(images, read_matrices(path / "traj.txt"), path / "traj.txt"),
         depth_paths=files_for_images(images, path / "results", "depth*"),
@@ -74,6 +76,7 @@ def _open_nice_slam(path: Path) -> Sequence:
 def _open_rendered(path: Path) -> Sequence:
     images = list_images(path / "rgb")
     camera, scale = _wide_camera(images[0]), None
+    times, timed = times_or_frame_numbers(images)
     if (path / "cam_params.json").is_file():
         camera, scale = read_intrinsics_json(path / "cam_params.json", integer_centres=True)
     label_folder = next(path / name for name in _CLASS_FOLDERS if (path / name).is_dir())
@@ -82,8 +85,9 @@ def _open_rendered(path: Path) -> Sequence:
         format="replica",
         root=path,
         names=tuple(p.name for p in images),
-        timestamps=times_or_frame_numbers(images),
+        timestamps=times,
         image_paths=tuple(images),
+        timed=timed,
         camera=camera,
         world_from_cam=_rendered_poses(path, images),
         depth_paths=files_for_images(images, path / "depth"),

@@ -40,7 +40,7 @@ def open_scannet(path: Path) -> Sequence:
         format="scannet",
         root=path,
         names=tuple(p.name for p in images),
-        timestamps=times_or_frame_numbers(images),
+        timestamps=times_or_frame_numbers(images)[0],  # the frame numbers count at the sensor's 30 a second
         image_paths=tuple(images),
         camera=_camera(path / "intrinsic" / "intrinsic_color.txt", images[0], _COLOR_SIZE),
         world_from_cam=np.stack([_pose(path / "pose" / f"{p.stem}.txt") for p in images]),

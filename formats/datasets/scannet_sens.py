@@ -90,12 +90,13 @@ def open_sens(path: Path) -> Sequence:
         index, poses, times = _read_index(file, path, header.frame_count, size)
     frames = SensFrames(path, header.depth_kind, header.depth_size, *index)
     count = header.frame_count
-    increasing = (np.diff(times) > 0).all() and times[-1] > times[0]
+    increasing = bool((np.diff(times) > 0).all() and times[-1] > times[0])
     return Sequence(
         format="sens",
         root=path,
         names=tuple(f"{i:06d}.jpg" for i in range(count)),
         timestamps=(times - times[0]) * _MICROSECONDS if increasing else np.arange(count) / ASSUMED_RATE,
+        timed=increasing,
         camera=scaled_camera(header.color_matrix, header.color_size, header.color_size),
         world_from_cam=clean_poses(poses, str(path)),
         depth_camera=scaled_camera(header.depth_matrix, header.depth_size, header.depth_size),

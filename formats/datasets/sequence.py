@@ -45,7 +45,8 @@ class FrameStore(Protocol):
 class Sequence:
     """N frames of one camera.
 
-    names: N file names, unique. timestamps (N,) seconds, strictly increasing. image_paths: N paths, or none where
+    names: N file names, unique. timestamps (N,) seconds, strictly increasing; `timed` says whether they were measured
+    (or counted at the sensor's known rate), else they only tell the order. image_paths: N paths, or none where
     `store` holds the frames. camera: None where unknown. world_from_cam (N, 4, 4) float64 with exact rotations,
     camera axes x right, y down, z forward; NaN for a frame without a pose; None without any. `metric` says whether
     its lengths are metres. depth_paths, label_paths: N paths, None for a frame without; empty without any.
@@ -61,6 +62,7 @@ class Sequence:
     image_paths: tuple[Path, ...] = ()
     camera: Camera | None = None
     world_from_cam: NDArray[np.float64] | None = None
+    timed: bool = True
     metric: bool = True
     depth_paths: tuple[Path | None, ...] = ()
     depth_camera: Camera | None = None

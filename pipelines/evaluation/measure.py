@@ -14,8 +14,9 @@ from pipelines.evaluation.image_quality import psnr, ssim
 from pipelines.evaluation.label_cells import label_cells
 from pipelines.evaluation.label_score import Counts, count_labels, indices_by_name, renamed
 from pipelines.evaluation.trajectory_error import AbsoluteError
-from pipelines.evaluation.truth import FramePixels, MatchedTruth
+from pipelines.evaluation.truth import MatchedTruth
 from pipelines.evaluation.views import MapView, view_map
+from pipelines.frames.source_pixels import FramePixels
 from pipelines.gaussians.render import track_gn
 from pipelines.mapping.load import split_frames
 from pipelines.outcome import Outcome

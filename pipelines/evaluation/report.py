@@ -98,7 +98,10 @@ def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[Loo
             "camera",
             f"{c.origin}: focal length {k.fx:.2f}{spread} px, centre ({k.cx:.1f}, {k.cy:.1f}), {k.width}×{k.height}",
         ),
-        ("distortion removed", "k1 {:.4f}, k2 {:.4f}, p1 {:.4f}, p2 {:.4f}".format(*c.distortion)),
+        (
+            "distortion removed",
+            ", ".join(f"{n} {v:.4f}" for n, v in zip(("k1", "k2", "p1", "p2", "k3"), c.distortion, strict=False)),
+        ),
         ("scale", _scale_text(outcome)),
         ("depth", str(outcome.run.load_proxy_report().get("depth", ""))),
         ("classes", f"{outcome.semantics}: {len(outcome.classes)}"),

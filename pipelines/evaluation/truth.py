@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.datasets import Sequence
-from formats.datasets.camera import Camera
 from formats.textfile import read_rows
 from formats.trajectory import read_matrices
 from pipelines.evaluation.trajectory_error import associate
-from pipelines.frames.lens import make_lens, to_pycolmap
-from pipelines.types import Calibration, Frame
+from pipelines.frames.originals import written_name
+from pipelines.types import Frame
 
 _MOST_SECONDS_APART = 0.02
 
@@ -39,7 +38,7 @@ def match_truth(frames: list[Frame], names_are_the_sources: bool, sequence: Sequ
 
     Times may differ by a constant: a video counts from its beginning, some data sets from 1970.
     """
-    index_of = {name: i for i, name in enumerate(sequence.names)}
+    index_of = {written_name(name): i for i, name in enumerate(sequence.names)}
     found = [index_of.get(f.name, -1) for f in frames]
     if names_are_the_sources and sum(i >= 0 for i in found) > 0.5 * len(frames):
         image = np.array(found, np.int64)
@@ -95,33 +94,3 @@ def _dense_trajectory(root: Path) -> tuple[NDArray[np.float64], NDArray[np.float
     known = np.isfinite(poses).all(axis=(1, 2))
     times = np.array([float(r[0]) for r in rows])
     return times[known], poses[known]
-
-
-class FramePixels:
-    """Where in the source's image each pixel of an undistorted frame comes from.
-
-    The way back through the run's own undistortion: right even where its focal length is not.
-    """
-
-    def __init__(self, calibration: Calibration) -> None:
-        k = calibration.intrinsics
-        v, u = np.indices((k.height, k.width)) + 0.5
-        rays = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones_like(u)], axis=-1).reshape(-1, 3)
-        camera = to_pycolmap(_distorted_camera(calibration))
-        self._size = (k.width, k.height)
-        self._xy = camera.img_from_cam(rays).reshape(k.height, k.width, 2)
-
-    def sample(self, image: NDArray) -> NDArray:
-        """(H, W) the nearest pixels of `image` (h, w), which covers the source's whole picture."""
-        scale = (image.shape[1] / self._size[0], image.shape[0] / self._size[1])
-        column, row = (np.floor(self._xy[..., i] * scale[i]).astype(np.int64) for i in (0, 1))
-        return image[row.clip(0, image.shape[0] - 1), column.clip(0, image.shape[1] - 1)]
-
-
-def _distorted_camera(calibration: Calibration) -> Camera:
-    """The lens before undistortion, which may have enlarged the picture to fill the frame."""
-    k, zoom = calibration.intrinsics, 1.0
-    for _ in range(6):
-        camera = Camera(k.width, k.height, k.fx / zoom, k.fy / zoom, k.cx, k.cy, calibration.distortion)
-        zoom = make_lens(to_pycolmap(camera)).pinhole.fx / camera.fx
-    return camera

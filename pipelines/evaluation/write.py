@@ -24,7 +24,8 @@ from pipelines.evaluation.pictures import (
 )
 from pipelines.evaluation.plots import BLUE, GREY, Line, plot
 from pipelines.evaluation.table import evaluation_table
-from pipelines.evaluation.truth import FramePixels, MatchedTruth, match_truth
+from pipelines.evaluation.truth import MatchedTruth, match_truth
+from pipelines.frames.source_pixels import FramePixels
 from pipelines.geometry.alignment import Similarity, align_points
 from pipelines.outcome import Outcome, load_outcome
 from pipelines.progress import Progress

@@ -89,8 +89,6 @@ def _from_numbers(numbers: list[float], width: int, height: int, where: str) -> 
 
 
 def _fit_to_source(camera: Camera, width: int, height: int, path: Path) -> Camera:
-    if len(camera.distortion) > 4 and any(camera.distortion[4:]):
-        raise InputError(f"{path}: distortion beyond k1, k2, p1, p2 is not supported: undistort the images first")
     sx, sy = width / camera.width, height / camera.height
     if abs(sx / sy - 1) > _SAME_SHAPE:
         raise InputError(

@@ -16,11 +16,15 @@ _BORDER_POINTS = 65
 
 
 def to_pycolmap(camera: Camera) -> pycolmap.Camera:
-    """A fixed camera with known intrinsics: OPENCV with distortion, PINHOLE without."""
+    """A fixed camera with known intrinsics: OPENCV with distortion, FULL_OPENCV with a third radial one, or PINHOLE."""
     params = [camera.fx, camera.fy, camera.cx, camera.cy]
-    model = "OPENCV" if any(camera.distortion) else "PINHOLE"
-    if model == "OPENCV":
-        params += list(camera.distortion[:4])
+    model = "PINHOLE"
+    if any(camera.distortion[4:]):
+        model = "FULL_OPENCV"
+        params += [*camera.distortion, 0.0, 0.0, 0.0]
+    elif any(camera.distortion):
+        model = "OPENCV"
+        params += camera.distortion[:4]
     made = pycolmap.Camera.create_from_model_name(1, model, camera.fx, camera.width, camera.height)
     made.params = params
     made.has_prior_focal_length = True
@@ -41,8 +45,8 @@ def with_second_radial(camera: pycolmap.Camera) -> None:
     camera.params = params
 
 
-def distortion_of(camera: pycolmap.Camera) -> tuple[float, float, float, float]:
-    """(k1, k2, p1, p2); zeros for a pinhole."""
+def distortion_of(camera: pycolmap.Camera) -> tuple[float, ...]:
+    """(k1, k2, p1, p2), and k3 where the camera has one; zeros for a pinhole."""
     params = [float(p) for p in camera.params]
     if camera.model == pycolmap.CameraModelId.SIMPLE_RADIAL:
         return params[3], 0.0, 0.0, 0.0
@@ -50,6 +54,8 @@ def distortion_of(camera: pycolmap.Camera) -> tuple[float, float, float, float]:
         return params[3], params[4], 0.0, 0.0
     if camera.model == pycolmap.CameraModelId.OPENCV:
         return params[4], params[5], params[6], params[7]
+    if camera.model == pycolmap.CameraModelId.FULL_OPENCV:
+        return tuple(params[4:9])
     return 0.0, 0.0, 0.0, 0.0
 
 

@@ -1,4 +1,4 @@
-"""The two kinds of source, a video file and a folder of images, read alike."""
+"""The kinds of source, a video file, a folder of images or a data set, read alike."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image
+from PIL import Image
 
 from formats.errors import InputError
 from formats.image_times import read_image_times
 from formats.images import exif_focal_px, image_size, list_images, read_rgb
 from formats.video import VideoFrame, VideoReader, probe_video
+from pipelines.frames.originals import is_plain, written_name
+from pipelines.frames.recording import RecordingSource, open_recording
 
 Warn = Callable[[str], None]
 
@@ -134,17 +136,12 @@ class FolderSource:
 
     def name(self, frame_id: int, index: int) -> str:
         """The image's own name; formats that are not written here become .png."""
-        path = self._images[index]
-        if path.suffix.lower() in (".jpg", ".jpeg", ".png"):
-            return path.name
-        return f"{path.name}.png"
+        return written_name(self._images[index].name)
 
     def original(self, index: int) -> Path | None:
         """The image's file, unless other programs would see it turned, transparent or not at all."""
         path = self._images[index]
-        with Image.open(path) as image:
-            plain = image.mode in ("RGB", "L") and image.getexif().get(ExifTags.Base.Orientation, 1) == 1
-        return path if plain and path.name == self.name(0, index) else None
+        return path if is_plain(path) else None
 
     def exif_focal(self) -> float | None:
         """That of the first readable image."""
@@ -170,11 +167,14 @@ def _is_depth_map(path: Path) -> bool:
         return False  # damaged: told of when it is read
 
 
-def open_source(path: Path) -> VideoSource | FolderSource:
-    """A video file or a folder of images.
+def open_source(path: Path, format: str = "auto") -> VideoSource | FolderSource | RecordingSource:
+    """A video file, a folder of images, or a data set (see `open_recording` for the format).
 
     Raises InputError when there is no such file, it is no video, it holds no image, or images differ in size.
     """
+    recording = open_recording(path, format)
+    if recording is not None:
+        return RecordingSource(recording)
     return FolderSource(path) if path.is_dir() else VideoSource(path)
 
 

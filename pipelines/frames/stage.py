@@ -25,6 +25,7 @@ from pipelines.frames.keyframes import KeyframeChoice, KeyframeOptions, choose_k
 from pipelines.frames.lens import Lens, distortion_of, make_lens, to_pycolmap, unknown_camera
 from pipelines.frames.parallax import require_motion
 from pipelines.frames.pick import sharpest_of_windows
+from pipelines.frames.recording import RecordingSource
 from pipelines.frames.sharpness import reduce_image, reduced_size
 from pipelines.frames.snapshots import Snapshots
 from pipelines.frames.source import FolderSource, VideoSource, open_source
@@ -38,12 +39,14 @@ _FEW_KEYFRAMES = 12
 _FOCAL_GUESS = 1.2
 _UNSURE_FOCAL = 0.05
 
+AnySource = VideoSource | FolderSource | RecordingSource
+
 
 def run(context: StageContext) -> dict[str, Any]:
     """See `StageContext`; raises InputError for a source that cannot be used."""
     config = context.config.frames
-    source = open_source(context.source)
-    camera, origin = _known_camera(config, source)
+    source = open_source(context.source, context.config.run.format)
+    camera, origin = _known_camera(context, source)
     _require_reasonable(config, source)
     frames = _pick(context, source)
     keyframes = _keyframes(context, frames)
@@ -57,22 +60,29 @@ def run(context: StageContext) -> dict[str, Any]:
     return _figures(frames, structure, calibration)
 
 
-def _known_camera(config: FramesConfig, source: VideoSource | FolderSource) -> tuple[pycolmap.Camera, str]:
+def _known_camera(context: StageContext, source: AnySource) -> tuple[pycolmap.Camera, str]:
     """The camera of the reduced frames as far as it is known before, and where from."""
+    config = context.config.frames
     width, height = reduced_size(source.width, source.height, config.max_side)
     if config.intrinsics:
         given = read_intrinsics(config.intrinsics, source.width, source.height)
         return to_pycolmap(given.resized(width, height)), "given"
+    known = source.known_camera() if isinstance(source, RecordingSource) else None
+    if known is not None and not known.fisheye:
+        return to_pycolmap(known.resized(width, height)), "given"
+    if known is not None:
+        context.warn("the data set's lens is a fisheye: its focal length is a start only, the frames calibrate it")
+        return unknown_camera(width, height, known.fx * width / source.width, is_prior=True), "self-calibrated"
     exif = source.exif_focal()
     if exif is not None:
         return unknown_camera(width, height, exif * width / source.width, is_prior=True), "exif"
     return unknown_camera(width, height, _FOCAL_GUESS * max(width, height), is_prior=False), "self-calibrated"
 
 
-def _require_reasonable(config: FramesConfig, source: VideoSource | FolderSource) -> None:
+def _require_reasonable(config: FramesConfig, source: AnySource) -> None:
     if isinstance(source, FolderSource) and source.expected_frames - len(source.unreadable) < 2:
         raise InputError(f"{source.path} holds one image only; a reconstruction needs several views of a scene")
-    if isinstance(source, FolderSource) and not source.has_times and source.expected_frames > config.max_frames:
+    if not source.has_times and source.expected_frames > config.max_frames:
         raise InputError(
             f"{source.path} holds {source.expected_frames} images, more than frames.max_frames = {config.max_frames}: "
             f"remove some, or allow more with --set frames.max_frames={source.expected_frames}"
@@ -82,7 +92,7 @@ def _require_reasonable(config: FramesConfig, source: VideoSource | FolderSource
 # picking --------------------------------------------------------------------------------------------------------
 
 
-def _pick(context: StageContext, source: VideoSource | FolderSource) -> list[Frame]:
+def _pick(context: StageContext, source: AnySource) -> list[Frame]:
     table = context.snapshot / "picked.json"
     if table.exists():
         stored = read_json(table)
@@ -115,7 +125,7 @@ def _untimed(config: FramesConfig, frame_id: int) -> float:
     return frame_id / (config.rate if config.rate > 0 else 1.0)
 
 
-def _save_picked(context: StageContext, source: VideoSource | FolderSource, picture: VideoFrame, name: str) -> None:
+def _save_picked(context: StageContext, source: AnySource, picture: VideoFrame, name: str) -> None:
     path = _picked(context, name)
     reduced = reduce_image(picture.rgb, context.config.frames.max_side)
     original = source.original(picture.source_index) if reduced is picture.rgb else None
@@ -225,7 +235,7 @@ def _write_backbone(
     save_sparse_model(context.folder / "backbone" / "model.npz", model)
 
 
-def _write_frames(context: StageContext, source: VideoSource | FolderSource, frames: list[Frame], lens: Lens) -> None:
+def _write_frames(context: StageContext, source: AnySource, frames: list[Frame], lens: Lens) -> None:
     """The frames without distortion; those of a lens without any are the picked ones, byte for byte."""
     missing = [f for f in frames if not (context.folder / f.name).exists()]
     if lens.shift_px <= _SIGNIFICANT_SHIFT_PX:

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.config import Config
+from pipelines.frames.recording import open_recording
 from pipelines.frames.source import open_source
 from pipelines.progress import SilentProgress
-from pipelines.proxy.files_depth import FilesDepth
-from pipelines.proxy.files_labels import FilesLabels
 from pipelines.proxy.networks.card import Card
 from pipelines.proxy.networks.onnx_file import external_locations, require_own_weights
 from pipelines.proxy.selection import (
@@ -20,6 +19,8 @@ from pipelines.proxy.selection import (
     choose_depth,
     choose_semantics,
     open_learned_depth,
+    open_depth_files,
+    open_label_files,
     open_learned_semantics,
 )
 from pipelines.proxy.sequence import Sequence, map_intrinsics
@@ -38,11 +39,9 @@ def proxy_inputs(source: Path, config: Config) -> dict[str, Any]:
     if "files" in (depth.kind, semantics.kind):
         around = _before_frames(source, config)
         if depth.kind == "files":
-            maps = FilesDepth(depth.folder, source, around.sequence, config.proxy.depth_scale)
-            identities["depth"] = _files_identity(maps.files())
+            identities["depth"] = _files_identity(open_depth_files(around, depth.folder).files())
         if semantics.kind == "files":
-            labels = FilesLabels(semantics.folder, source, around.sequence, around.progress)
-            identities["labels"] = _files_identity(labels.files())
+            identities["labels"] = _files_identity(open_label_files(around, semantics.folder).files())
     return identities
 
 
@@ -57,7 +56,7 @@ def check_proxy(source: Path, config: Config) -> None:
 
 def _before_frames(source: Path, config: Config) -> Surroundings:
     """As if every picture of the source were a frame; none of them is decoded."""
-    pictures = open_source(source)
+    pictures = open_source(source, config.run.format)
     width, height = pictures.width, pictures.height
     camera = Intrinsics(width, height, width, width, width / 2, height / 2)
     names = [Frame(i, pictures.name(i, i), 0.0, i, 0.0) for i in range(pictures.expected_frames)]
@@ -68,7 +67,8 @@ def _before_frames(source: Path, config: Config) -> Surroundings:
         raise AssertionError("providers are only opened here")
 
     sequence = Sequence(names, calibration, small, None, nothing)
-    return Surroundings(source, sequence, config.proxy, nothing, 1, "cpu", SilentProgress())
+    return Surroundings(source, sequence, config.proxy, nothing, 1, "cpu", SilentProgress(), recording)
+    recording = open_recording(source, config.run.format)
 
 
 def _files_identity(files: Rows[Path]) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from formats.datasets import Sequence as Recording
 from formats.errors import InputError
 from pipelines.config import ProxyConfig
 from pipelines.progress import Progress, log
@@ -18,13 +19,15 @@ from pipelines.proxy.networks.card import Card, read_card
 from pipelines.proxy.onnx_depth import OnnxDepth
 from pipelines.proxy.onnx_labels import OnnxLabels
 from pipelines.proxy.providers import DepthProvider, SemanticsProvider
+from pipelines.proxy.recording_maps import RecordingDepth, RecordingLabels
 from pipelines.proxy.segments import SegmentLabels
 from pipelines.proxy.sequence import Sequence
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What providers are made from. `scratch(name)` is a folder that lives as long as the stage is unfinished."""
+    """What providers are made from. `scratch(name)` is a folder that lives as long as the stage is unfinished;
+    `recording` is the data set that the source is, None for a video or plain images."""
 
     source: Path
     sequence: Sequence
@@ -33,6 +36,7 @@ class Surroundings:
     threads: int
     device: str
     progress: Progress
+    recording: Recording | None = None
 
 
 def split_choice(text: str, setting: str, kinds: tuple[str, ...]) -> tuple[str, str]:
@@ -82,10 +86,10 @@ def open_depth(around: Surroundings) -> DepthProvider:
     return _fused(around, learned) if fuse else learned
 
 
-def open_learned_depth(around: Surroundings, choice: Choice) -> FilesDepth | OnnxDepth:
+def open_learned_depth(around: Surroundings, choice: Choice) -> FilesDepth | RecordingDepth | OnnxDepth:
     """The provider of `files` or of a network, by itself."""
     if choice.card is None:
-        return FilesDepth(choice.folder, around.source, around.sequence, around.config.depth_scale)
+        return open_depth_files(around, choice.folder)
     return OnnxDepth(around.sequence, choice.card, *_surroundings(around, "network_depth"))
 
 
@@ -97,11 +101,25 @@ def open_semantics(around: Surroundings) -> SemanticsProvider:
     return open_learned_semantics(around, choice)
 
 
-def open_learned_semantics(around: Surroundings, choice: Choice) -> FilesLabels | OnnxLabels:
+def open_learned_semantics(around: Surroundings, choice: Choice) -> FilesLabels | RecordingLabels | OnnxLabels:
     """The provider of `files` or of a network, by itself."""
     if choice.card is None:
-        return FilesLabels(choice.folder, around.source, around.sequence, around.progress)
+        return open_label_files(around, choice.folder)
     return OnnxLabels(around.sequence, choice.card, *_surroundings(around, "network_labels"))
+
+
+def open_depth_files(around: Surroundings, folder: str) -> FilesDepth | RecordingDepth:
+    """The depth of a folder; without one, that of the data set itself, or what lies beside the source."""
+    if not folder and around.recording is not None:
+        return RecordingDepth(around.recording, around.sequence)
+    return FilesDepth(folder, around.source, around.sequence, around.config.depth_scale)
+
+
+def open_label_files(around: Surroundings, folder: str) -> FilesLabels | RecordingLabels:
+    """The labels of a folder; without one, those of the data set itself, or what lies beside the source."""
+    if not folder and around.recording is not None:
+        return RecordingLabels(around.recording, around.sequence, around.progress)
+    return FilesLabels(folder, around.source, around.sequence, around.progress)
 
 
 def _cached(task: str) -> Card | None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from formats.errors import InputError
 from pipelines.config import ProxyConfig
+from pipelines.frames.recording import open_recording
 from pipelines.progress import log
 from pipelines.proxy.compact import compact
 from pipelines.proxy.inputs import check_proxy, proxy_inputs
@@ -47,6 +48,7 @@ def run(context: StageContext) -> dict[str, Any]:
         context.progress,
     )
     depths = open_depth(around)
+        open_recording(context.source, context.config.run.format),
     semantics = open_semantics(around)
     log.info("proxy: depth by %s, classes by %s", depths.name, semantics.name)
     frames = _frames_to_do(context, sequence, config, depths)

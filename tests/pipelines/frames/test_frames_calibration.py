@@ -13,7 +13,7 @@ import pytest
 from formats.datasets.camera import Camera
 from formats.errors import InputError
 from pipelines.frames.calibration import read_intrinsics
-from pipelines.frames.lens import make_lens, to_pycolmap, unknown_camera, with_second_radial
+from pipelines.frames.lens import distortion_of, make_lens, to_pycolmap, unknown_camera, with_second_radial
 
 
 def test_numbers_on_the_command_line() -> None:
@@ -80,11 +80,11 @@ def test_wrong_files_are_refused(content: str, what: str, tmp_path: Path) -> Non
         read_intrinsics(str(tmp_path / "camera.txt"), 640, 480)
 
 
-def test_a_fifth_coefficient_is_refused(tmp_path: Path) -> None:
+def test_a_fifth_coefficient_is_kept(tmp_path: Path) -> None:
     camera = {"w": 640, "h": 480, "fx": 525, "fy": 526, "cx": 320, "cy": 240, "distortion": [0.1, 0, 0, 0, 0.3]}
     (tmp_path / "k3.json").write_text(json.dumps(camera))
-    with pytest.raises(InputError, match="beyond k1, k2, p1, p2"):
-        read_intrinsics(str(tmp_path / "k3.json"), 640, 480)
+    found = read_intrinsics(str(tmp_path / "k3.json"), 640, 480)
+    assert distortion_of(to_pycolmap(found)) == (0.1, 0, 0, 0, 0.3)
 
 
 LENSES = [(-0.15, 0.02, 0.001, -0.002), (0.08, -0.03, 0.0, 0.0), (-0.3, 0.1, 0.0, 0.003), (0.0, 0.0, 0.0, 0.0)]

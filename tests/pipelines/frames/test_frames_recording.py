@@ -1,0 +1,144 @@
+"""Data sets as sources: what their readers know reaches the frames, the camera and the proxies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from layouts import LAYOUTS, START, tum
+
+from formats.datasets import Camera, Sequence
+from formats.errors import InputError
+from formats.images import write_rgb
+from pipelines.config import Config, load_config
+from pipelines.frames.lens import distortion_of, make_lens, to_pycolmap
+from pipelines.frames.recording import RecordingSource
+from pipelines.frames.source import FolderSource, open_source
+from pipelines.frames.source_pixels import FramePixels
+from pipelines.progress import SilentProgress
+from pipelines.proxy.inputs import proxy_inputs
+from pipelines.proxy.recording_maps import RecordingDepth, RecordingLabels
+from pipelines.proxy.selection import Surroundings, open_depth_files, open_label_files
+from pipelines.proxy.sequence import Sequence as ProxySequence
+from pipelines.types import VOID, Calibration, Frame, Intrinsics
+
+
+@pytest.fixture(scope="session")
+def short(truth: Sequence) -> Sequence:
+    """Five frames of the room are enough to tell one layout from another."""
+    return truth.subset(range(0, 20, 4))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_each_layout_is_recognised_and_read(layout: str, short: Sequence, tmp_path: Path) -> None:
+    write, format, timed, _, _ = LAYOUTS[layout]
+    path = write(short, tmp_path / "set")
+    source = open_source(path)
+    assert isinstance(source, RecordingSource)
+    assert (source.sequence.format, source.expected_frames, source.has_times) == (format, 5, timed)
+    frames = list(source.read())
+    wanted = np.stack([short.rgb(i) for i in range(5)]).astype(float)
+    if layout == "euroc":
+        wanted = np.repeat(wanted[..., 1:2], 3, axis=-1)
+    # A .sens file holds JPEGs.
+    assert np.abs(np.stack([f.rgb for f in frames]) - wanted).mean() < (3 if layout == "sens" else 1e-9)
+    if timed:
+        gaps = 0.1 if layout in ("scannet", "seven_scenes") else np.diff(short.timestamps)
+        np.testing.assert_allclose(np.diff([f.timestamp for f in frames]), gaps, atol=1e-5)
+    camera, true = source.known_camera(), short.camera
+    assert camera is not None
+    assert true is not None
+    found, expected = ((c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (camera, true))
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+    assert len({source.name(i, i) for i in range(5)}) == 5
+    assert open_source(path, format).expected_frames == 5
+
+
+@pytest.mark.parametrize("layout", [name for name, row in LAYOUTS.items() if row[3]])
+def test_depth_and_labels_of_the_set_are_the_oracle(layout: str, short: Sequence, tmp_path: Path) -> None:
+    write, _, _, _, has_labels = LAYOUTS[layout]
+    path = write(short, tmp_path / "set")
+    around = surroundings(path)
+    depths = open_depth_files(around, "")
+    assert isinstance(depths, RecordingDepth)
+    assert depths.missing(around.sequence.frames) == []
+    # Half the size: the pixel under each centre.
+    wanted = short.depth(3)
+    assert wanted is not None
+    found = depths.estimate(around.sequence.frames[3])
+    assert found.depth.shape == (90, 120)
+    assert np.abs(found.depth - wanted[1::2, 1::2]).max() < 2e-3
+    assert (found.confidence == (found.depth > 0)).all()
+    before = proxy_inputs(path, _config("files", "files" if has_labels else "segments"))
+    assert before["depth"] != proxy_inputs(path, _config("multiview", "segments"))["depth"]
+    if not has_labels:
+        with pytest.raises(InputError, match="has no labels: --semantics files:FOLDER"):
+            open_label_files(around, "")
+        return
+    labels = open_label_files(around, "")
+    assert isinstance(labels, RecordingLabels)
+    labels.prepare(around.sequence.frames, lambda frame: depths.estimate(frame))
+    true = short.labels(3)
+    assert true is not None
+    given = labels.estimate(around.sequence.frames[3], found).labels
+    names = [*labels.classes().names]
+    expected = (
+        [*short.class_names] if layout == "semantic_nerf" else [f"class {i + 1}" for i in range(len(short.classes))]
+    )
+    for value in np.unique(given):
+        where = true[1::2, 1::2][given == value]
+        assert (where == (VOID if value == VOID else expected.index(names[value]))).all()
+
+
+def surroundings(path: Path) -> Surroundings:
+    source = open_source(path)
+    assert isinstance(source, RecordingSource)
+    camera = source.known_camera()
+    assert camera is not None
+    k = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    frames = [Frame(i, source.name(i, i), 0.1 * i, i, 1.0) for i in range(source.expected_frames)]
+    calibration = Calibration(k, "given", 0.0, (0.0, 0.0, 0.0, 0.0))
+    sequence = ProxySequence(frames, calibration, k.resized(120, 90), None, lambda frame: source.sequence.rgb(frame.id))
+    config = Config().proxy
+    return Surroundings(
+        path, sequence, config, lambda name: path / name, 1, "cpu", SilentProgress(), source.sequence
+    )  # fmt: skip
+
+
+def _config(depth: str, semantics: str) -> Config:
+    return load_config(overrides=[f"proxy.depth={depth}", f"proxy.semantics={semantics}"])
+
+
+@pytest.mark.parametrize("distortion", [(-0.2, 0.03, 0.001, 0.0), (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)])
+def test_maps_follow_the_lens(distortion: tuple[float, ...]) -> None:
+    """Sampling by the calibration alone finds the pixels that undistortion took, also those of a third coefficient."""
+    lens = make_lens(to_pycolmap(Camera(320, 240, 258.0, 257.0, 159.0, 121.0, distortion)))
+    assert lens.shift_px > 3
+    calibration = Calibration(lens.pinhole, "given", 0.0, distortion_of(lens.camera))
+    column = np.tile(np.arange(320, dtype=np.float32) * 0.7 + 10, (240, 1))
+    taken = lens.undistort_image(np.repeat(column[..., None], 3, axis=2))[..., 0].astype(float)
+    error = FramePixels(calibration).sample(column) - taken
+    assert 0 < np.abs(error)[3:-3, 3:-3].max() < 0.7 * 0.5 + 1.1  # half a pixel, and the picture's own rounding
+    ideal = FramePixels(Calibration(lens.pinhole, "given", 0.0, (0.0,) * 4)).sample(column) - taken
+    assert np.abs(ideal).max() > 2
+
+
+def test_a_folder_of_images_is_no_data_set_by_what_lies_beside_it(short: Sequence, tmp_path: Path) -> None:
+    path = LAYOUTS["semantic_nerf"][0](short, tmp_path / "set")
+    assert isinstance(open_source(path / "rgb"), FolderSource)
+    seven = LAYOUTS["seven_scenes"][0](short, tmp_path / "seven")
+    assert isinstance(open_source(seven), RecordingSource)
+    assert isinstance(open_source(seven, "images"), FolderSource)
+    for i in range(5):
+        write_rgb(tmp_path / "plain" / f"{i}.png", short.rgb(i))
+    LAYOUTS["colmap"][0](short, tmp_path / "plain")
+    assert isinstance(open_source(tmp_path / "plain"), FolderSource)
+    assert isinstance(open_source(tmp_path / "plain", "colmap"), RecordingSource)
+    with pytest.raises(InputError, match="did you mean 'scannet'"):
+        open_source(tmp_path / "plain", "scanet")
+
+
+def test_times_stay_those_of_the_set(short: Sequence, tmp_path: Path) -> None:
+    source = open_source(tum(short, tmp_path / "set"))
+    assert next(iter(source.read())).timestamp == pytest.approx(START + short.timestamps[0], abs=1e-6)
