@@ -93,6 +93,11 @@ UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], h
     "--hold-out", type=click.IntRange(0), metavar="N",
     help="Keep every N-th frame out of the map, to measure it there (evaluate). Default: 0, use all.",
 )  # fmt: skip
+@click.option(
+    "--scale-ref",
+    metavar="REF",
+    help="Metres without metric depth: PICTURE:X1,Y1,X2,Y2=METRES, two pixels of one picture, or height=METRES.",
+)
 @verbosity_options
 def reconstruct(
     source: Path,
@@ -106,6 +111,7 @@ def reconstruct(
     semantics: str | None,
     intrinsics: str | None,
     hold_out: int | None,
+    scale_ref: str | None,
     quiet: bool,
     verbose: bool,
 ) -> None:
@@ -126,6 +132,7 @@ def reconstruct(
         "run.device": device,
         "proxy.depth": depth,
         "proxy.semantics": semantics,
+        "proxy.scale_ref": scale_ref,
         "frames.intrinsics": intrinsics,
     }
     texts = [f'{key}="{_toml_escape(value)}"' for key, value in named.items() if value is not None]

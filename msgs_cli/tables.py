@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 KEY_FIGURES = {
     "frames": ("frames", "keyframes_placed", "calibration", "focal_px", "focal_sd_px"),
     "proxy": ("depth", "semantics", "metric", "classes"),
-    "tracking": ("posed", "keyframes", "lost", "scale"),
+    "tracking": ("posed", "keyframes", "lost", "scale", "scale_relative_sd"),
     "mapping": ("gaussians", "keyframe_psnr"),
     "global_ba": ("loops",),
     "export": ("images", "vertices", "faces"),

@@ -59,6 +59,12 @@ class ProxyConfig:
     )
     max_side: int = setting(640, "the maps are at most this many pixels on the long side")
     depth_scale: float = setting(0.001, "metres per unit of integer depth files")
+    scale_ref: str = setting(
+        "",
+        "what makes metres without metric depth: PICTURE:X1,Y1,X2,Y2=METRES, two pixels of one picture of the source "
+        "(an image's name or a video frame's number; the first pixel's centre is 0.5,0.5), or height=METRES of the "
+        "camera over the floor",
+    )
     fuse: str = setting(
         "learned",
         "which depth is fused with multi-view depth: a network's, also that of files, or none",

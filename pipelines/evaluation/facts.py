@@ -168,7 +168,7 @@ def _about_camera(outcome: Outcome) -> list[str]:
         )
     if not outcome.metric:
         found.append(
-            "Lengths have no unit: nothing in a single moving camera tells metres. Give metric depth (--depth files or "
-            "a metric network) to get them."
+            "Lengths have no unit: nothing in a single moving camera tells metres. Give a known distance (--scale-ref) "
+            "or metric depth (--depth files or a metric network) to get them."
         )
     return found

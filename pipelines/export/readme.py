@@ -19,5 +19,5 @@ mesh.ply, mesh.glb        the surface with a colour and a label (PLY: property l
 classes.json              number, name and colour of each class; 255 is "unknown".
 
 Axes: the world is the first keyframe: x right, y down, z forward. Lengths are metres where the proxy depth
-is metric; otherwise their unit is free, and `msgs-slam status` says so.
+is metric or a reference was given (--scale-ref); otherwise their unit is free, and `msgs-slam status` says so.
 """

@@ -117,9 +117,11 @@ def adjust(context: StageContext, model: SparseModel, found: FoundLoops) -> Clos
     def load_proxy(frame_id: int) -> ProxyMaps | None:
         return run.load_proxy(frame_id) if run.has_proxy(frame_id) else None
 
-    metric = bool(run.load_proxy_report().get("metric", False))
+    report = run.load_proxy_report()
+    metric = bool(report.get("metric", False))
+    tracking = replace(config.tracking, use_depth=config.tracking.use_depth and report.get("independent_depth", metric))
     drifted = drift > config.global_ba.drift_px
-    closed = close_loops(state, found.loops, drifted, intrinsics, load_proxy, metric, config.tracking, config.global_ba)
+    closed = close_loops(state, found.loops, drifted, intrinsics, load_proxy, metric, tracking, config.global_ba)
     if closed.error_after > 1.5 * closed.error_before + 0.05:
         context.warn(
             f"{len(found.loops)} loops were refused: with them the reprojection error of what was known before rises "

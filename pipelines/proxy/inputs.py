@@ -14,13 +14,14 @@ from pipelines.frames.source import open_source
 from pipelines.progress import SilentProgress
 from pipelines.proxy.networks.card import Card
 from pipelines.proxy.networks.onnx_file import external_locations, require_own_weights
+from pipelines.proxy.scale_reference import require_reference_in
 from pipelines.proxy.selection import (
     Surroundings,
     choose_depth,
     choose_semantics,
-    open_learned_depth,
     open_depth_files,
     open_label_files,
+    open_learned_depth,
     open_learned_semantics,
 )
 from pipelines.proxy.sequence import Sequence, map_intrinsics
@@ -46,7 +47,8 @@ def proxy_inputs(source: Path, config: Config) -> dict[str, Any]:
 
 
 def check_proxy(source: Path, config: Config) -> None:
-    """Open the networks, so that InputError tells of one that is not what its card says."""
+    """Open the networks, so that InputError tells of one that is not what its card says; read the scale reference."""
+    require_reference_in(source, config.proxy.scale_ref)
     depth, semantics = choose_depth(config.proxy), choose_semantics(config.proxy)
     if depth.card is not None:
         open_learned_depth(_before_frames(source, config), depth)
@@ -66,9 +68,9 @@ def _before_frames(source: Path, config: Config) -> Surroundings:
     def nothing(_: Any) -> Any:
         raise AssertionError("providers are only opened here")
 
+    recording = open_recording(source, config.run.format)
     sequence = Sequence(names, calibration, small, None, nothing)
     return Surroundings(source, sequence, config.proxy, nothing, 1, "cpu", SilentProgress(), recording)
-    recording = open_recording(source, config.run.format)
 
 
 def _files_identity(files: Rows[Path]) -> str:

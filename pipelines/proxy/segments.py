@@ -19,8 +19,16 @@ from pipelines.proxy.palette import class_colors
 from pipelines.proxy.providers import DepthEstimate, LabelEstimate
 from pipelines.proxy.regions.parts import cut_parts
 from pipelines.proxy.regions.spread import spread_votes
-from pipelines.proxy.regions.structure import NAMES, OTHER, find_gravity, name_structure
-from pipelines.proxy.regions.voxels import find, gather_frame, merge, neighbour_keys, select, voxel_keys
+from pipelines.proxy.regions.structure import FLOOR, NAMES, OTHER, Gravity, find_gravity, name_structure
+from pipelines.proxy.regions.voxels import (
+    Voxels,
+    find,
+    gather_frame,
+    merge,
+    neighbour_keys,
+    select,
+    voxel_keys,
+)
 from pipelines.proxy.sequence import Sequence, resample_nearest
 from pipelines.types import VOID, ClassTable, Frame
 
@@ -64,6 +72,15 @@ class SegmentLabels:
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Gather all frames and cut the scene."""
+        voxels, gravity, kind = self._structure(frames, depth_of)
+        self._name(kind, cut_parts(select(voxels, kind == OTHER), self._most - len(NAMES) - 1))
+        self._keys = voxels.keys
+        self._gravity = [round(float(v), 4) for v in gravity.up] if gravity.is_sure else []
+
+    def _structure(
+        self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]
+    ) -> tuple[Voxels, Gravity, NDArray[np.int64]]:
+        """All frames' surface in voxels (V,), which way is up, and floor, ceiling, wall, surface or other (V,)."""
         posed = [f for f in frames if f.id in self._world_from_cam]
         self._size = _scene_depth([depth_of(f) for f in posed[:: max(1, len(posed) // 12)]]) / _VOXELS_PER_DEPTH
         rows = [self._gather(f, depth_of(f)) for f in self._progress.track(posed, "regions", len(posed))]
@@ -71,10 +88,23 @@ class SegmentLabels:
         voxels = select(voxels, voxels.weight > _LEAST_WEIGHT)
         cameras = np.array([self._world_from_cam[f.id] for f in posed])
         gravity = find_gravity(voxels, -cameras[:, :3, 1].mean(0))
-        kind = name_structure(voxels, gravity, cameras[:, :3, 3])
-        self._name(kind, cut_parts(select(voxels, kind == OTHER), self._most - len(NAMES) - 1))
-        self._keys = voxels.keys
-        self._gravity = [round(float(v), 4) for v in gravity.up] if gravity.is_sure else []
+        return voxels, gravity, name_structure(voxels, gravity, cameras[:, :3, 3])
+
+    def heights(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> NDArray[np.float64]:
+        """(N,) height of each posed camera over the floor, in the unit of the depth; (0,) without a sure floor."""
+        voxels, gravity, kind = self._structure(frames, depth_of)
+        floor, weight = voxels.position[kind == FLOOR], voxels.weight[kind == FLOOR]
+        if len(floor) < 3:
+            return np.empty(0)
+        # Up is good to a degree or two, which is centimetres at the feet: the floor's own plane is exact.
+        for _ in range(5):
+            middle = np.average(floor, 0, weight)
+            normal = np.linalg.eigh((floor - middle).T @ ((floor - middle) * weight[:, None]))[1][:, 0]
+            normal *= np.sign(normal @ gravity.up)
+            off = np.abs((floor - middle) @ normal)
+            weight = voxels.weight[kind == FLOOR] / (1 + (off / (np.median(off) + 1e-12)) ** 2)
+        centres = np.array([self._world_from_cam[f.id][:3, 3] for f in frames if f.id in self._world_from_cam])
+        return np.asarray((centres - middle) @ normal)
 
     def _gather(self, frame: Frame, estimate: DepthEstimate) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         camera = self._sequence.intrinsics

@@ -155,7 +155,8 @@ def set_scale(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics, settings:
 def with_depths(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics, settings: TrackingConfig) -> Bundle:
     """The bundle with the rescaled proxy depths as its depth observations.
 
-    Proxies that were made from the same pictures (not metric) say nothing new about the poses and are left out.
+    Proxies that were made from the same pictures say nothing new about the poses: without metres, or with
+    `use_depth` off, they are left out.
     """
     if not (settings.use_depth and ties.metric):
         return bundle

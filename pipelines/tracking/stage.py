@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,10 @@ def run(context: StageContext) -> dict[str, Any]:
     frames = context.run.load_frames()
     intrinsics = context.run.load_calibration().intrinsics
     settings = context.config.tracking
-    metric = bool(context.run.load_proxy_report().get("metric", False))
+    proxy = context.run.load_proxy_report()
+    metric = bool(proxy.get("metric", False))
+    if not proxy.get("independent_depth", metric):  # made from the same pictures: nothing new about the poses
+        settings = replace(settings, use_depth=False)
     pictures = Pictures(context.run, frames)
 
     state = track_frames(context, frames, pictures)
@@ -44,6 +48,8 @@ def run(context: StageContext) -> dict[str, Any]:
     save_sparse_model(context.folder / "sparse.npz", to_sparse_model(state))
     save_depth_scales(context, state, report)
     figures = {**describe(state, frames, report, metric), **compared}
+    if "reference_relative_sd" in proxy:  # what the user's reference leaves open; depths agree far better
+        figures["scale_relative_sd"] = proxy["reference_relative_sd"]
     write_json(context.folder / "tracking.json", figures)
     warn_of_losses(context, state)
     return figures

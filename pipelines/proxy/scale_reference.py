@@ -1,0 +1,177 @@
+"""Metres from one thing that the user knows: a distance in one picture, or how high the camera was held."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.errors import InputError
+from pipelines.frames.source import FolderSource, open_source
+from pipelines.geometry.camera import unproject
+from pipelines.proxy.providers import DepthEstimate
+from pipelines.proxy.sequence import Sequence, resize_area
+from pipelines.types import Frame, Intrinsics
+
+Array = NDArray[np.float64]
+DepthOf = Callable[[Frame], DepthEstimate]
+
+_NUMBER = r"\s*([0-9.]+)\s*"
+_DISTANCE = re.compile(rf"(.+):{_NUMBER},{_NUMBER},{_NUMBER},{_NUMBER}={_NUMBER}m?")
+_HEIGHT = re.compile(rf"height\s*={_NUMBER}m?")
+_HOW = "PICTURE:X1,Y1,X2,Y2=METRES (two pixels of one picture of the source) or height=METRES (camera over the floor)"
+_LEAST_APART = 8.0
+_KEYFRAMES = 5
+_PATCH = 2
+_LEAST_CONFIDENCE = 0.3
+_PIXEL_SD = 1.0
+"""How exactly a person points at a pixel of the proxy maps."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """metres between `points` (2, 2), pixels of `picture` of the source; the camera's height where picture is ""."""
+
+    metres: float
+    picture: str = ""
+    points: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class ReferenceScale:
+    """Metres per unit of the depth, its relative standard deviation, and how many keyframes it was measured in."""
+
+    factor: float
+    relative_sd: float
+    keyframes: int
+
+
+def parse_reference(text: str) -> Reference | None:
+    """The reference a setting describes, None for "". Raises InputError for a malformed one."""
+    if not text.strip():
+        return None
+    if found := _HEIGHT.fullmatch(text.strip()):
+        return Reference(_positive(found[1], text))
+    if not (found := _DISTANCE.fullmatch(text.strip())):
+        raise InputError(f"--scale-ref {text}: expected {_HOW}")
+    x1, y1, x2, y2 = (_number(found[k], text) for k in range(2, 6))
+    if np.hypot(x2 - x1, y2 - y1) < _LEAST_APART:
+        raise InputError(f"--scale-ref {text}: the two pixels are nearly the same; take points farther apart")
+    return Reference(_positive(found[6], text), found[1].strip(), ((x1, y1), (x2, y2)))
+
+
+def require_reference_in(source: Path, text: str) -> None:
+    """Raise InputError for a reference that is malformed, to a picture the source does not have, or outside it."""
+    reference = parse_reference(text)
+    if reference is None or not reference.picture:
+        return
+    pictures = open_source(source)
+    _picture_index(source, pictures.expected_frames, reference.picture)
+    inside = all(0 <= x <= pictures.width and 0 <= y <= pictures.height for x, y in reference.points)
+    if not inside:
+        raise InputError(f"--scale-ref {text}: a pixel lies outside the picture ({pictures.width}x{pictures.height})")
+
+
+def distance_scale(
+    reference: Reference, source: Path, sequence: Sequence, frames: list[Frame], depth_of: DepthOf
+) -> ReferenceScale:
+    """The scale that makes the two points as far apart as they are known to be.
+
+    They are followed into the nearest keyframes and measured in each by its depth; the median counts. Raises
+    InputError when no keyframe near the picture sees both with reliable depth.
+    """
+    index = _picture_index(source, 1 << 40, reference.picture)
+    picture = next(iter(open_source(source).read({index})), None)
+    if picture is None:
+        raise InputError(f"--scale-ref: the source has no picture {reference.picture}")
+    points = np.array(reference.points) * [
+        sequence.intrinsics.width / picture.rgb.shape[1], sequence.intrinsics.height / picture.rgb.shape[0]
+    ]  # fmt: skip
+    small = resize_area(picture.rgb, sequence.intrinsics.width, sequence.intrinsics.height)
+    near = sorted(frames, key=lambda f: (abs(f.source_index - index), f.id))[:_KEYFRAMES]
+    lengths, relative_sds = [], []
+    for frame in near:
+        followed = _follow(small, sequence.image(frame), points)
+        length = None if followed is None else _length(followed, depth_of(frame), sequence.intrinsics)
+        if followed is not None and length is not None:
+            lengths.append(length)
+            relative_sds.append(_PIXEL_SD * np.sqrt(2) / float(np.linalg.norm(followed[1] - followed[0])))
+    if not lengths:
+        raise InputError(
+            f"--scale-ref: no keyframe near picture {reference.picture} has reliable depth at both points. Choose "
+            "corners of things, in a picture that was taken while moving"
+        )
+    length = float(np.median(lengths))
+    spread = 1.4826 * float(np.median(np.abs(np.array(lengths) / length - 1)))
+    return ReferenceScale(reference.metres / length, float(np.hypot(spread, np.median(relative_sds))), len(lengths))
+
+
+def height_scale(reference: Reference, heights: Array) -> ReferenceScale:
+    """The scale that puts the cameras, `heights` (N,) units over the floor, at the known height on average."""
+    height = float(np.median(heights))
+    return ReferenceScale(reference.metres / height, float(np.std(heights)) / height, len(heights))
+
+
+def _picture_index(source: Path, count: int, picture: str) -> int:
+    """Index in the source of a picture: the image's name, or the number of the video's frame."""
+    pictures = open_source(source)
+    if isinstance(pictures, FolderSource):
+        for i in range(pictures.expected_frames):
+            if picture in (pictures.name(i, i), Path(pictures.name(i, i)).stem):
+                return i
+        raise InputError(
+            f"--scale-ref: {source} has no image {picture}; give its name, for example {pictures.name(0, 0)}"
+        )
+    if not picture.isdecimal() or int(picture) >= count:
+        raise InputError(f"--scale-ref: {picture} is no frame of {source}; give its number, from 0 to {count - 1}")
+    return int(picture)
+
+
+def _follow(first: NDArray[np.uint8], second: NDArray[np.uint8], points: Array) -> Array | None:
+    """(2, 2) the points of one picture in another, by optical flow there and back; None where one is lost.
+
+    The first is a picture of the source, the second a frame without lens distortion: also between equal instants
+    points move a little.
+    """
+    a, b = (np.asarray(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), np.uint8) for i in (first, second))
+    if np.array_equal(a, b):
+        return points
+    start = (points - 0.5).astype(np.float32).reshape(-1, 1, 2)
+    there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, start, np.empty_like(start), winSize=(25, 25), maxLevel=4)
+    back, back_ok, _ = cv2.calcOpticalFlowPyrLK(b, a, there, np.empty_like(start), winSize=(25, 25), maxLevel=4)
+    if not (ok.all() and back_ok.all()) or np.linalg.norm(back - start, axis=-1).max() > 1:
+        return None
+    return there.reshape(2, 2).astype(np.float64) + 0.5
+
+
+def _length(points: Array, estimate: DepthEstimate, camera: Intrinsics) -> float | None:
+    """Distance of two pixels (2, 2) in the depth's unit; None where a depth is not reliable."""
+    depths = []
+    for x, y in points.tolist():
+        rows = slice(max(int(y) - _PATCH, 0), int(y) + _PATCH + 1)
+        columns = slice(max(int(x) - _PATCH, 0), int(x) + _PATCH + 1)
+        sure = estimate.depth[rows, columns][estimate.confidence[rows, columns] >= _LEAST_CONFIDENCE]
+        if x < 0 or y < 0 or len(sure) < _PATCH**2:
+            return None
+        depths.append(float(np.median(sure)))
+    first, second = unproject(points, np.array(depths), camera)
+    return float(np.linalg.norm(second - first))
+
+
+def _number(text: str, whole: str) -> float:
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InputError(f"--scale-ref {whole}: {text!r} is no number. Expected {_HOW}") from error
+
+
+def _positive(text: str, whole: str) -> float:
+    value = _number(text, whole)
+    if not 0 < value < 1e4:
+        raise InputError(f"--scale-ref {whole}: {value} metres make no sense; give the length in metres")
+    return value
