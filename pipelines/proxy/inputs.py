@@ -48,7 +48,8 @@ def proxy_inputs(source: Path, config: Config) -> dict[str, Any]:
 
 def check_proxy(source: Path, config: Config) -> None:
     """Open the networks, so that InputError tells of one that is not what its card says; read the scale reference."""
-    require_reference_in(source, config.proxy.scale_ref)
+    if config.proxy.scale_ref:
+        require_reference_in(open_source(source, config.run.format), config.proxy.scale_ref)
     depth, semantics = choose_depth(config.proxy), choose_semantics(config.proxy)
     if depth.card is not None:
         open_learned_depth(_before_frames(source, config), depth)

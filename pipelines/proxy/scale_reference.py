@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
-from pipelines.frames.source import FolderSource, open_source
+from pipelines.frames.source import Source, VideoSource
 from pipelines.geometry.camera import unproject
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.sequence import Sequence, resize_area
@@ -65,28 +65,27 @@ def parse_reference(text: str) -> Reference | None:
     return Reference(_positive(found[6], text), found[1].strip(), ((x1, y1), (x2, y2)))
 
 
-def require_reference_in(source: Path, text: str) -> None:
+def require_reference_in(source: Source, text: str) -> None:
     """Raise InputError for a reference that is malformed, to a picture the source does not have, or outside it."""
     reference = parse_reference(text)
     if reference is None or not reference.picture:
         return
-    pictures = open_source(source)
-    _picture_index(source, pictures.expected_frames, reference.picture)
-    inside = all(0 <= x <= pictures.width and 0 <= y <= pictures.height for x, y in reference.points)
+    _picture_index(source, reference.picture)
+    inside = all(0 <= x <= source.width and 0 <= y <= source.height for x, y in reference.points)
     if not inside:
-        raise InputError(f"--scale-ref {text}: a pixel lies outside the picture ({pictures.width}x{pictures.height})")
+        raise InputError(f"--scale-ref {text}: a pixel lies outside the picture ({source.width}x{source.height})")
 
 
 def distance_scale(
-    reference: Reference, source: Path, sequence: Sequence, frames: list[Frame], depth_of: DepthOf
+    reference: Reference, source: Source, sequence: Sequence, frames: list[Frame], depth_of: DepthOf
 ) -> ReferenceScale:
     """The scale that makes the two points as far apart as they are known to be.
 
     They are followed into the nearest keyframes and measured in each by its depth; the median counts. Raises
     InputError when no keyframe near the picture sees both with reliable depth.
     """
-    index = _picture_index(source, 1 << 40, reference.picture)
-    picture = next(iter(open_source(source).read({index})), None)
+    index = _picture_index(source, reference.picture)
+    picture = next(iter(source.read({index})), None)
     if picture is None:
         raise InputError(f"--scale-ref: the source has no picture {reference.picture}")
     points = np.array(reference.points) * [
@@ -117,19 +116,19 @@ def height_scale(reference: Reference, heights: Array) -> ReferenceScale:
     return ReferenceScale(reference.metres / height, float(np.std(heights)) / height, len(heights))
 
 
-def _picture_index(source: Path, count: int, picture: str) -> int:
+def _picture_index(source: Source, picture: str) -> int:
     """Index in the source of a picture: the image's name, or the number of the video's frame."""
-    pictures = open_source(source)
-    if isinstance(pictures, FolderSource):
-        for i in range(pictures.expected_frames):
-            if picture in (pictures.name(i, i), Path(pictures.name(i, i)).stem):
-                return i
-        raise InputError(
-            f"--scale-ref: {source} has no image {picture}; give its name, for example {pictures.name(0, 0)}"
-        )
-    if not picture.isdecimal() or int(picture) >= count:
-        raise InputError(f"--scale-ref: {picture} is no frame of {source}; give its number, from 0 to {count - 1}")
-    return int(picture)
+    if isinstance(source, VideoSource):
+        # Headers of videos may promise no frames at all.
+        if not picture.isdecimal() or 0 < source.expected_frames <= int(picture):
+            last = source.expected_frames - 1
+            raise InputError(f"--scale-ref: {picture} is no frame of {source.path}; give its number, from 0 to {last}")
+        return int(picture)
+    names = [source.name(i, i) for i in range(source.expected_frames)]
+    for i, name in enumerate(names):
+        if picture in (name, Path(name).stem):
+            return i
+    raise InputError(f"--scale-ref: the source has no image {picture}; give its name, for example {names[0]}")
 
 
 def _follow(first: NDArray[np.uint8], second: NDArray[np.uint8], points: Array) -> Array | None:

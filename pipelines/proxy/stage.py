@@ -12,13 +12,16 @@ import numpy as np
 from formats.errors import InputError
 from pipelines.config import ProxyConfig
 from pipelines.frames.recording import open_recording
+from pipelines.frames.source import open_source
 from pipelines.progress import log
 from pipelines.proxy.compact import compact
 from pipelines.proxy.inputs import check_proxy, proxy_inputs
 from pipelines.proxy.providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider
 from pipelines.proxy.reliability import reliability, semantic_agreement, theta, warp_labels
 from pipelines.proxy.scale import DepthScale, measure_scale
+from pipelines.proxy.scale_reference import ReferenceScale, distance_scale, height_scale, parse_reference
 from pipelines.proxy.scratch import load_scratch, save_scratch
+from pipelines.proxy.segments import SegmentLabels
 from pipelines.proxy.selection import Surroundings, open_depth, open_semantics
 from pipelines.proxy.sequence import Sequence, map_intrinsics
 from pipelines.proxy.symmetry import find_mirror_planes, mirror_pairs
@@ -56,13 +59,19 @@ def run(context: StageContext) -> dict[str, Any]:
     _warn_of_distortion(context, sequence, depths, semantics)
     _depth_pass(context, frames, depths)
     scale = measure_scale(sequence, frames, lambda frame: _load_depth(context.snapshot, frame))
+    reference = _reference_scale(context, sequence, frames, depths)
+    metres = reference.factor if reference else 1.0
     semantics.prepare(frames, lambda frame: _in_backbone_unit(_load_depth(context.snapshot, frame), scale))
     for message in semantics.warnings():
         context.warn(message)
     save_classes(context.folder, semantics.classes())
-    agreements = _maps_pass(context, sequence, frames, semantics, scale)
-    mirrors = _symmetry_pass(context, sequence, frames, scale) if context.config.proxy.symmetry else {}
-    report = {**_report(context, frames, depths, semantics, agreements), **_scale_figures(depths, scale), **mirrors}
+    agreements = _maps_pass(context, sequence, frames, semantics, scale, metres)
+    mirrors = _symmetry_pass(context, sequence, frames, scale, metres) if context.config.proxy.symmetry else {}
+    report = {
+        **_report(context, frames, depths, semantics, agreements),
+        **_scale_figures(depths, scale, reference),
+        **mirrors,
+    }
     write_json(context.folder / "proxy.json", report)
     return report
 
@@ -135,13 +144,52 @@ def _in_backbone_unit(estimate: DepthEstimate, scale: DepthScale) -> DepthEstima
     return replace(estimate, depth=(estimate.depth / np.float32(scale.value)).astype(np.float32))
 
 
+def _reference_scale(
+    context: StageContext, sequence: Sequence, frames: list[Frame], depths: DepthProvider
+) -> ReferenceScale | None:
+    """Metres per unit of the depth by what the user knows; None without that, and where the depth is metric anyway."""
+    config = context.config.proxy
+    known = parse_reference(config.scale_ref)
+    if known is None:
+        return None
+
+    def depth_of(frame: Frame) -> DepthEstimate:
+        return _load_depth(context.snapshot, frame)
+
+    if known.picture:
+        source = open_source(context.source, context.config.run.format)
+        found = distance_scale(known, source, sequence, frames, depth_of)
+    else:
+        heights = SegmentLabels(sequence, config.max_classes, context.progress).heights(frames, depth_of)
+        if len(heights) == 0 or np.median(heights) <= 0:
+            raise InputError(
+                f"--scale-ref {config.scale_ref}: no floor was found in the scene. Give a distance between two points"
+            )
+        found = height_scale(known, heights)
+    if depths.metric:
+        context.warn(
+            f"{depths.name} is metric, so the reference {config.scale_ref} is not used; it would make lengths "
+            f"{found.factor - 1:+.1%} longer"
+        )
+        return None
+    return found
+
+
 # maps -----------------------------------------------------------------------------------------------------------
 
 
 def _maps_pass(
-    context: StageContext, sequence: Sequence, frames: list[Frame], semantics: SemanticsProvider, scale: DepthScale
+    context: StageContext,
+    sequence: Sequence,
+    frames: list[Frame],
+    semantics: SemanticsProvider,
+    scale: DepthScale,
+    metres: float,
 ) -> list[float]:
-    """Labels and reliability of every frame; returns the semantic agreement m_t of each with the one before it."""
+    """Labels and reliability of every frame; returns the semantic agreement m_t of each with the one before it.
+
+    `metres` turns the provider's depth into that of the maps.
+    """
     config = context.config.proxy
     agreements: list[float] = []
     previous: Frame | None = None
@@ -155,7 +203,8 @@ def _maps_pass(
         if not path.exists():
             trust = theta(m, config.theta_slope, config.theta_middle)
             u = reliability(depth.depth, depth.confidence, trust, config.alpha, config.beta, config.gamma)
-            save_proxy_maps(path, compact(ProxyMaps(depth.depth, u, labels.labels, labels.confidence)))
+            scaled = (depth.depth * np.float32(metres)).astype(np.float32)
+            save_proxy_maps(path, compact(ProxyMaps(scaled, u, labels.labels, labels.confidence)))
         previous = frame
     return agreements
 
@@ -179,7 +228,9 @@ def _agreement(
     return 1.0 if m is None else m
 
 
-def _symmetry_pass(context: StageContext, sequence: Sequence, frames: list[Frame], scale: DepthScale) -> dict[str, Any]:
+def _symmetry_pass(
+    context: StageContext, sequence: Sequence, frames: list[Frame], scale: DepthScale, metres: float
+) -> dict[str, Any]:
     """Mirror planes of the scene, and the pixels they pair in every frame; says how many it found."""
     planes = find_mirror_planes(
         sequence,
@@ -192,7 +243,7 @@ def _symmetry_pass(context: StageContext, sequence: Sequence, frames: list[Frame
         if (pose := sequence.cam_from_world.get(frame.id)) is not None:
             maps = load_proxy_maps(proxy_path(context.folder, frame.id))
             # The planes are in the backbone's unit, the maps in the depth's.
-            in_cam = [(p.in_cam(pose) * [1, 1, 1, scale.value], p.confidence) for p in planes]
+            in_cam = [(p.in_cam(pose) * [1, 1, 1, scale.value * metres], p.confidence) for p in planes]
             pairs = mirror_pairs(sequence.image(frame), maps.depth, maps.confidence, sequence.intrinsics, in_cam)
             enlarge = np.float32(sequence.calibration.intrinsics.width / sequence.intrinsics.width)
             pairs_of[frame.id] = replace(pairs, pairs=pairs.pairs * enlarge)
@@ -237,13 +288,28 @@ def _report(
     }
 
 
-def _scale_figures(depths: DepthProvider, scale: DepthScale) -> dict[str, Any]:
-    """Metric depth tells how long the backbone's unit is."""
-    if not depths.metric or not scale.of_frame:
-        return {}
-    return {"metres_per_unit": round(scale.value, 6), "scale_spread": round(scale.spread, 5)}
+def _scale_figures(depths: DepthProvider, scale: DepthScale, reference: ReferenceScale | None) -> dict[str, Any]:
+    """Where metres come from, and how long the backbone's unit is in them.
+
+    independent_depth: whether the depth tells tracking something that the pictures' correspondences do not.
+    """
+    figures: dict[str, Any] = {"independent_depth": depths.metric}
+    if reference is not None:
+        return figures | {
+            "metric": True,
+            "scale_from": "reference",
+            "metres_per_unit": round(reference.factor * scale.value, 6),
+            "reference_relative_sd": round(reference.relative_sd, 5),
+            "reference_keyframes": reference.keyframes,
+        }
+    if not depths.metric:
+        return figures | {"scale_from": "nothing: lengths have no unit"}
+    figures["scale_from"] = "depth"
+    if scale.of_frame:
+        figures |= {"metres_per_unit": round(scale.value, 6), "scale_spread": round(scale.spread, 5)}
+    return figures
 
 
 STAGE = Stage(
-    "proxy", 3, run, "depth, reliability and classes of the keyframes", inputs=proxy_inputs, check=check_proxy
+    "proxy", 4, run, "depth, reliability and classes of the keyframes", inputs=proxy_inputs, check=check_proxy
 )
