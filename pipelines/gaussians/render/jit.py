@@ -17,25 +17,21 @@ import numba
 from numba.extending import register_jitable
 
 # No "nnan" or "ninf": comparisons with a NaN must stay what they are. "contract" lets a*b+c become one instruction.
-_FAST = {"contract", "nsz", "arcp"}
+_OPTIONS: dict[str, Any] = {"fastmath": {"contract", "nsz", "arcp"}, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile to machine code that runs without the GIL, cached on disk between runs."""
     directory = cache_directory()
     with _numba_cache_in(directory):
-        compiled: Callable[..., Any] = numba.njit(
-            nogil=True, cache=directory is not None, fastmath=_FAST, error_model="numpy", no_cfunc_wrapper=True
-        )(function)
+        compiled: Callable[..., Any] = numba.njit(nogil=True, cache=directory is not None, **_OPTIONS)(function)
         return compiled
 
 
 def inner(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function that only kernels call: it becomes part of them, so it needs no way in from Python and no
     place in the cache, which would take a third of the time of compiling it."""
-    called: Callable[..., Any] = register_jitable(
-        fastmath=_FAST, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True
-    )(function)
+    called: Callable[..., Any] = register_jitable(no_cpython_wrapper=True, **_OPTIONS)(function)
     return called
 
 
