@@ -23,23 +23,27 @@ def list_models() -> None:
         use = "commercial use allowed" if model.commercial else "ask before commercial use"
         task = store.families[model.family]["task"]
         size = f"{model.bytes / 1e6:.1f} MB" if model.bytes else "size unknown"
-        click.echo(f"{model.name:18} {task:13} {here:5} {size:>12}  {model.licence} ({use})")
+        known = "" if model.revision or model.sha256 else "; hash unknown: pull with --trust"
+        click.echo(f"{model.name:18} {task:13} {here:5} {size:>12}  {model.licence} ({use}{known})")
     click.echo(f"cache: {store.cache}")
 
 
 @models.command()
-@click.argument("names", nargs=-1, required=True)
+@click.argument("names", nargs=-1)
 @click.option("--trust", is_flag=True, help="Accept a model of unknown sha256 and record the hash of what comes.")
 @click.option("--offline", is_flag=True, help="Only check what is here; download nothing.")
 @click.option("--yes", is_flag=True, help="Do not ask about the licence.")
 def pull(names: tuple[str, ...], trust: bool, offline: bool, yes: bool) -> None:
-    """Download models by name; a broken download goes on where it stopped."""
+    """Download models by name, with what they need; without a name those for metric depth and named classes.
+
+    A broken download goes on where it stopped.
+    """
     from tqdm import tqdm
 
     from pipelines.proxy.models.registry import ModelStore
 
     store = ModelStore.open()
-    for model in [store.get(name) for name in names]:
+    for model in store.with_needed(names):
         if not store.is_here(model) and not offline:
             click.echo(f"{model.name}: {model.bytes / 1e6:.1f} MB, licence: {model.licence}")
             if not yes:

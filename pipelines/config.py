@@ -77,7 +77,8 @@ class ProxyConfig:
     theta_middle: float = setting(0.3, "eq. (3): phi, agreement (mean IoU) that counts one half")
     stereo_side: int = setting(320, "multiview matches images of this many pixels on the long side")
     stereo_planes: int = setting(96, "multiview tries this many depths")
-    max_classes: int = setting(16, "segments makes at most this many classes")
+    max_classes: int = setting(16, "segments and clusters make at most this many classes")
+    cache_mb: int = setting(2000, "results of networks are kept over runs, at most this many megabytes; 0 = none")
     symmetry: bool = setting(True, "look for mirror symmetry and pair the pixels of its two halves")
 
 
@@ -118,6 +119,8 @@ class MappingConfig:
     max_side: int = setting(640, "longer keyframes are mapped at this many pixels on the long side; 0 = as they are")
     hold_out: int = setting(0, "every n-th frame is never used for the map, only to measure it; 0 = use all")
     seed_stride: int = setting(2, "pixels between two new Gaussians where the map has a hole")
+    fine_share: float = setting(0.25, "share of a view, that of most detail, with a new Gaussian at every pixel")
+    flat_share: float = setting(0.5, "and that of least detail, where new ones stand twice as far apart")
     window_steps: int = setting(2, "coarse steps after each keyframe: on it, covisible and random past keyframes")
     passes: float = setting(10.0, "how often each keyframe is visited once all are seeded")
     min_iterations: int = setting(400, "at least this many such visits in all")

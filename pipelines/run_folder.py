@@ -114,6 +114,14 @@ class RunFolder:
         path = self.stage("proxy") / "symmetry.npz"
         return load_mirror_pairs(path) if path.exists() else {}
 
+    def load_descriptors(self) -> dict[int, NDArray[np.float32]]:
+        """Frame id → (F,) unit vector by which a network tells how the frame looks; {} where none did."""
+        path = self.stage("proxy") / "descriptors.npz"
+        if not path.exists():
+            return {}
+        arrays = load_arrays(path)
+        return dict(zip(arrays["frame_ids"].tolist(), arrays["vectors"], strict=True))
+
     # tracking, mapping, global_ba -------------------------------------------------------------------------------
 
     def load_trajectory(self, stage: str) -> Trajectory:
@@ -218,6 +226,13 @@ def load_proxy_maps(path: Path) -> ProxyMaps:
         labels=arrays["labels"],
         label_confidence=arrays["label_confidence"].astype(np.float32) / np.float32(255),
     )
+
+
+def save_descriptors(folder: Path, vectors: dict[int, NDArray[np.float32]]) -> None:
+    """One npz; nothing where there are none."""
+    if vectors:
+        ids = np.array(list(vectors), np.int64)
+        save_arrays(folder / "descriptors.npz", {"frame_ids": ids, "vectors": np.stack(list(vectors.values()))})
 
 
 def save_mirror_pairs(folder: Path, pairs_of: dict[int, MirrorPairs]) -> None:

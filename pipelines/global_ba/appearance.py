@@ -1,7 +1,8 @@
 """How keyframes look, as vectors whose products say how alike they are: VLAD over the run's own SIFT features.
 
-It stands where the article has DINOv2 features, which need weights: residuals of RootSIFT descriptors to a small
-vocabulary learnt from the run itself, each word normalised (Jégou et al., PAMI 2012; Arandjelović and Zisserman 2013).
+It stands where the article has DINOv2 features, which need weights, and beside them where there are any: residuals of
+RootSIFT descriptors to a small vocabulary learnt from the run itself, each word normalised (Jégou et al., PAMI 2012;
+Arandjelović and Zisserman 2013).
 """
 
 from __future__ import annotations
@@ -49,7 +50,19 @@ def describe_keyframes(descriptors: Sequence[Float], words: int, seed: int) -> F
     if len(pooled) == 0:
         return np.zeros((len(descriptors), 1), np.float32)
     centres = learn_vocabulary(pooled, words, seed)
-    vectors = np.array([vlad(d, centres) for d in descriptors])
-    # What all keyframes of a room share says nothing about which of them are the same place.
-    vectors -= vectors.mean(0)
+    return _centred(np.array([vlad(d, centres) for d in descriptors]))
+
+
+def join_appearances(own: Float, learned: Sequence[Float | None]) -> Float:
+    """(N, D + F) unit vectors whose products are the mean of those of `own` (N, D) and of a network's (N of (F,)), the
+    article's DINOSim; `own` alone unless the network has seen every keyframe."""
+    vectors = [v for v in learned if v is not None]
+    if len(vectors) < len(own) or not vectors:
+        return own
+    return np.concatenate([own, _centred(np.array(vectors))], 1) / np.sqrt(np.float32(2))
+
+
+def _centred(vectors: Float) -> Float:
+    """Unit vectors without their mean: what all keyframes of a room share says nothing of which are the same place."""
+    vectors = vectors - vectors.mean(0)
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-6), np.float32)

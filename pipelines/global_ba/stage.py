@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipelines.gaussians.map import GaussianMap
 from pipelines.geometry import se3
-from pipelines.global_ba.appearance import describe_keyframes
+from pipelines.global_ba.appearance import describe_keyframes, join_appearances
 from pipelines.global_ba.candidates import loop_candidates
 from pipelines.global_ba.close import Closed, close_loops, median_depth
 from pipelines.global_ba.joint import Refined, refine_together
@@ -71,7 +71,11 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
         return load_found(snapshot)
     run, settings, seed = context.run, context.config.global_ba, context.config.run.seed
     views = load_keyframe_views(context, model)
-    appearance = describe_keyframes([v.features.descriptors for v in views], settings.words, seed)
+    learned = run.load_descriptors()
+    appearance = join_appearances(
+        describe_keyframes([v.features.descriptors for v in views], settings.words, seed),
+        [learned.get(i) for i in model.frame_ids.tolist()],
+    )
     pairs = loop_candidates(model, appearance, load_summaries(run, model), settings)
     tracked = context.progress.track(pairs, "loops", len(pairs))
     found = find_loops(tracked, views, run.load_calibration().intrinsics, settings, seed)

@@ -81,7 +81,8 @@ def fuse(learned: DepthEstimate, geometry: DepthEstimate, scale: float, frame_sc
     confidence = np.where(lead, geometry.confidence, np.where(depth > 0, sure, 0)).astype(np.float32)
     guess = (depth <= 0) & (geometry.depth > 0)
     depth = np.where(guess, geometry.depth * scale, depth).astype(np.float32)
-    return DepthEstimate(depth, np.where(guess, geometry.confidence, confidence).astype(np.float32), learned.invalid)
+    confidence = np.where(guess, geometry.confidence, confidence).astype(np.float32)
+    return DepthEstimate(depth, confidence, learned.invalid, learned.normals)
 
 
 def _smooth_field(

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Sequence as Rows
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +9,7 @@ from pipelines.config import Config
 from pipelines.frames.recording import open_recording
 from pipelines.frames.source import open_source
 from pipelines.progress import SilentProgress
-from pipelines.proxy.networks.card import Card
-from pipelines.proxy.networks.onnx_file import external_locations, require_own_weights
+from pipelines.proxy.networks.identity import card_identity, files_identity
 from pipelines.proxy.scale_reference import require_reference_in
 from pipelines.proxy.selection import (
     Surroundings,
@@ -25,7 +21,6 @@ from pipelines.proxy.selection import (
     open_learned_semantics,
 )
 from pipelines.proxy.sequence import Sequence, map_intrinsics
-from pipelines.stages import file_digest
 from pipelines.types import Calibration, Frame, Intrinsics
 
 
@@ -36,13 +31,13 @@ def proxy_inputs(source: Path, config: Config) -> dict[str, Any]:
     """
     depth, semantics = choose_depth(config.proxy), choose_semantics(config.proxy)
     chosen = {"depth": depth, "labels": semantics}
-    identities = {k: c.kind if c.card is None else _card_identity(c.card) for k, c in chosen.items()}
+    identities = {k: c.kind if c.card is None else card_identity(c.card) for k, c in chosen.items()}
     if "files" in (depth.kind, semantics.kind):
         around = _before_frames(source, config)
         if depth.kind == "files":
-            identities["depth"] = _files_identity(open_depth_files(around, depth.folder).files())
+            identities["depth"] = files_identity(open_depth_files(around, depth.folder).files())
         if semantics.kind == "files":
-            identities["labels"] = _files_identity(open_label_files(around, semantics.folder).files())
+            identities["labels"] = files_identity(open_label_files(around, semantics.folder).files())
     return identities
 
 
@@ -72,19 +67,3 @@ def _before_frames(source: Path, config: Config) -> Surroundings:
     recording = open_recording(source, config.run.format)
     sequence = Sequence(names, calibration, small, None, nothing)
     return Surroundings(source, sequence, config.proxy, nothing, 1, "cpu", SilentProgress(), recording)
-
-
-def _files_identity(files: Rows[Path]) -> str:
-    digest = hashlib.sha256()
-    for path in files:
-        digest.update(f"{path.name}\0{file_digest(path)}\n".encode())
-    return digest.hexdigest()
-
-
-def _card_identity(card: Card) -> str:
-    """The contract and the bytes of the network and of all that it loads, wherever they lie."""
-    require_own_weights(card.model)
-    beside = [card.model.parent / name for name in external_locations(card.model)]
-    files = [card.model, *([card.head] if card.head else []), *beside]
-    contract = repr(replace(card, model=Path(card.model.name), head=None))
-    return hashlib.sha256((contract + _files_identity(files)).encode()).hexdigest()

@@ -7,19 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from formats.errors import InputError
 from pipelines.progress import Progress
+from pipelines.proxy.network_pass import Arrays, NetworkPass, ResultCache
 from pipelines.proxy.networks.card import Card
 from pipelines.proxy.networks.depth import network_depth
+from pipelines.proxy.networks.identity import card_identity
 from pipelines.proxy.networks.session import Network
 from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.scratch import load_scratch, save_scratch
 from pipelines.proxy.sequence import Sequence
 from pipelines.types import Frame
-
-PLAIN_CONFIDENCE = 0.5
-"""Confidence of a network that does not tell its own."""
 
 
 class OnnxDepth:
@@ -28,14 +27,24 @@ class OnnxDepth:
     metric = True
 
     def __init__(
-        self, sequence: Sequence, card: Card, folder: Callable[[], Path], threads: int, device: str, progress: Progress
+        self,
+        sequence: Sequence,
+        card: Card,
+        folder: Callable[[], Path],
+        threads: int,
+        device: str,
+        progress: Progress,
+        cache: ResultCache,
     ) -> None:
         """Opens the network. Raises InputError when it cannot be what the card says."""
         if card.task != "depth":
             raise InputError(f"{card.model}: its card says {card.task}, but proxy.depth needs a network for depth")
         self._network = Network(card, threads, device)
-        self._sequence, self._folder, self._progress = sequence, folder, progress
+        self._sequence, self._progress = sequence, progress
         self.name = f"onnx:{card.name}"
+        self._focals: dict[int, float] = {}
+        identity = f"{card_identity(card)} {sequence.intrinsics}"
+        self._pass = NetworkPass(self.name, identity, folder, cache, self._compute)
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """None: a network sees every frame."""
@@ -43,27 +52,35 @@ class OnnxDepth:
 
     def prepare(self, frames: list[Frame]) -> None:
         """Run the network; what is on disk stays."""
-        for frame in self._progress.track(frames, "network", len(frames)):
-            path = self._folder() / f"{frame.id:06d}.npz"
-            if not path.exists():
-                depth, confidence, invalid = network_depth(
-                    self._network, self._sequence.image(frame), self._sequence.intrinsics
-                )
-                if confidence is None:
-                    confidence = np.where(depth > 0, PLAIN_CONFIDENCE, 0).astype(np.float32)
-                save_scratch(path, depth=depth, confidence=confidence, invalid=np.array(invalid))
+        self._pass.run(frames, self._sequence.image, self._progress)
+
+    def _compute(self, image: NDArray[np.uint8]) -> Arrays:
+        found = network_depth(self._network, image, self._sequence.intrinsics)
+        arrays = {"depth": found.depth, "confidence": found.confidence, "invalid": np.array(found.invalid)}
+        if found.normals is not None:
+            arrays["normals"] = found.normals
+        return arrays | ({} if found.focal is None else {"focal": np.array(found.focal)})
 
     def estimate(self, frame: Frame) -> DepthEstimate:
         """What the network said. Raises InputError when that was nothing at all."""
-        stored = load_scratch(self._folder() / f"{frame.id:06d}.npz")
+        stored = self._pass.load(frame)
         if not (stored["depth"] > 0).any():
             raise InputError(
                 f"{self.name}: frame {frame.name} got no valid depth ({int(stored['invalid'])} of the network's values "
                 "are NaN or negative). Check the card, or choose another --depth provider"
             )
-        return DepthEstimate(stored["depth"], stored["confidence"], int(stored["invalid"]))
+        if "focal" in stored:
+            self._focals[frame.id] = float(stored["focal"])
+        return DepthEstimate(stored["depth"], stored["confidence"], int(stored["invalid"]), stored.get("normals"))
 
     def figures(self) -> dict[str, Any]:
-        """The size of the network's input."""
+        """The size of the network's input, and the focal length that its points imply, in pixels of the frames.
+
+        The camera was calibrated from correspondences before; the network's own focal length is a check of that.
+        """
         box = self._network.box(self._sequence.intrinsics.width, self._sequence.intrinsics.height)
-        return {"network_size": [box.box_width, box.box_height]}
+        figures: dict[str, Any] = {"network_size": [box.box_width, box.box_height]}
+        if self._focals:
+            enlarge = self._sequence.calibration.intrinsics.width / self._sequence.intrinsics.width
+            figures["network_focal_px"] = round(float(np.median(list(self._focals.values()))) * enlarge, 1)
+        return figures

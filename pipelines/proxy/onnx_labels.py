@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from formats.errors import InputError
 from pipelines.progress import Progress
+from pipelines.proxy.network_pass import Arrays, NetworkPass, ResultCache
 from pipelines.proxy.networks.card import Card
-from pipelines.proxy.networks.labels import network_labels
+from pipelines.proxy.networks.identity import card_identity
+from pipelines.proxy.networks.labels import class_token, network_labels
 from pipelines.proxy.networks.session import Network
 from pipelines.proxy.palette import class_colors
 from pipelines.proxy.providers import DepthEstimate, LabelEstimate
 from pipelines.proxy.regions.votes import WorldVotes
-from pipelines.proxy.scratch import load_scratch, save_scratch
 from pipelines.proxy.sequence import Sequence
 from pipelines.types import VOID, ClassTable, Frame
 
@@ -29,7 +30,14 @@ class OnnxLabels:
     """Only the classes that occur in the video are kept."""
 
     def __init__(
-        self, sequence: Sequence, card: Card, folder: Callable[[], Path], threads: int, device: str, progress: Progress
+        self,
+        sequence: Sequence,
+        card: Card,
+        folder: Callable[[], Path],
+        threads: int,
+        device: str,
+        progress: Progress,
+        cache: ResultCache,
     ) -> None:
         """Opens the network. Raises InputError when it cannot be what the card says."""
         if card.task != "segmentation":
@@ -37,11 +45,14 @@ class OnnxLabels:
                 f"{card.model}: its card says {card.task}, but proxy.semantics needs a segmentation network"
             )
         self._network = Network(card, threads, device)
-        self._sequence, self._folder, self._progress = sequence, folder, progress
+        self._sequence, self._progress = sequence, progress
         self.name = f"onnx:{card.name}"
-        self._label_of = np.full(len(card.labels) + 1, VOID, np.uint8)
+        self._names = card.labels
+        self._label_of = np.empty(0, np.uint8)
         self._classes = ClassTable((), ())
         self._votes: WorldVotes | None = None
+        identity = f"{card_identity(card)} {sequence.intrinsics.width}x{sequence.intrinsics.height}"
+        self._pass = NetworkPass(self.name, identity, folder, cache, self._compute)
 
     def warnings(self) -> list[str]:
         """Nothing is ever amiss."""
@@ -53,33 +64,43 @@ class OnnxLabels:
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Run the network, settle the classes, and let all frames vote on the classes of the places they see."""
-        names = self._network.card.labels
-        counts = np.zeros(len(names) + 1, np.int64)
-        for frame in self._progress.track(frames, "network", len(frames)):
+        self._pass.run(frames, self._sequence.image, self._progress)
+        self._learn(frames)
+        counts = np.zeros(len(self._names) + 1, np.int64)
+        for frame in frames:
             counts += np.bincount(self._raw(frame)[0].ravel() + 1, minlength=len(counts))
         kept = np.flatnonzero(counts[1:] >= _LEAST_SHARE * counts.sum())
         if not 0 < len(kept) < VOID:
             raise InputError(f"{self.name}: {len(kept)} classes occur; 1 to {VOID - 1} are needed. Check the card")
         # Index 0 of the table is void: ids are stored plus one.
+        self._label_of = np.full(len(self._names) + 1, VOID, np.uint8)
         self._label_of[kept + 1] = np.arange(len(kept), dtype=np.uint8)
-        self._classes = ClassTable(tuple(names[i] for i in kept), class_colors(len(kept)))
+        self._classes = ClassTable(tuple(self._names[i] for i in kept), class_colors(len(kept)))
         self._votes = WorldVotes.gather(self._sequence, frames, depth_of, self._labels, len(kept))
 
+    def _compute(self, image: NDArray[np.uint8]) -> Arrays:
+        output = self._network.run(image, self._network.box(image.shape[1], image.shape[0]))["output"]
+        ids, probability = network_labels(self._network, output, image.shape[1], image.shape[0])
+        arrays: Arrays = {
+            "ids": (ids + 1).astype(np.uint16),
+            "probability": np.round(probability * 255).astype(np.uint8),
+        }
+        token = class_token(self._network, output, image.shape[1], image.shape[0])
+        return arrays if token is None else {**arrays, "descriptor": token}
+
+    def _learn(self, frames: list[Frame]) -> None:
+        """What has to be known of all frames before `_raw`: nothing, the network knows its classes."""
+
     def _raw(self, frame: Frame) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Class ids (-1 void) and probabilities, from the disk when they are there."""
-        path = self._folder() / f"{frame.id:06d}.npz"
-        if not path.exists():
-            ids, probability = network_labels(self._network, self._sequence.image(frame))
-            save_scratch(
-                path, ids=(ids + 1).astype(np.uint16), probability=np.round(probability * 255).astype(np.uint8)
-            )
-        stored = load_scratch(path)
+        """Class ids (-1 void) and probabilities (h, w)."""
+        stored = self._pass.load(frame)
         return stored["ids"].astype(np.int64) - 1, stored["probability"].astype(np.float32) / np.float32(255)
 
     def _labels(self, frame: Frame) -> LabelEstimate:
         ids, probability = self._raw(frame)
         labels = self._label_of[ids + 1]
-        return LabelEstimate(labels, np.where(labels == VOID, 0, probability).astype(np.float32))
+        confidence = np.where(labels == VOID, 0, probability).astype(np.float32)
+        return LabelEstimate(labels, confidence, self._pass.load(frame).get("descriptor"))
 
     def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
         """The network's labels and the votes of the other frames together."""
@@ -92,4 +113,4 @@ class OnnxLabels:
 
     def figures(self) -> dict[str, Any]:
         """How many classes the network knows."""
-        return {"network_classes": len(self._network.card.labels)}
+        return {"network_classes": len(self._names)}

@@ -16,24 +16,32 @@ from pipelines.types import ClassTable, Frame, require_shape
 class DepthEstimate:
     """depth (h, w) float32, 0 = unknown; confidence (h, w) float32 in [0, 1], 0 where the depth is unknown.
 
-    `invalid` counts the values of the source that were no depth: NaN, infinite or negative.
+    `invalid` counts the values of the source that were no depth: NaN, infinite or negative. normals (h, w, 3) int8 in
+    127ths, unit vectors in the camera that face it, where a network gives them; 0 = unknown.
     """
 
     depth: NDArray[np.float32]
     confidence: NDArray[np.float32]
     invalid: int = 0
+    normals: NDArray[np.int8] | None = None
 
     def __post_init__(self) -> None:
         require_shape("depth", self.depth, (None, None))
         require_shape("confidence", self.confidence, self.depth.shape)
+        if self.normals is not None:
+            require_shape("normals", self.normals, (*self.depth.shape, 3))
 
 
 @dataclass(frozen=True)
 class LabelEstimate:
-    """labels (h, w) uint8 indices into the provider's class table or VOID; confidence (h, w) float32 in [0, 1]."""
+    """labels (h, w) uint8 indices into the provider's class table or VOID; confidence (h, w) float32 in [0, 1].
+
+    descriptor (F,) is a unit vector that says how the picture looks, where a network gives one.
+    """
 
     labels: NDArray[np.uint8]
     confidence: NDArray[np.float32]
+    descriptor: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         require_shape("labels", self.labels, (None, None))

@@ -118,6 +118,7 @@ class SegmentLabels:
             small,
             self._world_from_cam[frame.id],
             self._size,
+            None if estimate.normals is None else resample_nearest(estimate.normals, small.height, small.width),
         )
 
     def _name(self, kind: NDArray[np.int64], parts: NDArray[np.int64]) -> None:

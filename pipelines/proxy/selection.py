@@ -13,9 +13,11 @@ from pipelines.progress import Progress, log
 from pipelines.proxy.files_depth import FilesDepth
 from pipelines.proxy.files_labels import FilesLabels
 from pipelines.proxy.fused import FusedDepth
-from pipelines.proxy.models.registry import ModelStore
+from pipelines.proxy.models.registry import ModelStore, default_cache
 from pipelines.proxy.multiview import MultiviewDepth, StereoSettings
+from pipelines.proxy.network_pass import ResultCache
 from pipelines.proxy.networks.card import Card, read_card
+from pipelines.proxy.onnx_clusters import OnnxClusters
 from pipelines.proxy.onnx_depth import OnnxDepth
 from pipelines.proxy.onnx_labels import OnnxLabels
 from pipelines.proxy.providers import DepthProvider, SemanticsProvider
@@ -105,7 +107,8 @@ def open_learned_semantics(around: Surroundings, choice: Choice) -> FilesLabels 
     """The provider of `files` or of a network, by itself."""
     if choice.card is None:
         return open_label_files(around, choice.folder)
-    return OnnxLabels(around.sequence, choice.card, *_surroundings(around, "network_labels"))
+    arguments = (around.sequence, choice.card, *_surroundings(around, "network_labels"))
+    return OnnxClusters(*arguments, around.config.max_classes) if choice.card.is_clustered else OnnxLabels(*arguments)
 
 
 def open_depth_files(around: Surroundings, folder: str) -> FilesDepth | RecordingDepth:
@@ -144,5 +147,6 @@ def _fused(around: Surroundings, learned: DepthProvider) -> DepthProvider:
     return FusedDepth(learned, _multiview(around), around.sequence)
 
 
-def _surroundings(around: Surroundings, scratch: str) -> tuple[Callable[[], Path], int, str, Progress]:
-    return lambda: around.scratch(scratch), around.threads, around.device, around.progress
+def _surroundings(around: Surroundings, scratch: str) -> tuple[Callable[[], Path], int, str, Progress, ResultCache]:
+    cache = ResultCache(default_cache() / "results", around.config.cache_mb)
+    return lambda: around.scratch(scratch), around.threads, around.device, around.progress, cache

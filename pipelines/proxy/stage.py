@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from formats.errors import InputError
 from pipelines.config import ProxyConfig
@@ -29,6 +30,7 @@ from pipelines.run_folder import (
     load_proxy_maps,
     proxy_path,
     save_classes,
+    save_descriptors,
     save_mirror_pairs,
     save_proxy_maps,
     write_json,
@@ -65,7 +67,8 @@ def run(context: StageContext) -> dict[str, Any]:
     for message in semantics.warnings():
         context.warn(message)
     save_classes(context.folder, semantics.classes())
-    agreements = _maps_pass(context, sequence, frames, semantics, scale, metres)
+    agreements, descriptors = _maps_pass(context, sequence, frames, semantics, scale, metres)
+    save_descriptors(context.folder, descriptors)
     mirrors = _symmetry_pass(context, sequence, frames, scale, metres) if context.config.proxy.symmetry else {}
     report = {
         **_report(context, frames, depths, semantics, agreements),
@@ -127,7 +130,9 @@ def _depth_pass(context: StageContext, frames: list[Frame], depths: DepthProvide
         path = _depth_path(context.snapshot, frame)
         if not path.exists():
             estimate = depths.estimate(frame)
-            save_scratch(path, depth=estimate.depth, confidence=estimate.confidence, invalid=np.array(estimate.invalid))
+            arrays = {"depth": estimate.depth, "confidence": estimate.confidence, "invalid": np.array(estimate.invalid)}
+            normals = {} if estimate.normals is None else {"normals": estimate.normals}
+            save_scratch(path, **arrays, **normals)
 
 
 def _depth_path(snapshot: Path, frame: Frame) -> Path:
@@ -136,7 +141,7 @@ def _depth_path(snapshot: Path, frame: Frame) -> Path:
 
 def _load_depth(snapshot: Path, frame: Frame) -> DepthEstimate:
     stored = load_scratch(_depth_path(snapshot, frame))
-    return DepthEstimate(stored["depth"], stored["confidence"], int(stored["invalid"]))
+    return DepthEstimate(stored["depth"], stored["confidence"], int(stored["invalid"]), stored.get("normals"))
 
 
 def _in_backbone_unit(estimate: DepthEstimate, scale: DepthScale) -> DepthEstimate:
@@ -185,13 +190,15 @@ def _maps_pass(
     semantics: SemanticsProvider,
     scale: DepthScale,
     metres: float,
-) -> list[float]:
-    """Labels and reliability of every frame; returns the semantic agreement m_t of each with the one before it.
+) -> tuple[list[float], dict[int, NDArray[np.float32]]]:
+    """Labels and reliability of every frame; returns the semantic agreement m_t of each with the one before it, and
+    what a network says of how each looks.
 
     `metres` turns the provider's depth into that of the maps.
     """
     config = context.config.proxy
     agreements: list[float] = []
+    descriptors = {}
     previous: Frame | None = None
     for frame in context.progress.track(frames, "classes", len(frames)):
         path = proxy_path(context.folder, frame.id)
@@ -200,13 +207,15 @@ def _maps_pass(
         labels = semantics.estimate(frame, seen)
         m = _agreement(context, sequence, frame, previous, seen, labels)
         agreements.append(m)
+        if labels.descriptor is not None:
+            descriptors[frame.id] = labels.descriptor
         if not path.exists():
             trust = theta(m, config.theta_slope, config.theta_middle)
             u = reliability(depth.depth, depth.confidence, trust, config.alpha, config.beta, config.gamma)
             scaled = (depth.depth * np.float32(metres)).astype(np.float32)
             save_proxy_maps(path, compact(ProxyMaps(scaled, u, labels.labels, labels.confidence)))
         previous = frame
-    return agreements
+    return agreements, descriptors
 
 
 def _agreement(

@@ -1,4 +1,9 @@
-"""Downloading a large file over a line that may break, from mirrors that may be gone."""
+"""Downloading a large file over a line that may break, from mirrors that may be gone.
+
+A library such as pooch checks hashes and moves files into place, but knows one address, throws a broken download away
+and fetches through requests. Resuming, mirrors and the checks of what a server sends would be ours all the same, as its
+downloader: with them here, the few lines that are left to do cost less than the dependency.
+"""
 
 from __future__ import annotations
 

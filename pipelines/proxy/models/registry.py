@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,10 @@ _ADE20K = Path(__file__).with_name("ade20k.toml")
 
 @dataclass(frozen=True)
 class Model:
-    """One row of the table. `sha256` is "" and `bytes` 0 while unknown; `needs` names another model it works with."""
+    """One row of the table. `sha256` is "" and `bytes` 0 while unknown; `needs` names another model it works with.
+
+    `revision` is the commit that the addresses name, "" where they name a branch whose file may be replaced.
+    """
 
     name: str
     family: str
@@ -33,6 +36,8 @@ class Model:
     licence: str
     commercial: bool
     needs: str = ""
+    revision: str = ""
+    recommended: bool = False
 
 
 @dataclass(frozen=True)
@@ -47,7 +52,7 @@ class ModelStore:
     def open(cache: Path | None = None, table: Path = _TABLE) -> ModelStore:
         """The store of this user. `MSGS_SLAM_CACHE` names another cache folder."""
         values = tomllib.loads(table.read_text(encoding="utf-8"))
-        rows = [Model(**{**row, "urls": tuple(row["urls"])}) for row in values["model"]]
+        rows = [Model(**{**row, "urls": _addresses(row)}) for row in values["model"]]
         store = ModelStore(cache or default_cache(), tuple(rows), values["family"])
         own = store._load_own()
         pinned = own["pinned"]
@@ -71,6 +76,12 @@ class ModelStore:
             if model.name == name:
                 return model
         raise InputError(f"there is no model {name!r}; known: {', '.join(m.name for m in self.models)}")
+
+    def with_needed(self, names: Sequence[str]) -> list[Model]:
+        """The named models and those they work with; without names the recommended ones."""
+        chosen = [self.get(n) for n in names] if names else [m for m in self.models if m.recommended]
+        both = [m for model in chosen for m in (model, *([self.get(model.needs)] if model.needs else []))]
+        return list(dict.fromkeys(both))
 
     def card(self, model: Model) -> Card:
         """The contract of the model's family, for its file in the cache."""
@@ -102,7 +113,15 @@ class ModelStore:
             raise InputError(
                 f"{model.name} is not in {self.cache} and this is offline. Pull it where there is a network"
             )
-        actual = fetch(model.urls, path, model.bytes, model.sha256, progress)
+        try:
+            actual = fetch(model.urls, path, model.bytes, model.sha256, progress)
+        except InputError as error:
+            if model.revision or not model.sha256 or "expected" not in str(error):
+                raise
+            raise InputError(
+                f"{error}\nIts makers may have replaced the file since its hash was recorded. If you trust the new "
+                f"one, download it yourself and type: msgs-slam models add FILE --family {model.family}"
+            ) from error
         if not model.sha256:
             own = self._load_own()
             own["pinned"][model.name] = actual
@@ -159,6 +178,10 @@ class ModelStore:
     def _save_own(self, own: dict[str, Any]) -> None:
         with atomic_path(self.cache / "own.json") as temporary:
             temporary.write_text(json.dumps(own, indent=1) + "\n", encoding="utf-8")
+
+
+def _addresses(row: dict[str, Any]) -> tuple[str, ...]:
+    return tuple(url.format(revision=row.get("revision") or "main") for url in row["urls"])
 
 
 def _room_classes() -> dict[str, list[str]]:

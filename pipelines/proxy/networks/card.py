@@ -12,8 +12,12 @@ output = "predicted_depth"
 canonical_focal = 1000.0          # depth · focal / canonical_focal is metres; 0: depth is metres as it comes
 valid = [0.1, 200.0]              # values at or beyond these stops are unknown
 confidence = "confidence"         # an output in 0..1, when there is one
+normals = "predicted_normal"      # an output of unit normals, and one of how sure they are (any positive numbers)
+normal_confidence = "normal_confidence"
+metadata = true                   # mean and std stand in the file's own metadata and win over the card's
 classes = "labels.txt"            # segmentation: names, a file or a list
-kind = "logits"                   # segmentation: logits, probabilities or argmax
+kind = "logits"                   # segmentation: logits, probabilities, argmax, or tokens (of a transformer)
+head = "head.pth"                 # tokens: a linear head for the classes; without one, alike features are a class
 """
 
 from __future__ import annotations
@@ -53,6 +57,9 @@ class Card:
     canonical_focal: float = 0.0
     valid: tuple[float, ...] = (0.0, float("inf"))
     confidence: str = ""
+    normals: str = ""
+    normal_confidence: str = ""
+    metadata: bool = False
     kind: str = ""
     classes: tuple[str, ...] = ()
     groups: tuple[str, ...] = ()
@@ -66,6 +73,11 @@ class Card:
     @property
     def name(self) -> str:
         return self.model.stem
+
+    @property
+    def is_clustered(self) -> bool:
+        """Features without a head: their clusters are the classes."""
+        return self.kind == "tokens" and self.head is None
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -156,8 +168,8 @@ def _check(card: Card, path: Path) -> None:
         "valid is [lowest, highest]": len(card.valid) == 2 and 0 <= card.valid[0] < card.valid[1],
         "canonical_focal is 0 or positive": card.canonical_focal >= 0,
         "groups has one name for each class": len(card.groups) in (0, len(card.classes)),
-        "tokens needs a head": card.kind != "tokens" or card.head is not None,
-        "segmentation needs classes": card.task == "depth" or 1 <= len(card.classes) <= 10_000,
+        "segmentation needs classes": card.is_clustered or card.task == "depth" or 1 <= len(card.classes) <= 10_000,
+        "classes of tokens need a head": not (card.is_clustered and card.classes),
     }
     for rule, holds in problems.items():
         if not holds:

@@ -11,15 +11,15 @@ from pipelines.proxy.networks.letterbox import Letterbox
 from pipelines.proxy.networks.session import Network
 
 
-def network_labels(network: Network, image: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """(class ids (h, w), -1 for void; probability of that class (h, w)) of an RGB image (h, w, 3).
+def network_labels(
+    network: Network, output: NDArray, width: int, height: int
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """(class ids (h, w), -1 for void; probability of that class (h, w)) from the network's output for a picture.
 
     Raises InputError for an output that is no image of classes, or one without any number.
     """
     card = network.card
-    height, width = image.shape[:2]
     box = network.box(width, height)
-    output = network.run(image, box)[0]
     if card.kind == "argmax":
         return _from_ids(network, output, box)
     scores = _scores(network, output, box)
@@ -56,13 +56,32 @@ def _scores(network: Network, output: NDArray, box: Letterbox) -> NDArray[np.flo
 
 
 def _token_scores(network: Network, output: NDArray, box: Letterbox) -> NDArray[np.float32]:
-    """Scores of the patches of a transformer; the tokens before the patches (the class token) are left out."""
-    rows, columns = box.box_height // network.card.multiple, box.box_width // network.card.multiple
+    """(rows, columns, C) scores of the patches of a transformer."""
     head = network.head
-    if head is None or output.ndim != 2 or output.shape[0] < rows * columns or output.shape[1] != head.weight.shape[1]:
-        raise InputError(f"{network.card.model}: gave {output.shape}, which does not fit the head or the size")
+    if head is None or output.ndim != 2 or output.shape[1] != head.weight.shape[1]:
+        raise InputError(f"{network.card.model}: gave {output.shape}, which does not fit the head")
+    return head.scores(patch_features(network, output, box.width, box.height))
+
+
+def patch_features(network: Network, output: NDArray, width: int, height: int) -> NDArray[np.float32]:
+    """(rows, columns, F) features of a transformer's patches for a picture of width x height; the tokens before the
+    patches (the class token) are left out. Raises InputError for an output that is no such list of tokens."""
+    box = network.box(width, height)
+    rows, columns = box.box_height // network.card.multiple, box.box_width // network.card.multiple
+    if output.ndim != 2 or output.shape[0] < rows * columns:
+        raise InputError(f"{network.card.model}: gave {output.shape} where {rows * columns} tokens are expected")
     patches = output[output.shape[0] - rows * columns :].astype(np.float32)
-    return head.scores(patches).reshape(rows, columns, -1)
+    return patches.reshape(rows, columns, -1)
+
+
+def class_token(network: Network, output: NDArray, width: int, height: int) -> NDArray[np.float32] | None:
+    """(F,) unit vector that describes the whole picture: a transformer's first token; None where there is none."""
+    box = network.box(width, height)
+    patches = (box.box_height // network.card.multiple) * (box.box_width // network.card.multiple)
+    if network.card.kind != "tokens" or output.ndim != 2 or output.shape[0] <= patches:
+        return None
+    token = np.nan_to_num(output[0].astype(np.float32))
+    return (token / max(float(np.linalg.norm(token)), 1e-6)).astype(np.float32)
 
 
 def _grouped(card: Card, scores: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +39,7 @@ class Network:
         outputs = {o.name: o for o in self._session.get_outputs()}
         if set(inputs) != set(filter(None, (card.input, card.tokens))):
             raise InputError(f"{card.model}: its inputs are {', '.join(inputs)}; the card says {card.input}")
-        for wanted in _outputs(card):
+        for wanted in _outputs(card).values():
             if wanted not in outputs:
                 raise InputError(f"{card.model}: it has no output {wanted!r}, only {', '.join(outputs)}")
             _require_bounded(card.model, wanted, outputs[wanted].shape)
@@ -46,6 +48,10 @@ class Network:
         if kind not in _TYPES:
             raise InputError(f"{card.model}: input {card.input} is {kind}; float or float16 is expected")
         self._dtype = _TYPES[kind]
+        # A bonus: exports of the same family without them work as well.
+        self._extras = {k: n for k, n in (("normals", card.normals), ("kappa", card.normal_confidence)) if n in outputs}
+        if card.metadata:
+            self.card = card = _with_metadata(card, self._session.get_modelmeta().custom_metadata_map)
         shape = inputs[card.input].shape
         fixed = len(shape) == 4 and all(isinstance(s, int) and s > 0 for s in shape[2:])
         self._size = card.size if all(card.size) or not fixed else tuple(shape[2:])
@@ -54,9 +60,12 @@ class Network:
         """How a picture of width x height goes into the network."""
         return choose_box(width, height, self._size, self.card.multiple, self.card.pixels)
 
-    def run(self, image: NDArray[np.uint8], box: Letterbox) -> list[NDArray]:
-        """The card's outputs that are named (output, confidence, mask, metric_scale) without the batch axis, for an
-        RGB image (h, w, 3). Raises InputError when the network fails on it or answers with something huge."""
+    def run(self, image: NDArray[np.uint8], box: Letterbox) -> dict[str, NDArray]:
+        """The outputs that the card names (output, confidence, mask, metric_scale, and normals, kappa where the file
+        has them) without the batch axis, for an RGB image (h, w, 3).
+
+        Raises InputError when the network fails on it or answers with something huge.
+        """
         card = self.card
         mean, std = np.array(card.mean, np.float32), np.array(card.std, np.float32)
         # Padding of the mean colour: 0 after normalisation, here or in the graph.
@@ -68,7 +77,8 @@ class Network:
             tokens = round(box.box_width * box.box_height / card.multiple**2)
             feed[card.tokens] = np.array(min(max(tokens, _TOKENS[0]), _TOKENS[1]), np.int64)
         try:
-            outputs: Sequence[NDArray] = self._session.run(_outputs(card), feed)
+            names = {**_outputs(card), **self._extras}
+            outputs: Sequence[NDArray] = self._session.run(list(names.values()), feed)
         except Exception as error:  # onnxruntime's errors share no narrower base class
             if type(error).__module__.startswith("onnxruntime"):
                 size = f"{box.box_width}x{box.box_height}"
@@ -79,11 +89,28 @@ class Network:
         for output in outputs:
             if output.size > _MAX_OUTPUT_VALUES or output.size == 0:
                 raise InputError(f"{card.model}: gave an output of shape {output.shape}. Correct the card")
-        return [np.asarray(o[0]) for o in outputs]
+        return {role: np.asarray(o[0]) for role, o in zip(names, outputs, strict=True)}
 
 
-def _outputs(card: Card) -> list[str]:
-    return [n for n in (card.output, card.confidence, card.mask, card.metric_scale) if n]
+def _outputs(card: Card) -> dict[str, str]:
+    """Role → name of what the card asks for."""
+    roles = ("output", "confidence", "mask", "metric_scale")
+    return {role: name for role in roles if (name := getattr(card, role))}
+
+
+def _with_metadata(card: Card, metadata: dict[str, str]) -> Card:
+    """The card with the mean and std that the file itself states, in units of white; its own where there are none.
+
+    Keys that hold the words and three numbers are taken, whatever else they are called; numbers over 5 are of 0..255.
+    """
+    found: dict[str, tuple[float, ...]] = {}
+    for word in ("mean", "std"):
+        for key, text in sorted(metadata.items()):
+            numbers = [float(n) for n in re.findall(r"-?\d+\.?\d*(?:[eE]-?\d+)?", text)]
+            if word in key.lower() and len(numbers) == 3 and min(numbers) > 0:
+                found[word] = tuple(n / 255 if max(numbers) > 5 else n for n in numbers)
+                break
+    return replace(card, mean=found["mean"], std=found["std"]) if len(found) == 2 else card
 
 
 def _std_unit(card: Card) -> float:

@@ -76,7 +76,7 @@ class WorldVotes:
         strength = total.max(-1)
         best[strength <= 0] = VOID
         confidence = np.where(known, strength / (1 + _STRENGTH), strength)
-        return LabelEstimate(best, np.clip(confidence, 0, 1).astype(np.float32))
+        return LabelEstimate(best, np.clip(confidence, 0, 1).astype(np.float32), own.descriptor)
 
 
 def _voxel_size(sequence: Sequence, estimates: list[DepthEstimate]) -> float:

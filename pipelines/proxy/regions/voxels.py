@@ -77,13 +77,19 @@ def gather_frame(
     intrinsics: Intrinsics,
     world_from_cam: NDArray[np.float64],
     size: float,
+    given_normals: NDArray[np.int8] | None = None,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """One frame's voxels: keys (V,), and (V, 10) weight and weighted sums of position, normal and Lab colour.
 
-    All images have the size of `intrinsics`.
+    All images have the size of `intrinsics`. Normals (h, w, 3) in 127ths that a network gave take the place of those
+    of the depth where they are known: they do not suffer from its noise.
     """
     points = unproject_depth(depth, intrinsics) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
-    normals = normals_in_cam(depth, intrinsics) @ world_from_cam[:3, :3].T
+    normals = normals_in_cam(depth, intrinsics)
+    if given_normals is not None:
+        known = np.abs(given_normals).sum(-1, keepdims=True) > 0
+        normals = np.where(known & (np.abs(normals).sum(-1, keepdims=True) > 0), given_normals / 127.0, normals)
+    normals = normals @ world_from_cam[:3, :3].T
     lab = cv2.cvtColor((image / np.float32(255)).astype(np.float32), cv2.COLOR_RGB2LAB)
     use = (depth > 0) & (weight > 0) & (np.abs(normals).sum(-1) > 0)
     keys = voxel_keys(points, size)

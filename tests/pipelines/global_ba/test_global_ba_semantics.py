@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipelines.global_ba.appearance import describe_keyframes, learn_vocabulary
+from pipelines.global_ba.appearance import describe_keyframes, join_appearances, learn_vocabulary
 from pipelines.global_ba.semantics import mean_iou, richness, similarity, structure_similarity, summarise_labels
 from pipelines.types import VOID
 
@@ -65,3 +65,16 @@ def test_vocabulary_is_repeatable_and_bounded() -> None:
     assert learn_vocabulary(data, 4, 3).tobytes() == learn_vocabulary(data, 4, 3).tobytes()
     assert len(learn_vocabulary(data[:3], 8, 0)) == 3
     assert describe_keyframes([np.zeros((0, 8), np.float32)] * 2, 4, 0).shape[0] == 2
+
+
+def test_a_networks_descriptors_count_half_and_only_when_all_keyframes_have_them() -> None:
+    rng = np.random.default_rng(0)
+    own = rng.normal(size=(4, 6)).astype(np.float32)
+    own /= np.linalg.norm(own, axis=1, keepdims=True)
+    learned = rng.normal(size=(4, 3)).astype(np.float32) + 5
+    assert join_appearances(own, [None, *learned[1:]]) is own
+    joined = join_appearances(own, list(learned))
+    assert np.linalg.norm(joined, axis=1) == pytest.approx(1, rel=1e-5)
+    centred = learned - learned.mean(0)
+    centred /= np.linalg.norm(centred, axis=1, keepdims=True)
+    np.testing.assert_allclose(joined @ joined.T, (own @ own.T + centred @ centred.T) / 2, atol=1e-5)

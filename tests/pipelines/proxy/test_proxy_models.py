@@ -3,7 +3,7 @@
 import hashlib
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -170,6 +170,16 @@ def test_an_unknown_hash_is_refused_unless_trusted_and_then_recorded(
     assert models._load_own()["pinned"] == {"net": SHA}
 
 
+def test_a_replaced_file_is_refused_and_said_to_be_replaced(server: tuple[str, Behaviour], tmp_path: Path) -> None:
+    models = store(tmp_path, server[0], sha256="0" * 64)
+    with pytest.raises(InputError, match="have replaced the file"):
+        models.pull(models.get("net"), silent)
+    pinned = replace(models.get("net"), revision="8b1f705a")
+    with pytest.raises(InputError, match="expected 0000") as raised:
+        models.pull(pinned, silent)
+    assert "replaced" not in str(raised.value)
+
+
 def test_the_table_is_complete_and_every_family_makes_a_card(tmp_path: Path) -> None:
     models = ModelStore.open(tmp_path)
     assert {"metric3d-small", "metric3d-large", "moge2-small"} <= {m.name for m in models.models}
@@ -177,10 +187,21 @@ def test_the_table_is_complete_and_every_family_makes_a_card(tmp_path: Path) -> 
         assert len(model.sha256) == 64 or model.family == "head"
         assert model.licence
         assert all(u.startswith("https://") for u in model.urls)
+        assert all((model.revision or "main") in u for u in model.urls if "/resolve/" in u)
+        assert "{" not in "".join(model.urls)
         if model.family != "head":
             assert models.card(model).task in ("depth", "segmentation")
     with pytest.raises(InputError, match="known: metric3d"):
         models.get("metric4d")
+
+
+def test_one_word_pulls_what_a_room_needs(tmp_path: Path) -> None:
+    models = ModelStore.open(tmp_path)
+    assert [m.name for m in models.with_needed(())] == ["metric3d-small", "dinov2-small", "dinov2-small-head"]
+    assert [m.name for m in models.with_needed(("dinov2-small", "dinov2-small-head"))] == [
+        "dinov2-small",
+        "dinov2-small-head",
+    ]
 
 
 def test_own_files_are_added_checked_and_used_first(shared_data: Path, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Networks by card: stand-ins with the exact contracts, and what must be refused."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from formats.images import read_rgb
 from pipelines.proxy.networks.card import Card, read_card
 from pipelines.proxy.networks.depth import network_depth, solve_shift, solve_shift_and_focal
 from pipelines.proxy.networks.head import load_linear_head
-from pipelines.proxy.networks.labels import network_labels
+from pipelines.proxy.networks.labels import class_token, network_labels
 from pipelines.proxy.networks.letterbox import choose_box
 from pipelines.proxy.networks.onnx_file import external_locations, require_own_weights
 from pipelines.proxy.networks.session import Network
@@ -92,10 +93,7 @@ def save(path: Path, nodes: list, weights: list, output: str, shape: list, x_sha
 
 
 def write_card(path: Path, **values: Any) -> Card:
-    def text(value: Any) -> str:
-        return repr(value).replace("'", '"').replace("True", "true").replace("(", "[").replace(")", "]")
-
-    path.write_text("".join(f"{k} = {text(v)}\n" for k, v in values.items()))
+    path.write_text("".join(f"{k} = {json.dumps(v)}\n" for k, v in values.items()))
     return read_card(path)
 
 
@@ -105,6 +103,11 @@ def ramp(camera: Intrinsics) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     red = np.round(255 * (0.2 + 0.4 * x / camera.width + 0.3 * y / camera.height))
     picture = np.stack([red, np.full_like(red, 30), np.full_like(red, 200)], -1).astype(np.uint8)
     return picture, NEAREST + SPAN * red / 255
+
+
+def labels_of(network: Network, picture: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    height, width = picture.shape[:2]
+    return network_labels(network, network.run(picture, network.box(width, height))["output"], width, height)
 
 
 CAMERAS = {
@@ -133,13 +136,15 @@ def test_a_perfect_network_comes_back_as_metres(tmp_path: Path, family: str, siz
     keys: dict[str, Any] = {"task": "depth", "model": "net.onnx", "input": "x", "output": output, "white": white}
     card = write_card(tmp_path / "c.toml", **keys, **norm, **SIZES[size], canonical_focal=1000.0, valid=[0.1, 200.0])
     picture, truth = ramp(camera)
-    depth, confidence, invalid = network_depth(Network(card, 1, "cpu"), picture, camera)
+    found = network_depth(Network(card, 1, "cpu"), picture, camera)
+    depth = found.depth
     inner = (slice(12, -12), slice(12, -12))
     error = np.abs(depth / truth - 1)[inner]
     assert np.median(error) <= 1e-3
     assert abs((depth / truth)[inner].mean() - 1) <= 2e-3
-    assert confidence is None
-    assert invalid == 0
+    assert set(np.unique(found.confidence)) == {0.5}
+    assert found.invalid == 0
+    assert found.normals is found.focal is None
 
 
 @pytest.mark.parametrize("mistake", ["normalised twice", "no focal length", "wrong range"])
@@ -156,7 +161,7 @@ def test_a_mistaken_card_is_far_off(tmp_path: Path, mistake: str) -> None:
     if mistake == "wrong range":
         keys["white"] = 1.0
     picture, truth = ramp(camera)
-    depth, _, _ = network_depth(Network(write_card(tmp_path / "c.toml", **keys), 1, "cpu"), picture, camera)
+    depth = network_depth(Network(write_card(tmp_path / "c.toml", **keys), 1, "cpu"), picture, camera).depth
     assert np.median(np.abs(depth / truth - 1)) > 0.05
 
 
@@ -184,8 +189,10 @@ def test_stops_nan_and_negative_values_are_unknown_and_counted(tmp_path: Path) -
     weights = [const("none", 0), numpy_helper.from_array(plane, "plane")]
     card = depth_card(tmp_path, nodes, weights, [1, 32, 32], valid=[0.1, 200.0])
     camera = Intrinsics(32, 32, 30, 30, 16, 16)
-    depth, _, invalid = network_depth(Network(card, 1, "cpu"), np.zeros((32, 32, 3), np.uint8), camera)
-    assert invalid == 2
+    found = network_depth(Network(card, 1, "cpu"), np.zeros((32, 32, 3), np.uint8), camera)
+    depth = found.depth
+    assert found.invalid == 2
+    assert (found.confidence[depth == 0] == 0).all()
     assert all(depth[i, i] == 0 for i in (0, 8, 16, 24))
     assert (depth == 2).sum() == 32 * 32 - 4
 
@@ -290,15 +297,13 @@ def test_logits_are_read_where_the_picture_lies_in_the_box(tmp_path: Path) -> No
     scores[0, 1, :, :8] = 4
     scores[0, 2, :, 8:] = 4
     picture = np.zeros((60, 120, 3), np.uint8)
-    ids, probability = network_labels(segmentation(tmp_path, scores), picture)
+    ids, probability = labels_of(segmentation(tmp_path, scores), picture)
     assert (ids[:, :59] == 1).all()
     assert (ids[:, 61:] == 2).all()
     assert probability[30, 5] == pytest.approx(np.exp(4) / (np.exp(4) + 2), rel=1e-5)
-    ids, _ = network_labels(segmentation(tmp_path, scores, void=[2]), picture)
+    ids, _ = labels_of(segmentation(tmp_path, scores, void=[2]), picture)
     assert set(np.unique(ids)) == {-1, 1}
-    ids, _ = network_labels(
-        segmentation(tmp_path, scores.argmax(1).astype(np.float32)[:, None], kind="argmax"), picture
-    )
+    ids, _ = labels_of(segmentation(tmp_path, scores.argmax(1).astype(np.float32)[:, None], kind="argmax"), picture)
     assert (ids[:, :59] == 1).all()
     assert (ids[:, 61:] == 2).all()
 
@@ -306,7 +311,7 @@ def test_logits_are_read_where_the_picture_lies_in_the_box(tmp_path: Path) -> No
 def test_nan_scores_and_a_wrong_number_of_classes_are_refused(tmp_path: Path) -> None:
     picture = np.zeros((64, 64, 3), np.uint8)
     with pytest.raises(InputError, match="NaN"):
-        network_labels(segmentation(tmp_path, np.full((1, 3, 8, 8), np.nan, np.float32)), picture)
+        labels_of(segmentation(tmp_path, np.full((1, 3, 8, 8), np.nan, np.float32)), picture)
     with pytest.raises(InputError, match="4 classes, the card names 3"):
         segmentation(tmp_path, np.zeros((1, 4, 8, 8), np.float32))
 
@@ -322,7 +327,7 @@ def test_the_real_network_sees_chair_and_table(shared_data: Path, tmp_path: Path
     card = real_card(tmp_path)
     assert len(card.classes) == 21
     picture = read_rgb(shared_data / "kitchen" / "frame-000000.color.jpg")
-    ids, probability = network_labels(Network(card, 2, "cpu"), picture)
+    ids, probability = labels_of(Network(card, 2, "cpu"), picture)
     table, chair = card.classes.index("diningtable"), card.classes.index("chair")
     # In the first frame the table fills the lower right, a chair stands left of its middle, the floor is lower left.
     assert (ids[250:330, 420:600] == table).mean() > 0.9
@@ -347,8 +352,8 @@ def test_the_toy_network_has_the_516_rule(shared_data: Path, tmp_path: Path) -> 
     camera = CAMERAS["landscape"]
     network = Network(card, 1, "cpu")
     picture, _ = ramp(camera)
-    assert network.run(picture, network.box(640, 480))[0].shape == (516, 516)
-    depth, _, _ = network_depth(network, picture, camera)
+    assert network.run(picture, network.box(640, 480))["output"].shape == (516, 516)
+    depth = network_depth(network, picture, camera).depth
     assert depth.shape == (480, 640)
     assert np.isfinite(depth).all()
 
@@ -398,7 +403,9 @@ def test_the_point_map_family_comes_back_as_metres(tmp_path: Path) -> None:
         tmp_path / "c.toml", task="depth", model="net.onnx", input="x", white=1.0, multiple=14, pixels=100_000,
         output="points", kind="points", tokens="num_tokens", mask="mask", metric_scale="s",
     )  # fmt: skip
-    depth, _, _ = network_depth(Network(card, 1, "cpu"), np.zeros((480, 640, 3), np.uint8), camera)
+    found = network_depth(Network(card, 1, "cpu"), np.zeros((480, 640, 3), np.uint8), camera)
+    depth = found.depth
+    assert found.focal == pytest.approx(camera.fx, rel=0.01)
     v, u = np.indices((480, 640)) + 0.5
     truth = 2 + 0.5 * (u - camera.cx) / camera.fx - 0.8 * (v - camera.cy) / camera.fy
     known = depth > 0
@@ -470,8 +477,84 @@ def test_tokens_go_through_the_head_into_groups(tmp_path: Path) -> None:
     picture[:, :160, 0] = 255
     picture[:120, 160:, 1] = 255
     picture[120:, 160:, 2] = 255
-    ids, probability = network_labels(Network(card, 1, "cpu"), picture)
+    network = Network(card, 1, "cpu")
+    ids, probability = labels_of(network, picture)
+    output = network.run(picture, network.box(320, 240))["output"]
+    token = class_token(network, output, 320, 240)
+    assert token is not None
+    assert token == pytest.approx(np.full(3, 3**-0.5), rel=1e-5)
+    assert class_token(network, output[1:], 320, 240) is None
     assert card.labels == ("warm", "cold")
     assert (ids[:, :145] == 0).all()
     assert (ids[:, 175:] == 1).all()
     assert probability[:, :140].min() > 0.99
+
+
+def plane_network(folder: Path, camera: Intrinsics, flip: NDArray[np.float64], layout: str, **more: Any) -> Network:
+    """A network that answers with a slanted plane, its normals with the axes `flip`, and how sure it is of them."""
+    y, x = np.indices((camera.height, camera.width)) + 0.5
+    slope = np.array([0.3, -0.2, 1.0])
+    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones(x.shape)], -1)
+    depth = 2.0 / (rays @ slope)
+    normals = np.tile(flip * slope / np.linalg.norm(slope), (*x.shape, 1))
+    normals[:, : camera.width // 4] = flip * [0, 1, 0]  # there the two answers contradict each other
+    kappa = np.where(y < camera.height / 2, 30.0, 1.0)
+    values = {"depth": depth, "n": normals.transpose(2, 0, 1) if layout == "first" else normals, "k": kappa}
+    weights = [const(f"{k}_value", v[None]) for k, v in values.items()] + [const("none", 0)]
+    nodes = [helper.make_node("ReduceSum", ["x"], ["sum"], keepdims=0)]
+    nodes += [helper.make_node("Mul", ["sum", "none"], ["zero"])]
+    nodes += [helper.make_node("Add", [f"{k}_value", "zero"], [k]) for k in values]
+    outputs = [helper.make_tensor_value_info(k, TensorProto.FLOAT, [None] * (v.ndim + 1)) for k, v in values.items()]
+    size = (1, 3, camera.height, camera.width)
+    graph = helper.make_graph(
+        nodes, "plane", [helper.make_tensor_value_info("x", TensorProto.FLOAT, size)], outputs, weights
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
+    model.ir_version = 8
+    onnx.save(model, folder / "net.onnx")
+    keys = {"task": "depth", "model": "net.onnx", "input": "x", "output": "depth", "normals": "n"}
+    return Network(write_card(folder / "c.toml", **keys, **more), 1, "cpu")
+
+
+@pytest.mark.parametrize("layout", ["first", "last"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_normals_are_kept_and_tell_where_the_depth_is_doubtful(tmp_path: Path, layout: str, sign: int) -> None:
+    camera = Intrinsics(64, 48, 60, 60, 32, 24)
+    picture = np.zeros((48, 64, 3), np.uint8)
+    network = plane_network(tmp_path, camera, sign * np.ones(3), layout, normal_confidence="k")
+    found = network_depth(network, picture, camera)
+    assert found.normals is not None
+    wanted = -np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
+    assert found.normals[24, 40] / 127 == pytest.approx(wanted, abs=0.01)
+    right, left = found.confidence[4:20, 24:60], found.confidence[4:20, 4:12]
+    assert right.min() > 1.5 * left.max()
+    assert right.mean() > 1.1 * found.confidence[28:44, 24:60].mean()
+    assert 0 < found.confidence.min() <= found.confidence.max() <= 1
+
+
+def test_normals_with_other_axes_are_not_believed(tmp_path: Path) -> None:
+    camera = Intrinsics(64, 48, 60, 60, 32, 24)
+    network = plane_network(tmp_path, camera, np.array([1.0, 1.0, 0.0]), "first")
+    found = network_depth(network, np.zeros((48, 64, 3), np.uint8), camera)
+    assert found.normals is None
+    assert set(np.unique(found.confidence)) == {0.5}
+
+
+def test_mean_and_std_of_the_file_win_where_the_card_says_so(tmp_path: Path) -> None:
+    camera = CAMERAS["landscape"]
+    box = choose_box(640, 480, (0, 0), 28, 100_000)
+    stand_in(tmp_path / "net.onnx", "outside", 1000 / (520 * box.box_width / 640))
+    model = onnx.load(tmp_path / "net.onnx")
+    for key, values in (("image_mean", MEAN), ("image_std", STD)):
+        model.metadata_props.add(key=key, value=str([255 * v for v in values]))
+    onnx.save(model, tmp_path / "net.onnx")
+    keys: dict[str, Any] = {"task": "depth", "model": "net.onnx", "input": "x", "output": "pred_depth"}
+    keys |= {"multiple": 28, "pixels": 100_000, "canonical_focal": 1000.0, "mean": [0.5] * 3, "std": [0.5] * 3}
+    picture, truth = ramp(camera)
+    errors = []
+    for metadata in (True, False):
+        card = write_card(tmp_path / "c.toml", **keys, metadata=metadata)
+        depth = network_depth(Network(card, 1, "cpu"), picture, camera).depth
+        errors.append(float(np.median(np.abs(depth / truth - 1))))
+    assert errors[0] <= 1e-3
+    assert errors[1] > 0.02

@@ -1,6 +1,7 @@
 """The stage from frames to maps: contents, resuming, and what it says of itself."""
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,13 @@ import pytest
 from proxy_room import UNIT, Room
 
 from formats.errors import InputError
+from pipelines.proxy.files_depth import FilesDepth
+from pipelines.proxy.files_labels import FilesLabels
+from pipelines.proxy.providers import DepthEstimate, LabelEstimate
 from pipelines.proxy.stage import run
 from pipelines.run_folder import load_proxy_maps, proxy_path, read_json
 from pipelines.stages import StageContext
-from pipelines.types import VOID
+from pipelines.types import VOID, Frame
 
 Make = Callable[..., StageContext]
 FILES = ("proxy.depth=files", "proxy.semantics=files")
@@ -120,3 +124,29 @@ def test_missing_files_are_warned_of_and_leave_unknown_depth(room: Room, make_co
 def test_unknown_providers_are_refused(make_context: Make, setting: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         run(make_context(*FILES, setting))
+
+
+def test_what_a_network_says_of_normals_and_looks_reaches_the_run(
+    room: Room, make_context: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+    whole = FilesDepth.estimate
+
+    def with_normals(self: FilesDepth, frame: Frame) -> DepthEstimate:
+        found = whole(self, frame)
+        return replace(found, normals=np.full((*found.depth.shape, 3), frame.id, np.int8))
+
+    def with_descriptor(self: FilesLabels, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
+        assert depth.normals is not None
+        seen.append(int(depth.normals[0, 0, 0]))
+        labels = np.zeros(depth.depth.shape, np.uint8)
+        return LabelEstimate(labels, labels.astype(np.float32), np.eye(4, dtype=np.float32)[frame.id % 4])
+
+    monkeypatch.setattr(FilesDepth, "estimate", with_normals)
+    monkeypatch.setattr(FilesLabels, "estimate", with_descriptor)
+    context = make_context(*FILES)
+    run(context)
+    assert seen == [f.id for f in room.frames]
+    found = context.run.load_descriptors()
+    assert sorted(found) == [f.id for f in room.frames]
+    np.testing.assert_array_equal(found[5], np.eye(4)[1])

@@ -1,0 +1,119 @@
+"""A network over many frames: nothing is computed twice, and a long pass says beforehand how long."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.atomic import atomic_path
+from formats.errors import InputError
+from pipelines.progress import Progress, log
+from pipelines.proxy.scratch import load_scratch, save_scratch
+from pipelines.types import Frame
+
+Arrays = dict[str, NDArray]
+_MEASURED = 3
+_LONG = 120.0
+
+
+@dataclass(frozen=True)
+class ResultCache:
+    """Results of networks by content, over runs: at most `megabytes` of them, those used last stay. 0 keeps none."""
+
+    folder: Path
+    megabytes: int
+
+    def load(self, key: str) -> Arrays | None:
+        """None where there is none; a damaged one is removed."""
+        path = self._path(key)
+        if self.megabytes <= 0 or not path.exists():
+            return None
+        try:
+            found = load_scratch(path)
+        except InputError:
+            path.unlink(missing_ok=True)
+            return None
+        os.utime(path)
+        return found
+
+    def save(self, key: str, arrays: Arrays) -> None:
+        """Keep a result. A cache that cannot be written is no reason to stop."""
+        if self.megabytes <= 0:
+            return
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with atomic_path(self._path(key)) as temporary, temporary.open("wb") as stream:
+                np.savez_compressed(stream, allow_pickle=False, **arrays)
+        except OSError as error:
+            log.info("%s: the result is not kept (%s)", self.folder, error)
+
+    def trim(self) -> None:
+        """Remove what was used longest ago until the rest fits."""
+        entries = sorted((p.stat().st_mtime_ns, p.stat().st_size, p) for p in self.folder.glob("*.npz"))
+        total = sum(size for _, size, _ in entries)
+        for _, size, path in entries:
+            if total <= self.megabytes * 1_000_000:
+                break
+            path.unlink(missing_ok=True)
+            total -= size
+
+    def _path(self, key: str) -> Path:
+        return self.folder / f"{key}.npz"
+
+
+class NetworkPass:
+    """`compute` turns a picture (h, w, 3) into named arrays; `identity` says what else they depend on."""
+
+    def __init__(
+        self,
+        name: str,
+        identity: str,
+        folder: Callable[[], Path],
+        cache: ResultCache,
+        compute: Callable[[NDArray[np.uint8]], Arrays],
+    ) -> None:
+        self._name, self._identity, self._folder, self._cache, self._compute = name, identity, folder, cache, compute
+
+    def run(self, frames: list[Frame], image_of: Callable[[Frame], NDArray[np.uint8]], progress: Progress) -> None:
+        """Results of all frames to the disk; what is there stays, what another run has computed is taken over."""
+        todo = [f for f in frames if not self._path(f).exists()]
+        computed, seconds = 0, 0.0
+        for done, frame in enumerate(progress.track(todo, "network", len(todo))):
+            image = image_of(frame)
+            key = self._key(image)
+            arrays = self._cache.load(key)
+            if arrays is None:
+                started = time.monotonic()
+                arrays = self._compute(image)
+                seconds += time.monotonic() - started
+                computed += 1
+                self._cache.save(key, arrays)
+                if computed == _MEASURED:
+                    self._announce(seconds / computed, len(todo) - done - 1)
+            save_scratch(self._path(frame), **arrays)
+        self._cache.trim()
+
+    def load(self, frame: Frame) -> Arrays:
+        """What `run` has left."""
+        return load_scratch(self._path(frame))
+
+    def _announce(self, seconds: float, left: int) -> None:
+        """Said once, after the first frames, when it will be long."""
+        if seconds * left > _LONG:
+            log.warning(
+                "%s: about %.0f minutes for %d more frames (%.1f s each); stopped, `msgs-slam resume` goes on",
+                self._name, seconds * left / 60, left, seconds,
+            )  # fmt: skip
+
+    def _key(self, image: NDArray[np.uint8]) -> str:
+        return hashlib.sha256(f"{self._identity} {image.shape} ".encode() + image.tobytes()).hexdigest()
+
+    def _path(self, frame: Frame) -> Path:
+        return self._folder() / f"{frame.id:06d}.npz"
