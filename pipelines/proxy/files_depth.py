@@ -24,8 +24,8 @@ _INVALID_U16 = 65535
 class FilesDepth:
     """One file a frame: uint16 images in units of `unit` metres (0 and 65535 unknown), or .npy of float metres.
 
-    A folder `confidence` (or `conf`) beside it, of 8 or 16 bit images, gives the confidence; else it is 1 where the
-    depth is known.
+    A folder `confidence` (or `conf`) beside it, of 8 or 16 bit images, gives the confidence, first of all the one that
+    is named like the depth's: `proxy_conf` beside `proxy_depth`. Without one it is 1 where the depth is known.
     """
 
     metric = True
@@ -116,7 +116,8 @@ def _read_npy(path: Path) -> NDArray[np.float32]:
 
 def _match_confidence(depth_folder: Path, sequence: Sequence, is_video: bool) -> dict[int, Path]:
     suffixes = (".png", ".tif", ".tiff")
-    for name in _CONFIDENCE_NAMES:
+    alike = tuple(depth_folder.name.replace(_NAMES[0], n) for n in _CONFIDENCE_NAMES if _NAMES[0] in depth_folder.name)
+    for name in alike + _CONFIDENCE_NAMES:
         folder = depth_folder.parent / name
         if folder.is_dir() and any(p.suffix.lower() in suffixes for p in folder.iterdir()):
             return match_files(folder, suffixes, _CONFIDENCE_NAMES, sequence.frames, is_video)

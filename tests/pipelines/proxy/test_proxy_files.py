@@ -80,6 +80,15 @@ def test_confidence_files_are_used(source: Path, room: Room) -> None:
     np.testing.assert_allclose(estimate.confidence[estimate.depth > 0], 0.2)
 
 
+def test_confidence_named_like_the_depth_comes_first(source: Path, room: Room) -> None:
+    (source.parent / "depth").rename(source.parent / "net_depth")
+    for folder, value in (("confidence", 51), ("net_conf", 102)):
+        for frame in room.frames:
+            write_grey_png(source.parent / folder / frame.name, np.full((192, 256), value, np.uint8))
+    estimate = depth_files(source, room, str(source.parent / "net_depth")).estimate(room.frames[0])
+    np.testing.assert_allclose(estimate.confidence[estimate.depth > 0], 0.4)
+
+
 def broken_depth(kind: str, path: Path) -> None:
     if kind == "wrong size":
         write_grey_png(path, np.ones((100, 256), np.uint16))
