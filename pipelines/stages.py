@@ -129,7 +129,7 @@ def run_stages(
     wanted = stages[: STAGES.index(until) + 1]
     inputs = _check_inputs(wanted, source, config, records, source_digest)
     for stage in wanted:
-        fingerprint = _fingerprint(stage, config, upstream, inputs[stage.name])
+        fingerprint = stage_fingerprint(stage, config, upstream, inputs[stage.name])
         record = records.get(stage.name)
         if record is None or record.fingerprint != fingerprint or not _intact(run.stage(stage.name), record):
             for later in STAGES[STAGES.index(stage.name) :]:
@@ -141,7 +141,7 @@ def run_stages(
             _save_manifest(run, source, source_digest, records)
         else:
             log.info("%s: up to date", stage.name)
-        upstream = _next_upstream(upstream, record)
+        upstream = next_upstream(upstream, record)
     return records
 
 
@@ -156,9 +156,10 @@ def _check_inputs(
     settled = True
     for stage in stages:
         record = records.get(stage.name)
-        settled &= record is not None and record.fingerprint == _fingerprint(stage, config, upstream, record.inputs)
+        if record is None or record.fingerprint != stage_fingerprint(stage, config, upstream, record.inputs):
+            settled = False
         kept = record.inputs if record is not None and settled else None
-        upstream = _next_upstream(upstream, record) if record else upstream
+        upstream = next_upstream(upstream, record) if record else upstream
         try:
             inputs[stage.name] = stage.inputs(source, config) if stage.inputs else None
         except InputError as error:
@@ -172,7 +173,8 @@ def _check_inputs(
     return inputs
 
 
-def _next_upstream(upstream: str, record: StageRecord) -> str:
+def next_upstream(upstream: str, record: StageRecord) -> str:
+    """What the stages after `record` are made from, as one digest."""
     return hashlib.sha256((upstream + record.content).encode()).hexdigest()
 
 
@@ -222,7 +224,8 @@ def _flush_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) -> str:
+def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) -> str:
+    """Digest of what a stage's result depends on: its version, its settings, the seed, its inputs, what is before."""
     own = config_to_dict(getattr(config, stage.name))
     beside = [] if inputs is None else [inputs]
     text = json.dumps([stage.name, stage.version, own, config.run.seed, upstream, *beside], sort_keys=True)

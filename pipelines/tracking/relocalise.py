@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pipelines.config import TrackingConfig
+from pipelines.geometry import se3
 from pipelines.tracking.features import match_features
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.pnp import FramePose, solve_pose
 from pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
 from pipelines.types import Intrinsics
 
+Array = NDArray[np.float64]
+
+RIVAL_SHARE = 0.5
+"""Another place with this share of the best one's agreeing points is as good an answer."""
+COMMON_POINTS = 8
+"""Keyframes with so many points in common show one place."""
 SNAP = 2.0
 """A SIFT feature within so many pixels of a keyframe's sighting stands for the same point."""
 
@@ -24,18 +34,53 @@ def relocalise(
     settings: TrackingConfig,
     seed: int,
 ) -> tuple[Sightings, FramePose | None]:
-    """Sightings from the keyframes that look most like the frame, and the pose they agree on, if any."""
-    best: tuple[Sightings, FramePose | None] = (NO_SIGHTINGS, None)
-    for group in _candidate_groups(frame_id, state, pictures, settings.relocalise_candidates):
+    """Sightings from the keyframes that look most like the frame, and the pose they agree on, if any.
+
+    None, too, where two places explain the frame about as well and lie apart: things that repeat, such as the doors of
+    a corridor, tell nothing of which of them is seen.
+    """
+    groups = _candidate_groups(frame_id, state, pictures, settings.relocalise_candidates)
+    return recognise(frame_id, groups, state, pictures, intrinsics, settings, seed)
+
+
+def recognise(
+    frame_id: int,
+    groups: list[list[int]],
+    state: TrackState,
+    pictures: Pictures,
+    intrinsics: Intrinsics,
+    settings: TrackingConfig,
+    seed: int,
+) -> tuple[Sightings, FramePose | None]:
+    """What `relocalise` answers, of these groups of keyframes alone."""
+    answers: list[tuple[Sightings, FramePose, int]] = []
+    most = NO_SIGHTINGS
+    for group in groups:
         seen = NO_SIGHTINGS
         for keyframe in group:
             found = match_keyframe(frame_id, keyframe, state, pictures)
             seen = seen.joined(found.select(~np.isin(found.point, seen.point)))
         points = state.points[seen.point]
         solved = solve_pose(seen.xy, points, intrinsics, seed + frame_id, None, settings.pose_error)
-        if solved is not None and (best[1] is None or solved.inliers.sum() > best[1].inliers.sum()):
-            best = (seen, solved)
-    return best
+        if solved is not None:
+            answers.append((seen, solved, state.segment[group[0]]))
+        elif len(seen) > len(most):
+            most = seen
+    if not answers:
+        return most, None
+    seen, solved, segment = max(answers, key=lambda a: int(a[1].inliers.sum()))
+    depth = float(np.median((state.points[seen.point] @ solved.cam_from_world[2, :3]) + solved.cam_from_world[2, 3]))
+    for _, other, its_segment in answers:
+        as_good = other.inliers.sum() >= max(RIVAL_SHARE * solved.inliers.sum(), settings.min_inliers)
+        if as_good and its_segment == segment and _apart(other.cam_from_world, solved.cam_from_world, depth):
+            return seen, None
+    return seen, solved
+
+
+def _apart(first: Array, second: Array, depth: float) -> bool:
+    """Whether two poses of one frame differ by 10 degrees, or by a fifth of the distance of what it sees."""
+    moved = first @ se3.inverse(second)
+    return bool(se3.rotation_angle(moved) > np.radians(10) or np.linalg.norm(moved[:3, 3]) > 0.2 * max(depth, 0.0))
 
 
 def match_keyframe(frame_id: int, keyframe: int, state: TrackState, pictures: Pictures) -> Sightings:
@@ -54,19 +99,26 @@ def match_keyframe(frame_id: int, keyframe: int, state: TrackState, pictures: Pi
 
 
 def _candidate_groups(frame_id: int, state: TrackState, pictures: Pictures, count: int) -> list[list[int]]:
-    """Keyframes worth matching, those that belong together in time in one group, so that their points add up."""
+    """Keyframes worth matching; neighbours that see common points are one group, so that their points add up."""
     if not state.keyframes:
         return []
     ours = pictures.descriptor(frame_id)
     scores = np.array([float(pictures.descriptor(k) @ ours) for k in state.keyframes])
     alike = [state.keyframes[i] for i in np.argsort(-scores, kind="stable")[:count]]
+    return group_by_points({*alike, *state.nearest_keyframes(frame_id, 1)}, state)
+
+
+def group_by_points(keyframes: Iterable[int], state: TrackState) -> list[list[int]]:
+    """Keyframes in order, each in one group with the one before it if they see common points."""
     groups: list[list[int]] = []
-    for keyframe in sorted({*alike, *state.nearest_keyframes(frame_id, 1)}):
-        place = state.keyframes.index(keyframe)
-        joins = groups and state.keyframes.index(groups[-1][-1]) >= place - 1
-        same = joins and state.segment[groups[-1][-1]] == state.segment[keyframe]
-        if same:
+    for keyframe in sorted(keyframes):
+        if groups and _share_points(groups[-1][-1], keyframe, state):
             groups[-1].append(keyframe)
         else:
             groups.append([keyframe])
     return groups
+
+
+def _share_points(first: int, second: int, state: TrackState) -> bool:
+    shared = np.isin(state.sightings[first].point, state.sightings[second].point).sum()
+    return bool(shared >= COMMON_POINTS)

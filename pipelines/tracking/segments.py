@@ -13,9 +13,8 @@ from pipelines.config import TrackingConfig
 from pipelines.geometry import se3
 from pipelines.geometry.alignment import Similarity
 from pipelines.tracking.pictures import Pictures
-from pipelines.tracking.pnp import solve_pose
-from pipelines.tracking.relocalise import match_keyframe
-from pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
+from pipelines.tracking.relocalise import group_by_points, recognise
+from pipelines.tracking.state import Sightings, TrackState
 from pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
@@ -105,11 +104,8 @@ def _recognise(
     seed: int,
 ) -> tuple[Similarity, Sightings] | None:
     """main_from_segment, and the main segment's points in the frame."""
-    seen = NO_SIGHTINGS
-    for keyframe in keyframes:
-        found = match_keyframe(frame_id, keyframe, state, pictures)
-        seen = seen.joined(found.select(~np.isin(found.point, seen.point)))
-    solved = solve_pose(seen.xy, state.points[seen.point], intrinsics, seed + frame_id, None, settings.pose_error, 1.0)
+    groups = group_by_points(keyframes, state)
+    seen, solved = recognise(frame_id, groups, state, pictures, intrinsics, settings, seed)
     if solved is None or solved.inliers.sum() < max(settings.min_inliers, 0.4 * len(seen)):
         return None
     seen = seen.select(solved.inliers)

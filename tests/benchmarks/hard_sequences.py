@@ -31,7 +31,7 @@ def turn(folder: Path, data: Path) -> Array:
     return draw(folder, standing(np.linspace(0, 2 * np.pi, 60, endpoint=False), 0.02))
 
 
-def walk_turn_walk(folder: Path, data: Path) -> Array:
+def turn_within(folder: Path, data: Path) -> Array:
     """A walk, half a turn forth and back on the spot in its middle, and the walk goes on."""
     from pipelines.world.paths import room_walk
 
@@ -107,7 +107,7 @@ def whiteroom_fast(folder: Path, data: Path) -> Array:
 
 HARD: dict[str, Callable[[Path, Path], Array]] = {
     f.__name__: f
-    for f in (turn, walk_turn_walk, fast, fast_blank, exposure, kitchen_twice, replica_fast, whiteroom_fast)
+    for f in (turn, turn_within, fast, fast_blank, exposure, kitchen_twice, replica_fast, whiteroom_fast)
 }
 
 

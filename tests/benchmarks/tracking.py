@@ -39,6 +39,8 @@ from hard_sequences import HARD, write_hard
 from numpy.typing import NDArray
 
 DATA = ROOT.parent / "shared" / "data"
+COARSE = ("proxy.stereo_side=160", "proxy.stereo_planes=32")
+"""Quick proxies where only poses are judged: multi-view depth takes no part in them."""
 Truth = Callable[[str, int], NDArray[np.float64] | None]
 """(name in the source, index in the source) -> world_from_cam (4, 4), None where it is not known."""
 
@@ -104,7 +106,7 @@ def cases(work: Path) -> dict[str, Case]:
         "whiteroom_files": Case(white / "rgb", (files,), room),
         "corridor": Case(work / "corridor" / "rgb", (), lambda *_: None),
         "bedroom": Case(DATA / "videos/bedroom_848x364_58fps.mp4", (), lambda *_: None),
-        **{name: Case(work / name / "rgb", (), written_truth(work / name / "traj.txt")) for name in HARD},
+        **{name: Case(work / name / "rgb", COARSE, written_truth(work / name / "traj.txt")) for name in HARD},
     }
 
 
@@ -225,10 +227,17 @@ def adjustment_timed() -> Iterator[list[float]]:
 
 
 def walk_case(name: str, work: Path) -> Case:
-    """walk_N: N frames of the made-up room, at the same speed whatever their number."""
+    """walk_N: the first N frames of a walk of four laps of 250 frames through the made-up room."""
+    from pipelines.world.clip import ClipOptions, make_world, render_frame
+    from pipelines.world.write import write_sequence
+
     count = int(name.removeprefix("walk_"))
-    folder = write_walk(work / name, "room", count, count / 250)
-    return Case(folder, (), by_number(rows_of(folder.parent / "traj.txt")))
+    folder = work / name
+    if not (folder / "traj.txt").exists():
+        options = ClipOptions(frames=1000, width=320, height=240, laps=4.0)
+        world = make_world("room", texel=0.006)
+        write_sequence(folder, world, options, (render_frame(world, options, i) for i in range(count)))
+    return Case(folder / "rgb", COARSE, by_number(rows_of(folder / "traj.txt")))
 
 
 def original_names(source: Path, count: int, is_video: bool) -> list[str]:
@@ -270,7 +279,10 @@ def errors(
 
 
 def measure_colmap(name: str, work: Path, mapper: str) -> dict[str, Any]:
-    """pycolmap's mapper on the same pictures, camera unknown, sequential matching with overlap 10."""
+    """pycolmap's mapper on the same pictures, camera unknown, sequential matching with overlap 10.
+
+    The second mapper takes the first one's features and matches; their time counts in both rows.
+    """
     import pycolmap
 
     from pipelines.run_folder import RunFolder
@@ -282,20 +294,27 @@ def measure_colmap(name: str, work: Path, mapper: str) -> dict[str, Any]:
     source = prepare(name, case, work)
     folder = run.stage("frames") if source.is_file() else source
     names = [f.name for f in frames] if source.is_file() else original_names(source, len(frames), False)
-    place = work / f"{name}_{mapper}"
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir()
+    place = work / f"{name}_colmap"
+    database, stored = place / "database.db", place / "seconds.json"
+    if not stored.exists():
+        shutil.rmtree(place, ignore_errors=True)
+        place.mkdir()
+        clock, cpu = time.monotonic(), time.process_time()
+        reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
+        pycolmap.extract_features(database, folder, names, pycolmap.CameraMode.SINGLE, reader_options=reader)
+        pycolmap.match_sequential(database, pairing_options=pycolmap.SequentialPairingOptions(overlap=10))
+        stored.write_text(json.dumps([time.monotonic() - clock, time.process_time() - cpu]))
+    before = json.loads(stored.read_text())
+    own = place / f"{mapper}.db"
+    shutil.copy(database, own)
     clock, cpu = time.monotonic(), time.process_time()
-    database = place / "database.db"
-    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
-    pycolmap.extract_features(database, folder, names, pycolmap.CameraMode.SINGLE, reader_options=reader)
-    pycolmap.match_sequential(database, pairing_options=pycolmap.SequentialPairingOptions(overlap=10))
+    (place / mapper).mkdir(exist_ok=True)
     if mapper == "global":
-        pycolmap.calibrate_view_graph(database)
-        models = pycolmap.global_mapping(database, folder, place)
+        pycolmap.calibrate_view_graph(own)
+        models = pycolmap.global_mapping(own, folder, place / mapper)
     else:
-        models = pycolmap.incremental_mapping(database, folder, place)
-    spent = time.monotonic() - clock, time.process_time() - cpu
+        models = pycolmap.incremental_mapping(own, folder, place / mapper)
+    spent = time.monotonic() - clock + before[0], time.process_time() - cpu + before[1]
     poses, posed = np.tile(np.eye(4), (len(names), 1, 1)), np.zeros(len(names), bool)
     if models:
         model = max(models.values(), key=lambda m: m.num_reg_images())

@@ -1,0 +1,64 @@
+"""A lost frame is found again, unless two places explain it equally well."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pipelines.config import TrackingConfig
+from pipelines.geometry import se3
+from pipelines.geometry.camera import unproject
+from pipelines.tracking.features import extract_features, frame_descriptor
+from pipelines.tracking.relocalise import relocalise
+from pipelines.tracking.state import Sightings, TrackState
+from pipelines.types import Intrinsics
+
+CAMERA = Intrinsics(320, 240, 280, 280, 160, 120)
+
+
+def picture() -> np.ndarray:
+    noise = np.random.default_rng(0).normal(size=(240, 320)).astype(np.float32)
+    return np.clip(128 + 300 * cv2.GaussianBlur(noise, (0, 0), 2.5), 0, 255).astype(np.uint8)
+
+
+class OnePicture:
+    """Every frame shows the same."""
+
+    def __init__(self) -> None:
+        self._features = extract_features(picture(), 400)
+        self._descriptor = frame_descriptor(np.repeat(picture()[..., None], 3, 2))
+
+    def features(self, frame_id: int) -> Any:
+        return self._features
+
+    def descriptor(self, frame_id: int) -> Any:
+        return self._descriptor
+
+
+def add_place(state: TrackState, frame_id: int, cam_from_world: np.ndarray) -> None:
+    """A keyframe at a pose that sees a point of its own at every feature."""
+    xy = OnePicture().features(0).xy
+    depth = np.random.default_rng(1).uniform(2, 4, len(xy))
+    points = se3.transform(se3.inverse(cam_from_world), unproject(xy, depth, CAMERA))
+    index = state.add_points(points, np.zeros((len(xy), 3), np.uint8))
+    state.add_frame(frame_id, cam_from_world, Sightings(index, xy, np.full(len(xy), 0.5)), True, 0)
+
+
+HERE, FAR = se3.exp(np.array([0.1, 0.2, 0, 0, 0.1, 0])), se3.exp(np.array([6.0, 0, 0, 0, 1.5, 0]))
+
+
+@pytest.mark.parametrize(
+    ("places", "found"),
+    [([HERE], True), ([HERE, FAR], False), ([HERE, HERE], True)],
+    ids=["one place", "two equal places", "one place seen twice"],
+)
+def test_a_frame_is_posed_only_where_the_answer_is_unique(places: list[np.ndarray], found: bool) -> None:
+    state = TrackState()
+    for n, place in enumerate(places):
+        add_place(state, 10 + 40 * n, place)
+    seen, solved = relocalise(30, state, OnePicture(), CAMERA, TrackingConfig(), 0)  # type: ignore[arg-type]
+    assert len(seen) > 100
+    assert (solved is not None) == found
+    if solved is not None:
+        assert np.allclose(solved.cam_from_world, HERE, atol=1e-3)
