@@ -15,6 +15,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from formats.errors import InputError
 from msgs_cli import looking
+from msgs_cli.ablating import ablate
 from msgs_cli.models import models
 from msgs_cli.options import (
     FOLDER,
@@ -23,6 +24,8 @@ from msgs_cli.options import (
     open_run,
     set_up_logging,
     settings_options,
+    source_options,
+    source_settings,
     verbosity_options,
 )
 from pipelines.run_folder_names import EXPORTS, STAGES
@@ -54,16 +57,12 @@ def main() -> None:
     msgs-slam render video.msgs out.mp4 the map along its camera path
     msgs-slam view video.msgs           the map in the browser
     msgs-slam evaluate video.msgs --truth DATASET    errors against a known truth
+    msgs-slam ablate SOURCE --truth DATASET          what each term of the method earns
     msgs-slam models list               learned models for metric depth and named classes
     msgs-slam config                    every setting with its default and meaning
     """
 
 
-SOURCE_FORMAT_HELP = (
-    "What SOURCE is: auto, images (a video or plain images, whatever lies beside them), or a data set: 7scenes, "
-    "replica, tum, euroc, scannet, sens, nerfstudio, colmap, folder. Default: auto. A data set gives its times and "
-    "camera, and with --depth files --semantics files its depth and labels."
-)
 UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], help="Stop after this stage.")
 
 
@@ -71,49 +70,23 @@ UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], h
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option("--out", type=FOLDER, metavar="RUN", help="The run folder. Default: the source's name + .msgs, here.")
 @settings_options
-@click.option("--format", "layout", metavar="NAME", help=SOURCE_FORMAT_HELP)
-@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), help="Where dense work runs. Default: auto.")
+@source_options
 @UNTIL
-@click.option(
-    "--depth",
-    metavar="PROVIDER",
-    help="Proxy depth: auto, multiview (needs no weights), files[:FOLDER] or onnx:CARD. Default: auto.",
-)
-@click.option(
-    "--semantics",
-    metavar="PROVIDER",
-    help="Semantics: auto, segments (needs no weights), files[:FOLDER] or onnx:CARD. Default: auto.",
-)
-@click.option(
-    "--intrinsics",
-    metavar="FX,FY,CX,CY[,K1,K2,P1,P2]|FILE",
-    help="The camera, in pixels of the source (first pixel's centre at 0.5, 0.5). Default: EXIF, else self-calibrated.",
-)
 @click.option(
     "--hold-out", type=click.IntRange(0), metavar="N",
     help="Keep every N-th frame out of the map, to measure it there (evaluate). Default: 0, use all.",
 )  # fmt: skip
-@click.option(
-    "--scale-ref",
-    metavar="REF",
-    help="Metres without metric depth: PICTURE:X1,Y1,X2,Y2=METRES, two pixels of one picture, or height=METRES.",
-)
 @verbosity_options
 def reconstruct(
     source: Path,
     out: Path | None,
     config_file: Path | None,
     overrides: tuple[str, ...],
-    layout: str | None,
-    device: str | None,
     until: str,
-    depth: str | None,
-    semantics: str | None,
-    intrinsics: str | None,
     hold_out: int | None,
-    scale_ref: str | None,
     quiet: bool,
     verbose: bool,
+    **about_source: str | None,
 ) -> None:
     """Reconstruct SOURCE, a video, a folder of images or a data set, into a run folder.
 
@@ -127,15 +100,7 @@ def reconstruct(
     from pipelines.run_folder import RunFolder
 
     run = RunFolder(out) if out else default_run_folder(source)
-    named = {
-        "run.format": layout,
-        "run.device": device,
-        "proxy.depth": depth,
-        "proxy.semantics": semantics,
-        "proxy.scale_ref": scale_ref,
-        "frames.intrinsics": intrinsics,
-    }
-    texts = [f'{key}="{_toml_escape(value)}"' for key, value in named.items() if value is not None]
+    texts = source_settings(about_source)
     texts += [f"mapping.hold_out={hold_out}"] if hold_out is not None else []
     config = load_config(config_file, [*overrides, *texts], base=existing_config(run))
     records = _interruptible(lambda: run_reconstruct(source, run, config, make_progress(quiet), until), run.root)
@@ -261,10 +226,6 @@ def show_config(config_file: Path | None, overrides: tuple[str, ...]) -> None:
     click.echo(config_to_toml(load_config(config_file, overrides)), nl=False)
 
 
-def _toml_escape(text: str) -> str:
-    return text.replace("\\", "\\\\").replace('"', '\\"')
-
-
 def _interruptible(work: Callable[[], Any], root: Path) -> Any:
     try:
         return work()
@@ -286,6 +247,7 @@ def _print_summary(root: Path, records: dict[str, Any]) -> None:
 for command in (looking.evaluate, looking.report, looking.render, looking.view):
     main.add_command(command)
 main.add_command(models)
+main.add_command(ablate)
 
 if __name__ == "__main__":
     main()

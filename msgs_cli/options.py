@@ -36,6 +36,53 @@ def settings_options(command: Callable[..., None]) -> Callable[..., None]:
     )(command)  # fmt: skip
 
 
+_SOURCE_OPTIONS = {
+    "format": (
+        "run.format", "NAME",
+        "What SOURCE is: auto, images (a video or plain images, whatever lies beside them), or a data set: 7scenes, "
+        "replica, tum, euroc, scannet, sens, nerfstudio, colmap, folder. Default: auto. A data set gives its times and "
+        "camera, and with --depth files --semantics files its depth and labels.",
+    ),
+    "device": ("run.device", "auto|cpu|cuda", "Where dense work runs. Default: auto."),
+    "depth": (
+        "proxy.depth", "PROVIDER",
+        "Proxy depth: auto, multiview (needs no weights), files[:FOLDER] or onnx:CARD. Default: auto.",
+    ),
+    "semantics": (
+        "proxy.semantics", "PROVIDER",
+        "Semantics: auto, segments (needs no weights), files[:FOLDER] or onnx:CARD. Default: auto.",
+    ),
+    "intrinsics": (
+        "frames.intrinsics", "FX,FY,CX,CY[,K1,K2,P1,P2]|FILE",
+        "The camera, in pixels of the source (first pixel's centre at 0.5, 0.5). Default: the data set's, EXIF, else "
+        "self-calibrated.",
+    ),
+    "scale-ref": (
+        "proxy.scale_ref", "REF",
+        "Metres without metric depth: PICTURE:X1,Y1,X2,Y2=METRES, two pixels of one picture, or height=METRES.",
+    ),
+}  # fmt: skip
+"""Option → the setting it stands for, what is given, help."""
+
+
+def source_options(command: Callable[..., None]) -> Callable[..., None]:
+    """What a reconstruction is made from and where; see `source_settings`."""
+    for name, (setting, metavar, help) in reversed(_SOURCE_OPTIONS.items()):
+        command = click.option(f"--{name}", setting.replace(".", "__"), metavar=metavar, help=help)(command)
+    return command
+
+
+def source_settings(given: dict[str, str | None]) -> list[str]:
+    """The options of `source_options` as `section.key="value"` texts."""
+    texts = {key.replace("__", "."): value for key, value in given.items() if value is not None}
+    return [f"{key}={_toml_string(value)}" for key, value in texts.items()]
+
+
+def _toml_string(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'
+
+
 def set_up_logging(quiet: bool, verbose: bool) -> None:
     """Logs go to stderr: warnings, or everything, or errors only."""
     if quiet and verbose:

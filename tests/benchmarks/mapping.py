@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from formats.datasets import open_sequence
 from pipelines.config import load_config
+from pipelines.evaluation.ablation import ABLATIONS as ARTICLE_ABLATIONS
 from pipelines.evaluation.evaluate import evaluate_run
 from pipelines.progress import SilentProgress
 from pipelines.reconstruct import reconstruct
@@ -63,12 +64,8 @@ CASES = {
 }
 
 ABLATIONS = {
-    "complete": (),
-    "without proxy depth": ("mapping.use_proxy_depth=false",),
-    "without depth loss": ("mapping.depth_weight=0.0",),
-    "without semantic loss": ("mapping.label_weight=0.0",),
+    **ARTICLE_ABLATIONS,
     "semantic loss of eq. (20)": ("mapping.label_loss=image",),
-    "colour only": ("mapping.use_proxy_depth=false", "mapping.label_weight=0.0", "mapping.edge_weight=0.0"),
     "kappa = 5": ("mapping.kappa=5.0",),
     "without edge term": ("mapping.edge_weight=0.0",),
     "without region prior": ("mapping.region_prior=false",),
