@@ -52,8 +52,8 @@ class FramesConfig:
 class ProxyConfig:
     """Proxy depth and semantics of every keyframe."""
 
-    depth: str = setting("auto", "depth provider: auto, multiview, files:FOLDER, files, onnx:CARD")
-    semantics: str = setting("auto", "semantics provider: auto, segments, files:FOLDER, files, onnx:CARD")
+    depth: str = setting("auto", "depth provider: auto, multiview, files:FOLDER, files, onnx:CARD or onnx:MODEL")
+    semantics: str = setting("auto", "semantics provider: auto, segments, files:FOLDER, files, onnx:CARD or onnx:MODEL")
     frames: str = setting(
         "keyframes", "which frames get maps; all needs depth that needs no poses", ("keyframes", "all")
     )

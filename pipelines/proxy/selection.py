@@ -72,7 +72,7 @@ def choose_semantics(config: ProxyConfig) -> Choice:
 
 def _choose(text: str, setting: str, embedded: str, task: str) -> Choice:
     kind, rest = split_choice(text, setting, ("auto", embedded, "files", "onnx"))
-    card = _cached(task) if kind == "auto" else read_card(Path(rest)) if kind == "onnx" else None
+    card = _cached(task) if kind == "auto" else _read(rest) if kind == "onnx" else None
     if card is not None:
         return Choice("onnx", card=card)
     return Choice("files", rest) if kind == "files" else Choice(embedded)
@@ -123,6 +123,17 @@ def open_label_files(around: Surroundings, folder: str) -> FilesLabels | Recordi
     if not folder and around.recording is not None:
         return RecordingLabels(around.recording, around.sequence, around.progress)
     return FilesLabels(folder, around.source, around.sequence, around.progress)
+
+
+def _read(text: str) -> Card:
+    """The card of a file, or of a model in the cache by its name. Raises InputError when it is neither."""
+    store = ModelStore.open()
+    model = next((m for m in store.models if m.name == text and not Path(text).exists()), None)
+    if model is None:
+        return read_card(Path(text))
+    if not store.is_here(model):
+        raise InputError(f"{text} is not in {store.cache}; type: msgs-slam models pull {text}")
+    return store.card(model)
 
 
 def _cached(task: str) -> Card | None:

@@ -207,7 +207,7 @@ def _pairs_of_plane(
     tested, held = (
         cv2.blur(m.astype(np.float32), window, borderType=cv2.BORDER_REFLECT) for m in (both, both * agree * alike)
     )
-    around = held / np.maximum(tested, 0.05)
+    around = np.clip(held / np.maximum(tested, 0.05), 0, 1)
     confidence = np.where(both, np.sqrt(agree * around), around) * alike * sure
     rays = unproject(here, np.ones(depth.shape), camera)
     gain = 1 - 2 * plane[2] * (rays @ plane[:3])

@@ -73,7 +73,10 @@ def test_a_pulled_or_changed_model_is_seen_under_auto(source: Path, tmp_path: Pa
         assert after["depth"] != before["depth"]
         assert after["labels"] == "segments"
         check_proxy(source, settings("auto"))
+        assert proxy_inputs(source, settings("onnx:net"))["depth"] == after["depth"]
         before = after
+    with pytest.raises(InputError, match="models pull metric3d-small"):
+        proxy_inputs(source, settings("onnx:metric3d-small"))
     card = tmp_path / "card.toml"
     seen = []
     for gain, multiple in ((1.0, 14), (2.0, 14), (2.0, 28)):

@@ -222,6 +222,23 @@ def test_an_output_that_is_no_image_is_refused(tmp_path: Path) -> None:
         network_depth(Network(card, 1, "cpu"), np.zeros((32, 32, 3), np.uint8), camera)
 
 
+@pytest.mark.parametrize("side", [15_000, 3_000_000])
+def test_an_output_without_end_is_refused_when_it_comes(tmp_path: Path, side: int) -> None:
+    # The size depends on the input, so that nobody can tell it from the graph.
+    weights = [const("side", [side]), const("none", 0), const("one", [1], np.int64)]
+    nodes = [
+        helper.make_node("ReduceSum", ["x"], ["sum"], keepdims=0),
+        helper.make_node("Mul", ["sum", "none"], ["zero"]),
+        helper.make_node("Add", ["zero", "side"], ["length"]),
+        helper.make_node("Cast", ["length"], ["edge"], to=TensorProto.INT64),
+        helper.make_node("Concat", ["one", "edge", "edge"], ["sizes"], axis=0),
+        helper.make_node("Expand", ["zero", "sizes"], ["y"]),
+    ]
+    card = depth_card(tmp_path, nodes, weights, [1, "h", "w"])
+    with pytest.raises(InputError, match="Correct the card"):
+        network_depth(Network(card, 1, "cpu"), np.zeros((32, 32, 3), np.uint8), Intrinsics(32, 32, 30, 30, 16, 16))
+
+
 def external(path: Path, location: str) -> None:
     """A network that keeps a weight in another file."""
     weight = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[1], data_location=TensorProto.EXTERNAL)
