@@ -199,7 +199,8 @@ def measure_network(name: str, work: Path) -> dict[str, Any]:
 
     card_file = write_deeplab_card(work)
     run = RunFolder(work / f"{name}_deeplab.msgs")
-    run_proxy(VIDEOS[name], run, f'proxy.semantics="onnx:{card_file}"')
+    # Depth only carries the votes here: half its size does.
+    run_proxy(VIDEOS[name], run, f'proxy.semantics="onnx:{card_file}"', "proxy.stereo_side=160", "proxy.symmetry=false")
     network = Network(read_card(card_file), 2, "cpu")
     raw: dict[int, NDArray[np.uint8]] = {}
     seconds = cpu_seconds = 0.0
@@ -305,15 +306,13 @@ def measure_embedded(name: str, work: Path) -> dict[str, Any]:
 
 def measure_fused(name: str, work: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """A network that is off by 6 % and 3 %: alone, fused, and what there is without it."""
-    noisy = work / f"{name}_noisy"
+    yield "multiview", measure_embedded(name, work)
+    run, noisy = RunFolder(work / f"{name}_fused.msgs"), work / f"{name}_noisy"
+    if not run.root.exists():
+        shutil.copytree(work / f"{name}.msgs", run.root)
     write_noisy_depth(CASES[name].depth, noisy)
-    for provider, settings in (
-        ("network", (f'proxy.depth="files:{noisy}"', "proxy.fuse=never")),
-        ("network + multiview", (f'proxy.depth="files:{noisy}"', "proxy.fuse=always")),
-        ("multiview", ("proxy.depth=multiview",)),
-    ):
-        run = RunFolder(work / f"{name}.msgs")
-        run_proxy(pictures_of(name, work), run, *settings)
+    for provider, fuse in (("network", "never"), ("network + multiview", "always")):
+        run_proxy(pictures_of(name, work), run, f'proxy.depth="files:{noisy}"', f"proxy.fuse={fuse}")
         yield provider, measure_depth(CASES[name], run)
 
 
@@ -342,7 +341,7 @@ def main() -> None:
             run = RunFolder(work / f"{name}_deeplab.msgs")
         elif arguments.fused:
             found = list(measure_fused(name, work))
-            run = RunFolder(work / f"{name}.msgs")
+            run = RunFolder(work / f"{name}_fused.msgs")
         else:
             found = [("embedded", measure_embedded(name, work))]
             run = RunFolder(work / f"{name}.msgs")
