@@ -13,16 +13,14 @@ from numpy.typing import NDArray
 from formats.errors import InputError
 from pipelines.config import ProxyConfig
 from pipelines.frames.recording import open_recording
-from pipelines.frames.source import open_source
 from pipelines.progress import log
 from pipelines.proxy.compact import compact
 from pipelines.proxy.inputs import check_proxy, proxy_inputs
+from pipelines.proxy.metres import reference_scale, scale_figures
 from pipelines.proxy.providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider
 from pipelines.proxy.reliability import reliability, semantic_agreement, theta, warp_labels
 from pipelines.proxy.scale import DepthScale, measure_scale
-from pipelines.proxy.scale_reference import ReferenceScale, distance_scale, height_scale, parse_reference
 from pipelines.proxy.scratch import load_scratch, save_scratch
-from pipelines.proxy.segments import SegmentLabels
 from pipelines.proxy.selection import Surroundings, open_depth, open_semantics
 from pipelines.proxy.sequence import Sequence, map_intrinsics
 from pipelines.proxy.symmetry import find_mirror_planes, mirror_pairs
@@ -61,7 +59,9 @@ def run(context: StageContext) -> dict[str, Any]:
     _warn_of_distortion(context, sequence, depths, semantics)
     _depth_pass(context, frames, depths)
     scale = measure_scale(sequence, frames, lambda frame: _load_depth(context.snapshot, frame))
-    reference = _reference_scale(context, sequence, frames, depths)
+    reference = reference_scale(
+        context, sequence, frames, depths, scale, lambda frame: _load_depth(context.snapshot, frame)
+    )
     metres = reference.factor if reference else 1.0
     semantics.prepare(frames, lambda frame: _in_backbone_unit(_load_depth(context.snapshot, frame), scale))
     for message in semantics.warnings():
@@ -72,7 +72,7 @@ def run(context: StageContext) -> dict[str, Any]:
     mirrors = _symmetry_pass(context, sequence, frames, scale, metres) if context.config.proxy.symmetry else {}
     report = {
         **_report(context, frames, depths, semantics, agreements),
-        **_scale_figures(depths, scale, reference),
+        **scale_figures(depths, scale, reference),
         **mirrors,
     }
     write_json(context.folder / "proxy.json", report)
@@ -147,37 +147,6 @@ def _load_depth(snapshot: Path, frame: Frame) -> DepthEstimate:
 def _in_backbone_unit(estimate: DepthEstimate, scale: DepthScale) -> DepthEstimate:
     """The same depth in the unit of the backbone's poses."""
     return replace(estimate, depth=(estimate.depth / np.float32(scale.value)).astype(np.float32))
-
-
-def _reference_scale(
-    context: StageContext, sequence: Sequence, frames: list[Frame], depths: DepthProvider
-) -> ReferenceScale | None:
-    """Metres per unit of the depth by what the user knows; None without that, and where the depth is metric anyway."""
-    config = context.config.proxy
-    known = parse_reference(config.scale_ref)
-    if known is None:
-        return None
-
-    def depth_of(frame: Frame) -> DepthEstimate:
-        return _load_depth(context.snapshot, frame)
-
-    if known.picture:
-        source = open_source(context.source, context.config.run.format)
-        found = distance_scale(known, source, sequence, frames, depth_of)
-    else:
-        heights = SegmentLabels(sequence, config.max_classes, context.progress).heights(frames, depth_of)
-        if len(heights) == 0 or np.median(heights) <= 0:
-            raise InputError(
-                f"--scale-ref {config.scale_ref}: no floor was found in the scene. Give a distance between two points"
-            )
-        found = height_scale(known, heights)
-    if depths.metric:
-        context.warn(
-            f"{depths.name} is metric, so the reference {config.scale_ref} is not used; it would make lengths "
-            f"{found.factor - 1:+.1%} longer"
-        )
-        return None
-    return found
 
 
 # maps -----------------------------------------------------------------------------------------------------------
@@ -295,28 +264,6 @@ def _report(
         **depths.figures(),
         **semantics.figures(),
     }
-
-
-def _scale_figures(depths: DepthProvider, scale: DepthScale, reference: ReferenceScale | None) -> dict[str, Any]:
-    """Where metres come from, and how long the backbone's unit is in them.
-
-    independent_depth: whether the depth tells tracking something that the pictures' correspondences do not.
-    """
-    figures: dict[str, Any] = {"independent_depth": depths.metric}
-    if reference is not None:
-        return figures | {
-            "metric": True,
-            "scale_from": "reference",
-            "metres_per_unit": round(reference.factor * scale.value, 6),
-            "reference_relative_sd": round(reference.relative_sd, 5),
-            "reference_keyframes": reference.keyframes,
-        }
-    if not depths.metric:
-        return figures | {"scale_from": "nothing: lengths have no unit"}
-    figures["scale_from"] = "depth"
-    if scale.of_frame:
-        figures |= {"metres_per_unit": round(scale.value, 6), "scale_spread": round(scale.spread, 5)}
-    return figures
 
 
 STAGE = Stage(

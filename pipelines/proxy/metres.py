@@ -1,0 +1,81 @@
+"""Where the run's metres come from: the depth itself, something that the user knows, or nowhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from formats.errors import InputError
+from pipelines.frames.source import open_source
+from pipelines.proxy.providers import DepthEstimate, DepthProvider
+from pipelines.proxy.scale import DepthScale
+from pipelines.proxy.scale_reference import ReferenceScale, distance_scale, height_scale, parse_reference
+from pipelines.proxy.segments import SegmentLabels
+from pipelines.proxy.sequence import Sequence
+from pipelines.stages import StageContext
+from pipelines.types import Frame
+
+
+def reference_scale(
+    context: StageContext,
+    sequence: Sequence,
+    frames: list[Frame],
+    depths: DepthProvider,
+    scale: DepthScale,
+    depth_of: Callable[[Frame], DepthEstimate],
+) -> ReferenceScale | None:
+    """Metres per unit of the depth by what the user knows; None without that, and where the depth is metric anyway.
+
+    Raises InputError when the reference cannot be measured in this scene.
+    """
+    config = context.config.proxy
+    known = parse_reference(config.scale_ref)
+    if known is None:
+        return None
+
+    def in_backbone_unit(frame: Frame) -> DepthEstimate:
+        estimate = depth_of(frame)
+        return replace(estimate, depth=(estimate.depth / np.float32(scale.value)).astype(np.float32))
+
+    if known.picture:
+        source = open_source(context.source, context.config.run.format)
+        found = distance_scale(known, source, sequence, frames, depth_of)
+    else:
+        heights = SegmentLabels(sequence, config.max_classes, context.progress).heights(frames, in_backbone_unit)
+        if len(heights) == 0 or np.median(heights) <= 0:
+            raise InputError(
+                f"--scale-ref {config.scale_ref}: no floor was found in the scene. Give a distance between two points"
+            )
+        found = height_scale(known, heights * scale.value)
+    if depths.metric:
+        context.warn(
+            f"{depths.name} is metric, so the reference {config.scale_ref} is not used; it would make lengths "
+            f"{found.factor - 1:+.1%} longer"
+        )
+        return None
+    return found
+
+
+def scale_figures(depths: DepthProvider, scale: DepthScale, reference: ReferenceScale | None) -> dict[str, Any]:
+    """Where metres come from, and how long the backbone's unit is in them.
+
+    independent_depth: whether the depth tells tracking something that the pictures' correspondences do not.
+    """
+    figures: dict[str, Any] = {"independent_depth": depths.metric}
+    if reference is not None:
+        return figures | {
+            "metric": True,
+            "scale_from": "reference",
+            "metres_per_unit": round(reference.factor * scale.value, 6),
+            "reference_relative_sd": round(reference.relative_sd, 5),
+            "reference_keyframes": reference.keyframes,
+        }
+    if not depths.metric:
+        return figures | {"scale_from": "nothing: lengths have no unit"}
+    figures["scale_from"] = "depth"
+    if scale.of_frame:
+        figures |= {"metres_per_unit": round(scale.value, 6), "scale_spread": round(scale.spread, 5)}
+    return figures
