@@ -13,6 +13,7 @@ from pipelines.evaluation.depth_error import DepthErrorSum
 from pipelines.evaluation.image_quality import psnr, ssim
 from pipelines.evaluation.label_cells import label_cells
 from pipelines.evaluation.label_score import Counts, count_labels, indices_by_name, renamed
+from pipelines.evaluation.perceptual import open_lpips
 from pipelines.evaluation.trajectory_error import AbsoluteError
 from pipelines.evaluation.truth import MatchedTruth
 from pipelines.evaluation.views import MapView, view_map
@@ -28,13 +29,14 @@ AT_TRUE_POSES, AT_REFINED_POSES = " at true poses", " at refined poses"
 
 @dataclass(frozen=True)
 class MeasuredView:
-    """One rendered frame; depth_l1 in the run's unit, NaN without truth.
+    """One rendered frame; lpips NaN where it cannot be had; depth_l1 in the run's unit, NaN without truth.
     label_accuracy: share of the pixels with a true class that have it; NaN where the classes' names differ."""
 
     frame_id: int
     kind: str
     psnr: float
     ssim: float
+    lpips: float
     depth_l1: float
     label_accuracy: float
 
@@ -48,12 +50,13 @@ class Measured:
 
     def __init__(self, names: tuple[str, ...], true_names: tuple[str, ...]) -> None:
         self.views: list[MeasuredView] = []
+        self.lpips = open_lpips()
         self.depth = DepthErrorSum()
         self.match = indices_by_name(names, true_names)
         self.confusion: Counts = np.zeros((len(true_names), len(names) + 1), np.int64)
 
     def images(self) -> dict[str, Any]:
-        """Mean PSNR and SSIM by kind of view."""
+        """Mean PSNR, SSIM and LPIPS by kind of view."""
         cells: dict[str, Any] = {}
         for kind in dict.fromkeys(v.kind for v in self.views):
             chosen = [v for v in self.views if v.kind == kind]
@@ -61,10 +64,13 @@ class Measured:
             cells[kind] = {
                 "psnr": float(np.mean(finite)) if finite else None,
                 "ssim": float(np.mean([v.ssim for v in chosen])),
+                "lpips": {"missing": self.lpips}
+                if isinstance(self.lpips, str)
+                else float(np.mean([v.lpips for v in chosen])),
                 "views": len(chosen),
             }
         if HELD_OUT not in cells:
-            cells[HELD_OUT] = {"missing": "no frame was held out; reconstruct with --set mapping.hold_out=8"}
+            cells[HELD_OUT] = {"missing": "no frame was held out; reconstruct with --hold-out 8"}
         return cells
 
     def cells(self, outcome: Outcome, matched: MatchedTruth) -> dict[str, Any]:
@@ -169,7 +175,8 @@ def _measure(
             depth_l1 = _add_depth(measured, view, pixels.sample(depth))
         if (labels := matched.sequence.labels(index)) is not None:
             accuracy = _add_labels(measured, outcome, view, pixels.sample(labels))
-    return MeasuredView(frame_id, kind, psnr(picture, photo), ssim(picture, photo), depth_l1, accuracy)
+    perceived = float("nan") if isinstance(measured.lpips, str) else measured.lpips(picture, photo)
+    return MeasuredView(frame_id, kind, psnr(picture, photo), ssim(picture, photo), perceived, depth_l1, accuracy)
 
 
 def _add_depth(measured: Measured, view: MapView, truth: NDArray[np.float32]) -> float:

@@ -68,7 +68,11 @@ def _image_rows(cells: dict[str, Any], stage: str) -> list[Row]:
             continue
         text = f"{_text(cell['psnr'], '.2f')} dB, {cell['ssim']:.4f}"
         rows.append((f"PSNR, SSIM {kind}", text, f"{cell['views']} views, map of {stage}"))
-    return rows
+    lpips = {kind: cell["lpips"] for kind, cell in cells.items() if "lpips" in cell}
+    known = [f"{kind} {value:.4f}" for kind, value in lpips.items() if isinstance(value, float)]
+    if known:
+        return [*rows, ("LPIPS", ", ".join(known), "AlexNet")]
+    return rows + [row for value in list(lpips.values())[:1] for row in _missing("LPIPS", value)]
 
 
 def _depth_rows(cells: dict[str, Any]) -> list[Row]:
@@ -93,9 +97,12 @@ def _label_rows(cells: dict[str, Any]) -> list[Row]:
         return rows
     if "missing" in cells:
         return _missing("mIoU, pixel accuracy", cells)
-    worst = sorted(cells["class_iou"].items(), key=lambda item: item[1])[:3]
-    of = f"{cells['input']}; lowest: " + ", ".join(f"{n} {v:.0%}" for n, v in worst)
-    return [("mIoU, pixel accuracy", f"{cells['mean_iou']:.2%}, {cells['pixel_accuracy']:.2%}", of)]
+    of = f"{cells['input']}; over the {len(cells['class_iou'])} classes of the truth"
+    classes = ", ".join(f"{n} {v:.1%}" for n, v in sorted(cells["class_iou"].items(), key=lambda item: -item[1]))
+    return [
+        ("mIoU, pixel accuracy", f"{cells['mean_iou']:.2%}, {cells['pixel_accuracy']:.2%}", of),
+        ("IoU of each class", classes, f"{cells['unlabelled']:.1%} of the pixels were given no class"),
+    ]
 
 
 def _mesh_rows(cells: dict[str, Any]) -> list[Row]:
