@@ -228,6 +228,13 @@ def load_proxy_maps(path: Path) -> ProxyMaps:
     )
 
 
+def save_frame_scales(folder: Path, scales: dict[int, float], spreads: dict[int, float]) -> None:
+    """[{"frame_id", "scale", "spread"}]: proxy depth over the depth of the backbone's points, and how its own points
+    stray from that, relatively."""
+    rows = [{"frame_id": i, "scale": round(s, 6), "spread": round(spreads[i], 6)} for i, s in scales.items()]
+    write_json(folder / "frame_scales.json", rows)
+
+
 def save_descriptors(folder: Path, vectors: dict[int, NDArray[np.float32]]) -> None:
     """One npz; nothing where there are none."""
     if vectors:

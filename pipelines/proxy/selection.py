@@ -10,6 +10,7 @@ from formats.datasets import Sequence as Recording
 from formats.errors import InputError
 from pipelines.config import ProxyConfig
 from pipelines.progress import Progress, log
+from pipelines.proxy.aligned import AlignedDepth
 from pipelines.proxy.files_depth import FilesDepth
 from pipelines.proxy.files_labels import FilesLabels
 from pipelines.proxy.fused import FusedDepth
@@ -83,7 +84,9 @@ def open_depth(around: Surroundings) -> DepthProvider:
     choice = choose_depth(around.config)
     if choice.kind == "multiview":
         return _multiview(around)
-    learned = open_learned_depth(around, choice)
+    learned: DepthProvider = open_learned_depth(around, choice)
+    if isinstance(learned, OnnxDepth) and choice.card is not None and choice.card.relative:
+        learned = AlignedDepth(learned, around.sequence, choice.card.relative)
     fuse = around.config.fuse == "always" or (around.config.fuse == "learned" and choice.card is not None)
     return _fused(around, learned) if fuse else learned
 

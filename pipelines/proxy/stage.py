@@ -29,6 +29,7 @@ from pipelines.run_folder import (
     proxy_path,
     save_classes,
     save_descriptors,
+    save_frame_scales,
     save_mirror_pairs,
     save_proxy_maps,
     write_json,
@@ -69,6 +70,7 @@ def run(context: StageContext) -> dict[str, Any]:
     save_classes(context.folder, semantics.classes())
     agreements, descriptors = _maps_pass(context, sequence, frames, semantics, scale, metres)
     save_descriptors(context.folder, descriptors)
+    save_frame_scales(context.folder, scale.of_frame, scale.spread_in)
     mirrors = _symmetry_pass(context, sequence, frames, scale, metres) if context.config.proxy.symmetry else {}
     report = {
         **_report(context, frames, depths, semantics, agreements),

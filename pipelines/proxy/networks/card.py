@@ -10,6 +10,8 @@ multiple = 28                     # sides are multiples of this, near `pixels` i
 pixels = 263424
 output = "predicted_depth"
 canonical_focal = 1000.0          # depth · focal / canonical_focal is metres; 0: depth is metres as it comes
+relative = ""                     # else "scale", "depth" or "inverse": depth up to scale; depth, or inverse depth, up
+                                  # to scale and shift; each frame is then aligned to the triangulated points
 valid = [0.1, 200.0]              # values at or beyond these stops are unknown
 confidence = "confidence"         # an output in 0..1, when there is one
 normals = "predicted_normal"      # an output of unit normals, and one of how sure they are (any positive numbers)
@@ -55,6 +57,7 @@ class Card:
     pixels: int = 448 * 588
     align_corners: bool = False
     canonical_focal: float = 0.0
+    relative: str = ""
     valid: tuple[float, ...] = (0.0, float("inf"))
     confidence: str = ""
     normals: str = ""
@@ -166,6 +169,7 @@ def _check(card: Card, path: Path) -> None:
         "multiple is 1..512": 1 <= card.multiple <= 512,
         "pixels is 1000..10000000": 1000 <= card.pixels <= 10_000_000,
         "valid is [lowest, highest]": len(card.valid) == 2 and 0 <= card.valid[0] < card.valid[1],
+        "relative is scale, depth or inverse": card.relative in ("", "scale", "depth", "inverse"),
         "canonical_focal is 0 or positive": card.canonical_focal >= 0,
         "groups has one name for each class": len(card.groups) in (0, len(card.classes)),
         "segmentation needs classes": card.is_clustered or card.task == "depth" or 1 <= len(card.classes) <= 10_000,
