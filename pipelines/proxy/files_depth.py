@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
-from formats.images import MAX_IMAGE_PIXELS, read_depth_png, read_grey_png
+from formats.images import MAX_IMAGE_PIXELS, image_size, read_depth_png, read_grey_png
 from pipelines.proxy.matching_files import find_folder, match_files
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.sequence import Sequence, resample_nearest
@@ -84,8 +84,22 @@ def clean_depth(depth: NDArray[np.float32]) -> tuple[NDArray[np.float32], int]:
 
 def require_aspect(path: Path, array: NDArray, sequence: Sequence) -> None:
     """Raise InputError unless a map has the frames' shape at some scale (a pixel of rounding is allowed)."""
+    require_size(path, array.shape[1], array.shape[0], sequence)
+
+
+def require_sizes(files: list[Path], sequence: Sequence) -> None:
+    """`require_aspect` of many files by their headers alone, without reading what they hold."""
+    for path in files:
+        if path.suffix.lower() == ".npy":
+            height, width = _open_npy(path).shape
+            require_size(path, width, height, sequence)
+        elif path.suffix.lower() in (".png", ".tif", ".tiff"):
+            require_size(path, *image_size(path), sequence)
+
+
+def require_size(path: Path, width: int, height: int, sequence: Sequence) -> None:
+    """Raise InputError unless width x height has the frames' shape at some scale (a pixel of rounding is allowed)."""
     frame = sequence.calibration.intrinsics
-    height, width = array.shape[:2]
     # Cross-multiplied aspect ratios, with one pixel of slack on the smaller image.
     if abs(width * frame.height - height * frame.width) > max(frame.width, frame.height, width, height):
         raise InputError(
@@ -96,12 +110,13 @@ def require_aspect(path: Path, array: NDArray, sequence: Sequence) -> None:
 
 def _read(path: Path, unit: float) -> NDArray[np.float32]:
     if path.suffix.lower() == ".npy":
-        return _read_npy(path)
+        return np.array(_open_npy(path), dtype=np.float32)
     stored = read_depth_png(path)
     return np.where(stored == _INVALID_U16, 0, stored).astype(np.float32) * np.float32(unit)
 
 
-def _read_npy(path: Path) -> NDArray[np.float32]:
+def _open_npy(path: Path) -> NDArray[np.floating]:
+    """Mapped, not read: (h, w) floats. Raises InputError for anything else."""
     try:
         stored = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
@@ -111,7 +126,7 @@ def _read_npy(path: Path) -> NDArray[np.float32]:
         raise InputError(f"{path}: holds {stored.dtype} {shape}; depth is a float array (height, width) in metres")
     if stored.size > MAX_IMAGE_PIXELS:
         raise InputError(f"{path}: holds {stored.size} values, more than {MAX_IMAGE_PIXELS}. Reduce it")
-    return np.array(stored, dtype=np.float32)
+    return stored
 
 
 def _match_confidence(depth_folder: Path, sequence: Sequence, is_video: bool) -> dict[int, Path]:

@@ -9,6 +9,8 @@ from pipelines.config import Config
 from pipelines.frames.recording import open_recording
 from pipelines.frames.source import open_source
 from pipelines.progress import SilentProgress
+from pipelines.proxy.files_depth import FilesDepth, require_sizes
+from pipelines.proxy.files_labels import FilesLabels
 from pipelines.proxy.networks.identity import card_identity, files_identity
 from pipelines.proxy.scale_reference import require_reference_in
 from pipelines.proxy.selection import (
@@ -42,14 +44,19 @@ def proxy_inputs(source: Path, config: Config) -> dict[str, Any]:
 
 
 def check_proxy(source: Path, config: Config) -> None:
-    """Open the networks, so that InputError tells of one that is not what its card says; read the scale reference."""
+    """InputError for a network that is not what its card says, a map of another shape than the pictures, and a scale
+    reference that makes no sense."""
     if config.proxy.scale_ref:
         require_reference_in(open_source(source, config.run.format), config.proxy.scale_ref)
     depth, semantics = choose_depth(config.proxy), choose_semantics(config.proxy)
-    if depth.card is not None:
-        open_learned_depth(_before_frames(source, config), depth)
-    if semantics.card is not None:
-        open_learned_semantics(_before_frames(source, config), semantics)
+    opened: list[object] = []
+    if depth.kind in ("files", "onnx"):
+        opened.append(open_learned_depth(_before_frames(source, config), depth))
+    if semantics.kind in ("files", "onnx"):
+        opened.append(open_learned_semantics(_before_frames(source, config), semantics))
+    for provider in opened:
+        if isinstance(provider, FilesDepth | FilesLabels):
+            require_sizes(provider.files(), _before_frames(source, config).sequence)
 
 
 def _before_frames(source: Path, config: Config) -> Surroundings:

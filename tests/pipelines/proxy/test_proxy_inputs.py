@@ -96,6 +96,11 @@ def another_shape(folder: Path) -> str:
     return "files"
 
 
+def one_of_another_shape(folder: Path) -> str:
+    write_grey_png(sorted((folder / "depth").iterdir())[7], np.ones((100, 100), np.uint16))
+    return "files"
+
+
 def eight_bits(folder: Path) -> str:
     for path in (folder / "depth").iterdir():
         cv2.imwrite(str(path), np.ones((192, 256, 3), np.uint8))
@@ -122,6 +127,7 @@ def wrong_weights(folder: Path) -> str:
     [
         (no_folder, "no folder with depth files"),
         (another_shape, "not the shape of the frames"),
+        (one_of_another_shape, "000007.png is 100x100, which is not the shape"),
         (eight_bits, "depth"),
         (no_card, "cannot read the card"),
         (no_weights, r"no net\.onnx beside the card"),
