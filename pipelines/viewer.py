@@ -48,6 +48,7 @@ class Viewer:
         self._cameras = [self._add_camera(i, camera) for i, camera in enumerate(scene.cameras)]
         self._path = self._add_path()
         self._mesh = self._add_mesh()
+        self.boxes: dict[str, Any] = {}
         self._add_controls()
         self._place_clients()
 
@@ -56,12 +57,26 @@ class Viewer:
         """Where to look."""
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
-    def show(self, mode: str) -> None:
-        """Colour the Gaussians by "colour", "classes" or "distance"."""
+    def show(self, mode: str, client: Any = None) -> None:
+        """Colour the Gaussians by one of `MODES`; depth is seen from where `client` looks, else the first camera."""
         s = self.scene
+        colors = s.depth_colors(*self._eye(client)) if mode == "depth" else s.colors[mode]
         self._splats = self.server.scene.add_gaussian_splats(
-            "/map", s.centers, s.covariances, s.colors[mode].astype(np.float32) / 255, s.opacities
+            "/map", s.centers, s.covariances, colors.astype(np.float32) / 255, s.opacities
         )
+
+    def _eye(self, client: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(position, direction of view) as shown."""
+        if client is not None:
+            turn = Rotation.from_quat(np.asarray(client.camera.wxyz)[[1, 2, 3, 0]]).as_matrix()
+            return np.asarray(client.camera.position), turn[:, 2]
+        if self.scene.cameras:
+            world_from_cam = self.scene.cameras[0].world_from_cam
+            return world_from_cam[:3, 3] * self.scene.scale, world_from_cam[:3, 2]
+        return self._outside(), np.array([0.0, 2.0, 7.0]) / np.sqrt(53)
+
+    def _outside(self) -> NDArray[np.float64]:
+        return np.asarray(np.median(self.scene.centers, axis=0) + np.array([0.0, -2.0, -7.0]), np.float64)
 
     def wait(self) -> None:
         """Until the process is interrupted."""
@@ -74,8 +89,11 @@ class Viewer:
     def _add_controls(self) -> None:
         gui = self.server.gui
         gui.add_markdown(f"**{self.scene.title}**: {len(self.scene.centers):,} Gaussians")
-        self.mode = gui.add_dropdown("Gaussians", tuple(m for m in MODES if m in self.scene.colors))
-        self.mode.on_update(lambda _: self.show(self.mode.value))
+        modes = tuple(m for m in MODES if m in self.scene.colors or m == "depth")
+        self.mode = gui.add_dropdown("Gaussians", modes)
+        self.mode.on_update(lambda event: self.show(self.mode.value, event.client))
+        depth_here = gui.add_button("Depth from here", hint="Colour by depth, seen from the present view")
+        depth_here.on_click(self._show_depth)
         self._checkbox("Show Gaussians", True, lambda on: setattr(self._splats, "visible", on))
         if self._cameras:
             self._checkbox("Cameras", True, self._show_cameras)
@@ -83,10 +101,14 @@ class Viewer:
             self._checkbox("Mesh", False, lambda on: setattr(self._mesh, "visible", on))
         if self.scene.cameras:
             blank = np.full((30, 40, 3), 235, np.uint8)
-            self._preview = gui.add_image(blank, label="frame (click a camera)", format="jpeg")
+            self.preview = gui.add_image(blank, label="frame (click a camera)", format="jpeg")
+
+    def _show_depth(self, event: Any) -> None:
+        self.mode.value = "depth"
+        self.show("depth", event.client)
 
     def _checkbox(self, name: str, start: bool, change: Callable[[bool], None]) -> None:
-        box = self.server.gui.add_checkbox(name, start)
+        box = self.boxes[name] = self.server.gui.add_checkbox(name, start)
         box.on_update(lambda _: change(bool(box.value)))
 
     def _show_cameras(self, on: bool) -> None:
@@ -99,7 +121,7 @@ class Viewer:
             f"/cameras/{number:05d}", camera.fov, camera.aspect, scale=_FRUSTUM, color=(37, 99, 235),
             thickness=1.5, thickness_units="screen", wxyz=wxyz, position=position,
         )  # fmt: skip
-        handle.on_click(lambda event: self._visit(camera, event.client))
+        handle.on_click(lambda event: self.visit(camera, event.client))
         return handle
 
     def _pose(self, camera: ViewerCamera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -107,13 +129,15 @@ class Viewer:
         quat_xyzw = Rotation.from_matrix(camera.world_from_cam[:3, :3]).as_quat()
         return quat_xyzw[[3, 0, 1, 2]], camera.world_from_cam[:3, 3] * self.scene.scale
 
-    def _visit(self, camera: ViewerCamera, client: Any) -> None:
-        """Look from the clicked camera, and show its frame."""
+    def visit(self, camera: ViewerCamera, client: Any) -> None:
+        """Look from a camera, as after a click on it, and show its frame."""
         if client is not None:
             self._move(client, camera)
+            if self.mode.value == "depth":
+                self.show("depth", client)
         if self.scene.run is not None:
-            self._preview.image = _reduced(self.scene.run.image(camera.frame))
-            self._preview.label = f"{camera.frame.name}, {camera.frame.timestamp:.2f} s"
+            self.preview.image = _reduced(self.scene.run.image(camera.frame))
+            self.preview.label = f"{camera.frame.name}, {camera.frame.timestamp:.2f} s"
 
     def _move(self, client: Any, camera: ViewerCamera) -> None:
         wxyz, position = self._pose(camera)
@@ -132,9 +156,8 @@ class Viewer:
                     client.camera.position = position - 0.9 * forward + 0.5 * self.scene.up
                     client.camera.look_at = position + 1.5 * forward
                 return
-            middle = np.median(self.scene.centers, axis=0)
-            client.camera.position = middle + np.array([0.0, -2.0, -7.0])
-            client.camera.look_at = middle
+            client.camera.position = self._outside()
+            client.camera.look_at = np.median(self.scene.centers, axis=0)
 
         self.server.on_client_connect(place)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from formats.errors import InputError
-from formats.gaussian_ply import read_gaussian_ply
+from formats.gaussian_files import read_gaussians
 from pipelines.evaluation.camera_paths import upward
 from pipelines.evaluation.measure import evenly
 from pipelines.outcome import Outcome, load_outcome
@@ -19,7 +19,7 @@ from pipelines.proxy.palette import class_colors
 from pipelines.run_folder import RunFolder
 from pipelines.types import Frame
 
-MODES = ("colour", "classes", "distance")
+MODES = ("colour", "classes", "depth")
 MOST_CAMERAS = 60
 _USUAL_SIZE = 5.0
 """The scene is shown this large: covariances travel in half precision, which has few digits for small numbers."""
@@ -37,8 +37,9 @@ class ViewerCamera:
 
 @dataclass(frozen=True)
 class ViewerScene:
-    """centers (M, 3), covariances (M, 3, 3), opacities (M, 1); colors: mode → (M, 3) uint8; `scale` multiplies the
-    run's lengths for show; up (3,); path (N, 3) camera centres; mesh_file of the run, if there is one."""
+    """centers (M, 3), covariances (M, 3, 3), opacities (M, 1); colors: mode → (M, 3) uint8, of all modes but depth,
+    which is seen from somewhere; `scale` multiplies the run's lengths for show; up (3,); path (N, 3) camera centres;
+    mesh_file of the run, if there is one."""
 
     title: str
     centers: NDArray[np.float32]
@@ -52,13 +53,26 @@ class ViewerScene:
     mesh_file: Path | None = None
     run: RunFolder | None = None
 
+    def depth_colors(self, position: NDArray[np.float64], forward: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """(M, 3) near red, far blue: the depth of each Gaussian along the unit vector `forward` from `position` (3,),
+        both as shown. Behind the viewer it is as near as can be."""
+        depth = (self.centers - position.astype(np.float32)) @ forward.astype(np.float32)
+        seen = depth[depth > 0]
+        near, far = np.quantile(seen, (0.02, 0.98)) if len(seen) else (0.0, 1.0)
+        # Inverse depth, as in the pictures of the report: what is near has the finer steps.
+        low, high = 1 / max(float(far), 1e-6), 1 / max(float(near), 1e-6)
+        share = (1 / np.maximum(depth, max(float(near), 1e-6)) - low) / max(high - low, 1e-9)
+        shades = np.clip(share * 255, 0, 255).astype(np.uint8)
+        colors = np.asarray(cv2.applyColorMap(shades[:, None], cv2.COLORMAP_TURBO), np.uint8)
+        return np.ascontiguousarray(colors.reshape(-1, 3)[:, ::-1])
+
 
 def load_scene(path: Path) -> ViewerScene:
-    """Of a run folder or a .ply of Gaussians. Raises InputError for anything else, or a run without a map."""
+    """Of a run folder or a file of Gaussians. Raises InputError for anything else, or a run without a map."""
     if path.is_file():
-        return _from_ply(path)
+        return _from_file(path)
     if not path.is_dir():
-        raise InputError(f"{path}: there is no such run folder or PLY file")
+        raise InputError(f"{path}: there is no such run folder or splat file")
     return _from_run(load_outcome(RunFolder(path)))
 
 
@@ -78,7 +92,7 @@ def _from_run(outcome: Outcome) -> ViewerScene:
         centers=(means * scale).astype(np.float32),
         covariances=((radii * scale) ** 2)[:, None, None].astype(np.float32) * np.eye(3, dtype=np.float32),
         opacities=m.opacities.detach().cpu().numpy()[:, None].astype(np.float32),
-        colors=_colors(m.colors.cpu().numpy(), labels, list(outcome.classes.colors), means, centers),
+        colors=_colors(m.colors.cpu().numpy(), labels, list(outcome.classes.colors)),
         scale=scale,
         up=upward(world_from_cam[t.is_posed]),
         cameras=[
@@ -91,21 +105,20 @@ def _from_run(outcome: Outcome) -> ViewerScene:
     )
 
 
-def _from_ply(path: Path) -> ViewerScene:
-    cloud = read_gaussian_ply(path)
+def _from_file(path: Path) -> ViewerScene:
+    cloud = read_gaussians(path)
     if len(cloud) == 0:
         raise InputError(f"{path}: holds no Gaussians")
     scale = _scale(cloud.means, np.zeros((0, 3)))
     turn = Rotation.from_quat(cloud.quat_wxyz[:, [1, 2, 3, 0]]).as_matrix()
     axes = turn * (np.exp(cloud.log_scales) * scale)[:, None, :]
     classes = 0 if cloud.class_ids is None else int(cloud.class_ids.max()) + 1
-    middle = np.median(cloud.means, axis=0, keepdims=True).astype(np.float64)
     return ViewerScene(
         title=path.name,
         centers=(cloud.means * scale).astype(np.float32),
         covariances=(axes @ axes.transpose(0, 2, 1)).astype(np.float32),
         opacities=(1 / (1 + np.exp(-cloud.opacity_logits)))[:, None].astype(np.float32),
-        colors=_colors(cloud.colors, cloud.class_ids, list(class_colors(classes)), cloud.means, middle),
+        colors=_colors(cloud.colors, cloud.class_ids, list(class_colors(classes))),
         scale=scale,
         up=np.array([0.0, -1.0, 0.0]),
     )
@@ -119,22 +132,12 @@ def _scale(means: NDArray, centers: NDArray) -> float:
 
 
 def _colors(
-    rgb: NDArray,
-    labels: NDArray[np.uint8] | None,
-    palette: list[tuple[int, int, int]],
-    means: NDArray,
-    centers: NDArray,
+    rgb: NDArray, labels: NDArray[np.uint8] | None, palette: list[tuple[int, int, int]]
 ) -> dict[str, NDArray[np.uint8]]:
-    """(M, 3) for each of `MODES`; classes only where there are labels."""
+    """(M, 3) in own colours, and in those of the classes where there are labels."""
     colors = {"colour": np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)}
     if labels is not None and palette:
         table = np.full((256, 3), 128, np.uint8)
         table[: len(palette)] = np.array(palette, np.uint8)
         colors["classes"] = table[labels]
-    away = np.linalg.norm(means - centers.mean(axis=0), axis=1)
-    low, high = np.quantile(away, (0.02, 0.98))
-    share = np.clip((high - away) / max(float(high - low), 1e-9) * 255, 0, 255).astype(np.uint8)
-    colors["distance"] = np.asarray(cv2.applyColorMap(share[:, None], cv2.COLORMAP_TURBO), np.uint8).reshape(-1, 3)[
-        :, ::-1
-    ]
     return colors

@@ -21,7 +21,7 @@ section{background:var(--card);border:1px solid var(--line);border-radius:12px;p
 .chips{display:flex;flex-wrap:wrap;gap:10px}
 .chip{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:8px 14px;min-width:120px}
 .chip b{display:block;font-size:20px}.chip span{color:var(--soft);font-size:12px}
-.two{display:grid;grid-template-columns:repeat(auto-fit,minmax(440px,1fr));gap:14px}
+.two{display:grid;grid-template-columns:repeat(auto-fill,minmax(440px,1fr));gap:14px}
 svg.plot{width:100%;height:auto;display:block}
 table{border-collapse:collapse;width:100%;font-size:14px}
 th,td{text-align:left;padding:6px 10px;border-bottom:1px solid var(--line);vertical-align:top}
@@ -55,10 +55,11 @@ def section(title: str, *content: str, kind: str = "") -> str:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Cells are plain text."""
-    head = "".join(f"<th>{escape(h)}</th>" for h in header)
+    """Cells are plain text; a header of empty texts is left out."""
+    cells = "".join(f"<th>{escape(h)}</th>" for h in header)
+    head = f"<thead><tr>{cells}</tr></thead>" if any(header) else ""
     body = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in row) + "</tr>" for row in rows)
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    return f"<table>{head}<tbody>{body}</tbody></table>"
 
 
 def bullets(lines: Iterable[str]) -> str:

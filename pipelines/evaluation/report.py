@@ -15,7 +15,7 @@ from pipelines.evaluation.html import bullets, chips, page, section, table
 from pipelines.evaluation.plots import RED, Line, plot
 from pipelines.evaluation.report_views import RenderedViews, class_section, quality_section, render_views
 from pipelines.evaluation.table import evaluation_table
-from pipelines.evaluation.write import evaluation_file, trajectory_plots
+from pipelines.evaluation.write import PATH_FROM_ABOVE, evaluation_file, trajectory_plots
 from pipelines.export.readme import README
 from pipelines.outcome import Outcome, load_outcome
 from pipelines.progress import Progress, SilentProgress
@@ -44,7 +44,7 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
             _found_section(outcome, sparse, loops),
             _path_section(outcome),
             quality_section(outcome, capture, views),
-            "" if evaluation is None else _truth_section(evaluation),
+            "" if evaluation is None else _truth_section(evaluation, run),
             "" if views is None else section("What the map shows", views.sheet),
             "" if views is None else class_section(outcome, views),
             _time_section(outcome),
@@ -131,14 +131,16 @@ def _path_section(outcome: Outcome) -> str:
     return section("Camera path", '<div class="two">', *trajectory_plots(outcome, None), "</div>")
 
 
-def _truth_section(evaluation: dict[str, Any]) -> str:
+def _truth_section(evaluation: dict[str, Any], run: RunFolder) -> str:
     lines = evaluation_table(evaluation).splitlines()
     cells = [[c.strip() for c in line.strip("|").split("|")] for line in lines if line.startswith("| ")]
     errors = np.array(evaluation.get("frame errors", []), np.float64).reshape(-1, 2)
     drawn = ""
     if len(errors):
         points = np.stack([errors[:, 0], 100 * errors[:, 1]], axis=1)
-        drawn = plot("Distance from the true camera", "frame", "cm", [Line(points, RED, "")], height=240)
+        drawn = plot("Distance from the true camera", "frame", "cm", [Line(points, RED, "")])
+    beside = evaluation_file(run).with_name(PATH_FROM_ABOVE)
+    drawn += beside.read_text(encoding="utf-8") if beside.exists() else ""
     return section(
         f"Against the truth: {evaluation['truth']}",
         f'<div class="two">{drawn}</div>',

@@ -32,6 +32,7 @@ from pipelines.progress import Progress
 from pipelines.run_folder import RunFolder
 
 FOLDER = "evaluation"
+PATH_FROM_ABOVE, PATH_FROM_THE_SIDE = "trajectory_top.svg", "trajectory_side.svg"
 SHEET_VIEWS = 6
 TITLES = ("frame", "map", "depth of the map", "true depth", "error, white = 10 %", "labels of the map", "true labels")
 
@@ -39,7 +40,7 @@ TITLES = ("frame", "map", "depth of the map", "true depth", "error, white = 10 %
 def write_evaluation(
     run: RunFolder, truth: Sequence, progress: Progress | None = None, max_views: int = 100, legacy: bool = False
 ) -> dict[str, Any]:
-    """Evaluate and write RUN/evaluation/: evaluation.json, evaluation.md, trajectory.svg, views.png.
+    """Evaluate and write RUN/evaluation/: evaluation.json, evaluation.md, two plots of the path, views.png.
 
     Returns the figures (see `evaluate_run`). Raises InputError as that does, before anything is written.
     """
@@ -50,8 +51,8 @@ def write_evaluation(
     write_text(folder / "evaluation.md", evaluation_table(result))
     matched = match_truth(outcome.frames, outcome.source_is_folder, truth)
     top, side = trajectory_plots(outcome, matched)
-    write_text(folder / "trajectory_top.svg", top)
-    write_text(folder / "trajectory_side.svg", side)
+    write_text(folder / PATH_FROM_ABOVE, top)
+    write_text(folder / PATH_FROM_THE_SIDE, side)
     if outcome.gaussian_map is not None:
         write_rgb(folder / "views.png", comparison_sheet(outcome, matched))
     return result

@@ -44,7 +44,7 @@ def oracle_run(truth: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Ora
     """Makes a run whose poses, depth and labels are the truth's, its world moved by a similarity.
 
     metric, rename (classes lose their names), wrong_poses (N, 3) metres added to the camera centres, video (the run
-    comes from a video and not from the folder).
+    comes from a video and not from the folder), pixel_stride (more makes fewer, larger Gaussians).
     """
 
     def make(
@@ -55,14 +55,15 @@ def oracle_run(truth: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Ora
         video: bool = False,
         hold_out: int = 0,
         mesh: bool = False,
+        pixel_stride: int = 3,
     ) -> RunFolder:
         run = RunFolder(tmp_path_factory.mktemp("oracle") / "walk.msgs")
         move = world_from_truth or Similarity(1.0, np.eye(3), np.zeros(3))
         frames = _write_frames(run, truth, video)
-        classes = _write_proxy(run, truth, frames, metric, rename)
+        _write_proxy(run, truth, frames, metric, rename)
         trajectory = _trajectory(truth, frames, move, wrong_centers)
         save_trajectory(run.stage("tracking"), trajectory)
-        gaussian_map, class_ids = _seeded_map(truth, move, len(classes))
+        gaussian_map, class_ids = _seeded_map(truth, move, pixel_stride)
         save_map(run.stage("mapping"), gaussian_map)
         save_trajectory(run.stage("mapping"), trajectory)
         write_json(run.stage("mapping") / "mapping.json", {"class_ids": class_ids})
@@ -125,8 +126,8 @@ def _trajectory(truth: Sequence, frames: list[Frame], move: Similarity, wrong_ce
     )
 
 
-def _seeded_map(truth: Sequence, move: Similarity, classes: int) -> tuple[GaussianMap, list[int]]:
-    """A Gaussian at every third pixel of every keyframe, as large as its pixels."""
+def _seeded_map(truth: Sequence, move: Similarity, stride: int) -> tuple[GaussianMap, list[int]]:
+    """A Gaussian at every `stride`-th pixel of every keyframe, as large as its pixels."""
     means, radii, colors, labels, anchors = [], [], [], [], []
     assert truth.camera is not None
     assert truth.world_from_cam is not None
@@ -134,13 +135,13 @@ def _seeded_map(truth: Sequence, move: Similarity, classes: int) -> tuple[Gaussi
         depth, label = truth.depth(i), truth.labels(i)
         assert depth is not None
         assert label is not None
-        v, u = np.mgrid[0 : depth.shape[0] : 3, 0 : depth.shape[1] : 3]
+        v, u = np.mgrid[0 : depth.shape[0] : stride, 0 : depth.shape[1] : stride]
         z = depth[v, u].astype(np.float64)
         c = truth.camera
         cam = np.stack([(u + 0.5 - c.cx) / c.fx * z, (v + 0.5 - c.cy) / c.fy * z, z], axis=-1)[z > 0]
         pose = truth.world_from_cam[i]
         means.append(move.apply(cam @ pose[:3, :3].T + pose[:3, 3]))
-        radii.append(move.scale * cam[:, 2] / c.fx * 1.3)
+        radii.append(move.scale * cam[:, 2] / c.fx * 1.3 * stride / 3)
         colors.append(truth.rgb(i)[v, u][z > 0] / 255.0)
         labels.append(label[v, u][z > 0])
         anchors.append(np.full(len(cam), i))

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from numpy.typing import NDArray
 
 from formats.errors import InputError
@@ -28,13 +29,28 @@ def test_scene_of_a_run(oracle_run: OracleRun) -> None:
     scene = load_scene(oracle_run().root)
     m = len(scene.centers)
     assert scene.covariances.shape == (m, 3, 3)
-    assert set(scene.colors) == {"colour", "classes", "distance"}
+    assert set(scene.colors) == {"colour", "classes"}
     assert all(c.shape == (m, 3) and c.dtype == np.uint8 for c in scene.colors.values())
     assert len(scene.cameras) == 8
     # Half precision keeps ten bits above 6e-5; smaller covariances would fade.
     assert np.median(scene.covariances[:, 0, 0]) > 6e-5
     assert 4 < np.ptp(np.quantile(scene.centers, (0.05, 0.95), axis=0), axis=0).max() < 7
     np.testing.assert_allclose(scene.up, (0, 0, 1), atol=0.1)  # the world's z axis
+
+
+def test_depth_is_seen_from_the_camera(oracle_run: OracleRun) -> None:
+    scene = load_scene(oracle_run().root)
+    camera = scene.cameras[0].world_from_cam
+    position, forward = camera[:3, 3] * scene.scale, camera[:3, 2]
+    depth = (scene.centers - position) @ forward
+    colors = scene.depth_colors(position, forward).astype(int)
+    order = np.argsort(depth)
+    near, far = colors[order[depth[order] > 0][:50]].mean(axis=0), colors[order[-50:]].mean(axis=0)
+    assert near[0] > near[2]  # red before blue
+    assert far[2] > far[0]
+    equal = np.abs(depth - np.median(depth)) < 1e-3
+    assert equal.sum() > 3
+    assert np.ptp(colors[equal], axis=0).max() <= 12  # one depth, one colour, however far to the side
 
 
 def test_scene_of_a_splat_file_by_another_program(shared_data: Path) -> None:
@@ -76,7 +92,7 @@ class Page:
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
-            answer = json.loads(self._socket.recv(timeout=60))
+            answer = json.loads(self._socket.recv(timeout=240))
             if answer.get("id") == self._number:
                 if "error" in answer:  # a tab between two documents has no picture
                     raise NotReady(answer["error"])
@@ -85,9 +101,9 @@ class Page:
     def scene(self) -> NDArray[np.uint8]:
         """The picture left of the controls and below the browser's notice, BGR."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[160:540, :600]
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[160:, :400]
 
-    def wait_for(self, seen: Callable[[NDArray[np.uint8]], bool], seconds: float = 90) -> NDArray[np.uint8]:
+    def wait_for(self, seen: Callable[[NDArray[np.uint8]], bool], seconds: float = 240) -> NDArray[np.uint8]:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             with suppress(NotReady):
@@ -102,7 +118,7 @@ def browser(profile: Path) -> Iterator[Page]:
     connect = pytest.importorskip("websockets.sync.client").connect
     command = [str(BROWSER), *FLAGS, "--remote-debugging-port=0", "--remote-allow-origins=*"]
     process = subprocess.Popen(
-        [*command, f"--user-data-dir={profile}", "--window-size=1000,700", "about:blank"], stderr=subprocess.DEVNULL
+        [*command, f"--user-data-dir={profile}", "--window-size=760,520", "about:blank"], stderr=subprocess.DEVNULL
     )
     try:
         port_file, end = profile / "DevToolsActivePort", time.monotonic() + 60
@@ -119,12 +135,23 @@ def browser(profile: Path) -> Iterator[Page]:
         process.wait()
 
 
+def changes(page: Page, before: NDArray[np.uint8], by: float = 10) -> NDArray[np.uint8]:
+    """Wait until the picture differs, and until it is one at all."""
+    after = page.wait_for(lambda p: np.abs(p.astype(float) - before).mean() > by)
+    assert after.std() > 20
+    return after
+
+
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
-def test_page_shows_the_map_and_switching_to_classes_changes_it(oracle_run: OracleRun, tmp_path: Path) -> None:
+def test_page_shows_the_map_and_every_control_changes_it(oracle_run: OracleRun, tmp_path: Path) -> None:
     pytest.importorskip("viser")
     from pipelines.viewer import open_viewer
 
-    run = oracle_run(metric=False)
+    # A browser without a GPU draws few Gaussians at a speed that a test can wait for.
+    run = oracle_run(metric=False, pixel_stride=8, mesh=True)
+    box = trimesh.creation.box((30, 30, 0.1))
+    box.visual.vertex_colors = np.tile([250, 240, 20, 255], (len(box.vertices), 1))
+    box.export(run.stage("export") / "mesh.glb")
     viewer = open_viewer(run.root, port=0)
     try:
         with browser(tmp_path / "profile") as page:
@@ -132,7 +159,16 @@ def test_page_shows_the_map_and_switching_to_classes_changes_it(oracle_run: Orac
             page.call("Page.navigate", url=viewer.url)
             colour = page.wait_for(lambda p: p.std() > 20 and (p < 240).mean() > 0.3)
             viewer.mode.value = "classes"
-            classes = page.wait_for(lambda p: np.abs(p.astype(float) - colour).mean() > 10)
-            assert classes.std() > 20
+            classes = changes(page, colour)
+            viewer.mode.value = "depth"
+            depth = changes(page, classes)
+            client = next(iter(viewer.server.get_clients().values()))
+            viewer.visit(viewer.scene.cameras[4], client)
+            elsewhere = changes(page, depth)
+            assert viewer.preview.label.startswith(viewer.scene.cameras[4].frame.name)
+            viewer.boxes["Show Gaussians"].value = False
+            bare = page.wait_for(lambda p: np.abs(p.astype(float) - elsewhere).mean() > 10)
+            viewer.boxes["Mesh"].value = True
+            page.wait_for(lambda p: np.abs(p.astype(float) - bare).mean() > 10)
     finally:
         viewer.stop()
