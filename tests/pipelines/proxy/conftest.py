@@ -29,8 +29,8 @@ def room() -> Room:
 def make_context(room: Room, tmp_path: Path) -> Callable[..., StageContext]:
     """A stage's surroundings over a finished frames stage; the source has depth and labels beside its pictures."""
 
-    def make(*settings: str, name: str = "run", backbone: bool = True) -> StageContext:
-        source = write_source(room, tmp_path / "source")
+    def make(*settings: str, name: str = "run", backbone: bool = True, room: Room = room) -> StageContext:
+        source = write_source(room, tmp_path / f"source of {name}")
         run = RunFolder(tmp_path / name)
         folder = run.stage("frames")
         save_frames(folder, room.frames)

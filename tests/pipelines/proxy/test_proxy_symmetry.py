@@ -1,20 +1,25 @@
 """Mirror symmetry: found in a room that is its own mirror image, silent in one that is not."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from proxy_room import Room, perfect_backbone
 
 from pipelines.geometry.camera import project, unproject, unproject_depth
 from pipelines.progress import SilentProgress
 from pipelines.proxy.mirror_features import mirror_descriptors, mirrored_matches
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.sequence import Sequence
+from pipelines.proxy.stage import run
 from pipelines.proxy.symmetry import find_mirror_planes, mirror_pairs
 from pipelines.run_folder import RunFolder, save_mirror_pairs
+from pipelines.stages import StageContext
 from pipelines.types import Calibration, Frame, Intrinsics, MirrorPairs, SparseModel
+from pipelines.world import WorldFrame
 
 CAMERA = Intrinsics(320, 240, 260, 260, 160, 120)
 HALF = np.array([2.0, 1.5, 3.0])
@@ -135,15 +140,44 @@ def test_too_little_to_see_is_silent() -> None:
     assert find_mirror_planes(lost, lost.frames, lambda f: estimates[f.id], SilentProgress()) == []
 
 
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_the_stage_leaves_pairs_in_the_unit_of_its_maps(
+    make_context: Callable[..., StageContext], symmetric: bool
+) -> None:
+    sequence, _ = walk(symmetric)
+    views = []
+    for pose in sequence.cam_from_world.values():
+        image, depth = picture(pose, symmetric)
+        views.append(WorldFrame(image, depth, np.ones(depth.shape, np.uint8), np.linalg.inv(pose), 0.0))
+    room = Room(views, sequence.frames, sequence.calibration, perfect_backbone(views, CAMERA))
+    context = make_context("proxy.depth=files", "proxy.semantics=files", "proxy.max_side=240", room=room)
+    report = run(context)
+    found = context.run.load_symmetry()
+    if not symmetric:
+        assert (report["mirror_planes"], report["mirror_pairs"], found) == (0, 0, {})
+        return
+    assert report["mirror_planes"] >= 1
+    assert report["mirror_pairs"] == sum(len(p) for p in found.values())
+    pairs, depth = found[0], views[0].depth
+    assert pairs.pairs[:, ::2].max() > 200  # pixels of the frame, not of the maps
+    first, second = (
+        depth[np.floor(pairs.pairs[:, k + 1]).astype(int), np.floor(pairs.pairs[:, k]).astype(int)] for k in (0, 2)
+    )
+    # Metres, although the backbone's unit is another.
+    error = np.abs((pairs.gain * first + pairs.offset) / second - 1)
+    assert 0 < np.median(error) < 0.01
+    assert np.abs(pairs.offset).max() > 0.1
+
+
 def test_pairs_are_kept_by_frame(tmp_path: Path) -> None:
-    run = RunFolder(tmp_path)
-    run.stage("proxy").mkdir()
+    folder = RunFolder(tmp_path)
+    folder.stage("proxy").mkdir()
     rng = np.random.default_rng(0)
     two, none = (MirrorPairs(*(rng.random((k, 4) if a == 0 else k, np.float32) for a in range(4))) for k in (2, 0))
-    save_mirror_pairs(run.stage("proxy"), {1: none})
-    assert run.load_symmetry() == {}
-    save_mirror_pairs(run.stage("proxy"), {3: two, 4: none, 5: two})
-    loaded = run.load_symmetry()
+    save_mirror_pairs(folder.stage("proxy"), {1: none})
+    assert folder.load_symmetry() == {}
+    save_mirror_pairs(folder.stage("proxy"), {3: two, 4: none, 5: two})
+    loaded = folder.load_symmetry()
     assert sorted(loaded) == [3, 5]
     np.testing.assert_array_equal(loaded[5].pairs, two.pairs)
     np.testing.assert_array_equal(loaded[3].offset, two.offset)
