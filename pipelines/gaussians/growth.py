@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,14 +13,14 @@ from pipelines.config import MappingConfig
 from pipelines.gaussians import densify
 from pipelines.gaussians.render import Rendering
 from pipelines.gaussians.schedule import Seeding
-from pipelines.gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_grid
+from pipelines.gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
 from pipelines.gaussians.state import OptimiserState, expose
 from pipelines.mapping.views import View
 
 GROWN_OPACITY, ERROR_OPACITY = 0.3, 0.1
 """Of Gaussians added to a map that is already there: opaque ones would hide what has been learnt."""
-_LOW_RELIABILITY = 0.35
-_HIGH_RELIABILITY = 0.85
+LOW_RELIABILITY = 0.35
+HIGH_RELIABILITY = 0.85
 _SOLID = 0.8
 """Silhouette above which the map knows the depth of a pixel."""
 
@@ -41,8 +41,9 @@ class Growth:
 
         `rendering`: the map as the view sees it, None while there is none.
         """
-        view, s = self.views[index], self.settings
-        pixels = self._grid(view)
+        view = self.views[index]
+        spacing = self._spacing(view)
+        pixels = spacing > 0
         if rendering is None:
             completed = self._completed(index)
         else:
@@ -50,8 +51,8 @@ class Growth:
             completed = self._completed(index) if what is Seeding.TRUSTED else self._completed_by_map(view, rendering)
         depth, trust = (torch.from_numpy(x).to(view.image.device) for x in (completed.depth, completed.trust))
         if what is Seeding.TRUSTED:
-            pixels &= trust > _LOW_RELIABILITY
-        self._append(index, pixels, depth, trust, s.seed_stride, SEED_OPACITY)
+            pixels &= trust > LOW_RELIABILITY
+        self._append(index, pixels, depth, trust, spacing, SEED_OPACITY)
 
     @torch.no_grad()
     def grow(self, index: int, rendering: Rendering) -> None:
@@ -59,24 +60,30 @@ class Growth:
         view, s = self.views[index], self.settings
         needed = self._needed(view, rendering)
         needed |= densify.wrong_classes(rendering.features[..., 3:], view.channels, view.label_weight)
-        grid = self._grid(view)
+        spacing = self._spacing(view)
+        grid = spacing > 0
         colors = expose(rendering.features[..., :3], self.state.view_tables[index])
         wrong = densify.color_errors(colors, view.colors, 1 - s.error_share) & ~grid
         depth, trust = self._grown_depth(view, rendering)
-        self._append(index, needed & grid, depth, trust, s.seed_stride, GROWN_OPACITY)
+        self._append(index, needed & grid, depth, trust, spacing, GROWN_OPACITY)
         self._append(index, wrong, depth, trust, 1.0, ERROR_OPACITY)
 
     @torch.no_grad()
-    def prune(self) -> None:
-        """Drop the Gaussians nobody sees."""
+    def prune(self, largest_weight: Callable[[], Tensor] | None = None) -> None:
+        """Drop the Gaussians that are too transparent, too large or of too low `largest_weight` (M,)."""
         parameters, s = self.state.parameters, self.settings
         bad = densify.useless(parameters.to_map(), s.prune_opacity, s.prune_radius * self.unit)
+        if largest_weight is not None and s.prune_weight > 0:
+            bad |= largest_weight() < s.prune_weight
         if bad.any():
             parameters.keep(~bad)
 
-    def _grid(self, view: View) -> Tensor:
-        height, width = view.depth.shape
-        return torch.from_numpy(seed_grid(height, width, self.settings.seed_stride)).to(view.image.device)
+    def _spacing(self, view: View) -> Tensor:
+        s = self.settings
+        image, depth = view.image.cpu().numpy(), view.depth.cpu().numpy()
+        return torch.from_numpy(seed_spacing(image, depth, s.seed_stride, s.fine_share, s.flat_share)).to(
+            view.image.device
+        )
 
     def _holes(self, rendering: Rendering) -> Tensor:
         """Condition (a)."""
@@ -94,9 +101,9 @@ class Growth:
         """(H, W) depth and trust: the proxy where it is reliable, else the map's own; 0 where neither knows."""
         # A trusted proxy is sharp at depth edges, where the map's blended depth lies between the surfaces.
         nearer = densify.hidden_surfaces(rendering.depth, view.depth, view.trust, self.settings.depth_tolerance)
-        use_map = (rendering.silhouette > _SOLID) & ~nearer & (view.trust < _HIGH_RELIABILITY)
-        proxy = torch.where(view.trust > _LOW_RELIABILITY, view.depth, 0.0)
-        return torch.where(use_map, rendering.depth, proxy), torch.where(use_map, _LOW_RELIABILITY, view.trust)
+        use_map = (rendering.silhouette > _SOLID) & ~nearer & (view.trust < HIGH_RELIABILITY)
+        proxy = torch.where(view.trust > LOW_RELIABILITY, view.depth, 0.0)
+        return torch.where(use_map, rendering.depth, proxy), torch.where(use_map, LOW_RELIABILITY, view.trust)
 
     def _completed(self, index: int) -> SeedDepth:
         view = self.views[index]
@@ -104,15 +111,17 @@ class Growth:
 
     def _completed_by_map(self, view: View, rendering: Rendering) -> SeedDepth:
         """The view's depth, completed from what the other views have put into the map around its holes."""
-        known = (rendering.silhouette > _SOLID) & (view.trust < _HIGH_RELIABILITY)
-        trust = torch.where(known, view.trust.clamp(min=2 * _LOW_RELIABILITY), view.trust)
+        known = (rendering.silhouette > _SOLID) & (view.trust < HIGH_RELIABILITY)
+        trust = torch.where(known, view.trust.clamp(min=2 * LOW_RELIABILITY), view.trust)
         return self._complete(view, torch.where(known, rendering.depth, view.depth), trust)
 
     def _complete(self, view: View, depth: Tensor, trust: Tensor) -> SeedDepth:
         channels, prior = view.channels.cpu().numpy(), self.settings.region_prior
-        return complete_depth(depth.cpu().numpy(), trust.cpu().numpy(), channels, _LOW_RELIABILITY, prior)
+        return complete_depth(depth.cpu().numpy(), trust.cpu().numpy(), channels, LOW_RELIABILITY, prior)
 
-    def _append(self, index: int, pixels: Tensor, depth: Tensor, trust: Tensor, spacing: float, opacity: float) -> None:
+    def _append(
+        self, index: int, pixels: Tensor, depth: Tensor, trust: Tensor, spacing: float | Tensor, opacity: float
+    ) -> None:
         parameters, view = self.state.parameters, self.views[index]
         pixels = pixels & (depth > 0)
         if not pixels.any() or len(parameters) >= self.settings.max_gaussians:

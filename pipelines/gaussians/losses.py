@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from pipelines.gaussians.ssim import ssim_map
+from pipelines.mapping.mirrors import Mirrors, at
 from pipelines.types import VOID
 
 
@@ -68,6 +69,18 @@ def edge_loss(depth: Tensor, labels: Tensor, sharpness: float, unit: float) -> T
         term = torch.where(a == b, 1 - near, near)
         total = total + (term * ((a != VOID) & (b != VOID))).mean()
     return total / 2
+
+
+def symmetry_loss(depth: Tensor, mirrors: Mirrors, unit: float) -> Tensor:
+    """Mean over the pairs, weighed by their confidence: how far the second depth is from what the first one says."""
+    expected = mirrors.gain * at(depth, mirrors.first) + mirrors.offset
+    return (mirrors.confidence * (at(depth, mirrors.second) - expected).abs()).mean() / unit
+
+
+def label_symmetry_loss(logits: Tensor, mirrors: Mirrors) -> Tensor:
+    """Mean over the pairs, weighed by their confidence: the total variation between the two pixels' classes."""
+    first, second = at(logits, mirrors.first).softmax(-1), at(logits, mirrors.second).softmax(-1)
+    return (mirrors.confidence * (first - second).abs().sum(-1)).mean() / 2
 
 
 def size_loss(log_radii: Tensor, largest: float) -> Tensor:

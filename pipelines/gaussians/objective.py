@@ -8,6 +8,7 @@ from torch import Tensor
 
 from pipelines.config import MappingConfig
 from pipelines.gaussians import losses
+from pipelines.gaussians.clipping import clip_beside_boundary
 from pipelines.gaussians.parameters import AdamTable
 from pipelines.gaussians.render import Rendering
 from pipelines.gaussians.state import expose
@@ -32,6 +33,8 @@ class Objective:
     def of(self, view: View, table: AdamTable, rendering: Rendering, log_radii: Tensor, with_labels: bool) -> Tensor:
         """Scalar; `table` holds the view's exposure, `log_radii` (M,) the map's."""
         s = self.settings
+        if s.boundary_clip > 0:
+            clip_beside_boundary(rendering.features, view.channels, s.boundary_clip)
         colors = expose(rendering.features[..., :3], table)
         loss = s.color_weight * losses.image_loss(colors, view.colors, s.ssim_weight)
         loss = loss + s.silhouette_weight * losses.silhouette_loss(rendering.silhouette)
@@ -39,6 +42,8 @@ class Objective:
         if s.depth_weight > 0 and s.use_proxy_depth:
             weight = losses.depth_weight(view.trust, s.depth_nu)
             loss = loss + s.depth_weight * losses.depth_loss(rendering.depth, view.depth, weight, self.unit)
+        if s.symmetry_weight > 0 and view.mirrors is not None:
+            loss = loss + s.symmetry_weight * losses.symmetry_loss(rendering.depth, view.mirrors, self.unit)
         if with_labels and self.classes > 0:
             loss = loss + s.label_every * self._semantic(view, rendering)
         # Exposures are relative: without a pull to zero they and the colours drift together.
@@ -57,4 +62,6 @@ class Objective:
             loss = loss + s.label_weight * of_labels
         elif s.label_weight > 0:
             loss = loss + s.label_weight * losses.label_loss(logits, view.channels, view.label_weight)
+        if s.symmetry_weight > 0 and view.mirrors is not None:
+            loss = loss + s.symmetry_weight * losses.label_symmetry_loss(logits, view.mirrors)
         return loss

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from pipelines.config import MappingConfig
-from pipelines.gaussians.growth import Growth
+from pipelines.gaussians.growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
 from pipelines.gaussians.map import GaussianMap
 from pipelines.gaussians.objective import Objective
 from pipelines.gaussians.parameters import AdamTable
-from pipelines.gaussians.render import Rendering, render
+from pipelines.gaussians.render import Rendering, blending_weights, render
 from pipelines.gaussians.schedule import Schedule, Seeding, Step
 from pipelines.gaussians.state import Exposures, OptimisedMap, OptimiserState
 from pipelines.mapping.views import View, halved
@@ -72,17 +74,27 @@ class MapOptimiser:
         rendering = self.draw(view, table, with_labels)
         loss = self.objective.of(view, table, rendering, parameters["log_radii"], with_labels) * step.weight
         loss.backward()
-        parameters.table.step(self._map_rates(step.rate))
+        parameters.table.step(self._map_rates(step.rate), self._shares())
         table.step(self._view_rates(step))
         if step.grow:
             self.growth.grow(step.view, Rendering(*(x.detach() for x in vars(rendering).values())))
         if step.prune:
-            self.growth.prune()
+            self.growth.prune(self._blending_weights)
 
     @torch.no_grad()
     def _seed(self, index: int, what: Seeding) -> None:
         view, table = self.views[index], self.state.view_tables[index]
         self.growth.seed(index, what, self.draw(view, table, False) if len(self.state.parameters) else None)
+
+    def _blending_weights(self) -> Tensor:
+        """(M,) the largest weight with which each Gaussian stands in any pixel of any view."""
+        p = self.state.parameters
+        arguments = (p["means"], torch.exp(p["log_radii"]), torch.sigmoid(p["opacity_logits"]))
+        largest = torch.zeros(len(p), device=p["means"].device)
+        for index, view in enumerate(self.views):
+            pose = self.state.cam_from_world(index, view)
+            largest = torch.maximum(largest, blending_weights(*arguments, pose, view.intrinsics).largest)
+        return largest
 
     def draw(self, view: View, table: AdamTable, with_classes: bool = True) -> Rendering:
         """The map as the view's camera sees it now."""
@@ -98,6 +110,15 @@ class MapOptimiser:
             kappa=settings.kappa / self.unit**2,
             twist=table.values["twist"] if settings.refine_poses else None,
         )
+
+    def _shares(self) -> Tensor | None:
+        """(M,) step sizes by confidence class (MSGS-SLAM 3.4): high takes all of a step, low `low_trust_step` of it."""
+        low = self.settings.low_trust_step
+        if low == 1:
+            return None
+        trust = self.state.parameters.trust
+        shares = torch.where(trust > LOW_RELIABILITY, math.sqrt(low), low)
+        return torch.where(trust > HIGH_RELIABILITY, 1.0, shares)
 
     def _map_rates(self, factor: float) -> dict[str, float]:
         s = self.settings

@@ -29,8 +29,11 @@ class AdamTable:
             self.first.setdefault(key, torch.zeros_like(value))
             self.second.setdefault(key, torch.zeros_like(value))
 
-    def step(self, rates: Mapping[str, float]) -> None:
-        """One Adam step for the parameters that have a gradient; consumes the gradients."""
+    def step(self, rates: Mapping[str, float], shares: Tensor | None = None) -> None:
+        """One Adam step for the parameters that have a gradient; consumes the gradients.
+
+        `shares` (M,): how much of the step each row takes, None for all of it.
+        """
         self.steps += 1
         for key, value in self.values.items():
             if value.grad is None or rates.get(key, 0.0) == 0.0:
@@ -38,11 +41,14 @@ class AdamTable:
                 continue
             # adam() counts the step itself, hence one less.
             count = torch.tensor(float(self.steps - 1), device=value.device)
+            before = value.detach().clone() if shares is not None else None
             with torch.no_grad():
                 adam(
                     [value], [value.grad], [self.first[key]], [self.second[key]], [], [count], fused=True,
                     amsgrad=False, beta1=0.9, beta2=0.999, lr=rates[key], weight_decay=0.0, eps=1e-15, maximize=False,
                 )  # fmt: skip
+                if before is not None and shares is not None:
+                    value.copy_(torch.lerp(before, value, shares.reshape(-1, *[1] * (value.ndim - 1))))
             value.grad = None
 
     def keep(self, rows: Tensor) -> None:

@@ -19,6 +19,8 @@ SEED_RADIUS = 0.7
 """Radius of a seed in units of the distance between seeds on the image: neighbours then overlap without blurring."""
 SEED_LOGIT = 3.0
 """Logit of a seed's own class against 0 for the others."""
+LEAST_DETAIL = 8.0
+"""Colours that differ by less, of 255, are no detail however little else there is."""
 _MIN_REGION = 64
 _REGION_SAMPLES = 4000
 
@@ -118,7 +120,7 @@ def seed_gaussians(
     depth: Tensor,
     colors: Tensor,
     channels: Tensor,
-    spacing: float,
+    spacing: float | Tensor,
     classes: int,
     cam_from_world: Tensor,
     intrinsics: Intrinsics,
@@ -126,7 +128,8 @@ def seed_gaussians(
 ) -> GaussianMap:
     """One Gaussian for each marked pixel with a depth.
 
-    pixels (H, W) bool, depth (H, W), colors (H, W, 3) 0..1, channels (H, W) uint8, spacing: pixels between neighbours.
+    pixels (H, W) bool, depth (H, W), colors (H, W, 3) 0..1, channels (H, W) uint8, spacing: pixels between neighbours,
+    one number or (H, W).
     """
     rows, columns = torch.nonzero(pixels & (depth > 0), as_tuple=True)
     z = depth[rows, columns]
@@ -135,6 +138,8 @@ def seed_gaussians(
     world_from_cam = torch.linalg.inv(cam_from_world)
     in_world = torch.stack([x, y, z], 1).double() @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
     focal = math.sqrt(intrinsics.fx * intrinsics.fy)
+    if isinstance(spacing, Tensor):
+        spacing = spacing[rows, columns]
     channel = channels[rows, columns].long()
     logits = torch.zeros(len(z), classes + 1, device=z.device)
     # Void pixels write into a column of their own, which is cut off.
@@ -147,6 +152,65 @@ def seed_gaussians(
         class_logits=logits[:, :classes].contiguous(),
         anchor_frame_ids=torch.full((len(z),), frame_id, dtype=torch.int64, device=z.device),
     )
+
+
+def seed_spacing(
+    image: NDArray[np.uint8], depth: NDArray[np.float32], stride: int, fine_share: float, flat_share: float
+) -> NDArray[np.float32]:
+    """(H, W) where to seed: the distance in pixels to the next seed, 0 = no seed here.
+
+    image (H, W, 3), depth (H, W). A seed every `stride` pixels; one every pixel in the `fine_share` of the
+    cells with the most detail, one every 2 * stride in the `flat_share` with the least. Depth steps are never flat.
+    Shares instead of thresholds: what counts as detail depends on the noise of the camera.
+    """
+    height, width = depth.shape
+    out = np.zeros((height, width), np.float32)
+    out[seed_grid(height, width, stride)] = stride
+    detail = _detail(image)
+    if flat_share > 0:
+        side = 2 * stride
+        flat = _cells(detail, side) <= np.quantile(detail[::2, ::2], flat_share)
+        flat &= ~_cells(_steps(depth), side).astype(bool)
+        _refill(out, flat, side, float(side), side // 2)
+    if fine_share > 0 and stride > 1:
+        cells = _cells(detail, stride)
+        fine = cells > max(float(np.quantile(cells, 1 - fine_share)), LEAST_DETAIL)
+        _refill(out, fine, stride, 1.0, None)
+    return out
+
+
+def _detail(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(H, W) range of the colours around every pixel, 0..255, after a slight blur that takes the camera's noise."""
+    soft = cv2.GaussianBlur(image, (0, 0), 0.7)
+    square = np.ones((3, 3), np.uint8)
+    return (cv2.dilate(soft, square).astype(np.float32) - cv2.erode(soft, square)).max(-1)
+
+
+def _steps(depth: NDArray[np.float32], tolerance: float = 0.04) -> NDArray[np.float32]:
+    """(H, W) 1 beside a depth step or where the depth is unknown."""
+    square = np.ones((3, 3), np.uint8)
+    low, high = cv2.erode(depth, square), cv2.dilate(depth, square)
+    return (high - low > tolerance * high).astype(np.float32)
+
+
+def _cells(values: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    """(ceil(H / side), ceil(W / side)) largest value in each square."""
+    height, width = values.shape
+    padded = np.pad(values, ((0, -height % side), (0, -width % side)), mode="edge")
+    return padded.reshape(padded.shape[0] // side, side, padded.shape[1] // side, side).max((1, 3))
+
+
+def _refill(out: NDArray[np.float32], cells: NDArray[np.bool_], side: int, spacing: float, middle: int | None) -> None:
+    """In the marked cells: one seed in the middle, or (None) one at every pixel."""
+    height, width = out.shape
+    inside = np.repeat(np.repeat(cells, side, axis=0), side, axis=1)[:height, :width]
+    if middle is None:
+        out[inside] = spacing
+        return
+    out[inside] = 0
+    grid = np.zeros_like(inside)
+    grid[middle::side, middle::side] = True
+    out[inside & grid] = spacing
 
 
 def seed_grid(height: int, width: int, stride: int) -> NDArray[np.bool_]:

@@ -233,4 +233,4 @@ def _scaled(view: View, field: Array) -> View:
     map_x, map_y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
     log_scale = cv2.remap(field.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     scale = torch.from_numpy(np.exp(log_scale)).to(view.depth.device)
-    return view.with_depth(view.depth * scale, view.reliability)
+    return view.with_scaled_depth(scale)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pipelines.config import MappingConfig
 from pipelines.mapping.depth_fields import Anchors
+from pipelines.mapping.mirrors import Mirrors
 from pipelines.mapping.views import View, make_view, occurring_classes, working_size
 from pipelines.run_folder import RunFolder, read_json
 from pipelines.types import Frame, Intrinsics, ProxyMaps, Trajectory
@@ -32,8 +33,9 @@ def load_views(
 ) -> MappingInput:
     """The keyframes of `trajectory` with images and proxies, in order; proxies scaled to the world of tracking."""
     frames = {f.id: f for f in run.load_frames()}
-    intrinsics = working_size(run.load_calibration().intrinsics, settings.max_side)
-    scales = DepthScales.load(run)
+    full = run.load_calibration().intrinsics
+    intrinsics = working_size(full, settings.max_side)
+    scales, symmetry = DepthScales.load(run), run.load_symmetry()
     kept, measured = split_frames(trajectory, settings.hold_out)
     maps = {i: run.load_proxy(i) for i in kept + measured if run.has_proxy(i)}
     class_ids = occurring_classes([maps[i].labels for i in kept if i in maps])
@@ -42,7 +44,11 @@ def load_views(
     def load(frame_id: int) -> View:
         frame = frames[frame_id]
         scaled = scales.apply(frame_id, maps.get(frame_id))
-        return load_view(run, frame, intrinsics, poses[frame_id], scaled, class_ids, device)
+        view = load_view(run, frame, intrinsics, poses[frame_id], scaled, class_ids, device)
+        if frame_id not in symmetry:
+            return view
+        field = torch.from_numpy(scales.field(frame_id, tuple(view.depth.shape))).to(device)
+        return replace(view, mirrors=Mirrors.of(symmetry[frame_id], full, intrinsics, device).scaled(field))
 
     return MappingInput([load(i) for i in kept], [load(i) for i in measured], class_ids, load_anchors(run, intrinsics))
 
@@ -104,12 +110,18 @@ class DepthScales:
         grids = arrays["grids"] if "grids" in arrays else arrays["scales"][:, None, None]
         return DepthScales(dict(zip(arrays["frame_ids"].tolist(), grids, strict=True)))
 
+    def field(self, frame_id: int, shape: tuple[int, ...]) -> NDArray[np.float32]:
+        """(H, W) the scale of every pixel, 1 for a frame of which tracking said nothing."""
+        if frame_id not in self.grids:
+            return np.ones(shape, np.float32)
+        return scale_field(self.grids[frame_id], (shape[0], shape[1]))
+
     def apply(self, frame_id: int, maps: ProxyMaps | None) -> ProxyMaps | None:
         """The same maps with the depth in the unit of the world."""
         if maps is None or frame_id not in self.grids:
             return maps
-        field = scale_field(self.grids[frame_id], maps.depth.shape)
-        return ProxyMaps(maps.depth * field, maps.confidence, maps.labels, maps.label_confidence)
+        depth = maps.depth * self.field(frame_id, maps.depth.shape)
+        return ProxyMaps(depth, maps.confidence, maps.labels, maps.label_confidence)
 
 
 def scale_field(grid: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float32]:

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pipelines.mapping.mirrors import Mirrors
 from pipelines.run_folder import resize_maps
 from pipelines.types import VOID, Intrinsics, ProxyMaps
 
@@ -20,7 +21,7 @@ class View:
 
     cam_from_world (4, 4) float64; image (H, W, 3) uint8; depth (H, W) float32 in the world's unit, 0 = unknown;
     reliability U (H, W) uint8 0..255; channels (H, W) uint8: the class *channel* of each pixel, VOID where unknown;
-    channel_confidence (H, W) uint8. Kept in bytes: a run has hundreds of views.
+    channel_confidence (H, W) uint8; mirrors: where a symmetry was found. Kept in bytes: a run has hundreds of views.
     """
 
     frame_id: int
@@ -31,6 +32,7 @@ class View:
     reliability: Tensor
     channels: Tensor
     channel_confidence: Tensor
+    mirrors: Mirrors | None = None
 
     @property
     def colors(self) -> Tensor:
@@ -46,6 +48,11 @@ class View:
     def label_weight(self) -> Tensor:
         """(H, W) float32 in 0..1."""
         return self.channel_confidence.float() / 255
+
+    def with_scaled_depth(self, scale: Tensor) -> View:
+        """The same view with its depth multiplied by an (H, W) field."""
+        mirrors = None if self.mirrors is None else self.mirrors.scaled(scale)
+        return replace(self, depth=self.depth * scale, mirrors=mirrors)
 
     def with_depth(self, depth: Tensor, reliability: Tensor) -> View:
         """The same view with another depth and reliability."""
@@ -71,7 +78,7 @@ def make_view(
         maps = ProxyMaps(nothing, nothing, np.full((height, width), VOID, np.uint8), nothing)
     elif maps.depth.shape != (height, width):
         maps = resize_maps(maps, width, height)
-    tensors = (
+    arrays = (
         image,
         (maps.depth * depth_scale).astype(np.float32),
         np.round(maps.confidence * 255).astype(np.uint8),
@@ -79,7 +86,10 @@ def make_view(
         np.round(maps.label_confidence * 255).astype(np.uint8),
     )
     pose = torch.as_tensor(cam_from_world, dtype=torch.float64, device=device)
-    return View(frame_id, intrinsics, pose, *(torch.from_numpy(np.ascontiguousarray(t)).to(device) for t in tensors))
+    colors, depth, reliability, channels, confidence = (
+        torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays
+    )
+    return View(frame_id, intrinsics, pose, colors, depth, reliability, channels, confidence)
 
 
 def channel_table(class_ids: tuple[int, ...]) -> NDArray[np.uint8]:
@@ -105,6 +115,7 @@ def halved(view: View) -> View:
         reliability=sampled(view.reliability),
         channels=sampled(view.channels),
         channel_confidence=sampled(view.channel_confidence),
+        mirrors=None if view.mirrors is None else view.mirrors.halved(size[1], size[0]),
     )
 
 

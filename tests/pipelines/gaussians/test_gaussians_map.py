@@ -6,7 +6,7 @@ import torch
 
 from pipelines.gaussians import densify
 from pipelines.gaussians.parameters import KEYS, AdamTable, MapParameters, empty_map
-from pipelines.gaussians.seeding import complete_depth, fill_smoothly, seed_gaussians, seed_grid
+from pipelines.gaussians.seeding import complete_depth, fill_smoothly, seed_gaussians, seed_grid, seed_spacing
 from pipelines.geometry.camera import project
 from pipelines.types import VOID, Intrinsics
 
@@ -137,6 +137,37 @@ def test_fill_keeps_a_constant_and_the_range() -> None:
 def test_grid_spacing(stride: int) -> None:
     grid = seed_grid(30, 41, stride)
     assert grid.sum() == len(range(stride // 2, 30, stride)) * len(range(stride // 2, 41, stride))
+
+
+def test_seeds_stand_close_where_there_is_detail_and_far_apart_where_there_is_none() -> None:
+    rng = np.random.default_rng(0)
+    image = np.full((64, 96, 3), 128, np.uint8)
+    image[:, :24] = rng.integers(0, 255, (64, 24, 3))
+    image[:, 24:56] += np.arange(32, dtype=np.uint8)[None, :, None]
+    depth = np.full((64, 96), 2.0, np.float32)
+    depth[40:, 60:] = 3.0
+    spacing = seed_spacing(image, depth, 2, fine_share=0.3, flat_share=0.35)
+    assert (spacing[:, 2:18] == 1).all()
+    assert set(np.unique(spacing[:, 30:52])) == {0, 2}
+    assert set(np.unique(spacing[4:32, 64:92])) == {0, 4}
+    assert (spacing[4:32, 64:92] == 4).sum() == 7 * 7
+    # Beside a depth step the seeds stay close, however even the colour.
+    assert (spacing[38:42, 64:92] == 2).any()
+    # Every pixel is covered once: the squares of the seeds add up to the picture.
+    assert (spacing**2).sum() == spacing.size
+    assert np.array_equal(seed_spacing(image, depth, 2, 0.0, 0.0) > 0, seed_grid(64, 96, 2))
+
+
+def test_steps_by_shares() -> None:
+    parameters = MapParameters.from_map(seeds()[0])
+    before = parameters["colors"].detach().clone()
+    parameters["colors"].sum().backward()
+    shares = torch.ones(len(parameters))
+    shares[0] = 0.25
+    parameters.table.step({"colors": 0.1}, shares)
+    moved = (parameters["colors"] - before).abs().detach()
+    assert torch.allclose(moved[0], 0.25 * moved[1], rtol=1e-4)
+    assert moved[1].min() > 0.09
 
 
 def test_conditions_of_densification() -> None:

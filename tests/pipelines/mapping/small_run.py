@@ -1,6 +1,7 @@
 """A run folder of the synthetic room as the stages before mapping would leave it, with exact poses and proxies."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.images import read_rgb
+from pipelines.config import Config, config_to_toml
 from pipelines.run_folder import (
     RunFolder,
     proxy_path,
@@ -19,6 +21,7 @@ from pipelines.run_folder import (
     save_trajectory,
     write_json,
 )
+from pipelines.stages import StageRecord
 from pipelines.types import VOID, Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, SparseModel, Trajectory
 
 SIZE = (80, 60)
@@ -57,7 +60,18 @@ def make_run(root: Path, sequence: Path, every: int = 2) -> RunFolder:
     trajectory = Trajectory(np.arange(n), times, cam_from_world, np.ones(n, bool), ("",) * n)
     save_trajectory(root / "tracking", trajectory)
     save_sparse_model(root / "tracking" / "sparse.npz", points_seen_twice(k, cam_from_world, depths))
+    run.settings_file.write_text(config_to_toml(Config()))
+    note_stages(run, "frames", "proxy", "tracking")
     return run
+
+
+def note_stages(run: RunFolder, *stages: str) -> None:
+    """A manifest that says these stages are done."""
+    record = asdict(StageRecord("", {}, 0.0, 0.0, {}, [], ""))
+    write_json(
+        run.manifest_file,
+        {"source": {"path": str(run.root), "digest": ""}, "stages": {name: record for name in stages}},
+    )
 
 
 def grey(path: Path) -> NDArray:
