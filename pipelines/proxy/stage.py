@@ -77,6 +77,7 @@ def run(context: StageContext) -> dict[str, Any]:
         **scale_figures(depths, scale, reference),
         **mirrors,
     }
+    _warn_of_focal(context, sequence, report.get("network_focal_px"))
     write_json(context.folder / "proxy.json", report)
     return report
 
@@ -120,6 +121,18 @@ def _warn_of_distortion(
             f"the frames were undistorted (coefficients up to {strongest:.3f}), but map files are taken as they are: "
             "towards the borders they lie some pixels off. Give maps of undistorted pictures"
         )
+
+
+def _warn_of_focal(context: StageContext, sequence: Sequence, network_focal: float | None) -> None:
+    """A network that tells the camera from one picture is good to some per cent: it can only doubt a calibration."""
+    calibration = sequence.calibration
+    focal = calibration.intrinsics.fx
+    if network_focal is None or calibration.origin == "given" or abs(network_focal / focal - 1) < 0.15:
+        return
+    context.warn(
+        f"the depth network sees a focal length of {network_focal:.0f} pixels, the calibration ({calibration.origin}) "
+        f"says {focal:.0f} +- {calibration.focal_sd:.0f}: give --intrinsics if you know the camera"
+    )
 
 
 # depth ----------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from pipelines.proxy.files_depth import FilesDepth
 from pipelines.proxy.files_labels import FilesLabels
 from pipelines.proxy.providers import DepthEstimate, LabelEstimate
 from pipelines.proxy.stage import run
-from pipelines.run_folder import load_proxy_maps, proxy_path, read_json
+from pipelines.run_folder import load_proxy_maps, proxy_path, read_json, save_calibration
 from pipelines.stages import StageContext
 from pipelines.types import VOID, Frame
 
@@ -150,3 +150,17 @@ def test_what_a_network_says_of_normals_and_looks_reaches_the_run(
     found = context.run.load_descriptors()
     assert sorted(found) == [f.id for f in room.frames]
     np.testing.assert_array_equal(found[5], np.eye(4)[1])
+
+
+@pytest.mark.parametrize(
+    ("focal", "origin", "doubted"), [(1.3, "exif", True), (1.1, "exif", False), (1.3, "given", False)]
+)
+def test_a_network_that_sees_another_camera_is_told(
+    room: Room, make_context: Make, monkeypatch: pytest.MonkeyPatch, focal: float, origin: str, doubted: bool
+) -> None:
+    intrinsics = room.calibration.intrinsics
+    monkeypatch.setattr(FilesDepth, "figures", lambda self: {"network_focal_px": focal * intrinsics.fx})
+    context = make_context(*FILES, "proxy.symmetry=false")
+    save_calibration(context.run.stage("frames"), replace(room.calibration, origin=origin, focal_sd=3.0))
+    run(context)
+    assert any("focal length of" in w for w in context.warnings) == doubted
