@@ -162,6 +162,53 @@ def measure_depth(case: Case, run: RunFolder) -> dict[str, Any]:
     }
 
 
+def measure_symmetry(case: Case, run: RunFolder) -> dict[str, Any]:
+    """Errors of the depth that the mirror pairs predict from one half for the other; nothing without pairs.
+
+    truth: the true depth mirrored, against the true depth there; unsure: our own depth mirrored to where ours is not
+    reliable, beside what ours says there.
+    """
+    names = sorted((p.name for p in case.pictures.glob(case.glob)), key=natural_key)
+    frames, camera = {f.id: f for f in run.load_frames()}, run.load_calibration().intrinsics
+    rows = []
+    scale = run_scale(case, run)
+    for frame_id, found in run.load_symmetry().items():
+        maps = run.load_proxy(frame_id)
+        height, width = maps.depth.shape
+        truth = case.truth(names[frames[frame_id].source_index], width, height) * scale
+        pixels = np.floor(found.pairs * (width / camera.width)).astype(int)
+        here, there = (np.minimum(pixels[:, k : k + 2], [width - 1, height - 1]).T for k in (0, 2))
+        wanted = truth[there[1], there[0]]
+        known = (truth[here[1], here[0]] > 0) & (wanted > 0)
+        own = maps.depth[there[1], there[0]]
+        columns = [found.gain * d[here[1], here[0]] + found.offset for d in (truth, maps.depth)]
+        columns = [np.abs(c / np.maximum(wanted, 1e-9) - 1) for c in (*columns, own)]
+        rows.append(np.stack([*columns, maps.confidence[there[1], there[0]]], 1)[known])
+    if not rows:
+        return {}
+    errors = np.concatenate(rows)
+    unsure = errors[errors[:, 3] <= RELIABLE]
+    return {
+        "mirrored_truth_median": round(float(np.median(errors[:, 0])), 5),
+        "mirrored_truth_p90": round(float(np.percentile(errors[:, 0], 90)), 5),
+        "unsure_pairs": len(unsure),
+        "unsure_by_mirror": round(float(np.median(unsure[:, 1])), 5) if len(unsure) else None,
+        "unsure_by_own_depth": round(float(np.median(unsure[:, 2])), 5) if len(unsure) else None,
+    }
+
+
+def run_scale(case: Case, run: RunFolder) -> float:
+    """Depth of the maps over true depth, over the reliable pixels of all keyframes."""
+    names = sorted((p.name for p in case.pictures.glob(case.glob)), key=natural_key)
+    ratios = []
+    for frame in keyframes(run):
+        maps = run.load_proxy(frame.id)
+        truth = case.truth(names[frame.source_index], maps.depth.shape[1], maps.depth.shape[0])
+        use = (truth > 0) & (maps.confidence > RELIABLE)
+        ratios.append((maps.depth[use] / truth[use])[::7])
+    return float(np.median(np.concatenate(ratios)))
+
+
 # labels ---------------------------------------------------------------------------------------------------------
 
 
@@ -293,6 +340,7 @@ def measure_embedded(name: str, work: Path) -> dict[str, Any]:
         "flicker": flicker(run),
         "mirror_planes": report.get("mirror_planes"),
         "mirror_pairs": report.get("mirror_pairs"),
+        **measure_symmetry(CASES[name], run),
         "kilobytes_a_frame": report["kilobytes_a_frame"],
     }
     if "stereo" in seconds:
