@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    from pipelines.proxy.models.registry import Model
 
 
 @click.group()
 def models() -> None:
     """List, download and check the learned models for depth and classes. A reconstruction never downloads."""
+
+
+def _size(model: Model) -> str:
+    return f"{model.bytes / 1e6:.1f} MB" if model.bytes else "size unknown"
 
 
 @models.command("list")
@@ -20,11 +28,13 @@ def list_models() -> None:
     store = ModelStore.open()
     for model in store.models:
         here = "here" if store.is_here(model) else "-"
-        use = "commercial use allowed" if model.commercial else "ask before commercial use"
+        notes = ["commercial use allowed" if model.commercial else "ask before commercial use"]
+        if not model.sha256:
+            notes.append("hash unknown: pull with --trust")
+        elif model.urls and not model.revision:
+            notes.append("no fixed revision: refused if its makers replace it")
         task = store.families[model.family]["task"]
-        size = f"{model.bytes / 1e6:.1f} MB" if model.bytes else "size unknown"
-        known = "" if model.revision or model.sha256 else "; hash unknown: pull with --trust"
-        click.echo(f"{model.name:18} {task:13} {here:5} {size:>12}  {model.licence} ({use}{known})")
+        click.echo(f"{model.name:18} {task:13} {here:5} {_size(model):>12}  {model.licence} ({'; '.join(notes)})")
     click.echo(f"cache: {store.cache}")
 
 
@@ -45,7 +55,7 @@ def pull(names: tuple[str, ...], trust: bool, offline: bool, yes: bool) -> None:
     store = ModelStore.open()
     for model in store.with_needed(names):
         if not store.is_here(model) and not offline:
-            click.echo(f"{model.name}: {model.bytes / 1e6:.1f} MB, licence: {model.licence}")
+            click.echo(f"{model.name}: {_size(model)}, licence: {model.licence}")
             if not yes:
                 click.confirm("Download it?", default=True, abort=True)
         with tqdm(total=model.bytes, unit="B", unit_scale=True, desc=model.name, leave=False) as bar:

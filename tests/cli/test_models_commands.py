@@ -1,0 +1,71 @@
+"""`msgs-slam models` through click's runner, over a cache of the test's own."""
+
+from pathlib import Path
+
+import onnx
+import pytest
+from click.testing import CliRunner, Result
+from onnx import TensorProto, helper
+
+from msgs_cli.main import main
+from pipelines.proxy.models.registry import ModelStore
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("MSGS_SLAM_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def models(*arguments: object) -> Result:
+    return CliRunner().invoke(main, ["models", *map(str, arguments)])
+
+
+def write_network(path: Path, output: str) -> Path:
+    node = helper.make_node("ReduceMean", ["pixel_values"], [output], axes=[1], keepdims=0)
+    x = helper.make_tensor_value_info("pixel_values", TensorProto.FLOAT, [1, 3, "h", "w"])
+    y = helper.make_tensor_value_info(output, TensorProto.FLOAT, [1, "h", "w"])
+    graph = helper.make_graph([node], "net", [x], [y])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
+    return path
+
+
+def test_list_says_size_licence_and_what_is_not_pinned(cache: Path) -> None:
+    lines = models("list").stdout.splitlines()
+    rows = {line.split()[0]: line for line in lines}
+    assert "75.8 MB" in rows["metric3d-small"]
+    assert "e-mailed" in rows["metric3d-small"]
+    assert "revision" not in rows["metric3d-small"]
+    assert "no fixed revision" in rows["metric3d-large"]
+    assert "size unknown" in rows["dinov2-small-head"]
+    assert "--trust" in rows["dinov2-small-head"]
+    assert str(cache) in lines[-1]
+
+
+def test_pull_without_a_network_says_what_to_do_and_asks_for_the_licence_first(cache: Path) -> None:
+    offline = models("pull", "--offline")
+    assert offline.exit_code == 1
+    assert "metric3d-small is not in" in offline.stderr
+    refused = CliRunner().invoke(main, ["models", "pull", "moge2-small"], input="n\n")
+    assert refused.exit_code == 1
+    assert "licence: MIT" in refused.output
+    unknown = models("pull", "dinov2-small-head", "--yes")
+    assert unknown.exit_code == 1
+    assert "--trust" in unknown.stderr
+    assert not cache.exists() or not list(cache.glob("*.onnx"))
+
+
+def test_own_networks_are_added_checked_and_found(cache: Path, tmp_path: Path) -> None:
+    wrong = models("add", write_network(tmp_path / "net.onnx", "depths"), "--family", "metric3d-community")
+    assert wrong.exit_code == 1
+    assert "no output 'predicted_depth'" in wrong.stderr
+    right = models("add", write_network(tmp_path / "net.onnx", "predicted_depth"), "--family", "metric3d-community")
+    assert right.exit_code == 0, right.output
+    assert models("path", "net").stdout.strip() == str(cache / "net.onnx")
+    assert models("verify").exit_code == 0
+    with ModelStore.open().path(ModelStore.open().get("net")).open("ab") as stream:
+        stream.write(b"?")
+    damaged = models("verify")
+    assert damaged.exit_code == 1
+    assert "damaged" in damaged.stdout
+    assert models("path", "moge2-small").exit_code == 1
