@@ -29,6 +29,7 @@ class RunConfig:
     threads: int = setting(0, "CPU threads, 0 = all cores; the same count gives the same bytes")
     format: str = setting("auto", "layout of the source: a data set's; images = a video or plain images; auto looks")
     device: str = setting("auto", "where dense work runs; auto takes a GPU if there is one", ("auto", "cpu", "cuda"))
+    cache_mb: int = setting(2000, "results of networks are kept over runs, at most this many megabytes; 0 = none")
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,6 @@ class ProxyConfig:
     stereo_side: int = setting(320, "multiview matches images of this many pixels on the long side")
     stereo_planes: int = setting(96, "multiview tries this many depths")
     max_classes: int = setting(16, "segments and clusters make at most this many classes")
-    cache_mb: int = setting(2000, "results of networks are kept over runs, at most this many megabytes; 0 = none")
     symmetry: bool = setting(True, "look for mirror symmetry and pair the pixels of its two halves")
 
 

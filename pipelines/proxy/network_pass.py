@@ -55,7 +55,9 @@ class ResultCache:
             log.info("%s: the result is not kept (%s)", self.folder, error)
 
     def trim(self) -> None:
-        """Remove what was used longest ago until the rest fits."""
+        """Remove what was used longest ago until the rest fits. Without a cache, that of other runs is left alone."""
+        if self.megabytes <= 0:
+            return
         entries = sorted((p.stat().st_mtime_ns, p.stat().st_size, p) for p in self.folder.glob("*.npz"))
         total = sum(size for _, size, _ in entries)
         for _, size, path in entries:

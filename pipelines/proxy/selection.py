@@ -30,7 +30,8 @@ from pipelines.proxy.sequence import Sequence
 @dataclass(frozen=True)
 class Surroundings:
     """What providers are made from. `scratch(name)` is a folder that lives as long as the stage is unfinished;
-    `recording` is the data set that the source is, None for a video or plain images."""
+    `recording` is the data set that the source is, None for a video or plain images; results of networks are kept over
+    runs in `cache_mb` megabytes."""
 
     source: Path
     sequence: Sequence
@@ -40,6 +41,7 @@ class Surroundings:
     device: str
     progress: Progress
     recording: Recording | None = None
+    cache_mb: int = 0
 
 
 def split_choice(text: str, setting: str, kinds: tuple[str, ...]) -> tuple[str, str]:
@@ -162,5 +164,5 @@ def _fused(around: Surroundings, learned: DepthProvider) -> DepthProvider:
 
 
 def _surroundings(around: Surroundings, scratch: str) -> tuple[Callable[[], Path], int, str, Progress, ResultCache]:
-    cache = ResultCache(default_cache() / "results", around.config.cache_mb)
+    cache = ResultCache(default_cache() / "results", around.cache_mb)
     return lambda: around.scratch(scratch), around.threads, around.device, around.progress, cache

@@ -51,6 +51,7 @@ def run(context: StageContext) -> dict[str, Any]:
         context.config.run.device,
         context.progress,
         open_recording(context.source, context.config.run.format),
+        context.config.run.cache_mb,
     )
     depths = open_depth(around)
     semantics = open_semantics(around)

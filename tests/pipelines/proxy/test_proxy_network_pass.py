@@ -65,7 +65,9 @@ def test_a_damaged_result_is_computed_again_and_no_cache_is_no_harm(tmp_path: Pa
     victim = sorted((tmp_path / "cache").iterdir())[0]
     victim.write_bytes(b"torn")
     assert run(tmp_path, "b", "one")[1].calls == 1
+    kept = len(list((tmp_path / "cache").iterdir()))
     assert run(tmp_path, "c", "four", megabytes=0)[1].calls == len(FRAMES)
+    assert len(list((tmp_path / "cache").iterdir())) == kept
 
 
 def test_the_cache_is_bounded_and_keeps_what_was_used_last(tmp_path: Path) -> None:
