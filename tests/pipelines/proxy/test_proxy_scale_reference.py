@@ -19,6 +19,7 @@ from pipelines.proxy.stage import run
 from pipelines.reconstruct import reconstruct
 from pipelines.run_folder import RunFolder
 from pipelines.stages import StageContext
+from pipelines.tracking.stage import run as track
 
 Make = Callable[..., StageContext]
 EMBEDDED = ("proxy.stereo_side=128", "proxy.stereo_planes=32", "proxy.symmetry=false")
@@ -84,6 +85,26 @@ def test_a_known_distance_gives_metres(room: Room, make_context: Make) -> None:
     maps, view = context.run.load_proxy(5), room.views[5]
     ratio = maps.depth / view.depth
     assert np.median(ratio[maps.confidence > 0.35]) == pytest.approx(1, rel=0.02)
+
+
+def test_tracking_makes_the_world_metric_by_it_without_taking_the_depth_for_news(
+    room: Room, make_context: Make
+) -> None:
+    points = ((60.5, 80.5), (190.5, 100.5))
+    text = f"000005:60.5,80.5,190.5,100.5={known_length(room, 5, points):.4f}"
+    context = make_context(*EMBEDDED, setting(text))
+    reference = run(context)
+    context.run.stage("tracking").mkdir()
+    tracking = StageContext(
+        context.run, context.source, context.config, context.run.stage("tracking"), SilentProgress()
+    )
+    figures = track(tracking)
+    assert figures["scale"] == "metric"
+    assert figures["scale_relative_sd"] == reference["reference_relative_sd"]
+    centres = np.linalg.inv(context.run.load_trajectory("tracking").cam_from_world)[:, :3, 3]
+    truth = np.array([v.world_from_cam[:3, 3] for v in room.views])
+    walked = np.linalg.norm(centres[-1] - centres[0]) / np.linalg.norm(truth[-1] - truth[0])
+    assert walked == pytest.approx(1, rel=0.02)
 
 
 def test_the_height_of_the_camera_gives_metres(room: Room, make_context: Make) -> None:
