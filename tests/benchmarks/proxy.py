@@ -100,14 +100,14 @@ VIDEOS = {
 }
 
 
-def pictures_of(name: str, work: Path) -> Path:
-    """The folder to reconstruct; colour pictures only where depth lies among them."""
+def pictures_of(name: str, work: Path, first: int) -> Path:
+    """The folder to reconstruct: its `first` pictures (0 = all), colour only where depth lies among them."""
     case = CASES[name]
-    if case.glob == "*":
+    if case.glob == "*" and not first:
         return case.pictures
-    folder = work / f"{name}_pictures"
+    folder = work / f"{name}{first or ''}_pictures"
     folder.mkdir(exist_ok=True)
-    for path in case.pictures.glob(case.glob):
+    for path in sorted(case.pictures.glob(case.glob), key=lambda p: natural_key(p.name))[: first or None]:
         if not (folder / path.name).exists():
             shutil.copy(path, folder / path.name)
     return folder
@@ -329,10 +329,15 @@ def grey(values: NDArray[np.float32]) -> NDArray[np.uint8]:
 # main -----------------------------------------------------------------------------------------------------------
 
 
-def measure_embedded(name: str, work: Path) -> dict[str, Any]:
+def run_of(name: str, work: Path, first: int, suffix: str = "") -> RunFolder:
+    """Where a sequence's run lies."""
+    return RunFolder(work / f"{name}{first or ''}{suffix}.msgs")
+
+
+def measure_embedded(name: str, work: Path, first: int) -> dict[str, Any]:
     """One row: the providers that need no weights."""
-    run = RunFolder(work / f"{name}.msgs")
-    progress = run_proxy(pictures_of(name, work), run)
+    run = run_of(name, work, first)
+    progress = run_proxy(pictures_of(name, work, first), run)
     seconds = progress.seconds
     report = run.load_proxy_report()
     row = {
@@ -352,15 +357,15 @@ def measure_embedded(name: str, work: Path) -> dict[str, Any]:
     return row
 
 
-def measure_fused(name: str, work: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def measure_fused(name: str, work: Path, first: int) -> Iterator[tuple[str, dict[str, Any]]]:
     """A network that is off by 6 % and 3 %: alone, fused, and what there is without it."""
-    yield "multiview", measure_embedded(name, work)
-    run, noisy = RunFolder(work / f"{name}_fused.msgs"), work / f"{name}_noisy"
+    yield "multiview", measure_embedded(name, work, first)
+    run, noisy = run_of(name, work, first, "_fused"), work / f"{name}_noisy"
     if not run.root.exists():
-        shutil.copytree(work / f"{name}.msgs", run.root)
+        shutil.copytree(run_of(name, work, first).root, run.root)
     write_noisy_depth(CASES[name].depth, noisy)
     for provider, fuse in (("network", "never"), ("network + multiview", "always")):
-        run_proxy(pictures_of(name, work), run, f'proxy.depth="files:{noisy}"', f"proxy.fuse={fuse}")
+        run_proxy(pictures_of(name, work, first), run, f'proxy.depth="files:{noisy}"', f"proxy.fuse={fuse}")
         yield provider, measure_depth(CASES[name], run)
 
 
@@ -375,6 +380,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequences", nargs="*", help="of replica, whiteroom, kitchen; with --labels kitchen, bedroom")
     parser.add_argument("--work", type=Path, required=True, help="folder for the runs")
+    parser.add_argument("--first", type=int, default=0, help="only so many pictures of each sequence")
     parser.add_argument("--fused", action="store_true")
     parser.add_argument("--labels", action="store_true")
     parser.add_argument("--sheets", action="store_true")
@@ -388,11 +394,11 @@ def main() -> None:
             found = [("deeplab", measure_network(name, work))]
             run = RunFolder(work / f"{name}_deeplab.msgs")
         elif arguments.fused:
-            found = list(measure_fused(name, work))
-            run = RunFolder(work / f"{name}_fused.msgs")
+            found = list(measure_fused(name, work, arguments.first))
+            run = run_of(name, work, arguments.first, "_fused")
         else:
-            found = [("embedded", measure_embedded(name, work))]
-            run = RunFolder(work / f"{name}.msgs")
+            found = [("embedded", measure_embedded(name, work, arguments.first))]
+            run = run_of(name, work, arguments.first)
         rows += [{"sequence": name, "provider": provider, **row} for provider, row in found]
         print_rows(rows[-len(found) :])
         if arguments.sheets:
