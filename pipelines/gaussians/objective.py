@@ -35,7 +35,9 @@ class Objective:
         s = self.settings
         if s.boundary_clip > 0:
             clip_beside_boundary(rendering.features, view.channels, s.boundary_clip)
-        colors = expose(rendering.features[..., :3], table)
+        # split, not slices: the gradient of each slice would be a whole image of zeros around it.
+        shown, logits = rendering.features.split([3, rendering.features.shape[-1] - 3], dim=-1)
+        colors = expose(shown, table)
         loss = s.color_weight * losses.image_loss(colors, view.colors, s.ssim_weight)
         loss = loss + s.silhouette_weight * losses.silhouette_loss(rendering.silhouette)
         loss = loss + s.size_weight * losses.size_loss(log_radii, s.size_limit * self.unit)
@@ -45,17 +47,17 @@ class Objective:
         if s.symmetry_weight > 0 and view.mirrors is not None:
             loss = loss + s.symmetry_weight * losses.symmetry_loss(rendering.depth, view.mirrors, self.unit)
         if with_labels and self.classes > 0:
-            loss = loss + s.label_every * self._semantic(view, rendering)
+            loss = loss + s.label_every * self._semantic(view, rendering.depth, logits)
         # Exposures are relative: without a pull to zero they and the colours drift together.
         values = table.values
         return loss + _EXPOSURE_PULL * (values["log_gain"].square().sum() + values["offset"].square().sum())
 
-    def _semantic(self, view: View, rendering: Rendering) -> Tensor:
+    def _semantic(self, view: View, depth: Tensor, logits: Tensor) -> Tensor:
         """Labels, and the edge term (19) by which they shape the depth."""
-        s, logits = self.settings, rendering.features[..., 3:]
-        loss = rendering.depth.new_zeros(())
+        s = self.settings
+        loss = depth.new_zeros(())
         if s.edge_weight > 0:
-            edge = losses.edge_loss(rendering.depth, view.channels, s.edge_sharpness, self.unit)
+            edge = losses.edge_loss(depth, view.channels, s.edge_sharpness, self.unit)
             loss = loss + s.edge_weight * edge
         if s.label_weight > 0 and s.label_loss == "image":
             of_labels = losses.label_image_loss(logits, view.channels, view.label_weight, s.ssim_weight)

@@ -164,33 +164,40 @@ def proxy_settings(case: Case, recording: Path, made: Path) -> list[str]:
 
 
 def _noisy_depth(source: Path, target: Path) -> Path:
-    """Times a smooth field of 6 % and a scale of 3 % a frame: a model of a depth network's error."""
     rng = np.random.default_rng(0)
     for path, picture in _pictures(source, target):
-        field = cv2.resize(rng.normal(0, 0.06, (7, 9)), picture.shape[::-1], interpolation=cv2.INTER_CUBIC)
-        scale = 1 + 0.03 * rng.normal()
-        cv2.imwrite(str(path), np.clip(picture * (1 + field) * scale, 0, 65534).astype(np.uint16))
+        cv2.imwrite(str(path), np.clip(noisy_depth(picture, rng), 0, 65534).astype(np.uint16))
     return target
+
+
+def noisy_depth(depth: NDArray, rng: np.random.Generator) -> NDArray:
+    """Times a smooth field of 6 % and a scale of 3 % a frame: a model of a depth network's error."""
+    field = cv2.resize(rng.normal(0, 0.06, (7, 9)), depth.shape[::-1], interpolation=cv2.INTER_CUBIC)
+    return depth * (1 + field) * (1 + 0.03 * rng.normal())
 
 
 def _noisy_labels(source: Path, target: Path) -> Path:
-    """Boundaries displaced by up to 3 pixels, and each region of another class in 5 % of the frames."""
     rng = np.random.default_rng(0)
     for path, picture in _pictures(source, target):
-        height, width = picture.shape
-        shift = [cv2.resize(rng.uniform(-3, 3, (height // 12, width // 12)), (width, height)) for _ in range(2)]
-        y, x = np.mgrid[:height, :width]
-        noisy = picture[
-            np.clip(y + shift[0], 0, height - 1).round().astype(int),
-            np.clip(x + shift[1], 0, width - 1).round().astype(int),
-        ]
-        classes = np.unique(picture)
-        count, regions = cv2.connectedComponents(np.ones_like(noisy)) if len(classes) < 2 else _regions(noisy)
-        for region in range(count):
-            if rng.random() < 0.05:
-                noisy[regions == region] = rng.choice(classes)
-        cv2.imwrite(str(path), noisy)
+        cv2.imwrite(str(path), noisy_labels(picture, rng))
     return target
+
+
+def noisy_labels(labels: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Boundaries displaced by up to 3 pixels, and each region of another class in 5 % of the frames."""
+    height, width = labels.shape
+    shift = [cv2.resize(rng.uniform(-3, 3, (height // 12, width // 12)), (width, height)) for _ in range(2)]
+    y, x = np.mgrid[:height, :width]
+    noisy = labels[
+        np.clip(y + shift[0], 0, height - 1).round().astype(int),
+        np.clip(x + shift[1], 0, width - 1).round().astype(int),
+    ]
+    classes = np.unique(labels)
+    count, regions = _regions(noisy)
+    for region in range(count):
+        if rng.random() < 0.05:
+            noisy[regions == region] = rng.choice(classes)
+    return noisy
 
 
 def _regions(labels: NDArray[np.uint8]) -> tuple[int, NDArray[np.int32]]:
