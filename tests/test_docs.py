@@ -46,3 +46,10 @@ def test_named_files_exist() -> None:
         assert (ROOT / name).exists(), name
     for name in re.findall(r"python (tests/benchmarks/\w+\.py)", texts()):
         assert (ROOT / name).exists(), name
+
+
+def test_pictures_are_there_and_small() -> None:
+    names = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", DOCS[0].read_text(encoding="utf-8"))
+    assert names
+    for name in names:
+        assert 10_000 < (ROOT / name).stat().st_size < 300_000, name

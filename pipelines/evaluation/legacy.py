@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.evaluation.measure import KEYFRAMES, Measured
 from pipelines.evaluation.trajectory_error import absolute_error
@@ -27,11 +28,15 @@ def legacy_cells(outcome: Outcome, matched: MatchedTruth, measured: Measured | N
     truth = np.linalg.inv(matched.world_from_cam[rows])
     estimate, truth = (np.asarray(p @ np.linalg.inv(p[0]), np.float64) for p in (estimate, truth))
     cells: dict[str, Any] = {"note": NOTE}
-    try:
-        error = absolute_error(estimate[:, :3, 3], truth[:, :3, 3], with_scale=False)
-        cells["ate as they call it"] = error.statistics.mean
-    except ValueError as problem:
-        cells["missing"] = str(problem)
+    cells |= _ate(estimate[:, :3, 3], truth[:, :3, 3]) if outcome.metric else {"missing": "the run has no metric scale"}
     if measured is not None:
         cells["keyframe psnr"] = measured.images().get(KEYFRAMES, {}).get("psnr")
     return cells
+
+
+def _ate(translations: NDArray, true_translations: NDArray) -> dict[str, Any]:
+    try:
+        error = absolute_error(translations, true_translations, with_scale=False)
+    except ValueError as problem:
+        return {"missing": str(problem)}
+    return {"ate as they call it, m": error.statistics.mean}

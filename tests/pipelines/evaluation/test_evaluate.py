@@ -50,7 +50,7 @@ def test_every_cell_of_a_true_run(oracle_run: OracleRun, truth: Sequence) -> Non
     assert 0.5 < result["labels"]["mean_iou"] < result["labels"]["pixel_accuracy"]
     assert 0 < result["mesh"]["accuracy"] < 0.02
     assert result["cost"]["total seconds"] == 10
-    assert result["legacy"]["ate as they call it"] < 1e-6
+    assert result["legacy"]["ate as they call it, m"] < 1e-6
     table = (run.root / "evaluation" / "evaluation.md").read_text()
     assert "ATE Sim(3)" in table
     assert "legacy figures" in table

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from layouts import LAYOUTS, START, tum
 
-from formats.datasets import Camera, Sequence
+from formats.datasets import Camera, Sequence, open_sequence
 from formats.errors import InputError
 from formats.images import write_rgb
 from pipelines.config import Config, load_config
+from pipelines.evaluation.evaluate import evaluate_run
 from pipelines.frames.lens import distortion_of, make_lens, to_pycolmap
 from pipelines.frames.recording import RecordingSource
 from pipelines.frames.source import FolderSource, open_source
@@ -21,6 +23,8 @@ from pipelines.proxy.inputs import proxy_inputs
 from pipelines.proxy.recording_maps import RecordingDepth, RecordingLabels
 from pipelines.proxy.selection import Surroundings, open_depth_files, open_label_files
 from pipelines.proxy.sequence import Sequence as ProxySequence
+from pipelines.reconstruct import reconstruct
+from pipelines.run_folder import RunFolder
 from pipelines.types import VOID, Calibration, Frame, Intrinsics
 
 
@@ -142,3 +146,21 @@ def test_a_folder_of_images_is_no_data_set_by_what_lies_beside_it(short: Sequenc
 def test_times_stay_those_of_the_set(short: Sequence, tmp_path: Path) -> None:
     source = open_source(tum(short, tmp_path / "set"))
     assert next(iter(source.read())).timestamp == pytest.approx(START + short.timestamps[0], abs=1e-6)
+
+
+def test_a_data_set_is_reconstructed_with_what_it_knows(truth: Sequence, tmp_path: Path) -> None:
+    """TUM layout, nothing said but that its depth is wanted: its camera is taken, lengths are metres, times its own."""
+    path, run = tum(truth, tmp_path / "set"), RunFolder(tmp_path / "set.msgs")
+    config = load_config(overrides=["proxy.depth=files", "frames.rate=4", "run.threads=2"])
+    reconstruct(path, run, config, SilentProgress(), until="tracking")
+    calibration = run.load_calibration()
+    assert calibration.origin == "given"
+    assert truth.camera is not None
+    assert calibration.intrinsics.fx == pytest.approx(truth.camera.fx)
+    assert run.load_frames()[0].timestamp > START - 1
+    result = evaluate_run(run, open_sequence(path))
+    assert result["frames"]["with true pose"] == result["frames"]["posed"] == len(run.load_frames())
+    assert 0 < result["trajectory"]["se3 all"]["rmse"] < 0.03
+    # The same source under another name is another source.
+    with pytest.raises(InputError, match="another source"):
+        reconstruct(path, run, replace(config, run=replace(config.run, format="images")), SilentProgress())
