@@ -22,13 +22,17 @@ _TRUSTED_SPREAD = 0.05
 _LEARNED_CONFIDENCE = 0.7
 _OUTLIER = 0.05
 _FAR_OFF, _PROVEN = 0.2, 0.7
+_GUESS_SHARE, _GUESS_SPREAD, _GUESS_GAP = 0.9, 0.02, 0.15
+"""Where the views do not agree, the geometry guesses from its surroundings, and is as good as a network: two guesses
+that miss differently are better together. Its share grows with how much the network strays around the scale field, and
+fades as the two lie farther apart (all in log depth)."""
 
 
 class FusedDepth:
     """Depth in the learned provider's unit (metres).
 
     Where the views agree, the multi-view depth times one scale for the whole run. Elsewhere the learned depth,
-    bent to the geometry around it by a smooth scale field of the frame.
+    bent to the geometry around it by a smooth scale field of the frame, together with what the geometry guesses there.
     """
 
     def __init__(self, learned: DepthProvider, stereo: MultiviewDepth, sequence: Sequence) -> None:
@@ -68,14 +72,19 @@ def fuse(learned: DepthEstimate, geometry: DepthEstimate, scale: float, frame_sc
     lead = (geometry.confidence >= SURE) & (geometry.depth > 0)
     both = lead & (learned.depth > 0)
     base = np.log(scale / frame_scale)
-    ratio = np.log(np.where(both, geometry.depth * scale, 1)) - np.log(np.where(both, learned.depth, 1)) - base
+    known = (geometry.depth > 0) & (learned.depth > 0)
+    in_metres = np.log(np.where(known, geometry.depth * scale, 1))
+    ratio = in_metres - np.log(np.where(known, learned.depth, 1)) - base
     weight = np.where(both, geometry.confidence, 0).astype(np.float64)
     field, spread = _smooth_field(ratio, weight)
     for _ in range(2):
         field, spread = _smooth_field(ratio, weight / (1 + ((ratio - field) / _OUTLIER) ** 2))
     # A wrong match agrees with a view or two by chance, but then stands far off the learned surface as well.
     lead &= ~both | (np.abs(ratio - field) < _FAR_OFF) | (geometry.confidence > _PROVEN)
-    bent = learned.depth * np.exp(base + field)
+    guessed = known & (geometry.confidence < SURE)
+    doubt = spread**2 / (spread**2 + _GUESS_SPREAD**2)
+    share = np.where(guessed, _GUESS_SHARE * doubt * np.exp(-(((ratio - field) / _GUESS_GAP) ** 2)), 0)
+    bent = learned.depth * np.exp(base + field + share * (ratio - field))
     sure = np.maximum(_LEARNED_CONFIDENCE * np.exp(-((spread / _TRUSTED_SPREAD) ** 2)), 0.1) * learned.confidence
     depth = np.where(lead, geometry.depth * scale, bent).astype(np.float32)
     confidence = np.where(lead, geometry.confidence, np.where(depth > 0, sure, 0)).astype(np.float32)

@@ -9,7 +9,7 @@ from proxy_room import UNIT, Room
 
 from formats.errors import InputError
 from pipelines.progress import SilentProgress
-from pipelines.proxy.fused import FusedDepth
+from pipelines.proxy.fused import FusedDepth, fuse
 from pipelines.proxy.multiview import MultiviewDepth, StereoSettings
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.reliability import semantic_agreement, warp_labels
@@ -108,6 +108,22 @@ def test_fused_depth_is_metric_and_better_than_either(room: Room, stereo: Multiv
     assert (together > 0).all()
     assert (together < 0.75 * network).all()
     assert (together < np.add(geometry, [0, 1e-5])).all()
+
+
+def test_two_guesses_that_miss_differently_are_better_together() -> None:
+    shape = (60, 80)
+    whole = np.full(shape, 2.0, np.float32)
+    confidence = np.full(shape, 0.8, np.float32)
+    guess = whole.copy()
+    guess[:, 40:], confidence[:, 40:] = 2.2, 0.1  # the geometry guesses 10 % too far
+    guess[20:40, 60:] = 6.0  # and there wildly
+    learned = DepthEstimate((whole * np.where(np.arange(80) < 40, 1.0, 0.95)).astype(np.float32), np.ones_like(whole))
+    fused = fuse(learned, DepthEstimate(guess, confidence), 1.0, 1.0)
+    error = np.abs(fused.depth / whole - 1)
+    assert error[:, :36].max() < 1e-3
+    assert error[:15, 66:].max() < 0.06
+    assert fused.depth[:15, 66:].min() > 0.95 * 2.0  # between the two
+    assert np.abs(fused.depth[22:38, 66:] / whole[22:38, 66:] - 0.95).max() < 0.01
 
 
 def test_regions_mean_the_same_in_all_frames_and_know_the_floor(room: Room) -> None:
