@@ -86,7 +86,7 @@ def _pairs_in_world(sequence: Sequence, frame: Frame, estimate: DepthEstimate) -
     """(Q, 7): the two points of each mirrored match of a frame with reliable depths, and the farther depth."""
     camera = sequence.intrinsics
     matches = mirrored_matches(sequence.image(frame))
-    column, row = np.floor(matches.xy.reshape(-1, 2)).astype(np.int64).T
+    column, row = _pixels(matches.xy.reshape(-1, 2), camera).T
     depth = np.where(estimate.confidence >= _LEAST_CONFIDENCE, estimate.depth, 0)[row, column].astype(np.float64)
     points = unproject(matches.xy.reshape(-1, 2), depth, camera).reshape(-1, 2, 3)
     depth = depth.reshape(-1, 2)
@@ -194,7 +194,7 @@ def _pairs_of_plane(
     # On the plane itself a pixel is its own mirror image.
     inside &= np.linalg.norm(xy - here, axis=-1) > 2 * _STRIDE
     at = np.where(inside[..., None], xy, 0).astype(np.float32)
-    column, row = np.floor(at).astype(np.int64).transpose(2, 0, 1)
+    column, row = _pixels(at, camera).transpose(2, 0, 1)
     their_depth, their_u = depth[row, column], u[row, column]
     seen = cv2.remap(image, at[..., 0] - 0.5, at[..., 1] - 0.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     alike = np.clip(_structure(image, np.asarray(seen, np.uint8)), 0, 1)
@@ -216,6 +216,11 @@ def _pairs_of_plane(
     columns += [m[grid].ravel() for m in (confidence, gain, np.full(depth.shape, -2 * plane[2] * plane[3]))]
     rows = np.stack(columns, 1)
     return rows[rows[:, 4] > 0]
+
+
+def _pixels(xy: NDArray[np.floating], camera: Intrinsics) -> NDArray[np.int64]:
+    """(..., 2) column and row under positions in the image: those on its far border, also by rounding, are inside."""
+    return np.clip(np.floor(xy).astype(np.int64), 0, [camera.width - 1, camera.height - 1])
 
 
 def _structure(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.float64]:

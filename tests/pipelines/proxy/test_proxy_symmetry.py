@@ -11,6 +11,7 @@ from proxy_room import Room, perfect_backbone
 
 from pipelines.geometry.camera import project, unproject, unproject_depth
 from pipelines.progress import SilentProgress
+from pipelines.proxy import symmetry
 from pipelines.proxy.mirror_features import mirror_descriptors, mirrored_matches
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.sequence import Sequence
@@ -128,6 +129,19 @@ def test_a_room_without_symmetry_is_silent() -> None:
     assert find_mirror_planes(sequence, sequence.frames, lambda f: estimates[f.id], SilentProgress()) == []
     image, first = sequence.image(sequence.frames[0]), estimates[0]
     assert len(mirror_pairs(image, first.depth, first.confidence, CAMERA, [])) == 0
+
+
+def test_a_mirror_image_on_the_very_border_is_inside() -> None:
+    """In single precision the last position before the border is the border."""
+    image, depth = picture(np.eye(4), symmetric=True)
+    u = np.ones(depth.shape, np.float32)
+    for shift in (1e-6, 1e-7, 0.0):
+        edge = np.array([1.0, 0.0, 0.0, shift])
+        assert len(mirror_pairs(image, depth, u, CAMERA, [(edge, 1.0)])) > 100
+    assert symmetry._pixels(np.array([[np.float32(319.99999), 240.0], [0.0, 0.0]]), CAMERA).tolist() == [
+        [319, 239],
+        [0, 0],
+    ]
 
 
 def test_too_little_to_see_is_silent() -> None:
