@@ -46,18 +46,28 @@ def turn_within(folder: Path, data: Path) -> Array:
 
 def fast(folder: Path, data: Path) -> Array:
     """Two laps round the table in steps of 10 to 17 degrees, blurred and noisy."""
-    from pipelines.world.paths import room_walk
-
-    steps = np.cumsum(np.random.default_rng(1).uniform(10, 17, 54)) / 360
-    return draw(folder, room_walk(steps), blurred=room_walk, steps=steps, noise=3.0)
+    return fast_walk(folder, 54, seed=1)
 
 
 def fast_blank(folder: Path, data: Path) -> Array:
     """The same without texture on the walls."""
+    return fast_walk(folder, 54, seed=2, blank_walls=True)
+
+
+def blackout(folder: Path, data: Path) -> Array:
+    """One lap of it with the light off for three frames: no picture shows what lies on both sides."""
+    poses = fast_walk(folder, 26, seed=1)
+    for i in (12, 13, 14):
+        save(folder, i, np.random.default_rng(i).integers(0, 6, (SIZE[1], SIZE[0], 3)).astype(np.uint8))
+    return poses
+
+
+def fast_walk(folder: Path, count: int, seed: int, blank_walls: bool = False) -> Array:
+    """Steps of 10 to 17 degrees round the table, each picture blurred over a tenth of a step."""
     from pipelines.world.paths import room_walk
 
-    steps = np.cumsum(np.random.default_rng(2).uniform(10, 17, 54)) / 360
-    return draw(folder, room_walk(steps), blurred=room_walk, steps=steps, noise=3.0, blank_walls=True)
+    steps = np.cumsum(np.random.default_rng(seed).uniform(10, 17, count)) / 360
+    return draw(folder, room_walk(steps), blurred=room_walk, steps=steps, noise=3.0, blank_walls=blank_walls)
 
 
 def exposure(folder: Path, data: Path) -> Array:
@@ -107,7 +117,7 @@ def whiteroom_fast(folder: Path, data: Path) -> Array:
 
 HARD: dict[str, Callable[[Path, Path], Array]] = {
     f.__name__: f
-    for f in (turn, turn_within, fast, fast_blank, exposure, kitchen_twice, replica_fast, whiteroom_fast)
+    for f in (turn, turn_within, fast, fast_blank, blackout, exposure, kitchen_twice, replica_fast, whiteroom_fast)
 }
 
 
