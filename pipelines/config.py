@@ -152,7 +152,7 @@ class MappingConfig:
         0.02, "share of a view's pixels, those of largest error, that may add Gaussians a round"
     )
     prune_opacity: float = setting(0.03, "Gaussians more transparent than this are removed")
-    prune_weight: float = setting(0.0, "and those of less blending weight in every pixel of every keyframe; 0 = off")
+    prune_weight: float = setting(0.03, "and those of less blending weight in every pixel of every keyframe; 0 = off")
     prune_radius: float = setting(0.15, "and those larger than this, in units of the scene's median depth")
     mean_rate: float = setting(6e-4, "learning rate of positions, in units of the scene's median depth")
     radius_rate: float = setting(3e-2, "learning rate of log radii")
@@ -164,9 +164,9 @@ class MappingConfig:
     pose_rate: float = setting(1e-4, "learning rate of rotations (radians); translations times the median depth")
     exposure: bool = setting(True, "a gain and an offset a keyframe and colour")
     exposure_rate: float = setting(1e-2, "learning rate of gains and offsets")
-    low_trust_step: float = setting(1.0, "share of a step that Gaussians of unreliable depth take; medium its root")
+    low_trust_step: float = setting(4.0, "steps of Gaussians of unreliable depth, times; of medium, times its root")
     boundary_clip: float = setting(0.0, "clip gradients beside class boundaries to this times their mean; 0 = off")
-    symmetry_weight: float = setting(0.05, "pull between the two halves of what is mirror-symmetric; 0 = off")
+    symmetry_weight: float = setting(0.0, "pull between the two halves of what is mirror-symmetric; 0 = off")
     time_decay: float = setting(0.1, "τ of eq. (13), a keyframe, while the map is being seeded")
     reliability_decay: float = setting(1.0, "δ of eq. (14): keyframes of unreliable depth weigh less")
 

@@ -99,14 +99,23 @@ class Schedule:
             return int(rng.integers(now))
         return int(rng.choice(now, p=chances / chances.sum()))
 
+    def _kind_of_pass(self, number: int) -> tuple[bool, bool]:
+        """Whether the pass is coarse, and whether the map grows in it: by whole passes, or half of the views would get
+        Gaussians and the pruning at the end of the pass would never come."""
+        s, passes = self.settings, self.visits / self.views
+        coarse_passes = round(s.coarse_share * passes) if self.seeding > 0 else 0
+        if number < coarse_passes:
+            return True, False
+        turn = s.densify_every > 0 and (number - coarse_passes) % s.densify_every == 0
+        return False, turn and number < s.densify_until * passes
+
     def _visit(self, iteration: int) -> Step:
         s = self.settings
         visit = iteration - self.seeding
         number, place = divmod(visit, self.views)
         view = int(np.random.default_rng([self.seed, 2, number]).permutation(self.views)[place])
         share = visit / max(self.visits, 1)
-        coarse = self.seeding > 0 and share < s.coarse_share
-        grows = s.densify_every > 0 and not coarse and share < s.densify_until and number % s.densify_every == 0
+        coarse, grows = self._kind_of_pass(number)
         weights = keyframe_weights(0, self.reliability, 0.0, s.reliability_decay)
         return Step(
             iteration=iteration,

@@ -121,6 +121,18 @@ def test_schedule_visits_each_view_once_a_pass(room: MappingInput) -> None:
     assert [again.step(i) for i in (7, 40, 61)] == [steps[i] for i in (7, 40, 61)]
 
 
+def test_the_map_grows_by_whole_passes(room: MappingInput) -> None:
+    n = len(room.views)
+    settings = MappingConfig(passes=10.0, min_iterations=0, coarse_share=0.25, densify_every=2, densify_until=0.45)
+    schedule = Schedule.plan(room.views, settings, seed=0, seeding=True, passes=None)
+    visits = [schedule.step(i) for i in range(schedule.seeding, schedule.total)]
+    assert [i // n for i, s in enumerate(visits) if s.prune] == [2, 4]
+    assert Counter(i // n for i, s in enumerate(visits) if s.grow) == {2: n, 4: n}
+    assert sum(s.coarse for s in visits) == 2 * n
+    refining = Schedule.plan(room.views, settings, seed=0, seeding=False, passes=4.0)
+    assert not any(s.coarse for s in map(refining.step, range(refining.total)))
+
+
 def relative_error(views: list, truth: list) -> float:
     errors = [(v.depth / t.depth - 1).abs()[t.depth > 0] for v, t in zip(views, truth, strict=True)]
     return float(torch.cat(errors).mean())
