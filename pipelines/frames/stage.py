@@ -38,6 +38,7 @@ _SIGNIFICANT_SHIFT_PX = 0.3
 _FEW_KEYFRAMES = 12
 _FOCAL_GUESS = 1.2
 _UNSURE_FOCAL = 0.05
+_LEAST_PART = 3
 
 AnySource = VideoSource | FolderSource | RecordingSource
 
@@ -183,22 +184,29 @@ def _structure(
         threads=_threads(context),
         seed=context.config.run.seed,
     ).run(keyframes)
-    _warn_of_structure(context, structure, [frames[k].id for k in keyframes])
+    warn_of_structure(context, structure, [frames[k].id for k in keyframes])
     return structure
 
 
-def _warn_of_structure(context: StageContext, structure: Structure, ids: list[int]) -> None:
+def warn_of_structure(context: StageContext, structure: Structure, ids: list[int]) -> None:
     """What is missing in the structure, and where it contradicts the pictures; ids[k] is the frame of keyframe k."""
     report = structure.report
     if report.registered < report.total:
         context.warn(
             f"structure from motion could not place {report.total - report.registered} of {report.total} keyframes"
         )
-    if len(report.parts) > 1:
-        parts = ", ".join(f"{ids[p[0]]}-{ids[p[-1]]}" for p in report.parts)
+    parts = [p for p in report.parts if len(p) >= _LEAST_PART]
+    if len(parts) > 1:
+        named = ", ".join(f"{ids[p[0]]}-{ids[p[-1]]}" for p in parts)
         context.warn(
-            f"structure from motion fell into {len(report.parts)} parts that nothing holds together (frames {parts}): "
+            f"structure from motion fell into {len(parts)} parts that nothing holds together (frames {named}): "
             "tracking joins what it recognises"
+        )
+    alone = sorted(ids[k] for p in report.parts if len(p) < _LEAST_PART for k in p)
+    if alone:
+        context.warn(
+            f"{len(alone)} keyframes have hardly a point in common with the others (frames "
+            f"{', '.join(map(str, alone))}): tracking looks for them again"
         )
     folds = ", ".join(f"{ids[s.before]}-{ids[s.after]}" for s in report.contradicted)
     if folds or report.pairs_agreeing < 0.9:

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pycolmap
 import pytest
 
+from pipelines.frames.consistency import ModelReport
 from pipelines.frames.seams import PairCheck, Seam, cut, find_parts, find_seams, tracks_of, worst_contradictions
+from pipelines.frames.stage import warn_of_structure
+from pipelines.frames.structure import Structure
+from pipelines.stages import StageContext
 
 COUNT, REACH = 40, 4
 
@@ -75,3 +83,31 @@ def test_a_whole_model_is_not_touched(made_model: pycolmap.Reconstruction) -> No
     before = tracks_of(made_model)
     cut(made_model, [list(range(10))])
     assert tracks_of(made_model) == before
+
+
+def _seam(before: int, points: int = 50, agreeing: int = 9) -> Seam:
+    return Seam(before, before + 1, points, 10, agreeing)
+
+
+@pytest.mark.parametrize(
+    ("seams", "parts", "wanted"),
+    [
+        ([_seam(0)], [range(9)], []),
+        ([_seam(4, agreeing=1)], [range(9)], ["folded between frames 8-10"]),
+        ([_seam(4, points=0)], [range(5), range(5, 9)], ["2 parts .* 0-8, 10-16"]),
+        ([_seam(7, points=0)], [range(8), [8]], [r"1 keyframes .* \(frames 16\)"]),
+    ],
+    ids=["sound", "folded", "two parts", "one alone"],
+)
+def test_what_is_wrong_is_said(
+    seams: list[Seam],
+    parts: list[list[int]],
+    wanted: list[str],
+    make_context: Callable[..., StageContext],
+    tmp_path: Path,
+) -> None:
+    report = ModelReport(9, 9, 500, 0.3, 0.99, 0.99, tuple(seams), tuple(map(tuple, parts)))
+    context = make_context(tmp_path)
+    warn_of_structure(context, Structure(pycolmap.Reconstruction(), report, "global", 0.0), list(range(0, 18, 2)))
+    assert len(context.warnings) == len(wanted)
+    assert all(re.search(pattern, said) for pattern, said in zip(wanted, context.warnings, strict=True))
