@@ -148,6 +148,7 @@ class MappingConfig:
     depth_tolerance: float = setting(0.05, "T_depth, relative: a proxy nearer than the map by more adds Gaussians")
     densify_every: int = setting(2, "passes between two rounds of densification and pruning; 0 = never")
     densify_until: float = setting(0.45, "share of the visits after which the map no longer grows")
+    densify_classes: bool = setting(False, "also where the map shows another class than the label: fixes its noise too")
     error_share: float = setting(
         0.02, "share of a view's pixels, those of largest error, that may add Gaussians a round"
     )

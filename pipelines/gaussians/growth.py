@@ -56,10 +56,11 @@ class Growth:
 
     @torch.no_grad()
     def grow(self, index: int, rendering: Rendering) -> None:
-        """Add Gaussians by the three conditions of the article, and where the colours are most wrong."""
+        """Add Gaussians by the conditions of the article, and where the colours are most wrong."""
         view, s = self.views[index], self.settings
         needed = self._needed(view, rendering)
-        needed |= densify.wrong_classes(rendering.features[..., 3:], view.channels, view.label_weight)
+        if s.densify_classes:
+            needed |= densify.wrong_classes(rendering.features[..., 3:], view.channels, view.label_weight)
         spacing = self._spacing(view)
         grid = spacing > 0
         colors = expose(rendering.features[..., :3], self.state.view_tables[index])

@@ -72,6 +72,11 @@ ABLATIONS = {
     "without depth fields": ("mapping.depth_fields=false",),
     "without depth check": ("mapping.depth_check=false",),
     "without densification": ("mapping.densify_every=0",),
+    "densified by classes": ("mapping.densify_classes=true",),
+    "without pruning by weight": ("mapping.prune_weight=0.0",),
+    "steps alike": ("mapping.low_trust_step=1.0",),
+    "gradients clipped at boundaries": ("mapping.boundary_clip=1.0",),
+    "with symmetry": ("mapping.symmetry_weight=0.05",),
     "without exposure": ("mapping.exposure=false",),
     "without pose refinement": ("mapping.refine_poses=false",),
 }

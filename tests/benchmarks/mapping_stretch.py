@@ -156,7 +156,8 @@ def main() -> None:
     indices = range(arguments.first, min(arguments.first + arguments.frames, len(sequence)))
     shots = load_shots(sequence, camera, indices, arguments.depth, arguments.labels)
     rows = []
-    for name, switches in (ABLATIONS if arguments.ablation else {"complete": ()}).items():
+    variants = {n: s for n, s in ABLATIONS.items() if all(x.startswith("mapping.") for x in s)}
+    for name, switches in (variants if arguments.ablation else {"complete": ()}).items():
         settings = load_config(None, ["mapping.min_iterations=0", *arguments.overrides, *switches]).mapping
         row = measure(sequence, shots, camera, settings)
         rows.append({"variant": name, **row})
