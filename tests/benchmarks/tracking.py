@@ -39,6 +39,8 @@ from hard_sequences import HARD, write_hard
 from numpy.typing import NDArray
 
 DATA = ROOT.parent / "shared" / "data"
+PLAIN = ("run.format=images",)
+"""Pictures named like a data set's, but without what that says of their camera."""
 COARSE = ("proxy.stereo_side=160", "proxy.stereo_planes=32")
 """Quick proxies where only poses are judged: multi-view depth takes no part in them."""
 Truth = Callable[[str, int], NDArray[np.float64] | None]
@@ -97,16 +99,18 @@ def cases(work: Path) -> dict[str, Case]:
     files = f'proxy.depth="files:{white / "proxy_depth"}"'
     return {
         "kitchen_video": Case(DATA / "videos/kitchen_640x480_30fps.mp4", (), kitchen_truth),
-        "kitchen": Case(DATA / "kitchen", (), kitchen_truth, "*.color.jpg"),
-        "replica": Case(replica / "rgb", (), office),
-        "replica_files": Case(replica / "rgb", (known, f'proxy.depth="files:{work / "noisy"}"'), office),
-        "phone_desk": Case(phone / "images", (), phone_truth, last=60),
-        "phone_desk_jump": Case(phone / "images", (), phone_truth),
+        "kitchen": Case(DATA / "kitchen", PLAIN, kitchen_truth, "*.color.jpg"),
+        "replica": Case(replica / "rgb", PLAIN, office),
+        "replica_files": Case(replica / "rgb", (*PLAIN, known, f'proxy.depth="files:{work / "noisy"}"'), office),
+        "phone_desk": Case(phone / "images", PLAIN, phone_truth, last=60),
+        "phone_desk_jump": Case(phone / "images", PLAIN, phone_truth),
         "whiteroom_video": Case(white / "video.mp4", (), room),
-        "whiteroom_files": Case(white / "rgb", (files,), room),
-        "corridor": Case(work / "corridor" / "rgb", (), lambda *_: None),
+        "whiteroom_files": Case(white / "rgb", (*PLAIN, files), room),
+        "corridor": Case(work / "corridor" / "rgb", PLAIN, written_truth(work / "corridor" / "traj.txt")),
         "bedroom": Case(DATA / "videos/bedroom_848x364_58fps.mp4", (), lambda *_: None),
-        **{name: Case(work / name / "rgb", COARSE, written_truth(work / name / "traj.txt")) for name in HARD},
+        **{
+            name: Case(work / name / "rgb", (*PLAIN, *COARSE), written_truth(work / name / "traj.txt")) for name in HARD
+        },
     }
 
 
@@ -164,8 +168,7 @@ def measure_ours(name: str, work: Path, settings: Sequence[str], until: str) -> 
     with adjustment_timed() as adjusting:
         records, seconds = run_stages_timed(source, run, config, until)
     trajectory, frames = run.load_trajectory(until), run.load_frames()
-    is_video = source.is_file()
-    originals = original_names(source, len(frames), is_video)
+    originals = original_names(source, frames)
     truth = [case.truth(n, f.source_index) for n, f in zip(originals, frames, strict=True)]
     metric = bool(run.load_proxy_report().get("metric", False))
     return {
@@ -237,16 +240,17 @@ def walk_case(name: str, work: Path) -> Case:
         options = ClipOptions(frames=1000, width=320, height=240, laps=4.0)
         world = make_world("room", texel=0.006)
         write_sequence(folder, world, options, (render_frame(world, options, i) for i in range(count)))
-    return Case(folder / "rgb", COARSE, by_number(rows_of(folder / "traj.txt")))
+    return Case(folder / "rgb", (*PLAIN, *COARSE), by_number(rows_of(folder / "traj.txt")))
 
 
-def original_names(source: Path, count: int, is_video: bool) -> list[str]:
-    """Names of the pictures of a folder in order; nothing for a video."""
-    if is_video:
-        return [""] * count
+def original_names(source: Path, frames: Sequence[Any]) -> list[str]:
+    """Names of the frames' pictures in a folder; nothing for a video."""
+    if source.is_file():
+        return [""] * len(frames)
     from formats.images import list_images
 
-    return [p.name for p in list_images(source)]
+    names = [p.name for p in list_images(source)]
+    return [names[f.source_index] for f in frames]
 
 
 def errors(
@@ -293,7 +297,7 @@ def measure_colmap(name: str, work: Path, mapper: str) -> dict[str, Any]:
     frames = run.load_frames()
     source = prepare(name, case, work)
     folder = run.stage("frames") if source.is_file() else source
-    names = [f.name for f in frames] if source.is_file() else original_names(source, len(frames), False)
+    names = [f.name for f in frames] if source.is_file() else original_names(source, frames)
     place = work / f"{name}_colmap"
     database, stored = place / "database.db", place / "seconds.json"
     if not stored.exists():
