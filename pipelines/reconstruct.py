@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import shutil
 from collections.abc import Iterator
@@ -11,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from formats.atomic import atomic_path
+from formats.digest import file_sha256, files_sha256
 from formats.errors import DiskFullError, InputError
 from formats.jsonfile import write_json
 from pipelines.config import Config, config_to_toml, load_saved_config
@@ -18,7 +18,7 @@ from pipelines.frames.recording import open_recording
 from pipelines.progress import Progress, log
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
-from pipelines.stages import Stage, StageRecord, file_digest, load_records, load_source, run_stages
+from pipelines.stages import Stage, StageRecord, load_records, load_source, run_stages
 
 
 def all_stages() -> list[Stage]:
@@ -113,18 +113,13 @@ def _source_digest(source: Path, format: str) -> str:
         raise InputError(f"{source} is empty (0 bytes). Copy the video again")
     if not source.exists():
         raise InputError(f"{source}: there is no such file or folder. Give a video or a folder of images")
-    digest = hashlib.sha256()
     recording = open_recording(source, format)
     if recording is not None and recording.image_paths:
-        digest.update(f"{recording.format} {recording.camera}".encode() + recording.timestamps.tobytes())
-        for name, path in zip(recording.names, recording.image_paths, strict=True):
-            digest.update(f"{name}\0{file_digest(path)}\n".encode())
-        return digest.hexdigest()
+        head = f"{recording.format} {recording.camera}".encode() + recording.timestamps.tobytes()
+        return files_sha256(zip(recording.names, recording.image_paths, strict=True), head)
     if source.is_file():
-        return file_digest(source)
-    for path in sorted(p for p in source.iterdir() if p.is_file()):
-        digest.update(f"{path.name}\0{file_digest(path)}\n".encode())
-    return digest.hexdigest()
+        return file_sha256(source)
+    return files_sha256((p.name, p) for p in sorted(source.iterdir()) if p.is_file())
 
 
 def _require_same_source(run: RunFolder, source: Path, digest: str) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from formats.atomic import is_disk_full
+from formats.digest import file_sha256
 from formats.errors import DiskFullError, InputError
 from formats.jsonfile import write_json
 from pipelines.config import Config, config_to_dict
@@ -234,20 +235,14 @@ def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) 
 
 def _checksums(folder: Path) -> dict[str, tuple[int, str]]:
     paths = sorted(p for p in folder.rglob("*") if p.is_file() and not p.is_symlink())
-    return {str(p.relative_to(folder)): (p.stat().st_size, file_digest(p)) for p in paths}
+    return {str(p.relative_to(folder)): (p.stat().st_size, file_sha256(p)) for p in paths}
 
 
 def _intact(folder: Path, record: StageRecord) -> bool:
     return all(
-        (path := folder / name).is_file() and path.stat().st_size == size and file_digest(path) == digest
+        (path := folder / name).is_file() and path.stat().st_size == size and file_sha256(path) == digest
         for name, (size, digest) in record.files.items()
     )
-
-
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file's bytes."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _save_manifest(run: RunFolder, source: Path, source_digest: str, records: dict[str, StageRecord]) -> None:

@@ -46,9 +46,9 @@ class RecordingSource:
 
     def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
         """See `Source.read`; what the reader notes of the data set, and images that cannot be read, are told."""
-        for note in self.sequence.notes if warn is not None else ():
-            assert warn is not None
-            warn(f"{self.sequence.format}: {note}")
+        if warn is not None:
+            for note in self.sequence.notes:
+                warn(f"{self.sequence.format}: {note}")
         for index in range(len(self.sequence)):
             if wanted is not None and index not in wanted:
                 continue

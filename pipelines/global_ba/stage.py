@@ -31,6 +31,7 @@ from pipelines.run_folder import (
     write_json,
 )
 from pipelines.stages import Stage, StageContext
+from pipelines.tracking.adjust import without_dependent_depth
 from pipelines.tracking.bundle import reprojection_errors
 from pipelines.tracking.depth_scales import sample_proxy
 from pipelines.tracking.features import extract_features
@@ -123,7 +124,7 @@ def adjust(context: StageContext, model: SparseModel, found: FoundLoops) -> Clos
 
     report = run.load_proxy_report()
     metric = bool(report.get("metric", False))
-    tracking = replace(config.tracking, use_depth=config.tracking.use_depth and report.get("independent_depth", metric))
+    tracking = without_dependent_depth(config.tracking, report)
     drifted = drift > config.global_ba.drift_px
     closed = close_loops(state, found.loops, drifted, intrinsics, load_proxy, metric, tracking, config.global_ba)
     if closed.error_after > 1.5 * closed.error_before + 0.05:

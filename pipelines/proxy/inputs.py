@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from formats.digest import files_sha256
 from pipelines.config import Config
-from pipelines.frames.recording import open_recording
+from pipelines.frames.recording import RecordingSource
 from pipelines.frames.source import open_source
 from pipelines.progress import SilentProgress
 from pipelines.proxy.files_depth import FilesDepth, require_sizes
 from pipelines.proxy.files_labels import FilesLabels
-from pipelines.proxy.networks.identity import card_identity, files_identity
+from pipelines.proxy.networks.identity import card_identity
 from pipelines.proxy.scale_reference import require_reference_in
 from pipelines.proxy.selection import (
     Surroundings,
@@ -37,9 +38,9 @@ def proxy_inputs(source: Path, config: Config) -> dict[str, Any]:
     if "files" in (depth.kind, semantics.kind):
         around = _before_frames(source, config)
         if depth.kind == "files":
-            identities["depth"] = files_identity(open_depth_files(around, depth.folder).files())
+            identities["depth"] = _digest_of(open_depth_files(around, depth.folder).files())
         if semantics.kind == "files":
-            identities["labels"] = files_identity(open_label_files(around, semantics.folder).files())
+            identities["labels"] = _digest_of(open_label_files(around, semantics.folder).files())
     return identities
 
 
@@ -49,14 +50,21 @@ def check_proxy(source: Path, config: Config) -> None:
     if config.proxy.scale_ref:
         require_reference_in(open_source(source, config.run.format), config.proxy.scale_ref)
     depth, semantics = choose_depth(config.proxy), choose_semantics(config.proxy)
+    if not {depth.kind, semantics.kind} & {"files", "onnx"}:
+        return
+    around = _before_frames(source, config)
     opened: list[object] = []
     if depth.kind in ("files", "onnx"):
-        opened.append(open_learned_depth(_before_frames(source, config), depth))
+        opened.append(open_learned_depth(around, depth))
     if semantics.kind in ("files", "onnx"):
-        opened.append(open_learned_semantics(_before_frames(source, config), semantics))
+        opened.append(open_learned_semantics(around, semantics))
     for provider in opened:
         if isinstance(provider, FilesDepth | FilesLabels):
-            require_sizes(provider.files(), _before_frames(source, config).sequence)
+            require_sizes(provider.files(), around.sequence)
+
+
+def _digest_of(files: list[Path]) -> str:
+    return files_sha256((p.name, p) for p in files)
 
 
 def _before_frames(source: Path, config: Config) -> Surroundings:
@@ -71,6 +79,6 @@ def _before_frames(source: Path, config: Config) -> Surroundings:
     def nothing(_: Any) -> Any:
         raise AssertionError("providers are only opened here")
 
-    recording = open_recording(source, config.run.format)
+    recording = pictures.sequence if isinstance(pictures, RecordingSource) else None
     sequence = Sequence(names, calibration, small, None, nothing)
     return Surroundings(source, sequence, config.proxy, nothing, 1, "cpu", SilentProgress(), recording)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -36,15 +35,12 @@ def reference_scale(
     if known is None:
         return None
 
-    def in_backbone_unit(frame: Frame) -> DepthEstimate:
-        estimate = depth_of(frame)
-        return replace(estimate, depth=(estimate.depth / np.float32(scale.value)).astype(np.float32))
-
     if known.picture:
         source = open_source(context.source, context.config.run.format)
         found = distance_scale(known, source, sequence, frames, depth_of)
     else:
-        heights = SegmentLabels(sequence, config.max_classes, context.progress).heights(frames, in_backbone_unit)
+        segments = SegmentLabels(sequence, config.max_classes, context.progress)
+        heights = segments.heights(frames, lambda frame: scale.in_backbone_unit(depth_of(frame)))
         if len(heights) == 0 or np.median(heights) <= 0:
             raise InputError(
                 f"--scale-ref {config.scale_ref}: no floor was found in the scene. Give a distance between two points"

@@ -16,6 +16,7 @@ from formats.atomic import atomic_path
 from formats.errors import InputError
 from pipelines.progress import Progress, log
 from pipelines.proxy.scratch import load_scratch, save_scratch
+from pipelines.proxy.sequence import Sequence
 from pipelines.types import Frame
 
 Arrays = dict[str, NDArray]
@@ -70,37 +71,45 @@ class ResultCache:
         return self.folder / f"{key}.npz"
 
 
+@dataclass(frozen=True)
+class Workplace:
+    """Where networks run: on which frames, and how; `folder()` keeps this run's results, `cache` those of all runs."""
+
+    sequence: Sequence
+    folder: Callable[[], Path]
+    threads: int
+    device: str
+    progress: Progress
+    cache: ResultCache
+
+
 class NetworkPass:
     """`compute` turns a picture (h, w, 3) into named arrays; `identity` says what else they depend on."""
 
     def __init__(
-        self,
-        name: str,
-        identity: str,
-        folder: Callable[[], Path],
-        cache: ResultCache,
-        compute: Callable[[NDArray[np.uint8]], Arrays],
+        self, name: str, identity: str, place: Workplace, compute: Callable[[NDArray[np.uint8]], Arrays]
     ) -> None:
-        self._name, self._identity, self._folder, self._cache, self._compute = name, identity, folder, cache, compute
+        self._name, self._identity, self._place, self._compute = name, identity, place, compute
 
-    def run(self, frames: list[Frame], image_of: Callable[[Frame], NDArray[np.uint8]], progress: Progress) -> None:
+    def run(self, frames: list[Frame]) -> None:
         """Results of all frames to the disk; what is there stays, what another run has computed is taken over."""
+        cache = self._place.cache
         todo = [f for f in frames if not self._path(f).exists()]
         computed, seconds = 0, 0.0
-        for done, frame in enumerate(progress.track(todo, "network", len(todo))):
-            image = image_of(frame)
+        for done, frame in enumerate(self._place.progress.track(todo, "network", len(todo))):
+            image = self._place.sequence.image(frame)
             key = self._key(image)
-            arrays = self._cache.load(key)
+            arrays = cache.load(key)
             if arrays is None:
                 started = time.monotonic()
                 arrays = self._compute(image)
                 seconds += time.monotonic() - started
                 computed += 1
-                self._cache.save(key, arrays)
+                cache.save(key, arrays)
                 if computed == _MEASURED:
                     self._announce(seconds / computed, len(todo) - done - 1)
             save_scratch(self._path(frame), **arrays)
-        self._cache.trim()
+        cache.trim()
 
     def load(self, frame: Frame) -> Arrays:
         """What `run` has left."""
@@ -118,4 +127,4 @@ class NetworkPass:
         return hashlib.sha256(f"{self._identity} {image.shape} ".encode() + image.tobytes()).hexdigest()
 
     def _path(self, frame: Frame) -> Path:
-        return self._folder() / f"{frame.id:06d}.npz"
+        return self._place.folder() / f"{frame.id:06d}.npz"

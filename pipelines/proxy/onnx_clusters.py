@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.progress import Progress
-from pipelines.proxy.network_pass import Arrays, ResultCache
+from pipelines.proxy.network_pass import Arrays, Workplace
 from pipelines.proxy.networks.card import Card
 from pipelines.proxy.networks.labels import class_token, patch_features
 from pipelines.proxy.onnx_labels import OnnxLabels
-from pipelines.proxy.sequence import Sequence
 from pipelines.types import Frame
 
 _SAMPLE = 20000
@@ -25,19 +20,9 @@ _SOFTNESS = 0.1
 class OnnxClusters(OnnxLabels):
     """What looks alike to the network is one class, "cluster 1" the most frequent; spherical k-means, fixed seed."""
 
-    def __init__(
-        self,
-        sequence: Sequence,
-        card: Card,
-        folder: Callable[[], Path],
-        threads: int,
-        device: str,
-        progress: Progress,
-        cache: ResultCache,
-        most: int,
-    ) -> None:
+    def __init__(self, card: Card, place: Workplace, most: int) -> None:
         """`most` clusters at the most. Raises InputError as `OnnxLabels`."""
-        super().__init__(sequence, card, folder, threads, device, progress, cache)
+        super().__init__(card, place)
         self._most = most
         self._centres = np.empty((0, 0), np.float32)
 
@@ -53,7 +38,8 @@ class OnnxClusters(OnnxLabels):
         each = max(1, _SAMPLE // max(len(frames), 1))
         rows = []
         for frame in frames:
-            features = self._features(frame).reshape(-1, self._features(frame).shape[-1])
+            features = self._features(frame)
+            features = features.reshape(-1, features.shape[-1])
             rows.append(features[rng.permutation(len(features))[:each]])
         centres = spherical_kmeans(np.concatenate(rows), self._most, rng)
         self._centres = centres

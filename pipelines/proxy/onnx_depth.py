@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
-from pipelines.progress import Progress
-from pipelines.proxy.network_pass import Arrays, NetworkPass, ResultCache
+from pipelines.proxy.network_pass import Arrays, NetworkPass, Workplace
 from pipelines.proxy.networks.card import Card
 from pipelines.proxy.networks.depth import network_depth
 from pipelines.proxy.networks.identity import card_identity
 from pipelines.proxy.networks.session import Network
 from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.sequence import Sequence
 from pipelines.types import Frame
 
 
@@ -26,25 +22,16 @@ class OnnxDepth:
 
     metric = True
 
-    def __init__(
-        self,
-        sequence: Sequence,
-        card: Card,
-        folder: Callable[[], Path],
-        threads: int,
-        device: str,
-        progress: Progress,
-        cache: ResultCache,
-    ) -> None:
+    def __init__(self, card: Card, place: Workplace) -> None:
         """Opens the network. Raises InputError when it cannot be what the card says."""
         if card.task != "depth":
             raise InputError(f"{card.model}: its card says {card.task}, but proxy.depth needs a network for depth")
-        self._network = Network(card, threads, device)
-        self._sequence, self._progress = sequence, progress
+        self._network = Network(card, place.threads, place.device)
+        self._sequence = place.sequence
         self.name = f"onnx:{card.name}"
         self._focals: dict[int, float] = {}
-        identity = f"{card_identity(card)} {sequence.intrinsics}"
-        self._pass = NetworkPass(self.name, identity, folder, cache, self._compute)
+        identity = f"{card_identity(card)} {place.sequence.intrinsics}"
+        self._pass = NetworkPass(self.name, identity, place, self._compute)
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """None: a network sees every frame."""
@@ -52,7 +39,7 @@ class OnnxDepth:
 
     def prepare(self, frames: list[Frame]) -> None:
         """Run the network; what is on disk stays."""
-        self._pass.run(frames, self._sequence.image, self._progress)
+        self._pass.run(frames)
 
     def _compute(self, image: NDArray[np.uint8]) -> Arrays:
         found = network_depth(self._network, image, self._sequence.intrinsics)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
-from pipelines.progress import Progress
-from pipelines.proxy.network_pass import Arrays, NetworkPass, ResultCache
+from pipelines.proxy.network_pass import Arrays, NetworkPass, Workplace
 from pipelines.proxy.networks.card import Card
 from pipelines.proxy.networks.identity import card_identity
 from pipelines.proxy.networks.labels import class_token, network_labels
@@ -19,7 +17,6 @@ from pipelines.proxy.networks.session import Network
 from pipelines.proxy.palette import class_colors
 from pipelines.proxy.providers import DepthEstimate, LabelEstimate
 from pipelines.proxy.regions.votes import WorldVotes
-from pipelines.proxy.sequence import Sequence
 from pipelines.types import VOID, ClassTable, Frame
 
 _LEAST_SHARE = 0.001
@@ -29,30 +26,21 @@ _LEAST_SHARE = 0.001
 class OnnxLabels:
     """Only the classes that occur in the video are kept."""
 
-    def __init__(
-        self,
-        sequence: Sequence,
-        card: Card,
-        folder: Callable[[], Path],
-        threads: int,
-        device: str,
-        progress: Progress,
-        cache: ResultCache,
-    ) -> None:
+    def __init__(self, card: Card, place: Workplace) -> None:
         """Opens the network. Raises InputError when it cannot be what the card says."""
         if card.task != "segmentation":
             raise InputError(
                 f"{card.model}: its card says {card.task}, but proxy.semantics needs a segmentation network"
             )
-        self._network = Network(card, threads, device)
-        self._sequence, self._progress = sequence, progress
+        self._network = Network(card, place.threads, place.device)
+        self._sequence = place.sequence
         self.name = f"onnx:{card.name}"
         self._names = card.labels
         self._label_of = np.empty(0, np.uint8)
         self._classes = ClassTable((), ())
         self._votes: WorldVotes | None = None
-        identity = f"{card_identity(card)} {sequence.intrinsics.width}x{sequence.intrinsics.height}"
-        self._pass = NetworkPass(self.name, identity, folder, cache, self._compute)
+        identity = f"{card_identity(card)} {place.sequence.intrinsics.width}x{place.sequence.intrinsics.height}"
+        self._pass = NetworkPass(self.name, identity, place, self._compute)
 
     def warnings(self) -> list[str]:
         """Nothing is ever amiss."""
@@ -64,7 +52,7 @@ class OnnxLabels:
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Run the network, settle the classes, and let all frames vote on the classes of the places they see."""
-        self._pass.run(frames, self._sequence.image, self._progress)
+        self._pass.run(frames)
         self._learn(frames)
         counts = np.zeros(len(self._names) + 1, np.int64)
         for frame in frames:

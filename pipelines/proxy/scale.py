@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,10 @@ class DepthScale:
     def value(self) -> float:
         """The scale of the run; 1 where nothing is known."""
         return float(np.median(list(self.of_frame.values()))) if self.of_frame else 1.0
+
+    def in_backbone_unit(self, estimate: DepthEstimate) -> DepthEstimate:
+        """The same depth in the unit of the backbone's poses."""
+        return replace(estimate, depth=(estimate.depth / np.float32(self.value)).astype(np.float32))
 
     @property
     def spread(self) -> float:

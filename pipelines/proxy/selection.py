@@ -16,7 +16,7 @@ from pipelines.proxy.files_labels import FilesLabels
 from pipelines.proxy.fused import FusedDepth
 from pipelines.proxy.models.registry import ModelStore, default_cache
 from pipelines.proxy.multiview import MultiviewDepth, StereoSettings
-from pipelines.proxy.network_pass import ResultCache
+from pipelines.proxy.network_pass import ResultCache, Workplace
 from pipelines.proxy.networks.card import Card, read_card
 from pipelines.proxy.onnx_clusters import OnnxClusters
 from pipelines.proxy.onnx_depth import OnnxDepth
@@ -97,7 +97,7 @@ def open_learned_depth(around: Surroundings, choice: Choice) -> FilesDepth | Rec
     """The provider of `files` or of a network, by itself."""
     if choice.card is None:
         return open_depth_files(around, choice.folder)
-    return OnnxDepth(around.sequence, choice.card, *_surroundings(around, "network_depth"))
+    return OnnxDepth(choice.card, _workplace(around, "network_depth"))
 
 
 def open_semantics(around: Surroundings) -> SemanticsProvider:
@@ -112,8 +112,10 @@ def open_learned_semantics(around: Surroundings, choice: Choice) -> FilesLabels 
     """The provider of `files` or of a network, by itself."""
     if choice.card is None:
         return open_label_files(around, choice.folder)
-    arguments = (around.sequence, choice.card, *_surroundings(around, "network_labels"))
-    return OnnxClusters(*arguments, around.config.max_classes) if choice.card.is_clustered else OnnxLabels(*arguments)
+    place = _workplace(around, "network_labels")
+    if choice.card.is_clustered:
+        return OnnxClusters(choice.card, place, around.config.max_classes)
+    return OnnxLabels(choice.card, place)
 
 
 def open_depth_files(around: Surroundings, folder: str) -> FilesDepth | RecordingDepth:
@@ -163,6 +165,8 @@ def _fused(around: Surroundings, learned: DepthProvider) -> DepthProvider:
     return FusedDepth(learned, _multiview(around), around.sequence)
 
 
-def _surroundings(around: Surroundings, scratch: str) -> tuple[Callable[[], Path], int, str, Progress, ResultCache]:
+def _workplace(around: Surroundings, scratch: str) -> Workplace:
     cache = ResultCache(default_cache() / "results", around.cache_mb)
-    return lambda: around.scratch(scratch), around.threads, around.device, around.progress, cache
+    return Workplace(
+        around.sequence, lambda: around.scratch(scratch), around.threads, around.device, around.progress, cache
+    )

@@ -65,7 +65,7 @@ def run(context: StageContext) -> dict[str, Any]:
         context, sequence, frames, depths, scale, lambda frame: _load_depth(context.snapshot, frame)
     )
     metres = reference.factor if reference else 1.0
-    semantics.prepare(frames, lambda frame: _in_backbone_unit(_load_depth(context.snapshot, frame), scale))
+    semantics.prepare(frames, lambda frame: scale.in_backbone_unit(_load_depth(context.snapshot, frame)))
     for message in semantics.warnings():
         context.warn(message)
     save_classes(context.folder, semantics.classes())
@@ -160,11 +160,6 @@ def _load_depth(snapshot: Path, frame: Frame) -> DepthEstimate:
     return DepthEstimate(stored["depth"], stored["confidence"], int(stored["invalid"]), stored.get("normals"))
 
 
-def _in_backbone_unit(estimate: DepthEstimate, scale: DepthScale) -> DepthEstimate:
-    """The same depth in the unit of the backbone's poses."""
-    return replace(estimate, depth=(estimate.depth / np.float32(scale.value)).astype(np.float32))
-
-
 # maps -----------------------------------------------------------------------------------------------------------
 
 
@@ -188,7 +183,7 @@ def _maps_pass(
     for frame in context.progress.track(frames, "classes", len(frames)):
         path = proxy_path(context.folder, frame.id)
         depth = _load_depth(context.snapshot, frame)
-        seen = _in_backbone_unit(depth, scale)
+        seen = scale.in_backbone_unit(depth)
         labels = semantics.estimate(frame, seen)
         m = _agreement(context, sequence, frame, previous, seen, labels)
         agreements.append(m)
@@ -229,7 +224,7 @@ def _symmetry_pass(
     planes = find_mirror_planes(
         sequence,
         frames,
-        lambda frame: _in_backbone_unit(_load_depth(context.snapshot, frame), scale),
+        lambda frame: scale.in_backbone_unit(_load_depth(context.snapshot, frame)),
         context.progress,
     )
     pairs_of = {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -47,6 +47,12 @@ class Report:
     figures: dict[str, Any]
     frame_ids: list[int]
     ties: DepthTies
+
+
+def without_dependent_depth(settings: TrackingConfig, proxy_report: Mapping[str, Any]) -> TrackingConfig:
+    """The settings, `use_depth` off where the proxies were made from the same pictures: nothing new about the poses."""
+    independent = proxy_report.get("independent_depth", proxy_report.get("metric", False))
+    return settings if independent else replace(settings, use_depth=False)
 
 
 def adjust_state(

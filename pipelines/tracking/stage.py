@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from formats.tensors import save_arrays
 from pipelines.config import TrackingConfig
 from pipelines.run_folder import save_sparse_model, save_trajectory, write_json
 from pipelines.stages import Stage, StageContext
-from pipelines.tracking.adjust import Report, adjust_state
+from pipelines.tracking.adjust import Report, adjust_state, without_dependent_depth
 from pipelines.tracking.front_end import FrontEnd
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.refine import compare_frame
@@ -26,11 +25,9 @@ def run(context: StageContext) -> dict[str, Any]:
     """Keyframes from structure from motion, every other frame against them, then everything adjusted together."""
     frames = context.run.load_frames()
     intrinsics = context.run.load_calibration().intrinsics
-    settings = context.config.tracking
     proxy = context.run.load_proxy_report()
+    settings = without_dependent_depth(context.config.tracking, proxy)
     metric = bool(proxy.get("metric", False))
-    if not proxy.get("independent_depth", metric):  # made from the same pictures: nothing new about the poses
-        settings = replace(settings, use_depth=False)
     pictures = Pictures(context.run, frames)
 
     state = track_frames(context, frames, pictures)

@@ -7,7 +7,6 @@ downloader: with them here, the few lines that are left to do cost less than the
 
 from __future__ import annotations
 
-import hashlib
 import http.client
 import json
 import os
@@ -16,6 +15,7 @@ import urllib.request
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from formats.digest import file_sha256
 from formats.errors import DiskFullError, InputError
 from pipelines.progress import log
 
@@ -24,12 +24,6 @@ _MAX_UNKNOWN = 1 << 30
 _ATTEMPTS = 6
 _TIMEOUT = 30.0
 _SCHEMES = ("https://", "http://127.0.0.1", "http://localhost")
-
-
-def file_sha256(path: Path) -> str:
-    """Hex digest of a file's bytes."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def fetch(urls: Sequence[str], target: Path, size: int, sha256: str, progress: Callable[[int, int], None]) -> str:

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from formats.atomic import atomic_path
+from formats.digest import file_sha256
 from formats.errors import InputError
-from pipelines.proxy.models.download import fetch, file_sha256
+from pipelines.proxy.models.download import fetch
 from pipelines.proxy.networks.card import Card, card_from_values
 
 _TABLE = Path(__file__).with_name("registry.toml")

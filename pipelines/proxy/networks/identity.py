@@ -3,22 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from formats.digest import files_sha256
 from pipelines.proxy.networks.card import Card
 from pipelines.proxy.networks.onnx_file import external_locations, require_own_weights
-
-
-def files_identity(files: Sequence[Path]) -> str:
-    """SHA-256 over names and contents, wherever the files lie."""
-    digest = hashlib.sha256()
-    for path in files:
-        with path.open("rb") as stream:
-            content = hashlib.file_digest(stream, "sha256").hexdigest()
-        digest.update(f"{path.name}\0{content}\n".encode())
-    return digest.hexdigest()
 
 
 def card_identity(card: Card) -> str:
@@ -27,4 +17,4 @@ def card_identity(card: Card) -> str:
     beside = [card.model.parent / name for name in external_locations(card.model)]
     files = [card.model, *([card.head] if card.head else []), *beside]
     contract = repr(replace(card, model=Path(card.model.name), head=None))
-    return hashlib.sha256((contract + files_identity(files)).encode()).hexdigest()
+    return hashlib.sha256((contract + files_sha256((p.name, p) for p in files)).encode()).hexdigest()

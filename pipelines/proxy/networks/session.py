@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,6 +11,7 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
+from formats.digest import file_sha256
 from formats.errors import InputError
 from pipelines.progress import log
 from pipelines.proxy.networks.card import Card
@@ -144,8 +144,7 @@ def _open(path: Path, threads: int, device: str) -> ort.InferenceSession:
 def _require_hash(card: Card) -> None:
     if not card.sha256:
         return
-    with card.model.open("rb") as stream:
-        actual = hashlib.file_digest(stream, "sha256").hexdigest()
+    actual = file_sha256(card.model)
     if actual != card.sha256.lower():
         raise InputError(f"{card.model}: its sha256 is {actual}, the card says {card.sha256}. Download it again")
 

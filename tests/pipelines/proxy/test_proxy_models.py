@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from formats.digest import file_sha256
 from formats.errors import DiskFullError, InputError
-from pipelines.proxy.models.download import fetch, file_sha256
+from pipelines.proxy.models.download import fetch
 from pipelines.proxy.models.registry import Model, ModelStore
 
 DATA = np.random.default_rng(0).bytes(700_000)

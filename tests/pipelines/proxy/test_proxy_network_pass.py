@@ -14,11 +14,12 @@ from proxy_room import Room
 
 from pipelines.progress import SilentProgress
 from pipelines.proxy import network_pass
-from pipelines.proxy.network_pass import Arrays, NetworkPass, ResultCache
+from pipelines.proxy.network_pass import Arrays, NetworkPass, ResultCache, Workplace
 from pipelines.proxy.networks.card import read_card
 from pipelines.proxy.onnx_clusters import OnnxClusters, spherical_kmeans
 from pipelines.proxy.providers import DepthEstimate
-from pipelines.types import Frame
+from pipelines.proxy.sequence import Sequence
+from pipelines.types import Calibration, Frame, Intrinsics
 
 
 class Counting:
@@ -39,13 +40,22 @@ def picture(frame: Frame) -> NDArray[np.uint8]:
     return np.random.default_rng(frame.id).integers(0, 255, (40, 50, 3)).astype(np.uint8)
 
 
+CAMERA = Intrinsics(50, 40, 50, 50, 25, 20)
+SEQUENCE = Sequence(FRAMES, Calibration(CAMERA, "given", 0.0, (0.0, 0.0, 0.0, 0.0)), CAMERA, None, picture)
+
+
+def workplace(sequence: Sequence, tmp_path: Path, folder: Path, megabytes: int) -> Workplace:
+    cache = ResultCache(tmp_path / "cache", megabytes)
+    return Workplace(sequence, lambda: folder, 1, "cpu", SilentProgress(), cache)
+
+
 def run(tmp_path: Path, name: str, identity: str, megabytes: int = 10) -> tuple[NetworkPass, Counting]:
     counting = Counting()
     folder = tmp_path / name
     folder.mkdir(exist_ok=True)
-    cache = ResultCache(tmp_path / "cache", megabytes)
-    whole = NetworkPass("net", identity, lambda: folder, cache, counting)
-    whole.run(FRAMES, picture, SilentProgress())
+    place = workplace(SEQUENCE, tmp_path, folder, megabytes)
+    whole = NetworkPass("net", identity, place, counting)
+    whole.run(FRAMES)
     return whole, counting
 
 
@@ -134,9 +144,8 @@ def test_without_a_head_alike_features_are_a_class(room: Room, tmp_path: Path) -
     folder = tmp_path / "scratch"
     folder.mkdir()
     provider: Any = OnnxClusters(
-        sequence, read_card(transformer(tmp_path)), lambda: folder, 1, "cpu", SilentProgress(),
-        ResultCache(tmp_path / "cache", 0), 3,
-    )  # fmt: skip
+        read_card(transformer(tmp_path)), workplace(sequence, tmp_path, folder, megabytes=0), most=3
+    )
 
     def depth_of(frame: Frame) -> DepthEstimate:
         depth = (room.views[frame.id].depth * 0.5).astype(np.float32)
