@@ -102,6 +102,10 @@ class TrackingConfig:
     )
     silhouette: float = setting(0.95, "T_sil of eq. (16)")
     color_weight: float = setting(1.0, "λ_C of eq. (16)")
+    depth_weight: float = setting(
+        0.0, "λ_D of eq. (16), depths in units of the median; for frames with proxies (proxy.frames=all); 0 = off"
+    )
+    label_weight: float = setting(0.0, "λ_S of eq. (16), likewise; 0 = off")
     render_loss: float = setting(0.4, "a lost frame is posed by it when less than this share of its contrast is left")
     use_depth: bool = setting(True, "tie triangulated points to metric proxy depths in the adjustment")
     depth_sd: float = setting(0.05, "relative standard deviation of a reliable proxy depth after its scale is known")

@@ -1,4 +1,4 @@
-"""Finding the pose of a camera from a nearby one: Gauss-Newton through the renderer, MSGS-SLAM eq. (16) without labels.
+"""Finding the pose of a camera from a nearby one: Gauss-Newton through the renderer, MSGS-SLAM eq. (16).
 
 One evaluation, which yields the cost, its gradient and its curvature, costs less than one reverse-mode gradient. It
 needs a start within about 3 cm and 1 degree (some ten pixels); from farther away it refuses.

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from pipelines.config import TrackingConfig
 from pipelines.geometry import se3
@@ -35,6 +36,33 @@ def test_comparison_brings_a_pose_nearer(tmp_path: Path, make_run: Callable[...,
     assert nothing is None or nothing.unexplained > 1
     # Without depth there is nothing to compare with.
     assert compare_frame(10, start, [10], _with_keyframe(state, 10, truth), pictures, camera, settings) is None
+
+
+@pytest.mark.parametrize("term", ["depth_weight", "label_weight"])
+@pytest.mark.parametrize("depth_factor", [1.0, 1.2])
+def test_depth_and_labels_of_the_frame_bring_its_pose_nearer_without_its_colours(
+    tmp_path: Path, make_run: Callable[..., MadeRun], term: str, depth_factor: float
+) -> None:
+    made = make_run(tmp_path / "run", (9, 12), backbone_scale=1.0, all_proxies=True, depth_factor=depth_factor)
+    backbone = made.run.load_backbone()
+    assert backbone is not None
+    state = TrackState.from_backbone(backbone, 0.5)
+    for k in (9, 12):
+        state.poses[k] = made.cam_from_world[k]
+    pictures, camera = Pictures(made.run, made.run.load_frames()), made.run.load_calibration().intrinsics
+    truth = made.cam_from_world[10]
+    # Mostly along the view: there depth tells most. Its blending is some millimetres in front of the surface.
+    start = se3.exp(np.array([0.01, -0.01, 0.06, 0.003, -0.004, 0.002])) @ truth
+
+    def found_with(settings: TrackingConfig) -> float:
+        found = compare_frame(10, start, [9, 12], state, pictures, camera, settings)
+        assert found is not None
+        assert found.is_better
+        return float(np.linalg.norm(se3.log(found.cam_from_world @ se3.inverse(truth))))
+
+    begin = float(np.linalg.norm(se3.log(start @ se3.inverse(truth))))
+    assert 0 < found_with(TrackingConfig(color_weight=0.0, **{term: 1.0})) < 0.6 * begin
+    assert compare_frame(10, start, [9, 12], state, pictures, camera, TrackingConfig(color_weight=0.0)) is None
 
 
 def _with_keyframe(state: TrackState, frame_id: int, pose: np.ndarray) -> TrackState:

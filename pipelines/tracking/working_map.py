@@ -1,0 +1,140 @@
+"""The two sides of render-and-compare: Gaussians seeded from a few keyframes, and a frame with what is known of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pipelines.gaussians.seeding import seed_gaussians, seed_grid
+from pipelines.proxy.palette import class_colors
+from pipelines.tracking.depth_scales import keyframe_scale, sample_proxy
+from pipelines.tracking.pictures import Pictures
+from pipelines.tracking.state import TrackState
+from pipelines.types import VOID, Intrinsics, ProxyMaps
+
+Array = NDArray[np.float64]
+WORKING_SIDE = 320
+"""Long side of the pictures that are compared: smaller ones have a wider basin, and colours there are averages."""
+STRIDE = 2
+MIN_POINTS = 8
+"""Fewer points say nothing of the scale of a proxy depth."""
+
+
+@dataclass(frozen=True)
+class WorkingMap:
+    """M Gaussians: means (M, 3), radii (M,), opacities (M,), colors (M, 3), labels (M, 3): the colour of the class."""
+
+    means: Tensor
+    radii: Tensor
+    opacities: Tensor
+    colors: Tensor
+    labels: Tensor
+
+
+@dataclass(frozen=True)
+class View:
+    """What a frame shows at the working size h x w.
+
+    image (h, w, 3) 0..1; depth (h, w) in the world's unit, 0 = unknown, and its reliability U (h, w); unit: the median
+    of the depth, 1 without any; labels (h, w, 3): the colours of the classes; None without proxies.
+    """
+
+    image: Tensor
+    depth: Tensor
+    reliability: Tensor
+    unit: float
+    labels: Tensor | None
+
+
+def working_camera(intrinsics: Intrinsics) -> Intrinsics:
+    """The camera at the working size."""
+    factor = min(WORKING_SIDE / max(intrinsics.width, intrinsics.height), 1.0)
+    return intrinsics.resized(round(intrinsics.width * factor), round(intrinsics.height * factor))
+
+
+def seed_map(keyframes: list[int], state: TrackState, pictures: Pictures, intrinsics: Intrinsics) -> WorkingMap | None:
+    """Gaussians at the keyframes' proxy depths, each scaled to agree with the points it sees; None without depth."""
+    parts = [p for k in keyframes if (p := _seed_keyframe(k, state, pictures, intrinsics)) is not None]
+    if not parts:
+        return None
+    return WorkingMap(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
+
+
+def _seed_keyframe(
+    keyframe: int, state: TrackState, pictures: Pictures, intrinsics: Intrinsics
+) -> tuple[Tensor, ...] | None:
+    maps = pictures.proxy(keyframe)
+    if maps is None:
+        return None
+    small, motion = working_camera(intrinsics), state.poses[keyframe]
+    depth = _resized(maps.depth, small) * np.float32(proxy_scale(keyframe, motion, maps, state, intrinsics) or 1.0)
+    grid = torch.from_numpy(seed_grid(small.height, small.width, STRIDE))
+    channels = torch.from_numpy(_resized(maps.labels, small))
+    colors, pose = _picture(pictures.color(keyframe), small), torch.from_numpy(np.ascontiguousarray(motion))
+    seeds = seed_gaussians(grid, torch.from_numpy(depth), colors, channels, STRIDE, 1, pose, small, keyframe)
+    classes = channels[grid & torch.from_numpy(depth > 0)]
+    return seeds.means, seeds.radii, seeds.opacities, seeds.colors, _class_picture(classes)
+
+
+def view_of(
+    frame_id: int,
+    cam_from_world: Array,
+    keyframes: list[int],
+    state: TrackState,
+    pictures: Pictures,
+    camera: Intrinsics,
+) -> View:
+    """The frame, its proxy depth scaled by the points it sees or, without enough of them, as the keyframes' is."""
+    small, maps = working_camera(camera), pictures.proxy(frame_id)
+    image = _picture(pictures.color(frame_id), small)
+    if maps is None:
+        nothing = torch.zeros(small.height, small.width)
+        return View(image, nothing, nothing, 1.0, None)
+    scale = proxy_scale(frame_id, cam_from_world, maps, state, camera)
+    if scale is None:
+        near = [(k, m) for k in keyframes if (m := pictures.proxy(k)) is not None]
+        scales = [s for k, m in near if (s := proxy_scale(k, state.poses[k], m, state, camera)) is not None]
+        scale = float(np.exp(np.mean(np.log(scales)))) if scales else 1.0
+    depth = _resized(maps.depth, small) * np.float32(scale)
+    unit = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
+    labels = _class_picture(torch.from_numpy(_resized(maps.labels, small)))
+    return View(
+        image, torch.from_numpy(depth), torch.from_numpy(_resized(maps.confidence, small)), unit, labels
+    )  # fmt: skip
+
+
+def proxy_scale(
+    frame_id: int, cam_from_world: Array, maps: ProxyMaps, state: TrackState, intrinsics: Intrinsics
+) -> float | None:
+    """World over proxy depth: the median over the points that the frame sees; None for fewer than eight."""
+    if frame_id not in state.sightings:
+        return None
+    seen = state.sightings[frame_id]
+    known, trust = sample_proxy(maps, seen.xy, intrinsics)
+    z = state.points[seen.point] @ cam_from_world[2, :3] + cam_from_world[2, 3]
+    both = (known > 0) & (z > 0)
+    if both.sum() < MIN_POINTS:
+        return None
+    return float(np.exp(keyframe_scale(np.log(z[both] / known[both]), trust[both])))
+
+
+def _class_picture(labels: Tensor) -> Tensor:
+    """(..., 3) 0..1 colours of labels (...), black for VOID; not the table's, which may be alike."""
+    table = torch.zeros(VOID + 1, 3)
+    table[:VOID] = torch.tensor(class_colors(VOID)) / 255
+    return table[labels.long()]
+
+
+def _resized(values: NDArray, small: Intrinsics) -> NDArray:
+    return cv2.resize(values, (small.width, small.height), interpolation=cv2.INTER_NEAREST)
+
+
+def _picture(image: NDArray[np.uint8], small: Intrinsics) -> Tensor:
+    """(h, w, 3) float32 0..1 at the working size."""
+    reduced = cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(reduced.astype(np.float32) / 255)
