@@ -11,7 +11,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pipelines.proxy.stereo.bands import BAND_ROWS, Bands
-from pipelines.proxy.stereo.sweep import RADIUS, best_mean, correlate_row, window_moments
+from pipelines.proxy.stereo.window import RADIUS, best_mean, correlate_row, weigh_windows
+
+_ALIKE = 1e3
+"""Likeness by which all pixels of a window count alike: it lies on the surface itself, and needs all of its texture."""
 
 
 def refine_inverse_depth(
@@ -29,15 +32,12 @@ def refine_inverse_depth(
 
     A move of n steps costs `stiffness` n² of correlation, so that a surface without texture stays where it is.
     """
-    mean, variance = window_moments(image)
     refined = np.empty_like(inverse_depth)
     score = np.empty_like(inverse_depth)
 
     def work(first: int, last: int) -> None:
         _refine_band(
             image,
-            mean,
-            variance,
             others,
             warps,
             inverse_depth,
@@ -97,8 +97,6 @@ def _warp_surface_row(
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 def _refine_band(
     image: NDArray[np.float32],
-    mean: NDArray[np.float32],
-    variance: NDArray[np.float32],
     others: NDArray[np.float32],
     warps: NDArray[np.float64],
     inverse_depth: NDArray[np.float32],
@@ -116,7 +114,8 @@ def _refine_band(
     padded = width + 2 * RADIUS
     warped = np.empty((BAND_ROWS + 2 * RADIUS, padded), np.float32)
     seen = np.empty((BAND_ROWS + 2 * RADIUS, width), np.uint8)
-    columns = np.empty((3, padded), np.float32)
+    weights, weighted, moments = weigh_windows(image, first, last, _ALIKE)
+    sums = np.empty((3, width), np.float32)
     scores = np.empty((BAND_ROWS, views, width), np.float32)
     total = np.empty((2 * reach + 1, BAND_ROWS, width), np.float32)
     for d in range(2 * reach + 1):
@@ -125,7 +124,9 @@ def _refine_band(
                 y = min(max(first + k - RADIUS, 0), height - 1)
                 _warp_surface_row(others[n], warps[n], inverse_depth, (d - reach) * step, y, warped[k], seen[k])
             for k in range(last - first):
-                correlate_row(warped, image, k, first + k, mean, variance, seen[k + RADIUS], columns, scores[k, n])
+                correlate_row(
+                    warped[k:], weights[k], weighted[k], moments[k], seen[k + RADIUS], sums, scores[k, n]
+                )  # fmt: skip
         for k in range(last - first):
             for x in range(width):
                 total[d, k, x] = best_mean(scores[k], x, best) - np.float32(stiffness * (d - reach) ** 2)

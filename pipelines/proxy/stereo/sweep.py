@@ -1,6 +1,6 @@
 """Plane sweep: how well each inverse depth of a pixel agrees with the neighbouring views.
 
-The score of a hypothesis is the zero-mean normalised cross-correlation of a square window, averaged over the best few
+The score of a hypothesis is the zero-mean normalised cross-correlation of a weighted window, averaged over the best few
 neighbours, so that an occlusion in the others does not count (Kang, Szeliski, Chai, CVPR 2001).
 """
 
@@ -11,13 +11,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pipelines.proxy.stereo.bands import BAND_ROWS, Bands
+from pipelines.proxy.stereo.window import RADIUS, best_mean, correlate_row, weigh_windows
 
-RADIUS = 3
-"""Half the window: 7 x 7 pixels."""
-VARIANCE_FLOOR = 2e-5
-"""Added to both variances (intensities 0..1): below about one grey level there is no texture, only noise."""
-OUTSIDE = -2.0
-"""Marks the score of a view that does not see the pixel."""
+LIKENESS = 0.04
+"""How unlike a pixel may be and still count, of intensities 0..1: more than the texture of most surfaces, less than the
+step from one to the next."""
 
 
 def warps_to(
@@ -48,35 +46,13 @@ def sweep_cost(
     Intensities are 0..1. Where no view sees the point the cost is 1, as for a surface without texture.
     """
     height, width = image.shape
-    mean, variance = window_moments(image)
     cost = np.empty((height, width, len(inverse_depths)), np.float32)
 
     def work(first: int, last: int) -> None:
-        _sweep_band(image, mean, variance, others, warps, inverse_depths, best, first, last, cost)
+        _sweep_band(image, others, warps, inverse_depths, best, first, last, cost)
 
     bands.run(height, work)
     return cost
-
-
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def window_moments(image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean and variance of every window; the border is repeated outwards."""
-    height, width = image.shape
-    mean = np.empty((height, width), np.float32)
-    variance = np.empty((height, width), np.float32)
-    for y in range(height):
-        for x in range(width):
-            s = np.float32(0)
-            q = np.float32(0)
-            for j in range(-RADIUS, RADIUS + 1):
-                for i in range(-RADIUS, RADIUS + 1):
-                    v = image[min(max(y + j, 0), height - 1), min(max(x + i, 0), width - 1)]
-                    s += v
-                    q += v * v
-            n = np.float32((2 * RADIUS + 1) ** 2)
-            mean[y, x] = s / n
-            variance[y, x] = max(q / n - (s / n) * (s / n), np.float32(0))
-    return mean, variance
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
@@ -123,75 +99,8 @@ def _warp_row(
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def correlate_row(
-    warped: NDArray[np.float32],
-    image: NDArray[np.float32],
-    k: int,
-    y: int,
-    mean: NDArray[np.float32],
-    variance: NDArray[np.float32],
-    seen: NDArray[np.uint8],
-    columns: NDArray[np.float32],
-    score: NDArray[np.float32],
-) -> None:
-    """Score of the windows centred on row `y`; `warped` rows k..k+2R are rows y-R..y+R, padded by R on both sides."""
-    height, width = image.shape
-    padded = width + 2 * RADIUS
-    for x in range(padded):
-        columns[0, x] = 0
-        columns[1, x] = 0
-        columns[2, x] = 0
-    for j in range(2 * RADIUS + 1):
-        source = min(max(y + j - RADIUS, 0), height - 1)
-        for x in range(width):
-            w = warped[k + j, x + RADIUS]
-            columns[0, x + RADIUS] += w
-            columns[1, x + RADIUS] += w * w
-            columns[2, x + RADIUS] += w * image[source, x]
-    for c in range(3):
-        for i in range(RADIUS):
-            columns[c, i] = columns[c, RADIUS]
-            columns[c, width + RADIUS + i] = columns[c, width + RADIUS - 1]
-    inverse_count = np.float32(1.0 / (2 * RADIUS + 1) ** 2)
-    floor = np.float32(VARIANCE_FLOOR)
-    for x in range(width):
-        s = np.float32(0)
-        q = np.float32(0)
-        p = np.float32(0)
-        for i in range(2 * RADIUS + 1):
-            s += columns[0, x + i]
-            q += columns[1, x + i]
-            p += columns[2, x + i]
-        m = s * inverse_count
-        v = max(q * inverse_count - m * m, np.float32(0))
-        covariance = p * inverse_count - m * mean[y, x]
-        value = covariance / np.sqrt((v + floor) * (variance[y, x] + floor))
-        score[x] = value if seen[x] else np.float32(OUTSIDE)
-
-
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def best_mean(scores: NDArray[np.float32], x: int, best: int) -> np.floating:
-    """Mean of the `best` largest scores of column x among the views that see it; 0 when none does. Alters `scores`."""
-    total = np.float32(0)
-    used = 0
-    for _ in range(best):
-        at = 0
-        for n in range(1, scores.shape[0]):
-            if scores[n, x] > scores[at, x]:
-                at = n
-        if scores[at, x] <= np.float32(OUTSIDE):
-            break
-        total += scores[at, x]
-        scores[at, x] = np.float32(OUTSIDE)
-        used += 1
-    return total / np.float32(max(used, 1))
-
-
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 def _sweep_band(
     image: NDArray[np.float32],
-    mean: NDArray[np.float32],
-    variance: NDArray[np.float32],
     others: NDArray[np.float32],
     warps: NDArray[np.float64],
     inverse_depths: NDArray[np.float64],
@@ -205,7 +114,8 @@ def _sweep_band(
     padded = width + 2 * RADIUS
     warped = np.empty((BAND_ROWS + 2 * RADIUS, padded), np.float32)
     seen = np.empty((BAND_ROWS + 2 * RADIUS, width), np.uint8)
-    columns = np.empty((3, padded), np.float32)
+    weights, weighted, moments = weigh_windows(image, first, last, LIKENESS)
+    sums = np.empty((3, width), np.float32)
     scores = np.empty((BAND_ROWS, views, width), np.float32)
     block = np.empty((len(inverse_depths), last - first, width), np.float32)
     for d in range(len(inverse_depths)):
@@ -214,7 +124,9 @@ def _sweep_band(
                 y = min(max(first + k - RADIUS, 0), height - 1)
                 _warp_row(others[n], warps[n], inverse_depths[d], y, width, warped[k], seen[k])
             for k in range(last - first):
-                correlate_row(warped, image, k, first + k, mean, variance, seen[k + RADIUS], columns, scores[k, n])
+                correlate_row(
+                    warped[k:], weights[k], weighted[k], moments[k], seen[k + RADIUS], sums, scores[k, n]
+                )  # fmt: skip
         for k in range(last - first):
             for x in range(width):
                 block[d, k, x] = np.float32(1) - best_mean(scores[k], x, best)

@@ -9,8 +9,9 @@ from pipelines.proxy.stereo.consistency import fuse_depths
 from pipelines.proxy.stereo.fill import SURE, fill_unsure
 from pipelines.proxy.stereo.refine import refine_inverse_depth
 from pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
-from pipelines.proxy.stereo.sweep import RADIUS, VARIANCE_FLOOR, sweep_cost, warps_to
+from pipelines.proxy.stereo.sweep import LIKENESS, sweep_cost, warps_to
 from pipelines.proxy.stereo.upsample import upsample_depth
+from pipelines.proxy.stereo.window import RADIUS, STEP, VARIANCE_FLOOR
 
 HEIGHT, WIDTH, FOCAL = 40, 60, 50.0
 MATRIX = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
@@ -46,10 +47,10 @@ def scene(slope: float) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArr
 
 
 def slow_score(image: NDArray, other: NDArray, warp: NDArray, inverse: float, y: int, x: int) -> float:
-    """Normalised correlation of one window, written out."""
+    """Normalised correlation of one weighted window, written out."""
     values = []
-    for j in range(-RADIUS, RADIUS + 1):
-        for i in range(-RADIUS, RADIUS + 1):
+    for j in range(-RADIUS, RADIUS + 1, STEP):
+        for i in range(-RADIUS, RADIUS + 1, STEP):
             q = warp @ np.array([x + i + 0.5, y + j + 0.5, 1, inverse])
             px, py = q[0] / q[2] - 0.5, q[1] / q[2] - 0.5
             ix, iy = int(px), int(py)
@@ -58,8 +59,10 @@ def slow_score(image: NDArray, other: NDArray, warp: NDArray, inverse: float, y:
             sample = np.array([1 - fy, fy]) @ patch @ np.array([1 - fx, fx])
             values.append((image[y + j, x + i], sample))
     a, b = np.array(values, np.float64).T
-    covariance = ((a - a.mean()) * (b - b.mean())).mean()
-    return covariance / np.sqrt((a.var() + VARIANCE_FLOOR) * (b.var() + VARIANCE_FLOOR))
+    weights = np.exp(-0.5 * ((a - image[y, x]) / LIKENESS) ** 2)
+    a, b = a - np.average(a, weights=weights), b - np.average(b, weights=weights)
+    covariance, var_a, var_b = (np.average(v, weights=weights) for v in (a * b, a * a, b * b))
+    return covariance / np.sqrt((var_a + VARIANCE_FLOOR) * (var_b + VARIANCE_FLOOR))
 
 
 def test_sweep_is_the_correlation_written_out() -> None:
@@ -82,19 +85,50 @@ def test_views_that_do_not_see_the_point_do_not_count() -> None:
     np.testing.assert_array_equal(sweep_cost(image, others, mixed, planes, 3, Bands(1)), alone)
 
 
+def board_before_wall(cam_from_world: NDArray) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """A bright board at depth 1.5 before a dark wall at 3, both with little texture; where the board is."""
+    v, u = np.indices((HEIGHT, WIDTH)) + 0.5
+    x, y = (u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL
+    center = -cam_from_world[:2, 3]
+    near, far = (np.stack([x, y], -1) * z + center for z in (1.5, 3.0))
+    on_board = np.abs(near).max(-1) < 0.3
+    board, wall = (0.1 * (texture(p[..., 0], p[..., 1]) - 0.5) for p in (near, far))
+    return np.where(on_board, 0.8 + board, 0.3 + wall).astype(np.float32), on_board
+
+
+def test_objects_do_not_grow_into_what_lies_behind_them() -> None:
+    image, on_board = board_before_wall(np.eye(4))
+    others = np.stack([board_before_wall(c)[0] for c in CAMERAS])
+    warps, planes = warps_to(MATRIX, np.eye(4), [MATRIX] * 4, CAMERAS), np.linspace(1 / 4, 1, 40)
+    found = planes[sweep_cost(image, others, warps, planes, 2, Bands(1)).argmin(-1)]
+    around = np.indices((HEIGHT, WIDTH))
+    reach = np.maximum(np.abs(around[0] + 0.5 - HEIGHT / 2), np.abs(around[1] + 0.5 - WIDTH / 2))
+    # The border itself is mixed of both; a square window takes nearly all of the ring for the board.
+    ring = (reach > 0.3 / 1.5 * FOCAL + 1) & (reach < 0.3 / 1.5 * FOCAL + RADIUS)
+    assert not on_board[ring].any()
+    assert (np.abs(found[ring] - 1 / 1.5) < 0.1).mean() < 0.1
+
+
+INNER = (slice(6, -6), slice(8, -8))
+
+
 @pytest.mark.parametrize("slope", [0.0, 0.5])
-def test_sweep_smoothing_and_refinement_find_the_plane(slope: float) -> None:
+def test_sweep_and_smoothing_find_the_plane(slope: float) -> None:
     image, others, warps, truth = scene(slope)
     planes = np.linspace(1 / 4, 1, 40)
     total = smooth_cost(sweep_cost(image, others, warps, planes, 2, Bands(2)), image, 0.05, 0.4, 0.05, Bands(2))
-    step = planes[1] - planes[0]
-    coarse = (planes[0] + pick_planes(total)[0] * step).astype(np.float32)
-    fine, score = refine_inverse_depth(image, others, warps, coarse, step / 3, 2, 0.003, 2, Bands(2))
-    inner = (slice(6, -6), slice(8, -8))
-    error = np.abs(fine * truth - 1)[inner]
-    assert 0 < np.median(error) < 0.008  # a fifth of the distance between two planes
-    assert np.median(error) < np.median(np.abs(coarse * truth - 1)[inner])
-    assert np.median(score[inner]) > 0.98
+    found = planes[0] + pick_planes(total)[0] * (planes[1] - planes[0])
+    assert 0 < np.median(np.abs(found * truth - 1)[INNER]) < 0.008  # a fifth of the distance between two planes
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.5])
+def test_refinement_comes_closer_to_the_plane(slope: float) -> None:
+    image, others, warps, truth = scene(slope)
+    start = (1 / truth + 0.05).astype(np.float32)  # a third of a pixel in the other views
+    fine, score = refine_inverse_depth(image, others, warps, start, 0.03, 2, 1e-4, 2, Bands(2))
+    before, after = (np.median(np.abs(x * truth - 1)[INNER]) for x in (start, fine))
+    assert 0 < after < 0.2 * before
+    assert np.median(score[INNER]) > 0.98
 
 
 def test_bytes_do_not_depend_on_the_threads() -> None:

@@ -1,0 +1,113 @@
+"""The window by which two views are compared: pixels count by how like the middle they are.
+
+A plain square that reaches over the border of an object is matched by that border, so the object grows by half a
+window into whatever lies behind it. With weights by colour (Yoon and Kweon, PAMI 2006) a pixel is compared by its own
+surface. The weights fall off as a Gaussian and not as an exponential: the contrast of a border is so much larger than
+the texture of a wall that a thousandth of the weight still decides the correlation.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+RADIUS = 3
+STEP = 2
+SIDE = 4
+"""Every second pixel of 7 x 7, from -RADIUS to RADIUS: as good as all of them, at a third of the time."""
+VARIANCE_FLOOR = 2e-5
+"""Added to both variances (intensities 0..1): below about one grey level there is no texture, only noise."""
+OUTSIDE = -2.0
+"""Marks the score of a view that does not see the pixel."""
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def weigh_windows(
+    image: NDArray[np.float32], first: int, last: int, likeness: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Of rows first..last of the image (H, W): the windows' weights and the weights times intensity, both
+    (rows, SIDE, SIDE, W) with sums of one window 1 and its mean; and mean and variance (rows, 2, W).
+
+    likeness: standard deviation of the weights, a difference in intensity. The border is repeated outwards.
+    """
+    height, width = image.shape
+    weights = np.empty((last - first, SIDE, SIDE, width), np.float32)
+    weighted = np.empty((last - first, SIDE, SIDE, width), np.float32)
+    moments = np.empty((last - first, 2, width), np.float32)
+    narrow = np.float32(-0.5 / likeness**2)
+    for k in range(last - first):
+        for x in range(width):
+            middle = image[first + k, x]
+            total = np.float32(0)
+            mean = np.float32(0)
+            square = np.float32(0)
+            for j in range(SIDE):
+                row = min(max(first + k + j * STEP - RADIUS, 0), height - 1)
+                for i in range(SIDE):
+                    value = image[row, min(max(x + i * STEP - RADIUS, 0), width - 1)]
+                    # The middle is no part of the window; the floor keeps a lone bright pixel from dividing by nothing.
+                    weight = np.exp(narrow * (value - middle) ** 2) + np.float32(1e-6)
+                    total += weight
+                    mean += weight * value
+                    square += weight * value * value
+                    weights[k, j, i, x] = weight
+                    weighted[k, j, i, x] = weight * value
+            share = np.float32(1) / total
+            for j in range(SIDE):
+                for i in range(SIDE):
+                    weights[k, j, i, x] *= share
+                    weighted[k, j, i, x] *= share
+            mean *= share
+            moments[k, 0, x] = mean
+            moments[k, 1, x] = max(square * share - mean * mean, np.float32(0))
+    return weights, weighted, moments
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def correlate_row(
+    warped: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    weighted: NDArray[np.float32],
+    moments: NDArray[np.float32],
+    seen: NDArray[np.uint8],
+    sums: NDArray[np.float32],
+    score: NDArray[np.float32],
+) -> None:
+    """Into `score` (W,) the weighted correlation of one row's windows with the samples `warped` (2 RADIUS + 1,
+    W + 2 RADIUS) of another view; OUTSIDE where `seen` is 0. `sums` (3, W) is room to work in."""
+    width = len(score)
+    sums[:] = 0
+    for j in range(SIDE):
+        for i in range(SIDE):
+            for x in range(width):
+                value = warped[j * STEP, i * STEP + x]
+                part = weights[j, i, x] * value
+                sums[0, x] += part
+                sums[1, x] += part * value
+                sums[2, x] += weighted[j, i, x] * value
+    floor = np.float32(VARIANCE_FLOOR)
+    for x in range(width):
+        mean = sums[0, x]
+        variance = max(sums[1, x] - mean * mean, np.float32(0))
+        covariance = sums[2, x] - mean * moments[0, x]
+        value = covariance / np.sqrt((variance + floor) * (moments[1, x] + floor))
+        score[x] = value if seen[x] else np.float32(OUTSIDE)
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def best_mean(scores: NDArray[np.float32], x: int, best: int) -> np.floating:
+    """Mean of the `best` largest scores of column x among the views that see it; 0 when none does. Alters `scores`."""
+    total = np.float32(0)
+    used = 0
+    for _ in range(best):
+        at = 0
+        for n in range(1, scores.shape[0]):
+            if scores[n, x] > scores[at, x]:
+                at = n
+        if scores[at, x] <= np.float32(OUTSIDE):
+            break
+        total += scores[at, x]
+        scores[at, x] = np.float32(OUTSIDE)
+        used += 1
+    return total / np.float32(max(used, 1))
