@@ -12,9 +12,19 @@ from numpy.typing import NDArray
 
 from pipelines.frames.adjust import reprojection_errors
 from pipelines.frames.matching import VerifiedPair
-from pipelines.frames.seams import PairCheck, Seam, find_parts, find_seams, tracks_of, worst_contradictions
+from pipelines.frames.seams import (
+    PairCheck,
+    Seam,
+    find_misplaced,
+    find_parts,
+    find_seams,
+    take_out,
+    tracks_of,
+    worst_contradictions,
+)
 
 _AGREE_PX = 4.0
+_MOST_MISPLACED = 0.2
 
 
 @dataclass(frozen=True)
@@ -76,6 +86,16 @@ def judge(
         agreeing / max(matches, 1), sum(c.agrees for c in checks) / max(len(checks), 1),
         tuple(seams), tuple(map(tuple, parts)),
     )  # fmt: skip
+
+
+def without_misplaced(
+    model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], xy: Sequence[NDArray[np.float64]], reach: int
+) -> pycolmap.Reconstruction:
+    """The model, keyframes that their neighbours contradict taken out of it in place; arguments as of `judge`."""
+    misplaced = find_misplaced(check_pairs(model, pairs, xy), reach)
+    if len(misplaced) <= _MOST_MISPLACED * model.num_reg_images():  # of more, who knows which are right
+        take_out(model, misplaced)
+    return model
 
 
 def check_pairs(

@@ -6,6 +6,7 @@ what crosses between one keyframe and the next.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
@@ -92,6 +93,33 @@ def worst_contradictions(seams: Iterable[Seam]) -> list[Seam]:
     """Of every run of contradicted seams the worst one: most pairs that cross a seam cross those beside it too."""
     runs = [list(run) for bad, run in groupby(seams, key=lambda s: s.is_contradicted) if bad]
     return [min(run, key=lambda s: s.agreeing / s.pairs) for run in runs]
+
+
+def find_misplaced(checks: Iterable[PairCheck], reach: int) -> list[int]:
+    """Keyframes that most of their neighbours contradict, taken out one after the other until there are none left.
+
+    Such are one or a few views that a mapper put before another wall of the same pattern. Of a long run that lies
+    elsewhere, a fold, the keyframes have each other to agree with, and stay.
+    """
+    near = [c for c in checks if c.second - c.first <= reach]
+    out: list[int] = []
+    while True:
+        pairs, agreeing = Counter[int](), Counter[int]()
+        for check in near:
+            for k in (check.first, check.second):
+                pairs[k] += 1
+                agreeing[k] += check.agrees
+        wrong = [k for k in pairs if pairs[k] >= _LEAST_PAIRS and agreeing[k] < _PAIR_AGREES * pairs[k]]
+        if not wrong:
+            return out
+        out.append(min(wrong, key=lambda k: (agreeing[k] / pairs[k], k)))
+        near = [c for c in near if out[-1] not in (c.first, c.second)]
+
+
+def take_out(model: pycolmap.Reconstruction, keyframes: Iterable[int]) -> None:
+    """Take the poses and observations of keyframes away, in place; image i + 1 is keyframe i."""
+    for k in keyframes:
+        model.deregister_frame(model.images[k + 1].frame_id)
 
 
 def find_parts(placed: Sequence[int], seams: Iterable[Seam], tracks: Iterable[Sequence[int]]) -> list[list[int]]:

@@ -209,11 +209,16 @@ def warn_of_structure(context: StageContext, structure: Structure, ids: list[int
             f"{', '.join(map(str, alone))}): tracking looks for them again"
         )
     folds = ", ".join(f"{ids[s.before]}-{ids[s.after]}" for s in report.contradicted)
-    if folds or report.pairs_agreeing < 0.9:
-        where = f" between frames {folds}, where neighbouring pictures contradict it" if folds else ""
+    agreeing = f"{report.pairs_agreeing:.0%} of the matched pairs of views agree with it (mapper: {structure.mapper})"
+    if folds:
         context.warn(
-            f"the camera's path may be folded{where}: {report.pairs_agreeing:.0%} of the matched pairs of views agree "
-            f"with it (mapper: {structure.mapper})"
+            f"the camera's path may be folded between frames {folds}, where neighbouring pictures contradict it: "
+            f"{agreeing}"
+        )
+    elif report.pairs_agreeing < 0.9:
+        context.warn(
+            f"pictures taken far apart contradict the camera's path: {agreeing}. Either things that repeat were taken "
+            "for each other, which does no harm, or a loop is not closed"
         )
 
 
@@ -282,4 +287,4 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
     }
 
 
-STAGE = Stage("frames", 3, run, "pick frames, calibrate the camera, structure from motion over keyframes")
+STAGE = Stage("frames", 4, run, "pick frames, calibrate the camera, structure from motion over keyframes")

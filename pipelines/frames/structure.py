@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from formats.errors import InputError
 from pipelines.config import FramesConfig
 from pipelines.frames.adjust import adjust
-from pipelines.frames.consistency import ModelReport, judge
+from pipelines.frames.consistency import ModelReport, judge, without_misplaced
 from pipelines.frames.database import write_database
 from pipelines.frames.features import FeatureExtractor, Features
 from pipelines.frames.mapping import calibrate_focal, map_globally, map_incrementally
@@ -123,6 +123,7 @@ class StructureFromMotion:
             model = self.snapshots.model(name, lambda work, n=name: self._run_mapper(n, work, features, pairs))  # type: ignore[misc]
             if model is None:
                 continue
+            model = without_misplaced(model, pairs, xy, self.config.overlap)
             report = judge(model, pairs, xy, len(features), self.config.overlap)
             if best is None or report.score > best[2].score:
                 best = model, name, report

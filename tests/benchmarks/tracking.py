@@ -106,7 +106,7 @@ def cases(work: Path) -> dict[str, Case]:
         "phone_desk_jump": Case(phone / "images", PLAIN, phone_truth),
         "whiteroom_video": Case(white / "video.mp4", (), room),
         "whiteroom_files": Case(white / "rgb", (*PLAIN, files), room),
-        "corridor": Case(work / "corridor" / "rgb", PLAIN, written_truth(work / "corridor" / "traj.txt")),
+        "corridor": Case(work / "corridor" / "rgb", (*PLAIN, *COARSE), written_truth(work / "corridor" / "traj.txt")),
         "bedroom": Case(DATA / "videos/bedroom_848x364_58fps.mp4", (), lambda *_: None),
         **{
             name: Case(work / name / "rgb", (*PLAIN, *COARSE), written_truth(work / name / "traj.txt")) for name in HARD

@@ -11,7 +11,17 @@ import pycolmap
 import pytest
 
 from pipelines.frames.consistency import ModelReport
-from pipelines.frames.seams import PairCheck, Seam, cut, find_parts, find_seams, tracks_of, worst_contradictions
+from pipelines.frames.seams import (
+    PairCheck,
+    Seam,
+    cut,
+    find_misplaced,
+    find_parts,
+    find_seams,
+    take_out,
+    tracks_of,
+    worst_contradictions,
+)
 from pipelines.frames.stage import warn_of_structure
 from pipelines.frames.structure import Structure
 from pipelines.stages import StageContext
@@ -42,6 +52,31 @@ def test_one_contradicted_seam_among_many_good_ones() -> None:
 def test_far_pairs_say_nothing_of_a_seam() -> None:
     far = [PairCheck(5, 35, 400, 0)] * 50
     assert not any(s.is_contradicted for s in find_seams(range(COUNT), _checks(0) + far, _tracks(), REACH))
+
+
+def _elsewhere(lost: set[int]) -> list[PairCheck]:
+    """Pairs of neighbours that agree unless one of the two, but not both, is placed elsewhere."""
+    return [PairCheck(c.first, c.second, 100, 95 if (c.first in lost) == (c.second in lost) else 3) for c in _checks(0)]
+
+
+@pytest.mark.parametrize("lost", [set(), {17, 18}, {0}, {30, 31, 32}, {38, 39}, {3, 20}])
+def test_views_that_their_neighbours_contradict_are_misplaced(lost: set[int]) -> None:
+    far = [PairCheck(k, k + 20, 400, 400) for k in range(20)]
+    assert set(find_misplaced(_elsewhere(lost) + far, REACH)) == lost
+
+
+def test_a_fold_misplaces_nobody() -> None:
+    assert find_misplaced(_checks(torn_at=25), REACH) == []
+    assert find_misplaced(_elsewhere(set(range(10, 22))), REACH) == []
+
+
+def test_what_is_taken_out_leaves_no_observation(made_model: pycolmap.Reconstruction) -> None:
+    before = len(made_model.points3D)
+    take_out(made_model, [4, 7])
+    assert sorted(made_model.reg_image_ids()) == [1, 2, 3, 4, 6, 7, 9, 10]
+    tracks = tracks_of(made_model)
+    assert 50 < len(tracks) <= before
+    assert not any({4, 7} & set(t) for t in tracks)
 
 
 def test_keyframes_that_were_not_placed_leave_a_gap() -> None:
@@ -111,3 +146,11 @@ def test_what_is_wrong_is_said(
     warn_of_structure(context, Structure(pycolmap.Reconstruction(), report, "global", 0.0), list(range(0, 18, 2)))
     assert len(context.warnings) == len(wanted)
     assert all(re.search(pattern, said) for pattern, said in zip(wanted, context.warnings, strict=True))
+
+
+def test_pairs_far_apart_that_contradict_are_no_fold(make_context: Callable[..., StageContext], tmp_path: Path) -> None:
+    report = ModelReport(9, 9, 500, 0.3, 0.8, 0.69, (_seam(0),), (tuple(range(9)),))
+    context = make_context(tmp_path)
+    warn_of_structure(context, Structure(pycolmap.Reconstruction(), report, "global", 0.0), list(range(9)))
+    assert len(context.warnings) == 1
+    assert re.search("far apart contradict .* 69% of the matched pairs", context.warnings[0])
