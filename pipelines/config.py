@@ -68,7 +68,7 @@ class ProxyConfig:
     )
     fuse: str = setting(
         "learned",
-        "which depth is fused with multi-view depth: a network's, also that of files, or none",
+        "which depth is fused with multi-view depth: a network's, and files no better than one; all; or none",
         ("learned", "always", "never"),
     )
     alpha: float = setting(0.7, "eq. (2): how much depth edges lower the reliability")

@@ -278,5 +278,5 @@ def _report(
 
 
 STAGE = Stage(
-    "proxy", 5, run, "depth, reliability and classes of the keyframes", inputs=proxy_inputs, check=check_proxy
+    "proxy", 6, run, "depth, reliability and classes of the keyframes", inputs=proxy_inputs, check=check_proxy
 )

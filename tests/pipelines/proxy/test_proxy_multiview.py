@@ -5,9 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from proxy_room import UNIT, Room
+from proxy_room import UNIT, Room, write_source
 
 from formats.errors import InputError
+from formats.images import write_grey_png
+from pipelines.config import ProxyConfig
 from pipelines.progress import SilentProgress
 from pipelines.proxy.fused import FusedDepth, fuse
 from pipelines.proxy.multiview import MultiviewDepth, StereoSettings
@@ -15,6 +17,7 @@ from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.reliability import semantic_agreement, warp_labels
 from pipelines.proxy.scale import measure_scale
 from pipelines.proxy.segments import SegmentLabels
+from pipelines.proxy.selection import Surroundings, open_depth
 from pipelines.proxy.sequence import Sequence
 from pipelines.types import VOID, Frame, Intrinsics
 
@@ -108,6 +111,23 @@ def test_fused_depth_is_metric_and_better_than_either(room: Room, stereo: Multiv
     assert (together > 0).all()
     assert (together < 0.75 * network).all()
     assert (together < np.add(geometry, [0, 1e-5])).all()
+
+
+@pytest.mark.parametrize(
+    ("error", "fuse", "expected"),
+    [(0.0, "learned", False), (0.05, "learned", True), (0.05, "never", False), (0.0, "always", True)],
+)
+def test_files_no_better_than_a_network_are_fused_as_one(
+    error: float, fuse: str, expected: bool, room: Room, tmp_path: Path
+) -> None:
+    source = write_source(room, tmp_path)
+    for frame in room.frames:
+        y, x = np.indices(room.views[frame.id].depth.shape) / 40
+        off = room.views[frame.id].depth * (1 + 1.4 * error * np.sin(x + frame.id) * np.cos(1.3 * y))
+        write_grey_png(tmp_path / "depth" / frame.name, np.round(off * 1000).astype(np.uint16))
+    config = ProxyConfig(depth=f"files:{tmp_path / 'depth'}", fuse=fuse)
+    around = Surroundings(source, room.sequence(), config, lambda name: tmp_path / name, 1, "cpu", SilentProgress())
+    assert isinstance(open_depth(around), FusedDepth) == expected
 
 
 def test_two_guesses_that_miss_differently_are_better_together() -> None:
