@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from pathlib import Path
 
 import pycolmap
 
 # pycolmap tells of each step on stderr, through the progress bars; what fails is told by whoever called it.
 pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+# Its import makes a process that is asked to end print a stack trace first: back to what there was before.
+if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is not None:
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
 
 
 def calibrate_focal(database: Path, seed: int) -> None:
