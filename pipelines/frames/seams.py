@@ -117,9 +117,10 @@ def find_misplaced(checks: Iterable[PairCheck], reach: int) -> list[int]:
 
 
 def take_out(model: pycolmap.Reconstruction, keyframes: Iterable[int]) -> None:
-    """Take the poses and observations of keyframes away, in place; image i + 1 is keyframe i."""
+    """Remove keyframes and their observations from the model, in place; image i + 1 is keyframe i."""
     for k in keyframes:
         model.deregister_frame(model.images[k + 1].frame_id)
+    model.tear_down()  # the covariance of an adjustment wants a pose of every image there is
 
 
 def find_parts(placed: Sequence[int], seams: Iterable[Seam], tracks: Iterable[Sequence[int]]) -> list[list[int]]:

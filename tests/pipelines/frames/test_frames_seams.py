@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from pipelines.frames.adjust import adjust
 from pipelines.frames.consistency import ModelReport
 from pipelines.frames.seams import (
     PairCheck,
@@ -77,6 +78,9 @@ def test_what_is_taken_out_leaves_no_observation(made_model: pycolmap.Reconstruc
     tracks = tracks_of(made_model)
     assert 50 < len(tracks) <= before
     assert not any({4, 7} & set(t) for t in tracks)
+    focal = made_model.cameras[1].focal_length
+    assert 0 <= adjust(made_model, refine_camera=True) < 0.01 * focal
+    assert made_model.cameras[1].focal_length == pytest.approx(focal, rel=0.001)
 
 
 def test_keyframes_that_were_not_placed_leave_a_gap() -> None:
