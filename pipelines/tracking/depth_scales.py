@@ -1,4 +1,7 @@
-"""How proxy depths relate to triangulated structure: one scale for the world, one smooth field for each keyframe."""
+"""How proxy depths relate to triangulated structure: one scale for the world, one smooth field for each keyframe.
+
+A shift is no part of a field: depth that is known only up to one is given it before (`pipelines.proxy.aligned`).
+"""
 
 from __future__ import annotations
 
