@@ -125,6 +125,9 @@ class MappingConfig:
     seed_stride: int = setting(2, "pixels between two new Gaussians where the map has a hole")
     fine_share: float = setting(0.25, "share of a view, that of most detail, with a new Gaussian at every pixel")
     flat_share: float = setting(0.5, "and that of least detail, where new ones stand twice as far apart")
+    seed_finer: float = setting(
+        2.0, "new Gaussians also where the map's are this many times as large on the image as new ones; 0 = never"
+    )
     window_steps: int = setting(2, "coarse steps after each keyframe: on it, covisible and random past keyframes")
     passes: float = setting(10.0, "how often each keyframe is visited once all are seeded")
     min_iterations: int = setting(400, "at least this many such visits in all")
@@ -133,7 +136,7 @@ class MappingConfig:
     max_gaussians: int = setting(600000, "the map stops growing at this many")
     color_weight: float = setting(1.0, "λ_C of eq. (18)")
     ssim_weight: float = setting(0.2, "share of 1 - SSIM in the image loss, eq. (20)")
-    depth_weight: float = setting(1.6, "λ_D of eq. (18); 0 = no depth loss")
+    depth_weight: float = setting(3.2, "λ_D of eq. (18); 0 = no depth loss")
     depth_nu: float = setting(1.2, "ν: weight of a proxy depth of reliability U is min(1, ν U)")
     use_proxy_depth: bool = setting(True, "false: the proxies only seed the map, no loss and no condition uses them")
     label_weight: float = setting(0.1, "λ_S of eq. (18); 0 = no semantic loss")

@@ -13,7 +13,14 @@ from pipelines.config import MappingConfig
 from pipelines.gaussians import densify
 from pipelines.gaussians.render import Rendering
 from pipelines.gaussians.schedule import Seeding
-from pipelines.gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
+from pipelines.gaussians.seeding import (
+    SEED_OPACITY,
+    SEED_RADIUS,
+    SeedDepth,
+    complete_depth,
+    seed_gaussians,
+    seed_spacing,
+)
 from pipelines.gaussians.state import OptimiserState, expose
 from pipelines.mapping.views import View
 
@@ -39,7 +46,8 @@ class Growth:
     def seed(self, index: int, what: Seeding, rendering: Rendering | None) -> None:
         """Fill the view's holes with Gaussians at its completed depth (eq. 17): the trusted ones, or the rest.
 
-        `rendering`: the map as the view sees it, None while there is none.
+        `rendering`: the map as the view sees it, None while there is none; its feature is the radius on the image. A
+        trusted view that comes closer than those before it also gets Gaussians of its own size over their coarse ones.
         """
         view = self.views[index]
         spacing = self._spacing(view)
@@ -51,7 +59,11 @@ class Growth:
             completed = self._completed(index) if what is Seeding.TRUSTED else self._completed_by_map(view, rendering)
         depth, trust = (torch.from_numpy(x).to(view.image.device) for x in (completed.depth, completed.trust))
         if what is Seeding.TRUSTED:
-            pixels &= trust > LOW_RELIABILITY
+            trusted = trust > LOW_RELIABILITY
+            pixels &= trusted
+            if rendering is not None and self.settings.seed_finer > 0:
+                finer = self._coarse(rendering, spacing) & trusted & ~pixels
+                self._append(index, finer, depth, trust, spacing, GROWN_OPACITY)
         self._append(index, pixels, depth, trust, spacing, SEED_OPACITY)
 
     @torch.no_grad()
@@ -89,6 +101,11 @@ class Growth:
     def _holes(self, rendering: Rendering) -> Tensor:
         """Condition (a)."""
         return densify.holes(rendering.silhouette, self.settings.silhouette_threshold)
+
+    def _coarse(self, rendering: Rendering, spacing: Tensor) -> Tensor:
+        """Seed places drawn by Gaussians much larger than the seeds: what is here was first seen from farther away."""
+        radius = rendering.features[..., 0] / rendering.silhouette.clamp(min=self.settings.silhouette_threshold)
+        return (spacing > 0) & (radius > self.settings.seed_finer * SEED_RADIUS * spacing)
 
     def _needed(self, view: View, rendering: Rendering) -> Tensor:
         """Conditions (a) and (b)."""

@@ -101,7 +101,7 @@ class Schedule:
 
     def _kind_of_pass(self, number: int) -> tuple[bool, bool]:
         """Whether the pass is coarse, and whether the map grows in it: by whole passes, or half of the views would get
-        Gaussians and the pruning at the end of the pass would never come."""
+        Gaussians and the others none."""
         s, passes = self.settings, self.visits / self.views
         coarse_passes = round(s.coarse_share * passes) if self.seeding > 0 else 0
         if number < coarse_passes:
@@ -125,6 +125,7 @@ class Schedule:
             coarse=coarse,
             seed=Seeding.NOTHING,
             grow=grows,
-            prune=grows and place == self.views - 1,
+            # A pass later: what has just been added is still nearly transparent, and would go at once.
+            prune=number > 0 and self._kind_of_pass(number - 1)[1] and place == self.views - 1,
             refine_pose=view != 0,
         )

@@ -8,7 +8,9 @@ import pytest
 import torch
 
 from pipelines.config import MappingConfig
-from pipelines.gaussians.optimise import OptimisedMap, optimise_map
+from pipelines.gaussians.optimise import MapOptimiser, OptimisedMap, optimise_map
+from pipelines.gaussians.schedule import Seeding
+from pipelines.gaussians.state import OptimiserState
 from pipelines.geometry import se3
 from pipelines.mapping.load import MappingInput
 from pipelines.mapping.measure import ViewFigures, measure_view
@@ -45,6 +47,25 @@ def test_the_map_is_sound(mapped: OptimisedMap, room: MappingInput) -> None:
     assert m.opacities.min() >= SETTINGS.prune_opacity
     assert set(m.anchor_frame_ids.tolist()) <= {v.frame_id for v in room.views}
     assert mapped.iterations == (3 + 6) * len(room.views)
+
+
+@pytest.mark.parametrize(("times", "seed_finer", "fills"), [(1, 2.0, False), (5, 2.0, True), (5, 0.0, False)])
+def test_what_was_seen_from_afar_gets_finer_gaussians(
+    times: float, seed_finer: float, fills: bool, room: MappingInput
+) -> None:
+    views, classes = room.views[:1], len(room.class_ids)
+    settings = replace(SETTINGS, seed_finer=seed_finer, flat_share=0.0)
+    seeded = MapOptimiser(views, classes, settings, OptimiserState.fresh(views, classes, None, None))
+    seeded._seed(0, Seeding.TRUSTED)
+    before = seeded.state.parameters.to_map()
+    before = replace(before, log_radii=before.log_radii + np.log(times))
+    again = MapOptimiser(views, classes, settings, OptimiserState.fresh(views, classes, before, None))
+    again._seed(0, Seeding.TRUSTED)
+    added = again.state.parameters.to_map().log_radii[len(before) :]
+    assert (len(added) > 0.5 * len(before)) == fills
+    assert len(added) < len(before) * (1.1 if fills else 0.1)
+    if fills:
+        assert added.median() < before.log_radii.median() - 1.5
 
 
 class Killed(Exception):
