@@ -93,7 +93,7 @@ def without_misplaced(
 ) -> pycolmap.Reconstruction:
     """The model, keyframes that their neighbours contradict taken out of it in place; arguments as of `judge`."""
     misplaced = find_misplaced(check_pairs(model, pairs, xy), reach)
-    if len(misplaced) <= _MOST_MISPLACED * model.num_reg_images():  # of more, who knows which are right
+    if 0 < len(misplaced) <= _MOST_MISPLACED * model.num_reg_images():  # of more, who knows which are right
         take_out(model, misplaced)
     return model
 
