@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -9,7 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pipelines.frames.consistency import epipolar_error, judge
+from pipelines.frames.consistency import epipolar_error, judge, without_misplaced
 from pipelines.frames.database import write_database
 from pipelines.frames.features import FeatureExtractor, Features
 from pipelines.frames.keyframes import KeyframeOptions, choose_keyframes
@@ -194,8 +195,10 @@ def test_snapshots_come_back_as_they_were_and_are_not_computed_twice(tmp_path: P
     assert snapshots.pairs(1, lambda: []) == snapshots.pairs(1, lambda: pairs) == []
 
 
-def _known_model(bend: float) -> tuple[pycolmap.Reconstruction, list[VerifiedPair], list[np.ndarray]]:
-    """A model of ten views of which the later half is turned by `bend` radians against the matches."""
+def _known_model(
+    bend: float, turned: Sequence[int] = range(5, 10)
+) -> tuple[pycolmap.Reconstruction, list[VerifiedPair], list[np.ndarray]]:
+    """A model of ten views of which some, the later half, are turned by `bend` radians against the matches."""
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, 10, 120
     pycolmap.set_random_seed(0)
@@ -211,8 +214,8 @@ def _known_model(bend: float) -> tuple[pycolmap.Reconstruction, list[VerifiedPai
             matches = np.array([(points[i][p], points[j][p]) for p in common], np.uint32)
             pairs.append(VerifiedPair(i, j, matches, 2, np.zeros((3, 3, 3)), len(matches)))
     swing = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, np.sin(bend / 2), 0.0, np.cos(bend / 2)])), np.zeros(3))
-    for frame_id in range(6, 11):
-        frame = model.frames[frame_id]
+    for view in turned:
+        frame = model.frames[view + 1]
         frame.rig_from_world = frame.rig_from_world * swing
     return model, pairs, xy
 
@@ -226,6 +229,19 @@ def test_a_folded_model_is_recognised() -> None:
     assert folded.score < 0.7 * straight.score
     assert [(s.before, s.after) for s in folded.contradicted] == [(4, 5)]
     assert not straight.contradicted
+
+
+def test_one_misplaced_view_is_taken_out_and_half_of_them_are_not() -> None:
+    for turned, left in (([4], 9), (range(5, 10), 10), ([], 10)):
+        model, pairs, xy = _known_model(0.5, turned)
+        model = without_misplaced(model, pairs, xy, reach=3)
+        assert model.num_reg_images() == left
+        assert judge(model, pairs, xy, total=10, reach=3).is_sound == (len(turned) == 0)
+    # The nine that are left agree; the tenth is missed.
+    model, pairs, xy = _known_model(0.5, [4])
+    report = judge(without_misplaced(model, pairs, xy, reach=3), pairs, xy, total=10, reach=3)
+    assert report.pairs_agreeing > 0.99
+    assert (report.registered, report.contradicted) == (9, [])
 
 
 def test_pycolmap_reads_the_database(tmp_path: Path) -> None:
