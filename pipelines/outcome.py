@@ -138,10 +138,6 @@ def _load_exposure(run: RunFolder, map_stage: str, trajectory: Trajectory) -> Ex
     return None
 
 
-def labels_of_channels(
-    channels: NDArray, label_of_channel: NDArray[np.uint8], known: NDArray[np.bool_]
-) -> NDArray[np.uint8]:
-    """(H, W) labels of the strongest channels; VOID where not known."""
-    if len(label_of_channel) == 0:
-        return np.full(channels.shape, VOID, np.uint8)
-    return np.where(known, label_of_channel[channels], np.uint8(VOID)).astype(np.uint8)
+def labels_of_channels(channels: NDArray, label_of_channel: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(...) labels of channels; VOID where a channel is negative."""
+    return np.append(label_of_channel, np.uint8(VOID))[channels]

@@ -14,7 +14,8 @@ from formats.errors import InputError
 from formats.gaussian_files import read_gaussians
 from pipelines.evaluation.camera_paths import upward
 from pipelines.evaluation.measure import evenly
-from pipelines.outcome import Outcome, load_outcome
+from pipelines.gaussians.map import decided_channels
+from pipelines.outcome import Outcome, labels_of_channels, load_outcome
 from pipelines.proxy.palette import class_colors
 from pipelines.run_folder import RunFolder
 from pipelines.types import Frame
@@ -85,7 +86,8 @@ def _from_run(outcome: Outcome) -> ViewerScene:
     fov, aspect = 2 * float(np.arctan(k.height / 2 / k.fy)), k.width / k.height
     ids = evenly(t.frame_ids[t.is_keyframe].tolist(), MOST_CAMERAS)
     world_from_cam = t.world_from_cam
-    labels = outcome.label_of_channel[m.class_logits.argmax(1).cpu().numpy()] if m.class_logits.shape[1] else None
+    channels = decided_channels(m.class_logits).cpu().numpy()
+    labels = labels_of_channels(channels, outcome.label_of_channel) if m.class_logits.shape[1] else None
     mesh = outcome.run.stage("export") / "mesh.glb"
     return ViewerScene(
         title=outcome.run.root.name,

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussians.map import GaussianMap, decided_channels
 from pipelines.gaussians.render import median_depth, render
 from pipelines.outcome import Exposure, labels_of_channels
 from pipelines.types import Intrinsics
@@ -47,11 +47,10 @@ def view_map(
     drawn = render(m.means, m.radii, m.opacities, features, pose, intrinsics)
     depth = median_depth(m.means, m.radii, m.opacities, pose, intrinsics).cpu().numpy()
     coverage = drawn.silhouette.cpu().numpy()
-    channels = drawn.features[..., 3:]
-    strongest = channels.argmax(-1).cpu().numpy() if channels.shape[-1] else np.zeros(coverage.shape, np.int64)
+    channels = decided_channels(drawn.features[..., 3:]).cpu().numpy()
     return MapView(
         color=drawn.features[..., :3].clamp(0, 1).cpu().numpy().astype(np.float32),
         depth=np.where(coverage >= _SEEN, depth, 0).astype(np.float32),
-        labels=labels_of_channels(strongest, label_of_channel, coverage >= _SEEN),
+        labels=labels_of_channels(np.where(coverage >= _SEEN, channels, -1), label_of_channel),
         coverage=coverage.astype(np.float32),
     )

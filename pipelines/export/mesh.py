@@ -14,14 +14,11 @@ from pipelines.config import ExportConfig
 from pipelines.export.paint import PaintedView, paint
 from pipelines.export.surface import extract_surface, without_floaters
 from pipelines.export.volume import DepthView, fuse
-from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussians.map import GaussianMap, decided_channels
 from pipelines.gaussians.render import get_threads, median_depth, render
 from pipelines.outcome import Outcome
 from pipelines.progress import Progress
 from pipelines.types import VOID, Intrinsics, SemanticMesh
-
-_LEAST_LOGIT = 1.0
-"""A pixel whose best class leads the mean of the others by less has none; a seed of a known class leads by 3."""
 
 
 def make_mesh(outcome: Outcome, settings: ExportConfig, progress: Progress) -> SemanticMesh:
@@ -98,7 +95,7 @@ def _painted(gaussian_map: GaussianMap, views: Sequence[DepthView]) -> Iterator[
     for view in views:
         pose = torch.from_numpy(view.cam_from_world)
         shown = render(m.means, m.radii, m.opacities, features, pose, view.intrinsics).features
-        channels = _decided(shown[..., 3:]) if shown.shape[-1] > 3 else None
+        channels = decided_channels(shown[..., 3:]).numpy() if shown.shape[-1] > 3 else None
         yield PaintedView(view, shown[..., :3].numpy(), channels)
 
 
@@ -106,10 +103,3 @@ def mesh_figures(mesh: SemanticMesh) -> dict[str, int | float]:
     """Counts for the report."""
     labelled = float((mesh.labels != VOID).mean()) if len(mesh.labels) else 0.0
     return {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "labelled_share": round(labelled, 4)}
-
-
-def _decided(logits: torch.Tensor) -> NDArray[np.int64]:
-    """(H, W) the class channel shown, -1 where no class stands out: what was void in every view."""
-    best, channel = logits.max(-1)
-    others = (logits.sum(-1) - best) / max(logits.shape[-1] - 1, 1)
-    return torch.where(best - others > _LEAST_LOGIT, channel, -1).numpy()

