@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from pipelines.gaussians.entropy import weighted_entropy
 from pipelines.gaussians.ssim import ssim_map
 from pipelines.mapping.mirrors import Mirrors, at
 from pipelines.types import VOID
@@ -36,11 +37,7 @@ def depth_loss(rendered: Tensor, proxy: Tensor, weight: Tensor, unit: float) -> 
 
 def label_loss(logits: Tensor, labels: Tensor, weight: Tensor) -> Tensor:
     """Cross-entropy of (H, W, C) rendered logits with (H, W) labels, void ignored, weighted; mean over all pixels."""
-    rows, channels = labels.numel(), logits.shape[-1]
-    known = labels.reshape(-1) != VOID
-    target = torch.where(known, labels.reshape(-1), torch.zeros_like(labels.reshape(-1))).long()
-    entropy = functional.cross_entropy(logits.reshape(rows, channels), target, reduction="none")
-    return (entropy * (weight.reshape(-1) * known)).mean()
+    return weighted_entropy(logits, labels, weight)
 
 
 def label_image_loss(logits: Tensor, labels: Tensor, weight: Tensor, ssim_weight: float) -> Tensor:

@@ -48,7 +48,7 @@ class AdamTable:
                     amsgrad=False, beta1=0.9, beta2=0.999, lr=rates[key], weight_decay=0.0, eps=1e-15, maximize=False,
                 )  # fmt: skip
                 if before is not None and shares is not None:
-                    value.copy_(torch.lerp(before, value, shares.reshape(-1, *[1] * (value.ndim - 1))))
+                    torch.lerp(before, value, shares.reshape(-1, *[1] * (value.ndim - 1)), out=value)
             value.grad = None
 
     def keep(self, rows: Tensor) -> None:

@@ -6,6 +6,7 @@ import torch
 from skimage.metrics import structural_similarity
 
 from pipelines.gaussians import losses
+from pipelines.gaussians.entropy import plain_entropy, weighted_entropy
 from pipelines.gaussians.ssim import similarity, ssim_map
 from pipelines.types import VOID
 
@@ -90,6 +91,26 @@ def test_label_losses_ignore_void_and_fall_with_the_right_logit(image: bool) -> 
     assert gradient.grad is not None
     assert gradient.grad[1, 1].abs().max() == 0
     assert gradient.grad[0, 1, 1] < 0
+
+
+def test_compiled_entropy_is_torchs(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(0)
+    features = 3 * torch.randn(37, 23, 9, generator=generator)
+    channels = torch.randint(0, 7, (37, 23), generator=generator, dtype=torch.uint8)
+    channels[channels == 6] = VOID
+    weight = torch.rand(37, 23, generator=generator) * (torch.rand(37, 23, generator=generator) > 0.2)
+    results = []
+    for function in (plain_entropy, weighted_entropy):
+        logits = features[..., 3:].clone().requires_grad_()
+        loss = 2 * function(logits, channels, weight)
+        loss.backward()
+        results.append((loss.detach(), logits.grad))
+    (plain, by_plain), (fast, by_fast) = results
+    assert plain > 0.5
+    torch.testing.assert_close(fast, plain, rtol=1e-6, atol=0)
+    torch.testing.assert_close(by_fast, by_plain, rtol=1e-5, atol=1e-9)
+    monkeypatch.setattr("pipelines.gaussians.render.threads._state", {"threads": 3})
+    assert weighted_entropy(features[..., 3:], channels, weight).item() == fast.item() / 2
 
 
 def test_edge_loss_wants_steps_at_class_edges_and_nowhere_else() -> None:
