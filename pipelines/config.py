@@ -126,7 +126,7 @@ class MappingConfig:
     fine_share: float = setting(0.25, "share of a view, that of most detail, with a new Gaussian at every pixel")
     flat_share: float = setting(0.5, "and that of least detail, where new ones stand twice as far apart")
     seed_finer: float = setting(
-        2.0, "new Gaussians also where the map's are this many times as large on the image as new ones; 0 = never"
+        3.0, "new Gaussians also where the map's are this many times as large on the image as new ones; 0 = never"
     )
     window_steps: int = setting(2, "coarse steps after each keyframe: on it, covisible and random past keyframes")
     passes: float = setting(10.0, "how often each keyframe is visited once all are seeded")

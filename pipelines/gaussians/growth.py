@@ -76,7 +76,7 @@ class Growth:
         spacing = self._spacing(view)
         grid = spacing > 0
         colors = expose(rendering.features[..., :3], self.state.view_tables[index])
-        wrong = densify.color_errors(colors, view.colors, 1 - s.error_share) & ~grid
+        wrong = densify.color_errors(colors, view.colors, 1 - s.error_share) & ~(needed & grid)
         depth, trust = self._grown_depth(view, rendering)
         self._append(index, needed & grid, depth, trust, spacing, GROWN_OPACITY)
         self._append(index, wrong, depth, trust, 1.0, ERROR_OPACITY)

@@ -109,6 +109,11 @@ class Schedule:
         turn = s.densify_every > 0 and (number - coarse_passes) % s.densify_every == 0
         return False, turn and number < s.densify_until * passes
 
+    def _follows_new_ones(self, number: int) -> bool:
+        """Whether the pass before this one added to the map: pruned any sooner, the new ones would go while they are
+        still nearly transparent."""
+        return self.seeding > 0 if number == 0 else self._kind_of_pass(number - 1)[1]
+
     def _visit(self, iteration: int) -> Step:
         s = self.settings
         visit = iteration - self.seeding
@@ -125,7 +130,6 @@ class Schedule:
             coarse=coarse,
             seed=Seeding.NOTHING,
             grow=grows,
-            # A pass later: what has just been added is still nearly transparent, and would go at once.
-            prune=number > 0 and self._kind_of_pass(number - 1)[1] and place == self.views - 1,
+            prune=place == self.views - 1 and self._follows_new_ones(number),
             refine_pose=view != 0,
         )
