@@ -40,14 +40,15 @@ class Seam:
     """Between a placed keyframe and the next placed one (indices).
 
     points: seen on both sides by keyframes near each other; pairs: of keyframes near each other, one on each side, that
-    match; agreeing: how many of those agree with the poses.
+    match; agreement: the share of their matches in pairs that agree with the poses. Things that repeat match falsely,
+    but with fewer matches than what is truly seen twice: so that pairs are weighed.
     """
 
     before: int
     after: int
     points: int
     pairs: int
-    agreeing: int
+    agreement: float
 
     @property
     def is_loose(self) -> bool:
@@ -57,7 +58,7 @@ class Seam:
     @property
     def is_contradicted(self) -> bool:
         """The pictures on the two sides match, and say that they lie otherwise."""
-        return self.pairs >= _LEAST_PAIRS and self.agreeing < _PAIR_AGREES * self.pairs
+        return self.pairs >= _LEAST_PAIRS and self.agreement < _PAIR_AGREES
 
 
 def find_seams(
@@ -68,11 +69,11 @@ def find_seams(
     `tracks` are the keyframes (sorted indices) that see a point, for every point.
     """
     place = {k: n for n, k in enumerate(placed)}
-    points, pairs, agreeing = (np.zeros(len(placed) + 1, np.int64) for _ in range(3))
+    points, pairs, matches, agreeing = (np.zeros(len(placed) + 1, np.int64) for _ in range(4))
 
-    def cross(counts: NDArray[np.int64], first: int, last: int) -> None:
-        counts[first] += 1
-        counts[last] -= 1
+    def cross(counts: NDArray[np.int64], first: int, last: int, weight: int = 1) -> None:
+        counts[first] += weight
+        counts[last] -= weight
 
     for track in tracks:
         seen = [place[k] for k in track]
@@ -83,16 +84,19 @@ def find_seams(
         a, b = place[check.first], place[check.second]
         if b - a <= reach:
             cross(pairs, a, b)
+            cross(matches, a, b, check.matches)
             if check.agrees:
-                cross(agreeing, a, b)
-    crossing = [np.cumsum(c)[: len(placed) - 1].tolist() for c in (points, pairs, agreeing)]
+                cross(agreeing, a, b, check.matches)
+    points, pairs, matches, agreeing = (np.cumsum(c)[: len(placed) - 1] for c in (points, pairs, matches, agreeing))
+    agreement = agreeing / np.maximum(matches, 1)
+    crossing = points.tolist(), pairs.tolist(), agreement.tolist()
     return [Seam(*row) for row in zip(placed[:-1], placed[1:], *crossing, strict=True)]
 
 
 def worst_contradictions(seams: Iterable[Seam]) -> list[Seam]:
     """Of every run of contradicted seams the worst one: most pairs that cross a seam cross those beside it too."""
     runs = [list(run) for bad, run in groupby(seams, key=lambda s: s.is_contradicted) if bad]
-    return [min(run, key=lambda s: s.agreeing / s.pairs) for run in runs]
+    return [min(run, key=lambda s: s.agreement) for run in runs]
 
 
 def find_misplaced(checks: Iterable[PairCheck], reach: int) -> list[int]:
@@ -104,15 +108,16 @@ def find_misplaced(checks: Iterable[PairCheck], reach: int) -> list[int]:
     near = [c for c in checks if c.second - c.first <= reach]
     out: list[int] = []
     while True:
-        pairs, agreeing = Counter[int](), Counter[int]()
+        pairs, matches, agreeing = Counter[int](), Counter[int](), Counter[int]()
         for check in near:
             for k in (check.first, check.second):
                 pairs[k] += 1
-                agreeing[k] += check.agrees
-        wrong = [k for k in pairs if pairs[k] >= _LEAST_PAIRS and agreeing[k] < _PAIR_AGREES * pairs[k]]
+                matches[k] += check.matches
+                agreeing[k] += check.matches * check.agrees
+        wrong = [k for k in pairs if pairs[k] >= _LEAST_PAIRS and agreeing[k] < _PAIR_AGREES * matches[k]]
         if not wrong:
             return out
-        out.append(min(wrong, key=lambda k: (agreeing[k] / pairs[k], k)))
+        out.append(min(wrong, key=lambda k: (agreeing[k] / matches[k], k)))
         near = [c for c in near if out[-1] not in (c.first, c.second)]
 
 

@@ -50,6 +50,21 @@ def test_one_contradicted_seam_among_many_good_ones() -> None:
     assert not any(s.is_loose for s in seams)
 
 
+def test_things_that_repeat_contradict_no_seam_and_misplace_nobody() -> None:
+    """Most pairs across a corner are false, but those of neighbours have most of the matches."""
+    rows = []
+    for i in range(COUNT):
+        for j in range(i + 1, min(i + REACH + 1, COUNT)):
+            false = i < 25 <= j and j - i > 1
+            rows.append(PairCheck(i, j, 40 if false else 900 // (j - i) ** 2, 1 if false else 900 // (j - i) ** 2))
+    seams = find_seams(range(COUNT), rows, _tracks(), REACH)
+    corner = next(s for s in seams if s.after == 25)
+    assert corner.pairs == 10
+    assert 0.65 < corner.agreement < 0.75
+    assert worst_contradictions(seams) == []
+    assert find_misplaced(rows, REACH) == []
+
+
 def test_far_pairs_say_nothing_of_a_seam() -> None:
     far = [PairCheck(5, 35, 400, 0)] * 50
     assert not any(s.is_contradicted for s in find_seams(range(COUNT), _checks(0) + far, _tracks(), REACH))
@@ -88,7 +103,7 @@ def test_keyframes_that_were_not_placed_leave_a_gap() -> None:
     checks = [c for c in _checks(0) if c.first in placed and c.second in placed]
     tracks = [t for row in _tracks() if len(t := [k for k in row if k in placed]) > 1]
     seams = find_seams(placed, checks, tracks, REACH)
-    assert Seam(9, 13, 20, 4, 4) not in seams  # points of four neighbours reach 12 at most
+    assert Seam(9, 13, 20, 4, 1.0) not in seams  # points of four neighbours reach 12 at most
     assert next(s for s in seams if s.before == 9).is_loose
     assert find_parts(placed, seams, tracks) == [list(range(13, COUNT)), list(range(10))]
 
@@ -124,15 +139,15 @@ def test_a_whole_model_is_not_touched(made_model: pycolmap.Reconstruction) -> No
     assert tracks_of(made_model) == before
 
 
-def _seam(before: int, points: int = 50, agreeing: int = 9) -> Seam:
-    return Seam(before, before + 1, points, 10, agreeing)
+def _seam(before: int, points: int = 50, agreement: float = 0.9) -> Seam:
+    return Seam(before, before + 1, points, 10, agreement)
 
 
 @pytest.mark.parametrize(
     ("seams", "parts", "wanted"),
     [
         ([_seam(0)], [range(9)], []),
-        ([_seam(4, agreeing=1)], [range(9)], ["folded between frames 8-10"]),
+        ([_seam(4, agreement=0.1)], [range(9)], ["folded between frames 8-10"]),
         ([_seam(4, points=0)], [range(5), range(5, 9)], ["2 parts .* 0-8, 10-16"]),
         ([_seam(7, points=0)], [range(8), [8]], [r"1 keyframes .* \(frames 16\)"]),
     ],
