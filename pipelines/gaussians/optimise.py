@@ -86,13 +86,14 @@ class MapOptimiser:
         self.growth.seed(index, what, self._draw_footprints(index) if len(self.state.parameters) else None)
 
     def _draw_footprints(self, index: int) -> Rendering:
-        """The map as the view's camera sees it; its only feature is the radius on the image, in pixels."""
+        """The map as the view's camera sees it; features: colours, and the radius on the image in pixels."""
         p, view = self.state.parameters, self.views[index]
         pose = self.state.cam_from_world(index, view).to(p["means"])
         radii, opacities = torch.exp(p["log_radii"]), torch.sigmoid(p["opacity_logits"])
         depth = (p["means"] @ pose[2, :3] + pose[2, 3]).clamp(min=1e-3 * self.unit)
         footprints = radii / depth * math.sqrt(view.intrinsics.fx * view.intrinsics.fy)
-        return render(p["means"], radii, opacities, footprints[:, None], pose, view.intrinsics)
+        features = torch.cat([p["colors"], footprints[:, None]], dim=1)
+        return render(p["means"], radii, opacities, features, pose, view.intrinsics)
 
     def _blending_weights(self) -> Tensor:
         """(M,) the largest weight with which each Gaussian stands in any pixel of any view."""
