@@ -136,7 +136,7 @@ class MappingConfig:
     max_gaussians: int = setting(600000, "the map stops growing at this many")
     color_weight: float = setting(1.0, "λ_C of eq. (18)")
     ssim_weight: float = setting(0.2, "share of 1 - SSIM in the image loss, eq. (20)")
-    depth_weight: float = setting(3.2, "λ_D of eq. (18); 0 = no depth loss")
+    depth_weight: float = setting(4.8, "λ_D of eq. (18); 0 = no depth loss")
     depth_nu: float = setting(1.2, "ν: weight of a proxy depth of reliability U is min(1, ν U)")
     use_proxy_depth: bool = setting(True, "false: the proxies only seed the map, no loss and no condition uses them")
     label_weight: float = setting(0.1, "λ_S of eq. (18); 0 = no semantic loss")
