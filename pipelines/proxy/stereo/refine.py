@@ -55,7 +55,7 @@ def refine_inverse_depth(
     return refined, score
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def _warp_surface_row(
     other: NDArray[np.float32],
     warp: NDArray[np.float64],
@@ -94,7 +94,7 @@ def _warp_surface_row(
         row[width + RADIUS + i] = row[width + RADIUS - 1]
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def _refine_band(
     image: NDArray[np.float32],
     others: NDArray[np.float32],

@@ -55,7 +55,7 @@ def sweep_cost(
     return cost
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def _warp_row(
     other: NDArray[np.float32],
     warp: NDArray[np.float64],
@@ -98,7 +98,7 @@ def _warp_row(
         row[width + RADIUS + i] = row[width + RADIUS - 1]
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def _sweep_band(
     image: NDArray[np.float32],
     others: NDArray[np.float32],

@@ -4,6 +4,9 @@ A plain square that reaches over the border of an object is matched by that bord
 window into whatever lies behind it. With weights by colour (Yoon and Kweon, PAMI 2006) a pixel is compared by its own
 surface. The weights fall off as a Gaussian and not as an exponential: the contrast of a border is so much larger than
 the texture of a wall that a thousandth of the weight still decides the correlation.
+
+No kernel that correlates is compiled with fastmath: machine code made in the process and the same taken from the cache
+were seen to round differently with it, and a run has to end with the same bytes either way.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ OUTSIDE = -2.0
 """Marks the score of a view that does not see the pixel."""
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def weigh_windows(
     image: NDArray[np.float32], first: int, last: int, likeness: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
@@ -64,7 +67,7 @@ def weigh_windows(
     return weights, weighted, moments
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def correlate_row(
     warped: NDArray[np.float32],
     weights: NDArray[np.float32],
@@ -95,7 +98,7 @@ def correlate_row(
         score[x] = value if seen[x] else np.float32(OUTSIDE)
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def best_mean(scores: NDArray[np.float32], x: int, best: int) -> np.floating:
     """Mean of the `best` largest scores of column x among the views that see it; 0 when none does. Alters `scores`."""
     total = np.float32(0)
