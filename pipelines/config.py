@@ -125,15 +125,12 @@ class MappingConfig:
     seed_stride: int = setting(2, "pixels between two new Gaussians where the map has a hole")
     fine_share: float = setting(0.25, "share of a view, that of most detail, with a new Gaussian at every pixel")
     flat_share: float = setting(0.5, "and that of least detail, where new ones stand twice as far apart")
-    seed_finer: float = setting(
-        3.0, "new Gaussians also where the map's are this many times as large on the image as new ones; 0 = never"
-    )
     window_steps: int = setting(2, "coarse steps after each keyframe: on it, covisible and random past keyframes")
     passes: float = setting(10.0, "how often each keyframe is visited once all are seeded")
     min_iterations: int = setting(400, "at least this many such visits in all")
     coarse_share: float = setting(0.25, "share of those visits at half the size, before the others")
     snapshot_every: int = setting(150, "steps between two snapshots")
-    max_gaussians: int = setting(600000, "the map stops growing at this many")
+    max_gaussians: int = setting(1000000, "the map stops growing at this many")
     color_weight: float = setting(1.0, "λ_C of eq. (18)")
     ssim_weight: float = setting(0.2, "share of 1 - SSIM in the image loss, eq. (20)")
     depth_weight: float = setting(4.8, "λ_D of eq. (18); 0 = no depth loss")
@@ -156,13 +153,15 @@ class MappingConfig:
     densify_every: int = setting(2, "passes between two rounds of densification and pruning; 0 = never")
     densify_until: float = setting(0.45, "share of the visits after which the map no longer grows")
     densify_classes: bool = setting(False, "also where the map shows another class than the label: fixes its noise too")
-    error_share: float = setting(
-        0.02, "share of a view's pixels, those of largest error, that may add Gaussians a round"
+    split_error: float = setting(
+        0.1,
+        "Gaussians that answer for more colour error 0..1, summed over pixels, are split; 0 = none are",
     )
+    split_radius: float = setting(1.0, "and is larger there than this, pixels")
     prune_opacity: float = setting(0.03, "Gaussians more transparent than this are removed")
     prune_weight: float = setting(0.03, "and those of less blending weight in every pixel of every keyframe; 0 = off")
     prune_radius: float = setting(0.15, "and those larger than this, in units of the scene's median depth")
-    mean_rate: float = setting(6e-4, "learning rate of positions, in units of the scene's median depth")
+    mean_rate: float = setting(3e-4, "learning rate of positions, in units of the scene's median depth")
     radius_rate: float = setting(3e-2, "learning rate of log radii")
     opacity_rate: float = setting(8e-2, "learning rate of opacity logits")
     color_rate: float = setting(2.5e-2, "learning rate of colours")

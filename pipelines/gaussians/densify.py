@@ -1,4 +1,4 @@
-"""Where the map needs Gaussians (the three conditions of MSGS-SLAM 3.4, and plain error) and which are useless."""
+"""Where the map needs Gaussians (the three conditions of MSGS-SLAM 3.4) and which are useless."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from pipelines.gaussians.map import GaussianMap
-from pipelines.gaussians.ssim import blur
 from pipelines.types import VOID
 
 
@@ -29,14 +28,6 @@ def wrong_classes(logits: Tensor, channels: Tensor, weight: Tensor) -> Tensor:
     if logits.shape[-1] == 0:
         return torch.zeros_like(channels, dtype=torch.bool)
     return (channels != VOID) & (weight > 0.5) & (logits.argmax(-1) != channels)
-
-
-def color_errors(rendered: Tensor, image: Tensor, quantile: float, least: float = 0.03) -> Tensor:
-    """(H, W) bool: the pixels whose smoothed colour error lies above the quantile, and above what the eye forgives."""
-    error = blur((rendered - image).abs().mean(-1, keepdim=True))[..., 0]
-    # kthvalue: torch.quantile refuses images of more than 16 million pixels.
-    k = max(int(quantile * error.numel()), 1)
-    return (error > error.reshape(-1).kthvalue(k).values) & (error > least)
 
 
 def useless(gaussian_map: GaussianMap, least_opacity: float, largest_radius: float) -> Tensor:

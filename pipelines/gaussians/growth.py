@@ -13,22 +13,13 @@ from pipelines.config import MappingConfig
 from pipelines.gaussians import densify
 from pipelines.gaussians.render import Rendering
 from pipelines.gaussians.schedule import Seeding
-from pipelines.gaussians.seeding import (
-    SEED_OPACITY,
-    SEED_RADIUS,
-    SeedDepth,
-    complete_depth,
-    seed_gaussians,
-    seed_spacing,
-)
-from pipelines.gaussians.state import OptimiserState, expose
+from pipelines.gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
+from pipelines.gaussians.splitting import CHILDREN, Blame, split
+from pipelines.gaussians.state import OptimiserState
 from pipelines.mapping.views import View
 
-GROWN_OPACITY, ERROR_OPACITY = 0.3, 0.1
+GROWN_OPACITY = 0.3
 """Of Gaussians added to a map that is already there: opaque ones would hide what has been learnt."""
-COARSE_ERROR = 0.05
-"""Error of a colour, 0..1, that calls for finer Gaussians at once: the map is hardly trained while it is seeded.
-Without this limit a recording that needs none of them gets 40 % more."""
 LOW_RELIABILITY = 0.35
 HIGH_RELIABILITY = 0.85
 _SOLID = 0.8
@@ -49,9 +40,7 @@ class Growth:
     def seed(self, index: int, what: Seeding, rendering: Rendering | None) -> None:
         """Fill the view's holes with Gaussians at its completed depth (eq. 17): the trusted ones, or the rest.
 
-        `rendering`: the map as the view sees it, None while there is none; its last feature is the radius on the image.
-        A view that comes closer than those before it, and sees that the map is wrong, gets Gaussians of its own size
-        over the coarse ones.
+        `rendering`: the map as the view sees it, None while there is none.
         """
         view = self.views[index]
         spacing = self._spacing(view)
@@ -63,27 +52,33 @@ class Growth:
             completed = self._completed(index) if what is Seeding.TRUSTED else self._completed_by_map(view, rendering)
         depth, trust = (torch.from_numpy(x).to(view.image.device) for x in (completed.depth, completed.trust))
         if what is Seeding.TRUSTED:
-            trusted = trust > LOW_RELIABILITY
-            pixels &= trusted
-            if rendering is not None and self.settings.seed_finer > 0:
-                finer = self._too_coarse(index, rendering, spacing) & trusted & ~pixels
-                self._append(index, finer, depth, trust, spacing, GROWN_OPACITY)
+            pixels &= trust > LOW_RELIABILITY
         self._append(index, pixels, depth, trust, spacing, SEED_OPACITY)
 
     @torch.no_grad()
     def grow(self, index: int, rendering: Rendering) -> None:
-        """Add Gaussians by the conditions of the article, and where the colours are most wrong."""
+        """Add Gaussians by the conditions of the article."""
         view, s = self.views[index], self.settings
         needed = self._needed(view, rendering)
         if s.densify_classes:
             needed |= densify.wrong_classes(rendering.features[..., 3:], view.channels, view.label_weight)
         spacing = self._spacing(view)
-        grid = spacing > 0
-        colors = expose(rendering.features[..., :3], self.state.view_tables[index])
-        wrong = densify.color_errors(colors, view.colors, 1 - s.error_share) & ~(needed & grid)
         depth, trust = self._grown_depth(view, rendering)
-        self._append(index, needed & grid, depth, trust, spacing, GROWN_OPACITY)
-        self._append(index, wrong, depth, trust, 1.0, ERROR_OPACITY)
+        self._append(index, needed & (spacing > 0), depth, trust, spacing, GROWN_OPACITY)
+
+    @torch.no_grad()
+    def split(self, found: Blame) -> None:
+        """Split the Gaussians that answer for the most error, where they are too large: as many as the map may hold."""
+        parameters, s = self.state.parameters, self.settings
+        wrong = torch.where(found.footprint > s.split_radius, found.error, 0.0)
+        room = max(s.max_gaussians - len(parameters), 0) // (CHILDREN - 1)
+        rows = torch.argsort(wrong, descending=True, stable=True)[: min(int((wrong > s.split_error).sum()), room)]
+        if len(rows):
+            children, trust = split(parameters.to_map(), rows), parameters.trust[rows].repeat(CHILDREN)
+            kept = torch.ones(len(parameters), dtype=torch.bool, device=rows.device)
+            kept[rows] = False
+            parameters.keep(kept)
+            parameters.append(children, trust)
 
     @torch.no_grad()
     def prune(self, largest_weight: Callable[[], Tensor] | None = None) -> None:
@@ -105,14 +100,6 @@ class Growth:
     def _holes(self, rendering: Rendering) -> Tensor:
         """Condition (a)."""
         return densify.holes(rendering.silhouette, self.settings.silhouette_threshold)
-
-    def _too_coarse(self, index: int, rendering: Rendering, spacing: Tensor) -> Tensor:
-        """Seed places of wrong colour drawn by Gaussians much larger than the seeds: first seen from farther away."""
-        view = self.views[index]
-        radius = rendering.features[..., 3] / rendering.silhouette.clamp(min=self.settings.silhouette_threshold)
-        colors = expose(rendering.features[..., :3], self.state.view_tables[index])
-        wrong = densify.color_errors(colors, view.colors, 0.0, COARSE_ERROR)
-        return (spacing > 0) & wrong & (radius > self.settings.seed_finer * SEED_RADIUS * spacing)
 
     def _needed(self, view: View, rendering: Rendering) -> Tensor:
         """Conditions (a) and (b)."""

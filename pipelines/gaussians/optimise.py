@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial, reduce
 from pathlib import Path
 
 import torch
@@ -16,7 +17,8 @@ from pipelines.gaussians.objective import Objective
 from pipelines.gaussians.parameters import AdamTable
 from pipelines.gaussians.render import Rendering, blending_weights, render
 from pipelines.gaussians.schedule import Schedule, Seeding, Step
-from pipelines.gaussians.state import Exposures, OptimisedMap, OptimiserState
+from pipelines.gaussians.splitting import Blame, blame
+from pipelines.gaussians.state import Exposures, OptimisedMap, OptimiserState, expose
 from pipelines.mapping.views import View, halved
 from pipelines.progress import Progress, SilentProgress
 
@@ -78,22 +80,30 @@ class MapOptimiser:
         table.step(self._view_rates(step))
         if step.grow:
             self.growth.grow(step.view, Rendering(*(x.detach() for x in vars(rendering).values())))
+        if step.split and self.settings.split_error > 0:
+            self.growth.split(self._blame())
         if step.prune:
             self.growth.prune(self._blending_weights)
 
     @torch.no_grad()
     def _seed(self, index: int, what: Seeding) -> None:
-        self.growth.seed(index, what, self._draw_footprints(index) if len(self.state.parameters) else None)
+        known = len(self.state.parameters) > 0
+        view, table = self.views[index], self.state.view_tables[index]
+        self.growth.seed(index, what, self.draw(view, table, with_classes=False) if known else None)
 
-    def _draw_footprints(self, index: int) -> Rendering:
-        """The map as the view's camera sees it; features: colours, and the radius on the image in pixels."""
-        p, view = self.state.parameters, self.views[index]
-        pose = self.state.cam_from_world(index, view).to(p["means"])
-        radii, opacities = torch.exp(p["log_radii"]), torch.sigmoid(p["opacity_logits"])
-        depth = (p["means"] @ pose[2, :3] + pose[2, 3]).clamp(min=1e-3 * self.unit)
-        footprints = radii / depth * math.sqrt(view.intrinsics.fx * view.intrinsics.fy)
-        features = torch.cat([p["colors"], footprints[:, None]], dim=1)
-        return render(p["means"], radii, opacities, features, pose, view.intrinsics)
+    def _blame(self) -> Blame:
+        """What each Gaussian answers for in the view where that is most."""
+        gaussian_map, state = self.state.parameters.to_map(), self.state
+        found = (
+            blame(gaussian_map, state.cam_from_world(i, v), v.intrinsics, partial(self._color_errors, i))
+            for i, v in enumerate(self.views)
+        )
+        return reduce(Blame.worst_of, found)
+
+    @torch.no_grad()
+    def _color_errors(self, index: int, colors: Tensor) -> Tensor:
+        """(H, W) mean difference between the view's photo and the (H, W, 3) colours of the map."""
+        return (expose(colors, self.state.view_tables[index]) - self.views[index].colors).abs().mean(-1)
 
     def _blending_weights(self) -> Tensor:
         """(M,) the largest weight with which each Gaussian stands in any pixel of any view."""

@@ -33,6 +33,7 @@ class Step:
     coarse: bool
     seed: Seeding
     grow: bool
+    split: bool
     prune: bool
     refine_pose: bool
 
@@ -85,11 +86,11 @@ class Schedule:
             view = self._covisible(now, rng) if nth % 2 else int(rng.integers(now))
         weights = keyframe_weights(now, self.reliability, self.settings.time_decay, self.settings.reliability_decay)
         seed = Seeding.TRUSTED if nth == 0 else Seeding.NOTHING
-        return Step(iteration, view, float(weights[view]), 1.0, True, seed, False, False, False)
+        return Step(iteration, view, float(weights[view]), 1.0, True, seed, False, False, False, False)
 
     def _filling_step(self, iteration: int, view: int) -> Step:
         weights = keyframe_weights(0, self.reliability, 0.0, self.settings.reliability_decay)
-        return Step(iteration, view, float(weights[view]), 1.0, True, Seeding.REST, False, False, False)
+        return Step(iteration, view, float(weights[view]), 1.0, True, Seeding.REST, False, False, False, False)
 
     def _covisible(self, now: int, rng: np.random.Generator) -> int:
         overlap = self.overlap[now, :now]
@@ -130,6 +131,7 @@ class Schedule:
             coarse=coarse,
             seed=Seeding.NOTHING,
             grow=grows,
+            split=grows and place == self.views - 1,
             prune=place == self.views - 1 and self._follows_new_ones(number),
             refine_pose=view != 0,
         )

@@ -181,16 +181,6 @@ def test_conditions_of_densification() -> None:
     assert densify.wrong_classes(logits, channels, torch.ones(1, 3)).tolist() == [[False, True, False]]
 
 
-def test_color_errors_are_the_worst_share() -> None:
-    image = torch.zeros(40, 50, 3)
-    rendered = image.clone()
-    rendered[10:15, 20:25] = 0.8
-    worst = densify.color_errors(rendered, image, 0.98)
-    assert worst[12, 22]
-    assert 0 < worst.float().mean() <= 0.02
-    assert not densify.color_errors(image + 0.001, image, 0.98).any()
-
-
 def test_useless_gaussians() -> None:
     gaussians, _, _ = seeds(4)
     gaussians.opacity_logits[0] = -9

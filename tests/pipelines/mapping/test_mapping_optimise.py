@@ -9,7 +9,6 @@ import torch
 
 from pipelines.config import MappingConfig
 from pipelines.gaussians.optimise import MapOptimiser, OptimisedMap, optimise_map
-from pipelines.gaussians.schedule import Seeding
 from pipelines.gaussians.state import OptimiserState
 from pipelines.geometry import se3
 from pipelines.mapping.load import MappingInput
@@ -49,23 +48,23 @@ def test_the_map_is_sound(mapped: OptimisedMap, room: MappingInput) -> None:
     assert mapped.iterations == (3 + 6) * len(room.views)
 
 
-@pytest.mark.parametrize(("times", "seed_finer", "fills"), [(1, 2.0, False), (5, 2.0, True), (5, 0.0, False)])
-def test_what_was_seen_from_afar_gets_finer_gaussians(
-    times: float, seed_finer: float, fills: bool, room: MappingInput
-) -> None:
-    views, classes = room.views[:1], len(room.class_ids)
-    settings = replace(SETTINGS, seed_finer=seed_finer, flat_share=0.0)
-    seeded = MapOptimiser(views, classes, settings, OptimiserState.fresh(views, classes, None, None))
-    seeded._seed(0, Seeding.TRUSTED)
-    before = seeded.state.parameters.to_map()
-    before = replace(before, log_radii=before.log_radii + np.log(times))
-    again = MapOptimiser(views, classes, settings, OptimiserState.fresh(views, classes, before, None))
-    again._seed(0, Seeding.TRUSTED)
-    added = again.state.parameters.to_map().log_radii[len(before) :]
-    assert (len(added) > 0.5 * len(before)) == fills
-    assert len(added) < len(before) * (1.1 if fills else 0.1)
-    if fills:
-        assert added.median() < before.log_radii.median() - 1.5
+def test_splitting_sharpens_a_coarse_map(room: MappingInput) -> None:
+    coarse = replace(SETTINGS, seed_stride=4, fine_share=0.0, passes=8.0)
+    split, unsplit = (
+        optimise_map(room.views, len(room.class_ids), replace(coarse, split_error=e), seed=0) for e in (0.1, 0.0)
+    )
+    assert len(split.gaussian_map) > 1.3 * len(unsplit.gaussian_map)
+    for views in (room.views, room.held_out):
+        assert mean(split, views, "psnr") > mean(unsplit, views, "psnr") + 1
+
+
+def test_splitting_stops_at_the_largest_map(room: MappingInput) -> None:
+    few = optimise_map(room.views, len(room.class_ids), replace(SETTINGS, seed_stride=4, split_error=0.0), seed=0)
+    classes, most = len(room.class_ids), len(few.gaussian_map) + 31
+    state = OptimiserState.fresh(room.views, classes, few.gaussian_map, None)
+    optimiser = MapOptimiser(room.views, classes, replace(SETTINGS, max_gaussians=most), state)
+    optimiser.growth.split(optimiser._blame())
+    assert len(state.parameters) == len(few.gaussian_map) + 30
 
 
 class Killed(Exception):

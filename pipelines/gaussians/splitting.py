@@ -1,0 +1,82 @@
+"""Splitting Gaussians that are too large for what they show: four smaller ones, side by side on the surface."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussians.render import render
+from pipelines.types import Intrinsics
+
+CHILDREN = 4
+CHILD_RADIUS, CHILD_OFFSET = 0.55, 0.6
+"""In radii of the parent: the children cover together what it covered, and a little less reaches over its rim."""
+_NEIGHBOURS = 12
+"""Gaussians around a parent, itself included, to which the plane of its surface is fitted."""
+
+
+@dataclass(frozen=True)
+class Blame:
+    """Of each Gaussian, the error it answers for in the worst of several views: `error` (M,) in pixels times colour
+    error, and `footprint` (M,) its radius on that image in pixels."""
+
+    error: Tensor
+    footprint: Tensor
+
+    def worst_of(self, other: Blame) -> Blame:
+        """For each Gaussian the view of larger error."""
+        worse = other.error > self.error
+        return Blame(torch.where(worse, other.error, self.error), torch.where(worse, other.footprint, self.footprint))
+
+
+def blame(
+    gaussian_map: GaussianMap, cam_from_world: Tensor, intrinsics: Intrinsics, error_of: Callable[[Tensor], Tensor]
+) -> Blame:
+    """What each Gaussian answers for in one view: the errors of the pixels, weighed by its part in them, summed.
+
+    `error_of`: (H, W, 3) colours of the map to (H, W) errors. The sum is the gradient of a feature that nothing else
+    depends on (Rota Bulò, Porzi and Kontschieder, "Revising Densification in Gaussian Splatting", ECCV 2024).
+    """
+    m = gaussian_map
+    probe = torch.zeros(len(m), 1, device=m.means.device, requires_grad=True)
+    shown = render(m.means, m.radii, m.opacities, torch.cat([m.colors, probe], 1), cam_from_world, intrinsics).features
+    colors, probed = shown.split([3, 1], dim=-1)
+    (error,) = torch.autograd.grad((probed[..., 0] * error_of(colors.detach())).sum(), probe)
+    pose = cam_from_world.to(m.means)
+    # Behind the camera nothing is drawn, so nothing is blamed there and the footprint does not matter.
+    depth = (m.means @ pose[2, :3] + pose[2, 3]).clamp(min=1e-6)
+    return Blame(error[:, 0], m.radii / depth * math.sqrt(intrinsics.fx * intrinsics.fy))
+
+
+def split(gaussian_map: GaussianMap, rows: Tensor) -> GaussianMap:
+    """Four children in place of each of the given rows (n,), in a square in the plane of the map around the parent."""
+    first, second = _tangents(gaussian_map.means.cpu().numpy(), rows.cpu().numpy())
+    along, across = (torch.from_numpy(t).to(gaussian_map.means) for t in (first, second))
+    reach = CHILD_OFFSET * gaussian_map.radii[rows, None]
+    means = [gaussian_map.means[rows] + reach * (a * along + b * across) for a in (1, -1) for b in (1, -1)]
+    four = rows.repeat(CHILDREN)
+    return GaussianMap(
+        means=torch.cat(means),
+        log_radii=gaussian_map.log_radii[four] + math.log(CHILD_RADIUS),
+        opacity_logits=gaussian_map.opacity_logits[four],
+        colors=gaussian_map.colors[four],
+        class_logits=gaussian_map.class_logits[four],
+        anchor_frame_ids=gaussian_map.anchor_frame_ids[four],
+    )
+
+
+def _tangents(means: NDArray[np.float32], rows: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two unit vectors (n, 3) each along the surface: the two main directions of the nearest Gaussians."""
+    _, nearest = cKDTree(means).query(means[rows], k=min(_NEIGHBOURS, len(means)))
+    around = means[nearest.reshape(len(rows), -1)].astype(np.float64)
+    around -= around.mean(1, keepdims=True)
+    _, directions = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    return directions[:, :, 2], directions[:, :, 1]
