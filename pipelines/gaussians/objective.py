@@ -8,8 +8,8 @@ from torch import Tensor
 
 from pipelines.config import MappingConfig
 from pipelines.gaussians import losses
+from pipelines.gaussians.adam import AdamTable
 from pipelines.gaussians.clipping import clip_beside_boundary
-from pipelines.gaussians.parameters import AdamTable
 from pipelines.gaussians.render import Rendering
 from pipelines.gaussians.state import expose
 from pipelines.mapping.views import View

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from pipelines.config import MappingConfig
+from pipelines.gaussians.adam import AdamTable, gradients_of
 from pipelines.gaussians.growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
 from pipelines.gaussians.map import GaussianMap
 from pipelines.gaussians.objective import Objective
-from pipelines.gaussians.parameters import AdamTable
 from pipelines.gaussians.render import Rendering, blending_weights, render
 from pipelines.gaussians.schedule import Schedule, Seeding, Step
 from pipelines.gaussians.splitting import Blame, blame
@@ -75,9 +75,9 @@ class MapOptimiser:
         with_labels = self.objective.uses_labels(step.iteration) or step.grow
         rendering = self.draw(view, table, with_labels)
         loss = self.objective.of(view, table, rendering, parameters["log_radii"], with_labels) * step.weight
-        loss.backward()
-        parameters.table.step(self._map_rates(step.rate), self._shares())
-        table.step(self._view_rates(step))
+        of_map, of_view = gradients_of(loss, (parameters.table, table))
+        parameters.table.step(of_map, self._map_rates(step.rate), self._shares())
+        table.step(of_view, self._view_rates(step))
         if step.grow:
             self.growth.grow(step.view, Rendering(*(x.detach() for x in vars(rendering).values())))
         if step.split and self.settings.split_error > 0:

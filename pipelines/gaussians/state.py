@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from formats.tensors import load_tensors, save_tensors
+from pipelines.gaussians.adam import AdamTable
 from pipelines.gaussians.map import GaussianMap
-from pipelines.gaussians.parameters import AdamTable, MapParameters, empty_map
+from pipelines.gaussians.parameters import MapParameters, empty_map
 from pipelines.geometry import se3
 from pipelines.mapping.views import View
 

@@ -1,0 +1,156 @@
+"""Adam over tables of rows that come and go: values and moments under the same keys, kept aligned."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pipelines.gaussians.render.jit import kernel
+from pipelines.gaussians.render.threads import for_each
+
+_BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15
+_ROWS = 8192
+
+
+@dataclass
+class AdamTable:
+    """Named parameters with Adam's first and second moments (Kingma and Ba 2015) and one common step count."""
+
+    values: dict[str, Tensor]
+    first: dict[str, Tensor] = field(default_factory=dict)
+    second: dict[str, Tensor] = field(default_factory=dict)
+    steps: int = 0
+
+    def __post_init__(self) -> None:
+        for key, value in self.values.items():
+            self.values[key] = value.detach().clone().contiguous().requires_grad_()
+            self.first.setdefault(key, torch.zeros_like(value))
+            self.second.setdefault(key, torch.zeros_like(value))
+
+    def step(
+        self, gradients: Mapping[str, Tensor | None], rates: Mapping[str, float], shares: Tensor | None = None
+    ) -> None:
+        """One Adam step for the parameters that have a gradient and a rate.
+
+        `shares` (M,): how much of the step each row takes, None for all of it.
+        """
+        self.steps += 1
+        for key, value in self.values.items():
+            gradient, rate = gradients.get(key), rates.get(key, 0.0)
+            if gradient is not None and rate != 0:
+                descend(value.detach(), gradient, self.first[key], self.second[key], rate, self.steps, shares)
+
+    def keep(self, rows: Tensor) -> None:
+        """Keep only the given rows: (M,) bool or indices."""
+        for table in (self.first, self.second):
+            for key in table:
+                table[key] = table[key][rows].contiguous()
+        for key, value in self.values.items():
+            self.values[key] = value.detach()[rows].contiguous().requires_grad_()
+
+    def append(self, rows: Mapping[str, Tensor]) -> None:
+        """Add rows with empty moments."""
+        for key, value in self.values.items():
+            self.values[key] = torch.cat([value.detach(), rows[key]]).contiguous().requires_grad_()
+            for table in (self.first, self.second):
+                table[key] = torch.cat([table[key], torch.zeros_like(rows[key])]).contiguous()
+
+    def to_tensors(self, prefix: str) -> dict[str, Tensor]:
+        """A flat table for a snapshot; `from_tensors` is the inverse."""
+        out = {f"{prefix}.steps": torch.tensor(self.steps)}
+        for key, value in self.values.items():
+            out[f"{prefix}.{key}"] = value.detach()
+            out[f"{prefix}.first.{key}"] = self.first[key]
+            out[f"{prefix}.second.{key}"] = self.second[key]
+        return out
+
+    @staticmethod
+    def from_tensors(tensors: Mapping[str, Tensor], prefix: str, keys: tuple[str, ...]) -> AdamTable:
+        """Inverse of `to_tensors`."""
+        return AdamTable(
+            {k: tensors[f"{prefix}.{k}"] for k in keys},
+            {k: tensors[f"{prefix}.first.{k}"] for k in keys},
+            {k: tensors[f"{prefix}.second.{k}"] for k in keys},
+            int(tensors[f"{prefix}.steps"]),
+        )
+
+
+def gradients_of(loss: Tensor, tables: Sequence[AdamTable]) -> list[dict[str, Tensor | None]]:
+    """The loss's gradients by the values of each table; None for what it does not depend on.
+
+    Unlike backward(), which copies a gradient that is part of a larger tensor, this hands it on as it lies.
+    """
+    leaves = [value for table in tables for value in table.values.values()]
+    found = iter(torch.autograd.grad(loss, leaves, allow_unused=True))
+    return [{key: next(found) for key in table.values} for table in tables]
+
+
+@torch.no_grad()
+def descend(
+    value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, steps: int, shares: Tensor | None
+) -> None:
+    """The `steps`-th step of Kingma and Ba 2015 on (M, ...) values and moments, in place; `shares` (M,) of it or all.
+
+    float32 on a CPU takes a compiled loop, one pass over memory; everything else plain torch.
+    """
+    if value.device.type == "cpu" and value.dtype == torch.float32 and value.ndim in (1, 2) and value.is_contiguous():
+        _descend_fast(value, gradient, first, second, rate, steps, shares)
+    else:
+        plain_descend(value, gradient, first, second, rate, steps, shares)
+
+
+def plain_descend(
+    value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, steps: int, shares: Tensor | None
+) -> None:
+    """The same by torch's own functions."""
+    first.lerp_(gradient, 1 - _BETA1)
+    second.mul_(_BETA2).addcmul_(gradient, gradient, value=1 - _BETA2)
+    change = first / (second.sqrt() / math.sqrt(1 - _BETA2**steps) + _EPSILON) * (-rate / (1 - _BETA1**steps))
+    value.add_(change if shares is None else change * shares.reshape(-1, *[1] * (value.ndim - 1)))
+
+
+def _descend_fast(
+    value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, steps: int, shares: Tensor | None
+) -> None:
+    rows, width = len(value), value[0].numel() if len(value) else 0
+    if width == 0:
+        return
+    if width > 1 and gradient.stride(-1) != 1:
+        gradient = gradient.contiguous()
+    stride = gradient.stride(0)
+    # A gradient may be some columns of a larger one: taken as one long array from its first number to its last.
+    lies = torch.as_strided(gradient, (stride * (rows - 1) + width,), (1,)).numpy()
+    arrays = [x.numpy().reshape(-1) for x in (value, first, second)]
+    own = np.empty(0, np.float32) if shares is None else shares.numpy()
+    scale, root = np.float32(-rate / (1 - _BETA1**steps)), np.float32(1 / math.sqrt(1 - _BETA2**steps))
+
+    def work(block: int) -> None:
+        _descend_rows(
+            *arrays, lies, own, block * _ROWS, min(rows, (block + 1) * _ROWS), width, stride, scale, root,
+        )  # fmt: skip
+
+    for_each(work, -(-rows // _ROWS))
+
+
+@kernel
+def _descend_rows(
+    value: NDArray, first: NDArray, second: NDArray, gradient: NDArray, shares: NDArray, start: int, end: int,
+    width: int, stride: int, scale: float, root: float,
+) -> None:  # fmt: skip
+    """Rows start to end - 1 of `width` numbers each; a gradient's row starts every `stride` numbers."""
+    keep1, keep2, tiny = np.float32(_BETA1), np.float32(_BETA2), np.float32(_EPSILON)
+    new1, new2 = np.float32(1 - _BETA1), np.float32(1 - _BETA2)
+    for row in range(start, end):
+        share = scale * shares[row] if len(shares) else scale
+        for c in range(width):
+            i, g = row * width + c, gradient[row * stride + c]
+            m = keep1 * first[i] + new1 * g
+            v = keep2 * second[i] + new2 * g * g
+            first[i], second[i] = m, v
+            value[i] += share * m / (np.sqrt(v) * root + tiny)

@@ -1,0 +1,56 @@
+"""Adam on rows: torch's own steps, gradients as they lie, and shares of a step."""
+
+import pytest
+import torch
+
+from pipelines.gaussians.adam import AdamTable, descend, gradients_of, plain_descend
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_adam_is_torchs_adam(dtype: torch.dtype) -> None:
+    start = torch.randn(20000, 3, generator=torch.Generator().manual_seed(0), dtype=dtype)
+    table = AdamTable({"x": start, "unused": start})
+    reference = start.clone().requires_grad_()
+    optimiser = torch.optim.Adam([reference], lr=0.01, eps=1e-15)
+    for _ in range(7):
+        (gradients,) = gradients_of((table.values["x"].sin() ** 2).sum(), [table])
+        table.step(gradients, {"x": 0.01, "unused": 0.01})
+        (reference.sin() ** 2).sum().backward()
+        optimiser.step()
+        optimiser.zero_grad()
+    assert (reference - start).abs().max() > 0.01
+    assert torch.allclose(table.values["x"], reference, atol=1e-6)
+    assert torch.equal(table.values["unused"], start)
+
+
+@pytest.mark.parametrize("shape", [(9000,), (9000, 3), (1, 5), (0, 3), (4, 0)])
+@pytest.mark.parametrize("shared", [False, True])
+def test_the_compiled_step_is_the_plain_one(shape: tuple[int, ...], shared: bool) -> None:
+    generator = torch.Generator().manual_seed(1)
+    fast = [torch.rand(shape, generator=generator) for _ in range(3)]
+    plain = [x.clone() for x in fast]
+    shares = torch.rand(shape[0], generator=generator) if shared else None
+    for steps in (5, 6):
+        gradient = torch.randn(shape, generator=generator)
+        descend(fast[0], gradient, fast[1], fast[2], 0.1, steps, shares)
+        plain_descend(plain[0], gradient, plain[1], plain[2], 0.1, steps, shares)
+    for a, b in zip(fast, plain, strict=True):
+        assert torch.allclose(a, b, rtol=1e-4, atol=1e-6)
+
+
+def test_a_gradient_may_be_columns_of_a_larger_one() -> None:
+    table = AdamTable({"left": torch.zeros(50, 2), "right": torch.zeros(50, 3)})
+    wanted = torch.randn(50, 5, generator=torch.Generator().manual_seed(2))
+    (gradients,) = gradients_of((torch.cat(list(table.values.values()), 1) * wanted).sum(), [table])
+    right = gradients["right"]
+    assert right is not None
+    assert right.stride() == (5, 1), "copied: the compiled step is made for gradients that are not"
+    table.step(gradients, {"left": 0.1, "right": 0.1})
+    moved = torch.cat([x.detach() for x in table.values.values()], 1)
+    assert torch.allclose(moved, -0.1 * wanted.sign(), rtol=1e-3)
+
+
+def test_steps_by_shares() -> None:
+    table = AdamTable({"x": torch.zeros(3, 2)})
+    table.step({"x": torch.ones(3, 2)}, {"x": 0.1}, torch.tensor([0.25, 1.0, 0.0]))
+    assert torch.allclose(table.values["x"], torch.tensor([[-0.025], [-0.1], [0.0]]).expand(3, 2), rtol=1e-4)
