@@ -72,6 +72,7 @@ ABLATIONS = {
     "without depth fields": ("mapping.depth_fields=false",),
     "without depth check": ("mapping.depth_check=false",),
     "without densification": ("mapping.densify_every=0",),
+    "without splitting": ("mapping.split_error=0.0",),
     "densified by classes": ("mapping.densify_classes=true",),
     "without pruning by weight": ("mapping.prune_weight=0.0",),
     "steps alike": ("mapping.low_trust_step=1.0",),
