@@ -30,8 +30,9 @@ class AdamTable:
     def __post_init__(self) -> None:
         for key, value in self.values.items():
             self.values[key] = value.detach().clone().contiguous().requires_grad_()
-            self.first.setdefault(key, torch.zeros_like(value))
-            self.second.setdefault(key, torch.zeros_like(value))
+            # Like the copy, not like what was given: the compiled step needs moments that are contiguous too.
+            self.first.setdefault(key, torch.zeros_like(self.values[key].detach()))
+            self.second.setdefault(key, torch.zeros_like(self.values[key].detach()))
 
     def step(
         self, gradients: Mapping[str, Tensor | None], rates: Mapping[str, float], shares: Tensor | None = None

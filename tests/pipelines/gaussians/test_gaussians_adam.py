@@ -54,3 +54,10 @@ def test_steps_by_shares() -> None:
     table = AdamTable({"x": torch.zeros(3, 2)})
     table.step({"x": torch.ones(3, 2)}, {"x": 0.1}, torch.tensor([0.25, 1.0, 0.0]))
     assert torch.allclose(table.values["x"], torch.tensor([[-0.025], [-0.1], [0.0]]).expand(3, 2), rtol=1e-4)
+
+
+def test_values_may_be_given_in_any_order_of_memory() -> None:
+    table = AdamTable({"x": torch.zeros(3, 4).T})
+    table.step({"x": torch.ones(4, 3)}, {"x": 0.1})
+    assert torch.allclose(table.first["x"], torch.tensor(0.1))
+    assert torch.allclose(table.second["x"], torch.tensor(0.001))
