@@ -155,9 +155,9 @@ class MappingConfig:
     densify_classes: bool = setting(False, "also where the map shows another class than the label: fixes its noise too")
     split_error: float = setting(
         0.1,
-        "Gaussians that answer for more colour error 0..1, summed over pixels, are split; 0 = none are",
+        "Gaussians that answer for more colour error 0..1 than this, summed over a view's pixels, are split; 0 = none",
     )
-    split_radius: float = setting(1.0, "and is larger there than this, pixels")
+    split_radius: float = setting(1.0, "those of a larger radius than this in that view, pixels")
     prune_opacity: float = setting(0.03, "Gaussians more transparent than this are removed")
     prune_weight: float = setting(0.03, "and those of less blending weight in every pixel of every keyframe; 0 = off")
     prune_radius: float = setting(0.15, "and those larger than this, in units of the scene's median depth")

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pipelines.gaussians.map import GaussianMap
 from pipelines.gaussians.render import render
+from pipelines.gaussians.render.rendering import project_map
 from pipelines.types import Intrinsics
 
 CHILDREN = 4
@@ -50,10 +51,8 @@ def blame(
     shown = render(m.means, m.radii, m.opacities, torch.cat([m.colors, probe], 1), cam_from_world, intrinsics).features
     colors, probed = shown.split([3, 1], dim=-1)
     (error,) = torch.autograd.grad((probed[..., 0] * error_of(colors.detach())).sum(), probe)
-    pose = cam_from_world.to(m.means)
-    # Behind the camera nothing is drawn, so nothing is blamed there and the footprint does not matter.
-    depth = (m.means @ pose[2, :3] + pose[2, 3]).clamp(min=1e-6)
-    return Blame(error[:, 0], m.radii / depth * math.sqrt(intrinsics.fx * intrinsics.fy))
+    _, _, footprint, _ = project_map(m.means, m.radii, cam_from_world, intrinsics)
+    return Blame(error[:, 0], footprint)
 
 
 def split(gaussian_map: GaussianMap, rows: Tensor) -> GaussianMap:
