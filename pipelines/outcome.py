@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from formats.errors import InputError
 from formats.tensors import load_arrays
 from pipelines.config import Config, load_saved_config
-from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussian_map import GaussianMap
 from pipelines.mapping.load import load_class_ids
 from pipelines.run_folder import RunFolder
 from pipelines.stages import StageRecord, load_records, load_source

@@ -25,7 +25,7 @@ from formats.errors import InputError
 from formats.images import read_rgb
 from formats.jsonfile import write_json
 from formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
-from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussian_map import GaussianMap
 from pipelines.types import (
     Calibration,
     ClassTable,

@@ -14,7 +14,7 @@ from formats.errors import InputError
 from formats.gaussian_files import read_gaussians
 from pipelines.evaluation.camera_paths import upward
 from pipelines.evaluation.measure import evenly
-from pipelines.gaussians.map import decided_channels
+from pipelines.gaussian_map import decided_channels
 from pipelines.outcome import Outcome, labels_of_channels, load_outcome
 from pipelines.proxy.palette import class_colors
 from pipelines.run_folder import RunFolder

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipelines.gaussians.map import GaussianMap, decided_channels
+from pipelines.gaussian_map import GaussianMap, decided_channels
 from pipelines.gaussians.render import median_depth, render
 from pipelines.outcome import Exposure, labels_of_channels
 from pipelines.types import Intrinsics

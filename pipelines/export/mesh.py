@@ -14,7 +14,7 @@ from pipelines.config import ExportConfig
 from pipelines.export.paint import PaintedView, paint
 from pipelines.export.surface import extract_surface, without_floaters
 from pipelines.export.volume import DepthView, fuse
-from pipelines.gaussians.map import GaussianMap, decided_channels
+from pipelines.gaussian_map import GaussianMap, decided_channels
 from pipelines.gaussians.render import get_threads, median_depth, render
 from pipelines.outcome import Outcome
 from pipelines.progress import Progress

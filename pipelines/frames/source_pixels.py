@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.datasets.camera import Camera
-from pipelines.frames.lens import make_lens, to_pycolmap
+from pipelines.structure.lens import make_lens, to_pycolmap
 from pipelines.types import Calibration
 
 

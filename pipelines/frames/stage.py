@@ -19,19 +19,19 @@ from formats.errors import InputError
 from formats.images import read_rgb, write_rgb
 from formats.video import VideoFrame
 from pipelines.config import FramesConfig
-from pipelines.frames.backbone import to_sparse_model
-from pipelines.frames.calibration import read_intrinsics
+from pipelines.correspondence.snapshots import Snapshots
 from pipelines.frames.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes
-from pipelines.frames.lens import Lens, distortion_of, make_lens, to_pycolmap, unknown_camera
-from pipelines.frames.parallax import require_motion
 from pipelines.frames.pick import sharpest_of_windows
 from pipelines.frames.recording import RecordingSource
 from pipelines.frames.sharpness import reduce_image, reduced_size
-from pipelines.frames.snapshots import Snapshots
 from pipelines.frames.source import FolderSource, VideoSource, open_source
-from pipelines.frames.structure import Structure, StructureFromMotion, parallel_map
 from pipelines.run_folder import read_json, save_calibration, save_frames, save_sparse_model, write_json
 from pipelines.stages import Stage, StageContext
+from pipelines.structure.backbone import to_sparse_model
+from pipelines.structure.calibration import read_intrinsics
+from pipelines.structure.lens import Lens, distortion_of, make_lens, to_pycolmap, unknown_camera
+from pipelines.structure.parallax import require_motion
+from pipelines.structure.sfm import Structure, StructureFromMotion, parallel_map
 from pipelines.types import Calibration, Frame
 
 _SIGNIFICANT_SHIFT_PX = 0.3

@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 
 from pipelines.config import MappingConfig
-from pipelines.gaussians.map import GaussianMap
-from pipelines.gaussians.optimise import optimise_map
+from pipelines.gaussian_map import GaussianMap
 from pipelines.mapping.measure import measure_view
+from pipelines.mapping.optimise import optimise_map
 from pipelines.mapping.views import View
 from pipelines.stages import StageContext
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussian_map import GaussianMap
 from pipelines.geometry import se3
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussian_map import GaussianMap
 from pipelines.geometry import se3
 from pipelines.global_ba.appearance import describe_keyframes, join_appearances
 from pipelines.global_ba.candidates import loop_candidates

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussian_map import GaussianMap
 from pipelines.gaussians.render import Rendering, render
 from pipelines.gaussians.ssim import ssim_map
 from pipelines.mapping.views import View

@@ -8,11 +8,11 @@ import numpy as np
 
 from formats.errors import InputError
 from pipelines.config import MappingConfig
-from pipelines.gaussians.optimise import OptimisedMap, optimise_map
 from pipelines.mapping.consistency import without_contradicted_depth
 from pipelines.mapping.depth_fields import agree_on_depth
 from pipelines.mapping.load import MappingInput, load_views
 from pipelines.mapping.measure import ViewFigures, mean_figures, measure_view
+from pipelines.mapping.optimise import OptimisedMap, optimise_map
 from pipelines.mapping.poses import interpolate_rows, move_trajectory
 from pipelines.mapping.views import View
 from pipelines.run_folder import save_exposure, save_map, save_trajectory, write_json

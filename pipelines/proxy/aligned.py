@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
-from pipelines.proxy.onnx_depth import OnnxDepth
+from pipelines.proxy.networks.depth_provider import OnnxDepth
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.scale import depth_at_points
 from pipelines.proxy.sequence import Sequence

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.proxy.multiview import MultiviewDepth
 from pipelines.proxy.providers import DepthEstimate, DepthProvider
 from pipelines.proxy.scale import DepthScale, measure_scale
 from pipelines.proxy.sequence import Sequence
 from pipelines.proxy.stereo.fill import SURE
+from pipelines.proxy.stereo.provider import MultiviewDepth
 from pipelines.types import Frame
 
 _GRID_REACH = 1 / 10

@@ -10,8 +10,8 @@ from pipelines.config import Config
 from pipelines.frames.recording import RecordingSource
 from pipelines.frames.source import open_source
 from pipelines.progress import SilentProgress
-from pipelines.proxy.files_depth import FilesDepth, require_sizes
-from pipelines.proxy.files_labels import FilesLabels
+from pipelines.proxy.files.depth import FilesDepth, require_sizes
+from pipelines.proxy.files.labels import FilesLabels
 from pipelines.proxy.networks.identity import card_identity
 from pipelines.proxy.scale_reference import require_reference_in
 from pipelines.proxy.selection import (

@@ -10,9 +10,9 @@ import numpy as np
 from formats.errors import InputError
 from pipelines.frames.source import open_source
 from pipelines.proxy.providers import DepthEstimate, DepthProvider
+from pipelines.proxy.regions.provider import SegmentLabels
 from pipelines.proxy.scale import DepthScale
 from pipelines.proxy.scale_reference import ReferenceScale, distance_scale, height_scale, parse_reference
-from pipelines.proxy.segments import SegmentLabels
 from pipelines.proxy.sequence import Sequence
 from pipelines.stages import StageContext
 from pipelines.types import Frame

@@ -12,21 +12,21 @@ from formats.errors import InputError
 from pipelines.config import ProxyConfig
 from pipelines.progress import Progress, log
 from pipelines.proxy.aligned import AlignedDepth
-from pipelines.proxy.files_depth import FilesDepth
-from pipelines.proxy.files_labels import FilesLabels
+from pipelines.proxy.files.depth import FilesDepth
+from pipelines.proxy.files.labels import FilesLabels
+from pipelines.proxy.files.recording import RecordingDepth, RecordingLabels
 from pipelines.proxy.fused import FusedDepth
 from pipelines.proxy.models.registry import ModelStore, default_cache
-from pipelines.proxy.multiview import MultiviewDepth, StereoSettings
-from pipelines.proxy.network_pass import ResultCache, Workplace
 from pipelines.proxy.networks.card import Card, read_card
-from pipelines.proxy.onnx_clusters import OnnxClusters
-from pipelines.proxy.onnx_depth import OnnxDepth
-from pipelines.proxy.onnx_labels import OnnxLabels
+from pipelines.proxy.networks.clusters_provider import OnnxClusters
+from pipelines.proxy.networks.depth_provider import OnnxDepth
+from pipelines.proxy.networks.labels_provider import OnnxLabels
+from pipelines.proxy.networks.network_pass import ResultCache, Workplace
 from pipelines.proxy.providers import DepthProvider, SemanticsProvider
-from pipelines.proxy.recording_maps import RecordingDepth, RecordingLabels
+from pipelines.proxy.regions.provider import SegmentLabels
 from pipelines.proxy.scale import measure_scale
-from pipelines.proxy.segments import SegmentLabels
 from pipelines.proxy.sequence import Sequence
+from pipelines.proxy.stereo.provider import MultiviewDepth, StereoSettings
 
 LEARNED_SPREAD = 0.02
 """Files whose depths stray by more from the triangulated points, relatively and within one frame, are taken for a

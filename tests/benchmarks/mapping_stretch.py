@@ -33,8 +33,8 @@ from pipelines.evaluation.depth_error import DepthErrorSum
 from pipelines.evaluation.image_quality import psnr, ssim
 from pipelines.evaluation.label_score import count_labels, score
 from pipelines.evaluation.views import view_map
-from pipelines.gaussians.optimise import optimise_map
 from pipelines.mapping.load import MappingInput
+from pipelines.mapping.optimise import optimise_map
 from pipelines.mapping.stage import prepare_depth
 from pipelines.mapping.views import View, make_view, occurring_classes
 from pipelines.types import VOID, Intrinsics, ProxyMaps

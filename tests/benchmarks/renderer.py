@@ -35,11 +35,11 @@ import torch
 from render_scenes import room
 from torch import Tensor
 
-from pipelines.gaussians import losses
 from pipelines.gaussians.render import composite, render, set_threads, track_gn
 from pipelines.gaussians.render.compositing import choose_backend
 from pipelines.gaussians.render.rendering import project_map
 from pipelines.geometry import se3
+from pipelines.mapping import losses
 
 ROWS = [(320, 240, 50_000, 8), (320, 240, 200_000, 8), (640, 480, 200_000, 8), (640, 480, 200_000, 40)]
 WANTED = [8.2, 8.8, 12.3, 7.9]

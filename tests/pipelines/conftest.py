@@ -14,7 +14,7 @@ from formats.atomic import write_text
 from formats.datasets import Sequence, open_sequence
 from formats.images import write_rgb
 from pipelines.config import Config, MappingConfig, config_to_toml
-from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussian_map import GaussianMap
 from pipelines.geometry.alignment import Similarity
 from pipelines.run_folder import (
     RunFolder,

@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from formats.errors import InputError
-from pipelines.proxy.class_files import read_class_table
+from pipelines.proxy.files.classes import read_class_table
 
 _MAX_CARD_BYTES = 1 << 20
 _MAX_SIDE = 8192

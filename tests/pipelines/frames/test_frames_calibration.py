@@ -12,8 +12,8 @@ import pytest
 
 from formats.datasets.camera import Camera
 from formats.errors import InputError
-from pipelines.frames.calibration import read_intrinsics
-from pipelines.frames.lens import distortion_of, make_lens, to_pycolmap, unknown_camera, with_second_radial
+from pipelines.structure.calibration import read_intrinsics
+from pipelines.structure.lens import distortion_of, make_lens, to_pycolmap, unknown_camera, with_second_radial
 
 
 def test_numbers_on_the_command_line() -> None:

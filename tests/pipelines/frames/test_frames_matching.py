@@ -10,14 +10,14 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pipelines.frames.consistency import epipolar_error, judge, without_misplaced
-from pipelines.frames.database import write_database
-from pipelines.frames.features import FeatureExtractor, Features
+from pipelines.correspondence.database import write_database
+from pipelines.correspondence.features import FeatureExtractor, Features
+from pipelines.correspondence.matching import MatchOptions, VerifiedPair, match_descriptors, verify_matches
+from pipelines.correspondence.retrieval import frame_descriptors, loop_pairs, sequential_pairs
+from pipelines.correspondence.snapshots import Snapshots
 from pipelines.frames.keyframes import KeyframeOptions, choose_keyframes
-from pipelines.frames.matching import MatchOptions, VerifiedPair, match_descriptors, verify_matches
-from pipelines.frames.parallax import rotation_residual
-from pipelines.frames.retrieval import frame_descriptors, loop_pairs, sequential_pairs
-from pipelines.frames.snapshots import Snapshots
+from pipelines.structure.consistency import epipolar_error, judge, without_misplaced
+from pipelines.structure.parallax import rotation_residual
 from tests.pipelines.frames.conftest import FOCAL, HEIGHT, WIDTH, render, sideways, turn
 
 CAMERA = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, WIDTH, HEIGHT)

@@ -14,17 +14,17 @@ from formats.errors import InputError
 from formats.images import write_rgb
 from pipelines.config import Config, load_config
 from pipelines.evaluation.evaluate import evaluate_run
-from pipelines.frames.lens import distortion_of, make_lens, to_pycolmap
 from pipelines.frames.recording import RecordingSource
 from pipelines.frames.source import FolderSource, open_source
 from pipelines.frames.source_pixels import FramePixels
 from pipelines.progress import SilentProgress
+from pipelines.proxy.files.recording import RecordingDepth, RecordingLabels
 from pipelines.proxy.inputs import proxy_inputs
-from pipelines.proxy.recording_maps import RecordingDepth, RecordingLabels
 from pipelines.proxy.selection import Surroundings, open_depth_files, open_label_files
 from pipelines.proxy.sequence import Sequence as ProxySequence
 from pipelines.reconstruct import reconstruct
 from pipelines.run_folder import RunFolder
+from pipelines.structure.lens import distortion_of, make_lens, to_pycolmap
 from pipelines.types import VOID, Calibration, Frame, Intrinsics
 
 

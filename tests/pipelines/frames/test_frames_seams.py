@@ -10,9 +10,11 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pipelines.frames.adjust import adjust
-from pipelines.frames.consistency import ModelReport
-from pipelines.frames.seams import (
+from pipelines.frames.stage import warn_of_structure
+from pipelines.stages import StageContext
+from pipelines.structure.adjust import adjust
+from pipelines.structure.consistency import ModelReport
+from pipelines.structure.seams import (
     PairCheck,
     Seam,
     cut,
@@ -23,9 +25,7 @@ from pipelines.frames.seams import (
     tracks_of,
     worst_contradictions,
 )
-from pipelines.frames.stage import warn_of_structure
-from pipelines.frames.structure import Structure
-from pipelines.stages import StageContext
+from pipelines.structure.sfm import Structure
 
 COUNT, REACH = 40, 4
 

@@ -15,12 +15,12 @@ import pytest
 from formats.errors import InputError
 from formats.images import read_rgb, write_rgb
 from pipelines.config import load_config
-from pipelines.frames import structure
 from pipelines.frames.stage import run
 from pipelines.geometry.alignment import align_points
 from pipelines.progress import SilentProgress
 from pipelines.run_folder import RunFolder, calibration_from_json, load_sparse_model, read_json
 from pipelines.stages import StageContext
+from pipelines.structure import sfm
 from tests.pipelines.frames.conftest import QUICK, WALK_FRAMES, Walk, render, sideways, turn, write_walk
 
 T = TypeVar("T")
@@ -113,7 +113,7 @@ def test_a_stage_killed_again_and_again_ends_with_the_same_bytes(
     make_context: Callable[..., StageContext],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(structure, "_PAIRS_PER_BLOCK", 16)
+    monkeypatch.setattr(sfm, "_PAIRS_PER_BLOCK", 16)
     places = [("picking", 7), ("keyframes", 5), ("features", 3), ("matches", 1), ("mapping", 1), ("undistorting", 4)]
     for label, item in places:
         with pytest.raises(Killed):

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussian_map import GaussianMap
 from pipelines.geometry import se3
 from pipelines.geometry.camera import project
 from pipelines.global_ba.move_map import follow_keyframes, move_map

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from pipelines.config import Config, load_config
-from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussian_map import GaussianMap
 from pipelines.geometry import se3
 from pipelines.geometry.alignment import align_points
 from pipelines.geometry.camera import unproject

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from pipelines.config import MappingConfig
-from pipelines.gaussians.optimise import MapOptimiser, OptimisedMap, optimise_map
-from pipelines.gaussians.state import OptimiserState
 from pipelines.geometry import se3
 from pipelines.mapping.load import MappingInput
 from pipelines.mapping.measure import ViewFigures, measure_view
+from pipelines.mapping.optimise import MapOptimiser, OptimisedMap, optimise_map
+from pipelines.mapping.state import OptimiserState
 from pipelines.mapping.views import View
 
 SETTINGS = MappingConfig(passes=6.0, min_iterations=0, snapshot_every=20, seed_stride=1)

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from pipelines.config import MappingConfig
-from pipelines.gaussians.schedule import Schedule, Seeding
 from pipelines.geometry import se3
 from pipelines.mapping.consistency import without_contradicted_depth
 from pipelines.mapping.covisibility import keyframe_weights, overlaps
 from pipelines.mapping.depth_fields import Anchors, agree_on_depth
 from pipelines.mapping.load import DepthScales, MappingInput, load_views, scale_field, split_frames
 from pipelines.mapping.poses import interpolate_rows, move_trajectory
+from pipelines.mapping.schedule import Schedule, Seeding
 from pipelines.mapping.views import channel_table, halved, occurring_classes, working_size
 from pipelines.run_folder import RunFolder
 from pipelines.types import VOID, Intrinsics, Trajectory

@@ -11,10 +11,10 @@ from proxy_room import Room, write_source
 from formats.errors import InputError
 from formats.images import write_grey_png, write_rgb
 from pipelines.progress import SilentProgress
-from pipelines.proxy.class_files import find_class_table, read_class_table
-from pipelines.proxy.files_depth import FilesDepth
-from pipelines.proxy.files_labels import FilesLabels
-from pipelines.proxy.matching_files import frame_key
+from pipelines.proxy.files.classes import find_class_table, read_class_table
+from pipelines.proxy.files.depth import FilesDepth
+from pipelines.proxy.files.labels import FilesLabels
+from pipelines.proxy.files.matching import frame_key
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.sequence import Sequence
 from pipelines.types import VOID, Calibration, Frame, Intrinsics

@@ -12,13 +12,13 @@ from formats.images import write_grey_png
 from pipelines.config import ProxyConfig
 from pipelines.progress import SilentProgress
 from pipelines.proxy.fused import FusedDepth, fuse
-from pipelines.proxy.multiview import MultiviewDepth, StereoSettings
 from pipelines.proxy.providers import DepthEstimate
+from pipelines.proxy.regions.provider import SegmentLabels
 from pipelines.proxy.reliability import semantic_agreement, warp_labels
 from pipelines.proxy.scale import measure_scale
-from pipelines.proxy.segments import SegmentLabels
 from pipelines.proxy.selection import Surroundings, open_depth
 from pipelines.proxy.sequence import Sequence
+from pipelines.proxy.stereo.provider import MultiviewDepth, StereoSettings
 from pipelines.types import VOID, Frame, Intrinsics
 
 SETTINGS = StereoSettings(side=256, planes=64)

@@ -13,10 +13,10 @@ from onnx import TensorProto, helper, numpy_helper
 from proxy_room import Room
 
 from pipelines.progress import SilentProgress
-from pipelines.proxy import network_pass
-from pipelines.proxy.network_pass import Arrays, NetworkPass, ResultCache, Workplace
+from pipelines.proxy.networks import network_pass
 from pipelines.proxy.networks.card import read_card
-from pipelines.proxy.onnx_clusters import OnnxClusters, spherical_kmeans
+from pipelines.proxy.networks.clusters_provider import OnnxClusters, spherical_kmeans
+from pipelines.proxy.networks.network_pass import Arrays, NetworkPass, ResultCache, Workplace
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.sequence import Sequence
 from pipelines.types import Calibration, Frame, Intrinsics

@@ -10,8 +10,8 @@ import pytest
 from proxy_room import UNIT, Room
 
 from formats.errors import InputError
-from pipelines.proxy.files_depth import FilesDepth
-from pipelines.proxy.files_labels import FilesLabels
+from pipelines.proxy.files.depth import FilesDepth
+from pipelines.proxy.files.labels import FilesLabels
 from pipelines.proxy.providers import DepthEstimate, LabelEstimate
 from pipelines.proxy.stage import run
 from pipelines.run_folder import load_proxy_maps, proxy_path, read_json, save_calibration

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pycolmap
 
-from pipelines.frames.features import Features
-from pipelines.frames.matching import VerifiedPair
+from pipelines.correspondence.features import Features
+from pipelines.correspondence.matching import VerifiedPair
 
 
 def write_database(

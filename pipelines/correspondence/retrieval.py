@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from pipelines.frames.features import DESCRIPTOR_NORM, Features
+from pipelines.correspondence.features import DESCRIPTOR_NORM, Features
 
 _WORDS = 64
 _TRAINING_DESCRIPTORS = 20000

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.gaussians import densify
-from pipelines.gaussians.map import decided_channels
-from pipelines.gaussians.parameters import KEYS, MapParameters, empty_map
+from pipelines.gaussian_map import decided_channels
 from pipelines.gaussians.seeding import complete_depth, fill_smoothly, seed_gaussians, seed_grid, seed_spacing
 from pipelines.geometry.camera import project
+from pipelines.mapping import densify
+from pipelines.mapping.parameters import KEYS, MapParameters, empty_map
 from pipelines.types import VOID, Intrinsics
 
 CAMERA = Intrinsics(40, 30, 35.0, 35.0, 20.0, 15.0)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.proxy.network_pass import Arrays, Workplace
 from pipelines.proxy.networks.card import Card
 from pipelines.proxy.networks.labels import class_token, patch_features
-from pipelines.proxy.onnx_labels import OnnxLabels
+from pipelines.proxy.networks.labels_provider import OnnxLabels
+from pipelines.proxy.networks.network_pass import Arrays, Workplace
 from pipelines.types import Frame
 
 _SAMPLE = 20000

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussian_map import GaussianMap
 from pipelines.gaussians.render import render
 from pipelines.gaussians.render.rendering import project_map
 from pipelines.types import Intrinsics

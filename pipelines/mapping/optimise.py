@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from pipelines.config import MappingConfig
+from pipelines.gaussian_map import GaussianMap
 from pipelines.gaussians.adam import AdamTable, gradients_of
-from pipelines.gaussians.growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
-from pipelines.gaussians.map import GaussianMap
-from pipelines.gaussians.objective import Objective
 from pipelines.gaussians.render import Rendering, blending_weights, render
-from pipelines.gaussians.schedule import Schedule, Seeding, Step
-from pipelines.gaussians.splitting import Blame, blame
-from pipelines.gaussians.state import Exposures, OptimisedMap, OptimiserState, expose
+from pipelines.mapping.growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
+from pipelines.mapping.objective import Objective
+from pipelines.mapping.schedule import Schedule, Seeding, Step
+from pipelines.mapping.splitting import Blame, blame
+from pipelines.mapping.state import Exposures, OptimisedMap, OptimiserState, expose
 from pipelines.mapping.views import View, halved
 from pipelines.progress import Progress, SilentProgress
 

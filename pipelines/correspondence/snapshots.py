@@ -13,8 +13,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from formats.tensors import load_arrays, save_arrays
-from pipelines.frames.features import Features
-from pipelines.frames.matching import VerifiedPair
+from pipelines.correspondence.features import Features
+from pipelines.correspondence.matching import VerifiedPair
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussian_map import GaussianMap
 from pipelines.types import VOID
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipelines.frames.lens import with_second_radial
+from pipelines.structure.lens import with_second_radial
 
 _CAUCHY_PX = 1.0
 _MAX_REPROJECTION_PX = 4.0

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from pipelines.config import MappingConfig
-from pipelines.gaussians import losses
 from pipelines.gaussians.adam import AdamTable
-from pipelines.gaussians.clipping import clip_beside_boundary
 from pipelines.gaussians.render import Rendering
-from pipelines.gaussians.state import expose
+from pipelines.mapping import losses
+from pipelines.mapping.clipping import clip_beside_boundary
+from pipelines.mapping.state import expose
 from pipelines.mapping.views import View
 
 _EXPOSURE_PULL = 0.1

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipelines.frames.features import DESCRIPTOR_NORM, Features
+from pipelines.correspondence.features import DESCRIPTOR_NORM, Features
 
 
 @dataclass(frozen=True)

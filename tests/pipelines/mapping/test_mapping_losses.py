@@ -5,9 +5,9 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from pipelines.gaussians import losses
 from pipelines.gaussians.entropy import plain_entropy, weighted_entropy
 from pipelines.gaussians.ssim import similarity, ssim_map
+from pipelines.mapping import losses
 from pipelines.types import VOID
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from formats.errors import InputError
 from formats.images import MAX_IMAGE_PIXELS, image_size, read_depth_png, read_grey_png
-from pipelines.proxy.matching_files import find_folder, match_files
+from pipelines.proxy.files.matching import find_folder, match_files
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.sequence import Sequence, resample_nearest
 from pipelines.types import Frame

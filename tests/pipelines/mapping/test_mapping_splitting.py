@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
-from pipelines.gaussians.map import GaussianMap
+from pipelines.gaussian_map import GaussianMap
 from pipelines.gaussians.render import blending_weights, render
-from pipelines.gaussians.splitting import CHILDREN, Blame, blame, split
+from pipelines.mapping.splitting import CHILDREN, Blame, blame, split
 from pipelines.types import Intrinsics
 
 CAMERA = Intrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
-from pipelines.proxy.network_pass import Arrays, NetworkPass, Workplace
 from pipelines.proxy.networks.card import Card
 from pipelines.proxy.networks.identity import card_identity
 from pipelines.proxy.networks.labels import class_token, network_labels
+from pipelines.proxy.networks.network_pass import Arrays, NetworkPass, Workplace
 from pipelines.proxy.networks.session import Network
 from pipelines.proxy.palette import class_colors
 from pipelines.proxy.providers import DepthEstimate, LabelEstimate

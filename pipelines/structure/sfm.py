@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 
 from formats.errors import InputError
 from pipelines.config import FramesConfig
-from pipelines.frames.adjust import adjust
-from pipelines.frames.consistency import ModelReport, judge, without_misplaced
-from pipelines.frames.database import write_database
-from pipelines.frames.features import FeatureExtractor, Features
-from pipelines.frames.mapping import calibrate_focal, map_globally, map_incrementally
-from pipelines.frames.matching import MatchOptions, VerifiedPair, match_pair
-from pipelines.frames.parallax import HOW_TO_FILM, require_parallax
-from pipelines.frames.retrieval import frame_descriptors, loop_pairs, sequential_pairs
-from pipelines.frames.seams import cut
-from pipelines.frames.snapshots import Snapshots
+from pipelines.correspondence.database import write_database
+from pipelines.correspondence.features import FeatureExtractor, Features
+from pipelines.correspondence.matching import MatchOptions, VerifiedPair, match_pair
+from pipelines.correspondence.retrieval import frame_descriptors, loop_pairs, sequential_pairs
+from pipelines.correspondence.snapshots import Snapshots
 from pipelines.progress import Progress
+from pipelines.structure.adjust import adjust
+from pipelines.structure.consistency import ModelReport, judge, without_misplaced
+from pipelines.structure.mappers import calibrate_focal, map_globally, map_incrementally
+from pipelines.structure.parallax import HOW_TO_FILM, require_parallax
+from pipelines.structure.seams import cut
 
 _PAIRS_PER_BLOCK = 64
 _MIN_KEYFRAMES = 3

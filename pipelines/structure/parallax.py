@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
-from pipelines.frames.matching import VerifiedPair
+from pipelines.correspondence.matching import VerifiedPair
 
 HOW_TO_FILM = (
     "Film again while walking: move the camera sideways by a tenth of the distance to what it shows, rather than "

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
-from pipelines.proxy.network_pass import Arrays, NetworkPass, Workplace
 from pipelines.proxy.networks.card import Card
 from pipelines.proxy.networks.depth import network_depth
 from pipelines.proxy.networks.identity import card_identity
+from pipelines.proxy.networks.network_pass import Arrays, NetworkPass, Workplace
 from pipelines.proxy.networks.session import Network
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.types import Frame

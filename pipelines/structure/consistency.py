@@ -10,9 +10,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipelines.frames.adjust import reprojection_errors
-from pipelines.frames.matching import VerifiedPair
-from pipelines.frames.seams import (
+from pipelines.correspondence.matching import VerifiedPair
+from pipelines.structure.adjust import reprojection_errors
+from pipelines.structure.seams import (
     PairCheck,
     Seam,
     find_misplaced,

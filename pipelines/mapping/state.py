@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from formats.tensors import load_tensors, save_tensors
+from pipelines.gaussian_map import GaussianMap
 from pipelines.gaussians.adam import AdamTable
-from pipelines.gaussians.map import GaussianMap
-from pipelines.gaussians.parameters import MapParameters, empty_map
 from pipelines.geometry import se3
+from pipelines.mapping.parameters import MapParameters, empty_map
 from pipelines.mapping.views import View
 
 VIEW_KEYS = ("twist", "log_gain", "offset")

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pipelines.gaussian_map import GaussianMap
 from pipelines.gaussians.adam import AdamTable
-from pipelines.gaussians.map import GaussianMap
 
 KEYS = ("means", "log_radii", "opacity_logits", "colors", "class_logits")
 

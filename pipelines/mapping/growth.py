@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from pipelines.config import MappingConfig
-from pipelines.gaussians import densify
 from pipelines.gaussians.render import Rendering
-from pipelines.gaussians.schedule import Seeding
 from pipelines.gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
-from pipelines.gaussians.splitting import CHILDREN, Blame, split
-from pipelines.gaussians.state import OptimiserState
+from pipelines.mapping import densify
+from pipelines.mapping.schedule import Seeding
+from pipelines.mapping.splitting import CHILDREN, Blame, split
+from pipelines.mapping.state import OptimiserState
 from pipelines.mapping.views import View
 
 GROWN_OPACITY = 0.3

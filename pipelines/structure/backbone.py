@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipelines.frames.lens import Lens
+from pipelines.structure.lens import Lens
 from pipelines.types import SparseModel
 
 

@@ -1,0 +1,1 @@
+"""Depth and labels from files of the user or of a data set."""
