@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import shutil
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from formats.errors import DiskFullError, InputError
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NOT_ALLOWED = {errno.EACCES, errno.EPERM, errno.EROFS}
 _NEARLY_FULL_BYTES = 1 << 20
+_LONGEST_NAME = 255
 
 
 @contextmanager
@@ -26,7 +28,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     Raises DiskFullError when the disk is full, InputError when the folder cannot be written.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
+    temporary = path.with_name(_temporary_name(path))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.unlink(missing_ok=True)
@@ -36,8 +38,15 @@ def atomic_path(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise _explained(error, path) from error
     finally:
-        with suppress(NotADirectoryError):
+        with suppress(OSError):  # what the block raised says more
             temporary.unlink(missing_ok=True)
+
+
+def _temporary_name(path: Path) -> str:
+    name = f".{path.stem}.tmp{path.suffix}"
+    if len(os.fsencode(name)) <= _LONGEST_NAME:
+        return name
+    return f".{hashlib.sha256(os.fsencode(path.name)).hexdigest()}.tmp{path.suffix}"
 
 
 def write_bytes(path: Path, data: bytes | bytearray | memoryview) -> None:
@@ -65,6 +74,8 @@ def _explained(error: OSError, path: Path) -> Exception:
         )
     if error.errno in _NOT_ALLOWED:
         return InputError(f"cannot write {path}, {error.strerror}: choose another output folder or change its rights")
+    if error.errno == errno.ENAMETOOLONG:
+        return InputError(f"cannot write {path}: the name is too long for this disk: choose a shorter one")
     if error.errno in (errno.ENOTDIR, errno.EEXIST):
         return InputError(f"cannot write {path}, a part of that path is a file: choose another output folder")
     return error

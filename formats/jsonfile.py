@@ -1,14 +1,23 @@
-"""JSON files: written whole or not at all, and checked before anyone relies on what they hold."""
+"""JSON and TOML files: written whole or not at all, and checked before anyone relies on what they hold."""
 
 from __future__ import annotations
 
 import json
+import math
+import re
+import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from formats.atomic import write_text
 from formats.errors import InputError
+from formats.reading import parsing
 from formats.textfile import read_text
+
+MAX_JSON_BYTES = 32 * 1024 * 1024
+MAX_TOML_BYTES = 1024 * 1024
+_MOST_DIGITS = 40
+_HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -16,15 +25,49 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
+def read_json(path: Path, most: int = MAX_JSON_BYTES) -> Any:
+    """What a JSON file holds: numbers are finite and of at most 40 digits, texts are whole Unicode.
+
+    Raises InputError when it is missing, larger than `most` bytes, damaged, or nested too deep.
+    """
+    text = read_text(path, most)
+    with parsing(path, "valid JSON", "was it cut short or edited by hand?"):
+        value = json.loads(text, parse_constant=_refuse, parse_float=_finite, parse_int=_integer)
+        if _HALF_CHARACTER.search(text):  # half of a pair cannot be written anywhere: neither in a path nor in a file
+            json.dumps(value, ensure_ascii=False).encode("utf-8")
+    return value
+
+
 def read_json_object(path: Path) -> dict[str, Any]:
-    """The object in a JSON file. Raises InputError when it is missing, damaged, or holds something else."""
-    try:
-        value = json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is no valid JSON ({error}): was it cut short or edited by hand?") from error
+    """The object in a JSON file. Raises InputError as `read_json`, and when it holds something else."""
+    value = read_json(path)
     if not isinstance(value, dict):
         raise InputError(f"{path} holds a {type(value).__name__}, expected an object in braces")
     return value
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The table in a TOML file. Raises InputError when it is missing, too large, damaged or nested too deep."""
+    text = read_text(path, MAX_TOML_BYTES)
+    with parsing(path, "valid TOML", "correct it"):
+        return tomllib.loads(text)
+
+
+def _refuse(word: str) -> NoReturn:
+    raise ValueError(f"{word} is no number in JSON")
+
+
+def _finite(digits: str) -> float:
+    value = float(digits)
+    if not math.isfinite(value):
+        raise ValueError(f"the number {digits[:_MOST_DIGITS]} is too large")
+    return value
+
+
+def _integer(digits: str) -> int:
+    if len(digits) > _MOST_DIGITS:
+        raise ValueError(f"a number of {len(digits)} digits")
+    return int(digits)
 
 
 def number(table: dict[str, Any], path: Path, *names: str) -> float:
@@ -42,5 +85,5 @@ def optional_number(table: dict[str, Any], path: Path, *names: str) -> float | N
         return None
     value = table[name]
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{path}: {name!r} is {value!r}, expected a number")
+        raise InputError(f"{path}: {name!r} is {str(value)[:80]!r}, expected a number")
     return float(value)

@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import json
-import struct
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import safetensors.numpy
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors import safe_open
 
-from formats.atomic import atomic_path
+from formats.atomic import atomic_path, write_bytes
 from formats.errors import InputError
+from formats.reading import parsing, require_file
 
 if TYPE_CHECKING:
     import torch
 
 MAX_ARRAY_BYTES = 16 * 1024**3
-"""A file whose arrays would take more memory in total is refused."""
+"""A file of arrays as they lie in memory that is larger is refused."""
 
-_MAX_HEADER_BYTES = 100_000_000
+MAX_UNPACKED_BYTES = 1024**3
+"""A packed file whose arrays would take more memory in total is refused: a few kilobytes can unpack to anything."""
 
 
 def save_arrays(path: Path, arrays: Mapping[str, NDArray], *, compress: bool = True) -> None:
@@ -48,19 +49,16 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray], *, compress: bool = T
 def load_arrays(path: Path) -> dict[str, NDArray]:
     """The arrays of an .npz file.
 
-    Raises InputError when it is missing, damaged, holds objects, or unpacks to more than `MAX_ARRAY_BYTES`.
+    Raises InputError when it is missing, damaged, holds objects, or unpacks to more than `MAX_UNPACKED_BYTES`.
     """
-    path = Path(path)
-    _require_file(path)
-    try:
+    require_file(path)
+    with parsing(path, ".npz file of plain arrays", "make it again"):
         with zipfile.ZipFile(path) as archive:
             total = sum(entry.file_size for entry in archive.infolist())
-        if total > MAX_ARRAY_BYTES:
+        if total > MAX_UNPACKED_BYTES:
             raise InputError(f"{path} would unpack to {total / 1e9:.0f} GB: it is not a file of this program")
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
-    except (zipfile.BadZipFile, ValueError, OSError, EOFError, KeyError, MemoryError) as error:
-        raise InputError(f"{path} is damaged or no .npz file of plain arrays ({error}): make it again") from error
 
 
 def save_tensors(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
@@ -68,19 +66,17 @@ def save_tensors(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
     import safetensors.torch  # torch is slow to import, and most of this package does without
 
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    with atomic_path(Path(path)) as temporary:
-        safetensors.torch.save_file(contiguous, temporary)
+    # Made in memory: the library's own file has other rights than its neighbours, and its own errors on a full disk.
+    write_bytes(path, safetensors.torch.save(contiguous))
 
 
 def load_tensors(path: Path) -> dict[str, torch.Tensor]:
     """All tensors of a .safetensors file, on the CPU. Raises InputError as `load_safetensors` does."""
     import safetensors.torch
 
-    _require_file(Path(path))
-    try:
+    require_file(path, MAX_ARRAY_BYTES)
+    with parsing(path, ".safetensors file", "make it again"):
         return safetensors.torch.load_file(path)
-    except (SafetensorError, ValueError, OSError) as error:
-        raise InputError(f"{path} is damaged or no .safetensors file ({error}): make it again") from error
 
 
 def save_safetensors(path: Path, arrays: Mapping[str, NDArray], meta: Mapping[str, str] | None = None) -> None:
@@ -89,9 +85,7 @@ def save_safetensors(path: Path, arrays: Mapping[str, NDArray], meta: Mapping[st
     Raises InputError when the disk refuses.
     """
     contiguous = {name: np.ascontiguousarray(arrays[name]) for name in sorted(arrays)}
-    with atomic_path(Path(path)) as temporary:
-        save_file(contiguous, str(temporary), metadata=dict(meta or {}))
-        _sort_metadata(temporary)
+    write_bytes(path, _with_sorted_metadata(safetensors.numpy.save(contiguous, metadata=dict(meta or {}))))
 
 
 def load_safetensors(path: Path) -> tuple[dict[str, NDArray], dict[str, str]]:
@@ -99,32 +93,15 @@ def load_safetensors(path: Path) -> tuple[dict[str, NDArray], dict[str, str]]:
 
     Raises InputError when it is missing, damaged, cut short or too large.
     """
-    path = Path(path)
-    _require_file(path)
-    if path.stat().st_size > MAX_ARRAY_BYTES:
-        raise InputError(f"{path} is larger than {MAX_ARRAY_BYTES / 1e9:.0f} GB: it is not a file of this program")
-    try:
-        with safe_open(str(path), framework="numpy") as file:
-            return {name: file.get_tensor(name) for name in sorted(file.keys())}, dict(file.metadata() or {})
-    except (SafetensorError, TypeError, ValueError, OSError) as error:
-        raise InputError(f"{path} is damaged or no .safetensors file ({error}): make it again") from error
+    require_file(path, MAX_ARRAY_BYTES)
+    with parsing(path, ".safetensors file", "make it again"), safe_open(str(path), framework="numpy") as file:
+        return {name: file.get_tensor(name) for name in sorted(file.keys())}, dict(file.metadata() or {})
 
 
-def _require_file(path: Path) -> None:
-    if not path.is_file():
-        raise InputError(f"no such file: {path}: check the spelling, or run the step that makes it")
-
-
-def _sort_metadata(path: Path) -> None:
+def _with_sorted_metadata(data: bytes) -> bytes:
     """safetensors writes its metadata in hash order, another in every process: put the header's keys in order."""
-    with path.open("r+b") as file:
-        (size,) = struct.unpack("<Q", file.read(8))
-        if size > _MAX_HEADER_BYTES:
-            raise ValueError(f"safetensors header of {size} bytes")
-        header = json.loads(file.read(size))
-        header["__metadata__"] = dict(sorted(header.get("__metadata__", {}).items()))
-        text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
-        if len(text) > size:
-            return  # cannot happen with the library's own compact JSON; the file is good as it is
-        file.seek(8)
-        file.write(text.ljust(size))
+    size = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + size])
+    header["__metadata__"] = dict(sorted(header.get("__metadata__", {}).items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    return data[:8] + text.ljust(size) + data[8 + size :]

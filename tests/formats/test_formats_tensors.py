@@ -107,7 +107,8 @@ def test_damaged_files_are_explained(tmp_path: Path, suffix: str) -> None:
 
 
 def test_arrays_larger_than_the_limit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(formats.tensors, "MAX_ARRAY_BYTES", 100_000)
+    for limit in ("MAX_ARRAY_BYTES", "MAX_UNPACKED_BYTES"):
+        monkeypatch.setattr(formats.tensors, limit, 100_000)
     np.savez_compressed(tmp_path / "bomb.npz", a=np.zeros(1_000_000, np.uint8))
     assert (tmp_path / "bomb.npz").stat().st_size < 10_000
     with pytest.raises(InputError, match="unpack"):
