@@ -6,6 +6,7 @@ BIN := $(VENV)/bin
 .PHONY: demo test lint clean
 
 demo: $(VENV)/.installed
+	$(BIN)/msgs-slam models pull --yes || echo "The demo goes on without networks: no names, no metres."
 	$(BIN)/msgs-slam demo
 
 test: lint

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from pipelines.proxy.models.registry import Model
+    from pipelines.proxy.models.registry import Model, ModelStore
 
 
 @click.group()
@@ -29,43 +29,69 @@ def list_models() -> None:
     for model in store.models:
         here = "here" if store.is_here(model) else "-"
         notes = ["commercial use allowed" if model.commercial else "ask before commercial use"]
+        if model.pull:
+            notes.append("comes with `models pull`" if model.pull == "default" else "comes with `models pull --best`")
         if not model.sha256:
             notes.append("hash unknown: pull with --trust")
         elif model.urls and not model.revision:
             notes.append("no fixed revision: refused if its makers replace it")
-        task = store.families[model.family]["task"]
-        click.echo(f"{model.name:18} {task:13} {here:5} {_size(model):>12}  {model.licence} ({'; '.join(notes)})")
+        family = store.families[model.family]
+        use = "metres" if family.get("metres_only") else family["task"]
+        click.echo(f"{model.name:18} {use:13} {here:5} {_size(model):>12}  {model.licence} ({'; '.join(notes)})")
     click.echo(f"cache: {store.cache}")
 
 
 @models.command()
 @click.argument("names", nargs=-1)
+@click.option("--best", is_flag=True, help="The large networks for metric depth and named classes.")
+@click.option(
+    "--from",
+    "folder",
+    type=click.Path(path_type=Path),
+    help="Take the files from this folder, under whatever names, instead of the network.",
+)
 @click.option("--trust", is_flag=True, help="Accept a model of unknown sha256 and record the hash of what comes.")
 @click.option("--offline", is_flag=True, help="Only check what is here; download nothing.")
-@click.option("--yes", is_flag=True, help="Do not ask about the licence.")
-def pull(names: tuple[str, ...], trust: bool, offline: bool, yes: bool) -> None:
-    """Download models by name, with what they need; without a name those for metric depth and named classes.
+@click.option("--yes", is_flag=True, help="Do not ask about the licences.")
+def pull(names: tuple[str, ...], best: bool, folder: Path | None, trust: bool, offline: bool, yes: bool) -> None:
+    """Download models by name, with what they need; without a name the small ones (4 MB): classes, metres, people.
 
     A broken download goes on where it stopped.
     """
-    from tqdm import tqdm
-
+    from formats.errors import InputError
     from pipelines.proxy.models.registry import ModelStore
 
     store = ModelStore.open()
-    for model in store.with_needed(names):
-        if not store.is_here(model) and not offline:
+    if folder is not None:
+        wanted = store.with_needed(names, best) if names or best else list(store.models)
+        found = store.take(folder, wanted)
+        if not found or (names and len(found) < len(wanted)):
+            missed = ", ".join(m.name for m in wanted if m not in found)
+            raise InputError(f"{folder}: holds no file of {missed}, by its sha256 (`msgs-slam models list`)")
+        for model in found:
+            click.echo(str(store.path(model)))
+        return
+    wanted = store.with_needed(names, best)
+    lacking = [m for m in wanted if not store.is_here(m)]
+    if lacking and not offline:
+        for model in lacking:
             click.echo(f"{model.name}: {_size(model)}, licence: {model.licence}")
-            if not yes:
-                click.confirm("Download it?", default=True, abort=True)
-        with tqdm(total=model.bytes, unit="B", unit_scale=True, desc=model.name, leave=False) as bar:
+        if not yes:
+            click.confirm("Download?", default=True, abort=True)
+    for model in wanted:
+        click.echo(str(_pull_one(store, model, trust, offline)))
 
-            def show(done: int, size: int, bar: tqdm = bar) -> None:
-                bar.n = done
-                bar.refresh()
 
-            path = store.pull(model, show, trust, offline)
-        click.echo(str(path))
+def _pull_one(store: ModelStore, model: Model, trust: bool, offline: bool) -> Path:
+    from tqdm import tqdm
+
+    with tqdm(total=model.bytes, unit="B", unit_scale=True, desc=model.name, leave=False) as bar:
+
+        def show(done: int, size: int) -> None:
+            bar.n = done
+            bar.refresh()
+
+        return store.pull(model, show, trust, offline)
 
 
 @models.command()
@@ -73,7 +99,7 @@ def pull(names: tuple[str, ...], trust: bool, offline: bool, yes: bool) -> None:
 @click.option("--family", required=True, help="Which contract it keeps, for example metric3d-community or moge.")
 @click.option("--name", default="", help="Its name in the cache; by default the file's own.")
 def add(file: Path, family: str, name: str) -> None:
-    """Copy your own ONNX file into the cache as a model of a known family."""
+    """Copy your own ONNX or TFLite file into the cache as a model of a known family."""
     from pipelines.proxy.models.registry import ModelStore
 
     model = ModelStore.open().add(file, family, name)
@@ -87,7 +113,7 @@ def verify() -> None:
 
     found = ModelStore.open().verify()
     for name, state in found.items():
-        click.echo(f"{name:16} {state}")
+        click.echo(f"{name:18} {state}")
     if any(state.startswith("damaged") for state in found.values()):
         raise SystemExit(1)
 

@@ -1,5 +1,6 @@
 """Shared fixtures."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,14 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"needs the real recordings in {SHARED_DATA}")
     return SHARED_DATA
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_networks_of_the_user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What `auto` chooses must not depend on what this machine's user has pulled."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MSGS_SLAM_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 @pytest.fixture(scope="session")

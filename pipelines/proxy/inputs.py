@@ -9,7 +9,7 @@ from formats.digest import files_sha256
 from pipelines.config import Config
 from pipelines.frames.recording import RecordingSource
 from pipelines.frames.source import open_source
-from pipelines.progress import SilentProgress
+from pipelines.progress import SilentProgress, log
 from pipelines.proxy.files.depth import FilesDepth, require_sizes
 from pipelines.proxy.files.labels import FilesLabels
 from pipelines.proxy.networks.identity import card_identity
@@ -18,6 +18,7 @@ from pipelines.proxy.selection import (
     Surroundings,
     choose_depth,
     choose_semantics,
+    missing_networks,
     open_depth_files,
     open_label_files,
     open_learned_depth,
@@ -50,6 +51,8 @@ def check_proxy(source: Path, config: Config) -> None:
     if config.proxy.scale_ref:
         require_reference_in(open_source(source, config.run.format), config.proxy.scale_ref)
     depth, semantics = choose_depth(config.proxy), choose_semantics(config.proxy)
+    if config.proxy.semantics == "auto" and (line := missing_networks()):
+        log.info(line)
     if not {depth.kind, semantics.kind} & {"files", "onnx"}:
         return
     around = _before_frames(source, config)

@@ -10,7 +10,7 @@ from statistics import median
 from formats.datasets import Sequence as Recording
 from formats.errors import InputError
 from pipelines.config import ProxyConfig
-from pipelines.progress import Progress, log
+from pipelines.progress import Progress
 from pipelines.proxy.aligned import AlignedDepth
 from pipelines.proxy.files.depth import FilesDepth
 from pipelines.proxy.files.labels import FilesLabels
@@ -163,10 +163,31 @@ def _cached(task: str) -> Card | None:
     """The card of the best learned model whose weights are in the cache; nothing is ever downloaded here."""
     store = ModelStore.open()
     model = store.first_here(task)
-    if model is None:
-        log.info("no learned model for %s is in %s; `msgs-slam models list` shows what there is", task, store.cache)
+    return None if model is None else store.card(model)
+
+
+def open_metric_network(around: Surroundings) -> OnnxDepth | None:
+    """The best network for metric depth in the cache, for the scale alone; None where there is none.
+
+    `prepare(frames)` runs it, `estimate(frame).depth` is what it says of a frame in metres as it comes, (h, w).
+    """
+    store = ModelStore.open()
+    model = store.first_here("depth", metres_only=True)
+    return None if model is None else OnnxDepth(store.card(model), _workplace(around, "network_metres"))
+
+
+def missing_networks() -> str | None:
+    """One line on what the default networks would add where there are none; None where there are."""
+    store = ModelStore.open()
+    lacks = [
+        what
+        for what, task in (("names", "segmentation"), ("metres", "depth"), ("masks of people", "person"))
+        if store.first_here(task, metres_only=True) is None
+    ]
+    if not lacks:
         return None
-    return store.card(model)
+    size = sum(m.bytes for m in store.with_needed([])) / 1e6
+    return f"no networks for {', '.join(lacks)} are here: `msgs-slam models pull` fetches them ({size:.0f} MB, once)"
 
 
 def _multiview(around: Surroundings) -> MultiviewDepth:

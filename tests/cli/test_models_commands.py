@@ -45,7 +45,8 @@ def test_list_says_size_licence_and_what_is_not_pinned(cache: Path) -> None:
 def test_pull_without_a_network_says_what_to_do_and_asks_for_the_licence_first(cache: Path) -> None:
     offline = models("pull", "--offline")
     assert offline.exit_code == 1
-    assert "metric3d-small is not in" in offline.stderr
+    assert "ade20k-small is not in" in offline.stderr
+    assert "metric3d-small is not in" in models("pull", "--best", "--offline").stderr
     refused = CliRunner().invoke(main, ["models", "pull", "moge2-small"], input="n\n")
     assert refused.exit_code == 1
     assert "licence: MIT" in refused.output
@@ -53,6 +54,22 @@ def test_pull_without_a_network_says_what_to_do_and_asks_for_the_licence_first(c
     assert unknown.exit_code == 1
     assert "--trust" in unknown.stderr
     assert not cache.exists() or not list(cache.glob("*.onnx"))
+
+
+def test_files_of_a_folder_are_taken_by_their_content(cache: Path, tmp_path: Path, shared_data: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    nothing = models("pull", "--from", tmp_path / "empty")
+    assert nothing.exit_code == 1
+    assert "holds no file of metric3d-large" in nothing.stderr
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "whatever.bin").write_bytes(
+        (shared_data / "models" / "selfie_segmentation.tflite").read_bytes()
+    )
+    lacking = models("pull", "person", "fast-depth", "--from", tmp_path / "mine")
+    assert "holds no file of fast-depth" in lacking.stderr
+    assert models("pull", "--from", tmp_path / "mine").stdout.strip() == str(cache / "person.tflite")
+    assert "here" in next(line for line in models("list").stdout.splitlines() if line.startswith("person"))
+    assert models("path", "person").exit_code == 0
 
 
 def test_own_networks_are_added_checked_and_found(cache: Path, tmp_path: Path) -> None:

@@ -19,6 +19,8 @@ from pipelines.proxy.models.download import fetch
 from pipelines.proxy.networks.card import Card, card_from_values
 
 _TABLE = Path(__file__).with_name("registry.toml")
+_NOT_IN_CARDS = ("suffix", "ade20k", "metres_only")
+"""Keys of a family that are the table's own."""
 _ADE20K = Path(__file__).with_name("ade20k.toml")
 
 
@@ -26,7 +28,8 @@ _ADE20K = Path(__file__).with_name("ade20k.toml")
 class Model:
     """One row of the table. `sha256` is "" and `bytes` 0 while unknown; `needs` names another model it works with.
 
-    `revision` is the commit that the addresses name, "" where they name a branch whose file may be replaced.
+    `revision` is the commit that the addresses name, "" where they name a branch whose file may be replaced. `pull`
+    says what brings it without its name: "default" a plain pull, "best" a pull of the large ones.
     """
 
     name: str
@@ -38,7 +41,7 @@ class Model:
     commercial: bool
     needs: str = ""
     revision: str = ""
-    recommended: bool = False
+    pull: str = ""
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ class ModelStore:
 
     def path(self, model: Model) -> Path:
         """Where the model's file lies, or would lie."""
-        return self.cache / f"{model.name}{'.pth' if model.family == 'head' else '.onnx'}"
+        return self.cache / f"{model.name}{self.families[model.family].get('suffix', '.onnx')}"
 
     def is_here(self, model: Model) -> bool:
         """Whether the file is there with the right size (the content is checked when it is opened)."""
@@ -78,25 +81,51 @@ class ModelStore:
                 return model
         raise InputError(f"there is no model {name!r}; known: {', '.join(m.name for m in self.models)}")
 
-    def with_needed(self, names: Sequence[str]) -> list[Model]:
-        """The named models and those they work with; without names the recommended ones."""
-        chosen = [self.get(n) for n in names] if names else [m for m in self.models if m.recommended]
+    def with_needed(self, names: Sequence[str], best: bool = False) -> list[Model]:
+        """The named models and those they work with; without names the small ones, or the `best`."""
+        wanted = "best" if best else "default"
+        chosen = [self.get(n) for n in names] if names else [m for m in self.models if m.pull == wanted]
         both = [m for model in chosen for m in (model, *([self.get(model.needs)] if model.needs else []))]
         return list(dict.fromkeys(both))
 
     def card(self, model: Model) -> Card:
         """The contract of the model's family, for its file in the cache."""
-        values = {**self.families[model.family], "model": self.path(model), "sha256": model.sha256}
+        values = self._contract(model.family) | {"model": self.path(model), "sha256": model.sha256}
         if model.needs:
-            values |= {"head": self.path(self.get(model.needs)), **_room_classes()}
+            values["head"] = self.path(self.get(model.needs))
         return card_from_values(values, _TABLE)
 
-    def first_here(self, task: str) -> Model | None:
-        """The best model of a task whose file is in the cache."""
+    def _contract(self, family: str) -> dict[str, Any]:
+        """The keys of a family's card."""
+        values = {k: v for k, v in self.families[family].items() if k not in _NOT_IN_CARDS}
+        count = self.families[family].get("ade20k")
+        return values | (_room_classes(count) if count else {})
+
+    def first_here(self, task: str, metres_only: bool = False) -> Model | None:
+        """The best model of a task whose file is in the cache; with `metres_only` also one that is good for nothing
+        but the scale."""
         for model in self.models:
-            if self.families[model.family]["task"] == task and self.is_here(model):
+            family = self.families[model.family]
+            if family["task"] == task and self.is_here(model) and (metres_only or not family.get("metres_only")):
                 return model
         return None
+
+    def take(self, folder: Path, models: Sequence[Model]) -> list[Model]:
+        """Copy the files of `models` that lie in `folder` into the cache; they are known by their content, whatever
+        they are called. Returns those that were found. Raises InputError when there is no such folder."""
+        if not folder.is_dir():
+            raise InputError(f"{folder}: there is no such folder")
+        of_size: dict[int, list[Path]] = {}
+        for file in sorted(p for p in folder.iterdir() if p.is_file()):
+            of_size.setdefault(file.stat().st_size, []).append(file)
+        found = []
+        for model in models:
+            same = (f for f in of_size.get(model.bytes, []) if model.sha256 and file_sha256(f) == model.sha256)
+            if (source := next(same, None)) is not None:
+                with atomic_path(self.path(model)) as temporary:
+                    shutil.copyfile(source, temporary)
+                found.append(model)
+        return found
 
     def pull(
         self, model: Model, progress: Callable[[int, int], None], trust: bool = False, offline: bool = False
@@ -143,7 +172,7 @@ class ModelStore:
             raise InputError(f"{model.name} is the name of a known model. Give another with --name")
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", model.name):
             raise InputError(f"{model.name!r} is no name for a model: letters, digits, dot, dash and underscore")
-        values = {**self.families[family], "model": file.resolve(), "sha256": digest}
+        values = self._contract(family) | {"model": file.resolve(), "sha256": digest}
         Network(card_from_values(values, _TABLE), 1, "cpu")
         with atomic_path(self.path(model)) as temporary:
             shutil.copyfile(file, temporary)
@@ -185,11 +214,13 @@ def _addresses(row: dict[str, Any]) -> tuple[str, ...]:
     return tuple(url.format(revision=row.get("revision") or "main") for url in row["urls"])
 
 
-def _room_classes() -> dict[str, list[str]]:
-    """ADE20K's classes and for each the kind of thing in a room that it counts for."""
+def _room_classes(count: int) -> dict[str, list[str]]:
+    """The first `count` of ADE20K's classes, "other" before them unless it is all of them, and for each the kind of
+    thing in a room that it counts for."""
     values = tomllib.loads(_ADE20K.read_text(encoding="utf-8"))
     kind_of = {name: kind for kind, names in values["groups"].items() for name in names}
-    return {"classes": values["classes"], "groups": [kind_of.get(name, "other") for name in values["classes"]]}
+    names = values["classes"] if count == len(values["classes"]) else ["other", *values["classes"][:count]]
+    return {"classes": names, "groups": [kind_of.get(name, "other") for name in names]}
 
 
 def default_cache() -> Path:

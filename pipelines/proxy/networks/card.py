@@ -1,14 +1,14 @@
 """The card of a network: a TOML or JSON file that says what goes in and what comes out.
 
-task = "depth"                    # or "segmentation"
-model = "metric3d.onnx"           # beside the card
-input = "pixel_values"            # 1 x 3 x H x W, RGB
+task = "depth"                    # or "segmentation", or "person": how likely every pixel is one
+model = "metric3d.onnx"           # beside the card; ONNX, or TensorFlow Lite as .tflite
+input = "pixel_values"            # 1 x 3 x H x W, RGB (.tflite: 1 x H x W x 3, quantised or not)
 white = 255.0                     # input value of white; 1.0 for networks that want 0..1
 mean = [0.485, 0.456, 0.406]      # subtracted, in units of `white`; leave out what the graph does itself
 std = [0.229, 0.224, 0.225]
 multiple = 28                     # sides are multiples of this, near `pixels` in total; or: size = [height, width]
 pixels = 263424
-output = "predicted_depth"
+output = "predicted_depth"        # .tflite: any tensor of the network, also one before its last step
 canonical_focal = 1000.0          # depth · focal / canonical_focal is metres; 0: depth is metres as it comes
 relative = ""                     # else "scale", "depth" or "inverse": depth up to scale; depth, or inverse depth, up
                                   # to scale and shift; each frame is then aligned to the triangulated points
@@ -35,7 +35,11 @@ from pipelines.proxy.files.classes import read_class_table
 
 _MAX_CARD_BYTES = 1 << 20
 _MAX_SIDE = 8192
-_KINDS = {"depth": ("plane", "points"), "segmentation": ("logits", "probabilities", "argmax", "tokens")}
+_KINDS = {
+    "depth": ("plane", "points"),
+    "segmentation": ("logits", "probabilities", "argmax", "tokens"),
+    "person": ("probability",),
+}
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,8 @@ class Card:
 
     @property
     def name(self) -> str:
-        return self.model.stem
+        """`onnx:NAME` or `tflite:NAME`, after the file."""
+        return f"{'tflite' if self.model.suffix.lower() == '.tflite' else 'onnx'}:{self.model.stem}"
 
     @property
     def is_clustered(self) -> bool:
@@ -161,7 +166,7 @@ def _converted(key: str, value: Any, kind: Any) -> Any:
 
 def _check(card: Card, path: Path) -> None:
     problems = {
-        "task is depth or segmentation": card.task in ("depth", "segmentation"),
+        f"task is {', '.join(_KINDS)}": card.task in _KINDS,
         f"kind is {', '.join(_KINDS.get(card.task, ()))}": card.kind in ("", *_KINDS.get(card.task, ())),
         "mean and std have three numbers, std positive": len(card.mean) == len(card.std) == 3 and min(card.std) > 0,
         "white is positive": card.white > 0,
@@ -172,7 +177,9 @@ def _check(card: Card, path: Path) -> None:
         "relative is scale, depth or inverse": card.relative in ("", "scale", "depth", "inverse"),
         "canonical_focal is 0 or positive": card.canonical_focal >= 0,
         "groups has one name for each class": len(card.groups) in (0, len(card.classes)),
-        "segmentation needs classes": card.is_clustered or card.task == "depth" or 1 <= len(card.classes) <= 10_000,
+        "segmentation needs classes": card.is_clustered
+        or card.task != "segmentation"
+        or 1 <= len(card.classes) <= 10_000,
         "classes of tokens need a head": not (card.is_clustered and card.classes),
     }
     for rule, holds in problems.items():

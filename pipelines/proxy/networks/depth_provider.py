@@ -28,7 +28,7 @@ class OnnxDepth:
             raise InputError(f"{card.model}: its card says {card.task}, but proxy.depth needs a network for depth")
         self._network = Network(card, place.threads, place.device)
         self._sequence = place.sequence
-        self.name = f"onnx:{card.name}"
+        self.name = card.name
         self._focals: dict[int, float] = {}
         identity = f"{card_identity(card)} {place.sequence.intrinsics}"
         self._pass = NetworkPass(self.name, identity, place, self._compute)

@@ -9,12 +9,15 @@ from pathlib import Path
 from formats.digest import files_sha256
 from pipelines.proxy.networks.card import Card
 from pipelines.proxy.networks.onnx_file import external_locations, require_own_weights
+from pipelines.proxy.networks.runtime import is_tflite
 
 
 def card_identity(card: Card) -> str:
     """The contract and the bytes of the network and of all that it loads. InputError for weights elsewhere."""
-    require_own_weights(card.model)
-    beside = [card.model.parent / name for name in external_locations(card.model)]
+    beside = []
+    if not is_tflite(card.model):  # those carry all of their weights
+        require_own_weights(card.model)
+        beside = [card.model.parent / name for name in external_locations(card.model)]
     files = [card.model, *([card.head] if card.head else []), *beside]
     contract = repr(replace(card, model=Path(card.model.name), head=None))
     return hashlib.sha256((contract + files_sha256((p.name, p) for p in files)).encode()).hexdigest()

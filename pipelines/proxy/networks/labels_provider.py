@@ -34,7 +34,7 @@ class OnnxLabels:
             )
         self._network = Network(card, place.threads, place.device)
         self._sequence = place.sequence
-        self.name = f"onnx:{card.name}"
+        self.name = card.name
         self._names = card.labels
         self._label_of = np.empty(0, np.uint8)
         self._classes = ClassTable((), ())

@@ -1,4 +1,4 @@
-"""Running an ONNX network."""
+"""Running a network that a card describes."""
 
 from __future__ import annotations
 
@@ -8,21 +8,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import NDArray
 
 from formats.digest import file_sha256
 from formats.errors import InputError
-from pipelines.progress import log
 from pipelines.proxy.networks.card import Card
 from pipelines.proxy.networks.head import load_linear_head
 from pipelines.proxy.networks.letterbox import Letterbox, choose_box
-from pipelines.proxy.networks.onnx_file import require_own_weights
+from pipelines.proxy.networks.runtime import open_runtime
 
 _MAX_OUTPUT_VALUES = 200_000_000
 _IMAGENET_MEAN = (123.675, 116.28, 103.53)
 _TOKENS = (1200, 3600)
-_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 
 class Network:
@@ -31,30 +28,34 @@ class Network:
     def __init__(self, card: Card, threads: int, device: str) -> None:
         """Raises InputError for a file that is not what the card says, before anything is computed."""
         self.card = card
-        require_own_weights(card.model)
-        _require_hash(card)
+        _require_whole(card)
         self.head = load_linear_head(card.head, len(card.classes)) if card.head is not None else None
-        self._session = _open(card.model, threads, device)
-        inputs = {i.name: i for i in self._session.get_inputs()}
-        outputs = {o.name: o for o in self._session.get_outputs()}
+        wanted = list(_outputs(card).values())
+        bonus = {k: n for k, n in (("normals", card.normals), ("kappa", card.normal_confidence)) if n}
+        self._runtime = open_runtime(card.model, [*wanted, *bonus.values()], threads, device)
+        inputs, outputs = self._runtime.inputs, self._runtime.outputs
         if set(inputs) != set(filter(None, (card.input, card.tokens))):
             raise InputError(f"{card.model}: its inputs are {', '.join(inputs)}; the card says {card.input}")
-        for wanted in _outputs(card).values():
-            if wanted not in outputs:
-                raise InputError(f"{card.model}: it has no output {wanted!r}, only {', '.join(outputs)}")
-            _require_bounded(card.model, wanted, outputs[wanted].shape)
-        _require_channels(card, outputs[card.output].shape)
-        kind = inputs[card.input].type
-        if kind not in _TYPES:
-            raise InputError(f"{card.model}: input {card.input} is {kind}; float or float16 is expected")
-        self._dtype = _TYPES[kind]
+        for name in wanted:
+            if name not in outputs:
+                raise InputError(
+                    f"{card.model}: it has no output {name!r}, only {', '.join(outputs)}. Correct the card"
+                )
+            _require_bounded(card.model, name, outputs[name].shape)
+        _require_fitting(card, outputs[card.output].shape)
+        kind = inputs[card.input].dtype
+        if kind is None:
+            raise InputError(f"{card.model}: input {card.input} is not of float or float16. Correct the card")
+        self._dtype = kind
         # A bonus: exports of the same family without them work as well.
-        self._extras = {k: n for k, n in (("normals", card.normals), ("kappa", card.normal_confidence)) if n in outputs}
+        self._extras = {k: n for k, n in bonus.items() if n in outputs}
         if card.metadata:
-            self.card = card = _with_metadata(card, self._session.get_modelmeta().custom_metadata_map)
+            self.card = card = _with_metadata(card, self._runtime.metadata)
         shape = inputs[card.input].shape
-        fixed = len(shape) == 4 and all(isinstance(s, int) and s > 0 for s in shape[2:])
-        self._size = card.size if all(card.size) or not fixed else tuple(shape[2:])
+        fixed = tuple(s for s in shape[2:] if isinstance(s, int) and s > 0) if len(shape) == 4 else ()
+        if len(fixed) == 2 and all(card.size) and card.size != fixed:
+            raise InputError(f"{card.model}: takes {fixed[0]}x{fixed[1]}, the card says {card.size}. Correct the card")
+        self._size = fixed if len(fixed) == 2 else card.size
 
     def box(self, width: int, height: int) -> Letterbox:
         """How a picture of width x height goes into the network."""
@@ -76,16 +77,12 @@ class Network:
         if card.tokens:
             tokens = round(box.box_width * box.box_height / card.multiple**2)
             feed[card.tokens] = np.array(min(max(tokens, _TOKENS[0]), _TOKENS[1]), np.int64)
+        names = {**_outputs(card), **self._extras}
         try:
-            names = {**_outputs(card), **self._extras}
-            outputs: Sequence[NDArray] = self._session.run(list(names.values()), feed)
-        except Exception as error:  # onnxruntime's errors share no narrower base class
-            if type(error).__module__.startswith("onnxruntime"):
-                size = f"{box.box_width}x{box.box_height}"
-                raise InputError(
-                    f"{card.model}: does not run on an input of {size} ({error}). Correct the card"
-                ) from error
-            raise
+            outputs = self._runtime.run(list(names.values()), feed)
+        except RuntimeError as error:
+            size = f"{box.box_width}x{box.box_height}"
+            raise InputError(f"{card.model}: does not run on an input of {size} ({error}). Correct the card") from error
         for output in outputs:
             if output.size > _MAX_OUTPUT_VALUES or output.size == 0:
                 raise InputError(f"{card.model}: gave an output of shape {output.shape}. Correct the card")
@@ -118,30 +115,9 @@ def _std_unit(card: Card) -> float:
     return 1.0 if all(s == 1.0 for s in card.std) else card.white
 
 
-def _open(path: Path, threads: int, device: str) -> ort.InferenceSession:
-    wanted = "CUDAExecutionProvider" if device == "cuda" else "CPUExecutionProvider"
-    if wanted not in ort.get_available_providers():
-        log.warning("this onnxruntime has no CUDA: the network runs on the CPU (pip install onnxruntime-gpu)")
-        wanted = "CPUExecutionProvider"
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.log_severity_level = 3
-    # Threads that spin while they wait steal the cores of whatever else runs.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    providers = [wanted] if wanted == "CPUExecutionProvider" else [wanted, "CPUExecutionProvider"]
-    try:
-        session = ort.InferenceSession(str(path), options, providers=providers)
-    except Exception as error:  # onnxruntime's errors share no narrower base class
-        if type(error).__module__.startswith("onnxruntime"):
-            raise InputError(f"{path}: onnxruntime cannot load it ({error}). Download it again") from error
-        raise
-    # It falls back to the CPU without an error when CUDA's libraries are missing.
-    if session.get_providers()[0] != wanted:
-        log.warning("%s was asked for, the network runs on %s", wanted, session.get_providers()[0])
-    return session
-
-
-def _require_hash(card: Card) -> None:
+def _require_whole(card: Card) -> None:
+    if not card.model.is_file():
+        raise InputError(f"{card.model}: there is no such file. Pull or download it again")
     if not card.sha256:
         return
     actual = file_sha256(card.model)
@@ -155,8 +131,13 @@ def _require_bounded(path: Path, name: str, shape: Sequence[int | str | None]) -
         raise InputError(f"{path}: output {name} has the shape {list(shape)}, which is too large to be an image")
 
 
-def _require_channels(card: Card, shape: Sequence[int | str | None]) -> None:
-    if card.task == "depth" or card.kind in ("argmax", "tokens") or len(shape) != 4 or not isinstance(shape[1], int):
+def _require_fitting(card: Card, shape: Sequence[int | str | None]) -> None:
+    """What a file of fixed shapes tells of its output before it runs: 1 x channels x rows x columns."""
+    if card.kind in ("tokens", "points") or len(shape) != 4 or not isinstance(shape[1], int):
         return
-    if shape[1] != len(card.classes):
-        raise InputError(f"{card.model}: has {shape[1]} classes, the card names {len(card.classes)}. Correct the card")
+    planes = 1 if card.task != "segmentation" or card.kind == "argmax" else len(card.classes)
+    if shape[1] != planes:
+        wanted = f"{planes} classes" if planes > 1 else "one plane"
+        raise InputError(
+            f"{card.model}: output {card.output} has {shape[1]} channels, the card is for {wanted}. Correct the card"
+        )

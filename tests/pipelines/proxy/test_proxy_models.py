@@ -191,14 +191,18 @@ def test_the_table_is_complete_and_every_family_makes_a_card(tmp_path: Path) -> 
         assert all((model.revision or "main") in u for u in model.urls if "/resolve/" in u)
         assert "{" not in "".join(model.urls)
         if model.family != "head":
-            assert models.card(model).task in ("depth", "segmentation")
+            assert models.card(model).task in ("depth", "segmentation", "person")
     with pytest.raises(InputError, match="known: metric3d"):
         models.get("metric4d")
 
 
 def test_one_word_pulls_what_a_room_needs(tmp_path: Path) -> None:
     models = ModelStore.open(tmp_path)
-    assert [m.name for m in models.with_needed(())] == ["metric3d-small", "dinov2-small", "dinov2-small-head"]
+    best = ["metric3d-small", "dinov2-small", "dinov2-small-head"]
+    assert [m.name for m in models.with_needed((), best=True)] == best
+    small = models.with_needed(())
+    assert [m.name for m in small] == ["ade20k-small", "fast-depth", "person"]
+    assert sum(m.bytes for m in small) < 5e6
     assert [m.name for m in models.with_needed(("dinov2-small", "dinov2-small-head"))] == [
         "dinov2-small",
         "dinov2-small-head",

@@ -329,7 +329,7 @@ def test_nan_scores_and_a_wrong_number_of_classes_are_refused(tmp_path: Path) ->
     picture = np.zeros((64, 64, 3), np.uint8)
     with pytest.raises(InputError, match="NaN"):
         labels_of(segmentation(tmp_path, np.full((1, 3, 8, 8), np.nan, np.float32)), picture)
-    with pytest.raises(InputError, match="4 classes, the card names 3"):
+    with pytest.raises(InputError, match="4 channels, the card is for 3 classes"):
         segmentation(tmp_path, np.zeros((1, 4, 8, 8), np.float32))
 
 
