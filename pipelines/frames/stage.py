@@ -287,4 +287,4 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
     }
 
 
-STAGE = Stage("frames", 4, run, "pick frames, calibrate the camera, structure from motion over keyframes")
+STAGE = Stage("frames", 5, run, "pick frames, calibrate the camera, structure from motion over keyframes")

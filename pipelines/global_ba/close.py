@@ -78,7 +78,7 @@ def straighten(state: TrackState, loops: Sequence[Loop], settings: GlobalBaConfi
     ids = state.keyframes
     place = {frame_id: n for n, frame_id in enumerate(ids)}
     old = np.array([state.poses[i] for i in ids])
-    depth = np.array([median_depth(state, i) for i in ids])
+    depth = np.array([state.median_depth(i) for i in ids])
     edges = _edges(old, depth, loops, place, settings)
     new, scales = optimise_pose_graph(old, np.ones(len(ids)), edges)
     _move_points(state, ids, old, new, scales)
@@ -86,13 +86,6 @@ def straighten(state: TrackState, loops: Sequence[Loop], settings: GlobalBaConfi
         rigid = new[n].copy()
         rigid[:3, 3] /= scales[n]
         state.poses[frame_id] = rigid
-
-
-def median_depth(state: TrackState, frame_id: int) -> float:
-    """Of the points the frame sees; 1 when it sees none."""
-    motion, seen = state.poses[frame_id], state.sightings[frame_id]
-    depth = state.points[seen.point] @ motion[2, :3] + motion[2, 3]
-    return float(np.median(depth)) if len(depth) else 1.0
 
 
 def _edges(poses: Array, depth: Array, loops: Sequence[Loop], place: dict[int, int], settings: GlobalBaConfig) -> Edges:

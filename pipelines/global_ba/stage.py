@@ -12,7 +12,7 @@ from pipelines.gaussian_map import GaussianMap
 from pipelines.geometry import se3
 from pipelines.global_ba.appearance import describe_keyframes, join_appearances
 from pipelines.global_ba.candidates import loop_candidates
-from pipelines.global_ba.close import Closed, close_loops, median_depth
+from pipelines.global_ba.close import Closed, close_loops
 from pipelines.global_ba.joint import Refined, refine_together
 from pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_found
 from pipelines.global_ba.move_map import follow_keyframes, move_map
@@ -186,7 +186,7 @@ def largest_motion(context: StageContext, state: TrackState, model: SparseModel)
     apart = se3.inverse(moved[:1]) @ moved
     centres = se3.inverse(model.cam_from_world)[:, :3, 3]
     shift = np.linalg.norm(np.einsum("nij,nj->ni", apart[:, :3, :3], centres) + apart[:, :3, 3] - centres, axis=1)
-    depth = np.array([median_depth(state, i) for i in model.frame_ids.tolist()])
+    depth = np.array([state.median_depth(i) for i in model.frame_ids.tolist()])
     focal = context.run.load_calibration().intrinsics.fx
     return float((focal * (se3.rotation_angle(apart) + shift / depth)).max())
 

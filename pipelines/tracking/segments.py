@@ -83,7 +83,8 @@ def _join(
         found = _recognise(ours[n], alike, state, pictures, intrinsics, settings, seed)
         if found is None:
             continue
-        if any(_agree(found[0], other, state.poses[ours[n]]) for _, other, _ in answers):
+        depth = state.median_depth(ours[n])
+        if any(agree(found[0], other, state.poses[ours[n]], depth) for _, other, _ in answers):
             answers.append((ours[n], *found))
             _move(segment, main, found[0], state)
             for frame_id, _, seen in answers:
@@ -132,15 +133,16 @@ def _depth_ratio(frame_id: int, cam_from_main: Array, seen: Sightings, state: Tr
     return float(np.exp(np.median(np.log(theirs[good] / ours[good])))) if good.sum() >= 8 else 1.0
 
 
-def _agree(first: Similarity, second: Similarity, cam_from_world: Array) -> bool:
-    """Whether both put this camera in nearly the same place: 3 degrees, a tenth of its distance from the origin or of a
-    unit, a tenth of scale."""
+def agree(first: Similarity, second: Similarity, cam_from_world: Array, depth: float) -> bool:
+    """Whether both put this camera in nearly the same place: 3 degrees, a tenth of the depth it sees, a tenth of scale.
+
+    `depth` is in the unit that both similarities start from. Where either world has its origin does not matter.
+    """
     a, b = (s.apply_to_poses(cam_from_world[None])[0] for s in (first, second))
     apart = a @ se3.inverse(b)
-    reach = max(float(np.linalg.norm(se3.inverse(a)[:3, 3])), first.scale)
     return bool(
         se3.rotation_angle(apart) < np.radians(3)
-        and np.linalg.norm(apart[:3, 3]) < 0.1 * reach
+        and np.linalg.norm(apart[:3, 3]) < 0.1 * first.scale * depth
         and abs(np.log(first.scale / second.scale)) < 0.1
     )
 

@@ -95,6 +95,12 @@ class TrackState:
         """The segment of the keyframes that see a point."""
         return next(self.segment[k] for k in self.keyframes if point in self.sightings[k].point)
 
+    def median_depth(self, frame_id: int) -> float:
+        """Of the points the frame sees; 1 when it sees none."""
+        motion, seen = self.poses[frame_id], self.sightings[frame_id]
+        depth = self.points[seen.point] @ motion[2, :3] + motion[2, 3]
+        return float(np.median(depth)) if len(depth) else 1.0
+
     def nearest_keyframes(self, frame_id: int, count: int) -> list[int]:
         """Up to `count` keyframes on each side in time, nearest first."""
         place, behind = bisect_left(self.keyframes, frame_id), bisect_right(self.keyframes, frame_id)

@@ -8,9 +8,11 @@ import pytest
 
 from pipelines.config import TrackingConfig
 from pipelines.geometry import se3
+from pipelines.geometry.alignment import Similarity
 from pipelines.geometry.camera import unproject
 from pipelines.tracking.features import extract_features, frame_descriptor
 from pipelines.tracking.relocalise import relocalise
+from pipelines.tracking.segments import agree
 from pipelines.tracking.state import Sightings, TrackState
 from pipelines.types import Intrinsics
 
@@ -62,3 +64,12 @@ def test_a_frame_is_posed_only_where_the_answer_is_unique(places: list[np.ndarra
     assert (solved is not None) == found
     if solved is not None:
         assert np.allclose(solved.cam_from_world, HERE, atol=1e-3)
+
+
+@pytest.mark.parametrize("away", [0.0, 100.0])
+@pytest.mark.parametrize(("apart", "joined"), [(0.1, True), (0.6, False)])
+def test_two_ways_to_join_are_as_near_or_far_wherever_the_origin_is(away: float, apart: float, joined: bool) -> None:
+    """Things lie 3 units before the camera, and a tenth of that may differ, ten or a hundred units from the origin."""
+    shift = np.array([away, 0, 0])
+    first, second = Similarity(1.0, np.eye(3), shift), Similarity(1.02, np.eye(3), shift + np.array([0, apart, 0]))
+    assert agree(first, second, np.eye(4), depth=3.0) == joined
