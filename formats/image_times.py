@@ -24,11 +24,14 @@ def read_image_times(images: list[Path]) -> NDArray[np.float64] | None:
     """
     if not images:
         return None
-    for folder in (images[0].parent, images[0].parent.parent):
-        for name in _LIST_NAMES:
-            if (folder / name).is_file():
-                return _require_increasing(_from_list(folder / name, images), folder / name)
-    return _from_exif(images)
+    path = times_file(images[0].parent)
+    return _require_increasing(_from_list(path, images), path) if path else _from_exif(images)
+
+
+def times_file(folder: Path) -> Path | None:
+    """The list of times that belongs to the images of a folder, None where there is none."""
+    candidates = (place / name for place in (folder, folder.parent) for name in _LIST_NAMES)
+    return next((path for path in candidates if path.is_file()), None)
 
 
 def frame_number(path: Path) -> int | None:

@@ -136,18 +136,15 @@ def resume(
 @click.option("-v", "--verbose", is_flag=True, help="Every figure of every stage.")
 def status(run_path: Path, verbose: bool) -> None:
     """Say which stages of RUN are done, what they found, and what was degraded."""
-    from msgs_cli.tables import stage_table, warning_lines
-    from pipelines.reconstruct import require_run
-    from pipelines.run_folder import RunFolder
-    from pipelines.stages import load_records, load_source
+    from msgs_cli.tables import status_table, warning_lines
+    from pipelines.status import run_status
 
-    run = RunFolder(run_path)
-    require_run(run)
-    records = load_records(run)
-    interrupted = [name for name in STAGES if run.partial(name).exists()]
-    click.echo(f"{run.root}: made from {load_source(run)['path']}\n")
-    click.echo(stage_table(records, STAGES, interrupted, verbose))
-    for line in warning_lines(records):
+    run = open_run(run_path)
+    found = run_status(run)
+    click.echo(f"{run.root}: made from {found.source}\n")
+    click.echo(status_table(found.stages, verbose))
+    records = {s.name: s.record for s in found.stages if s.record}
+    for line in [*(f"warning: {w}" for w in found.warnings), *warning_lines(records)]:
         click.echo(line)
 
 
@@ -176,10 +173,10 @@ def export(
         raise click.UsageError("with --set or --config, say where to write with --to")
     from pipelines.config import load_config
     from pipelines.export.stage import export_run
-    from pipelines.reconstruct import existing_config
+    from pipelines.reconstruct import made_with
 
     run = open_run(run_path)
-    settings = load_config(config_file, overrides, base=existing_config(run)).export
+    settings = load_config(config_file, overrides, base=made_with(run)).export
     for path in export_run(run, to or run.stage("export"), only, make_progress(quiet), settings):
         if not quiet:
             click.echo(path)
@@ -235,9 +232,10 @@ def _interruptible(work: Callable[[], Any], root: Path) -> Any:
 
 
 def _print_summary(root: Path, records: dict[str, Any]) -> None:
-    from msgs_cli.tables import stage_table, warning_lines
+    from msgs_cli.tables import status_table, warning_lines
+    from pipelines.status import DONE, StageStatus
 
-    click.echo(stage_table(records, [name for name in STAGES if name in records]))
+    click.echo(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
     for line in warning_lines(records):
         click.echo(line, err=True)
     if "export" in records:

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pipelines.stages import StageRecord
+    from pipelines.records import StageRecord
+    from pipelines.status import StageStatus
 
 
 KEY_FIGURES = {
@@ -30,18 +31,16 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([lines[0], "  ".join("-" * width for width in widths), *lines[1:]])
 
 
-def stage_table(
-    records: dict[str, StageRecord], stages: Sequence[str], interrupted: Sequence[str] = (), everything: bool = False
-) -> str:
+def status_table(stages: Sequence[StageStatus], everything: bool = False) -> str:
     """One row a stage: state, seconds, peak memory, key figures or all of them."""
     rows = []
-    for name in stages:
-        if (record := records.get(name)) is None:
-            rows.append([name, "interrupted" if name in interrupted else "not yet", "", "", ""])
+    for stage in stages:
+        if (record := stage.record) is None:
+            rows.append([stage.name, stage.state, "", "", ""])
             continue
-        wanted = record.figures if everything else [k for k in KEY_FIGURES[name] if k in record.figures]
+        wanted = record.figures if everything else [k for k in KEY_FIGURES[stage.name] if k in record.figures]
         figures = ", ".join(f"{key} {format_figure(record.figures[key])}" for key in wanted)
-        rows.append([name, "done", f"{record.seconds:.1f}", f"{record.peak_memory_mb:.0f}", figures])
+        rows.append([stage.name, stage.state, f"{record.seconds:.1f}", f"{record.peak_memory_mb:.0f}", figures])
     return format_table(["stage", "state", "seconds", "peak MB", "figures"], rows)
 
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
-from formats.atomic import write_text
-from formats.jsonfile import write_json
-from pipelines.config import Config, config_to_toml
-from pipelines.run_folder import RunFolder
-from pipelines.stages import Stage, StageRecord, load_records, load_source, next_upstream, stage_fingerprint
+from pipelines.config import Config
+from pipelines.records import StageRecord, load_records, load_source, save_manifest
+from pipelines.run_folder import RunFolder, save_settings
+from pipelines.stages import Stage, next_upstream, stage_fingerprint
 
 
 def branch(
@@ -37,8 +36,8 @@ def branch(
     shutil.copyfile(origin.settings_file, unfinished.settings_file)
     if accept is not None:
         taken = _accepted(taken, *accept, source["digest"])
-        write_text(unfinished.settings_file, config_to_toml(accept[1]))
-    write_json(unfinished.manifest_file, {"source": source, "stages": {n: asdict(r) for n, r in taken.items()}})
+        save_settings(unfinished, accept[1])
+    save_manifest(unfinished, source, taken)
     os.replace(unfinished.root, target.root)
 
 

@@ -14,8 +14,8 @@ from formats.tensors import load_arrays
 from pipelines.config import Config, load_saved_config
 from pipelines.gaussian_map import GaussianMap
 from pipelines.mapping.load import load_class_ids
+from pipelines.records import StageRecord, load_records, load_source, recorded_config
 from pipelines.run_folder import RunFolder
-from pipelines.stages import StageRecord, load_records, load_source
 from pipelines.types import VOID, Calibration, ClassTable, Frame, SparseModel, Trajectory
 
 _MAP_STAGES = ("global_ba", "mapping")
@@ -50,8 +50,9 @@ class Exposure:
 
 @dataclass(frozen=True)
 class Outcome:
-    """map_stage is "" and gaussian_map None before mapping is done; label_of_channel (C,) takes a class channel of the
-    map to its label. `metric`: whether the world's unit is the metre of the proxy depth."""
+    """config: the settings that each finished stage was made with. map_stage is "" and gaussian_map None before mapping
+    is done; label_of_channel (C,) takes a class channel of the map to its label. `metric`: whether the world's unit is
+    the metre of the proxy depth."""
 
     run: RunFolder
     records: Mapping[str, StageRecord]
@@ -94,8 +95,8 @@ class Outcome:
 
 def load_outcome(run: RunFolder) -> Outcome:
     """Raises InputError for a run whose tracking is not done."""
-    config = load_saved_config(run.settings_file)
     records = load_records(run)
+    config = recorded_config(records, load_saved_config(run.settings_file))
     pose_stage = _latest(run, records, _POSE_STAGES, "trajectory.npz")
     if not pose_stage:
         raise InputError(

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import os
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from formats.atomic import atomic_path
 from formats.digest import file_sha256, files_sha256
-from formats.errors import DiskFullError, InputError
-from formats.jsonfile import write_json
-from pipelines.config import Config, config_to_toml, load_saved_config
+from formats.errors import InputError
+from formats.image_times import times_file
+from formats.images import list_images
+from pipelines.config import Config, load_saved_config
 from pipelines.frames.recording import open_recording
+from pipelines.lock import LOCK, locked
 from pipelines.progress import Progress, log
+from pipelines.records import StageRecord, load_records, load_source, recorded_config
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
-from pipelines.stages import Stage, StageRecord, load_records, load_source, run_stages
+from pipelines.stages import Stage, run_stages
 
 
 def all_stages() -> list[Stage]:
@@ -40,8 +39,13 @@ def default_run_folder(source: Path) -> RunFolder:
 
 
 def existing_config(run: RunFolder) -> Config | None:
-    """The settings a run was made with, or None where there is no run."""
+    """The settings of run.toml, with which the run goes on, or None where there is no run."""
     return load_saved_config(run.settings_file) if run.settings_file.exists() else None
+
+
+def made_with(run: RunFolder) -> Config:
+    """The settings that each finished stage was made with; of the others those of run.toml."""
+    return recorded_config(load_records(run), load_saved_config(run.settings_file))
 
 
 def reconstruct(
@@ -52,25 +56,12 @@ def reconstruct(
     Raises InputError for a source that cannot be used and for a folder that holds something else; a folder made by
     this call is removed again when the source turns out to be unusable.
     """
-    digest = _source_digest(source, config.run.format)
-    is_new = not run.root.exists()
-    if not is_new:
-        _require_same_source(run, source, digest)
+    digest = source_digest(source, config.run.format)
+    _require_run_or_empty(run)
     config = _with_device(config)
-    run.root.mkdir(parents=True, exist_ok=True)
-    try:
-        with _only_one_process(run):
-            if not run.manifest_file.exists():
-                write_json(
-                    run.manifest_file, {"source": {"path": str(source.resolve()), "digest": digest}, "stages": {}}
-                )
-            with atomic_path(run.settings_file) as temporary:
-                temporary.write_text(config_to_toml(config), encoding="utf-8")
-            return _run(run, source, digest, config, progress, until)
-    except InputError as error:
-        if is_new and not isinstance(error, DiskFullError) and not load_records(run):
-            shutil.rmtree(run.root)
-        raise
+    with locked(run):
+        _require_same_source(run, source, digest)
+        return _run(run, source.resolve(), digest, config, progress, until)
 
 
 def resume(
@@ -80,15 +71,12 @@ def resume(
     require_run(run)
     origin = load_source(run)
     source = Path(origin["path"])
-    config = config or load_saved_config(run.settings_file)
-    if "frames" not in load_records(run) and _source_digest(source, config.run.format) != origin["digest"]:
-        raise InputError(
-            f"{source} has changed since {run.root} was begun. Reconstruct it into another folder: --out NEW"
-        )
-    config = _with_device(config)
-    with _only_one_process(run):
-        with atomic_path(run.settings_file) as temporary:
-            temporary.write_text(config_to_toml(config), encoding="utf-8")
+    config = _with_device(config or load_saved_config(run.settings_file))
+    with locked(run):
+        if "frames" not in load_records(run) and source_digest(source, config.run.format) != origin["digest"]:
+            raise InputError(
+                f"{source} has changed since {run.root} was begun. Reconstruct it into another folder: --out NEW"
+            )
         return _run(run, source, origin["digest"], config, progress, until)
 
 
@@ -107,8 +95,11 @@ def _run(
     return run_stages(all_stages(), run, source, digest, config, progress, until)
 
 
-def _source_digest(source: Path, format: str) -> str:
-    """Identity of a source: its bytes; for a folder the names and bytes of its files, for a data set of its images."""
+def source_digest(source: Path, format: str) -> str:
+    """Identity of a source: a video's bytes; names and bytes of the pictures of a folder or data set, and their times.
+
+    What else lies in the folder does not count. Raises InputError where there is nothing to read.
+    """
     if source.is_file() and source.stat().st_size == 0:
         raise InputError(f"{source} is empty (0 bytes). Copy the video again")
     if not source.exists():
@@ -119,15 +110,20 @@ def _source_digest(source: Path, format: str) -> str:
         return files_sha256(zip(recording.names, recording.image_paths, strict=True), head)
     if source.is_file():
         return file_sha256(source)
-    return files_sha256((p.name, p) for p in sorted(source.iterdir()) if p.is_file())
+    images, times = list_images(source), times_file(source)
+    return files_sha256((p.name, p) for p in [*images, *([times] if times else [])])
+
+
+def _require_run_or_empty(run: RunFolder) -> None:
+    """Nothing is written, not even a lock, into a folder that holds something else."""
+    if not run.root.is_dir() or run.manifest_file.exists():
+        return
+    if any(p.name != LOCK for p in run.root.iterdir()):
+        raise InputError(f"{run.root} exists and is not a run folder. Choose another with --out FOLDER")
 
 
 def _require_same_source(run: RunFolder, source: Path, digest: str) -> None:
-    if not run.root.is_dir():
-        raise InputError(f"{run.root} is a file; the run needs a folder. Choose another with --out FOLDER")
     if not run.manifest_file.exists():
-        if any(run.root.iterdir()):
-            raise InputError(f"{run.root} exists and is not a run folder. Choose another with --out FOLDER")
         return
     origin = load_source(run)
     if origin["digest"] != digest:
@@ -161,21 +157,3 @@ def _set_threads(threads: int) -> None:
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
     set_threads(threads)
-
-
-@contextmanager
-def _only_one_process(run: RunFolder) -> Iterator[None]:
-    """Hold the run's lock. The system releases it when the process ends, however it ends."""
-    try:
-        import fcntl
-    except ImportError:  # Windows has no flock; two processes on one run are then the user's to avoid.
-        yield
-        return
-    with (run.root / ".lock").open("w") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InputError(
-                f"{run.root}: another msgs-slam process is working on this run. Wait for it to end"
-            ) from error
-        yield

@@ -20,11 +20,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.atomic import atomic_path
+from formats.atomic import atomic_path, write_text
 from formats.errors import InputError
 from formats.images import read_rgb
 from formats.jsonfile import write_json
 from formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
+from pipelines.config import Config, config_to_toml
 from pipelines.gaussian_map import GaussianMap
 from pipelines.types import (
     Calibration,
@@ -151,6 +152,11 @@ class RunFolder:
         """The verified loops of the global adjustment."""
         rows = read_json(self.stage("global_ba") / "loops.json")
         return [LoopEdge(**{**r, "frame2_from_frame1": np.array(r["frame2_from_frame1"])}) for r in rows]
+
+
+def save_settings(run: RunFolder, config: Config) -> None:
+    """run.toml. Raises InputError when the disk refuses."""
+    write_text(run.settings_file, config_to_toml(config))
 
 
 # writers: pure functions of a folder and a value ----------------------------------------------------------------

@@ -5,12 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import resource
 import shutil
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,16 @@ from formats.errors import DiskFullError, InputError
 from formats.jsonfile import write_json
 from pipelines.config import Config, config_to_dict
 from pipelines.progress import Progress, log
-from pipelines.run_folder import RunFolder, read_json
+from pipelines.records import (
+    StageRecord,
+    checksums,
+    content_digest,
+    load_records,
+    plain,
+    save_manifest,
+    settings_of,
+)
+from pipelines.run_folder import RunFolder, read_json, save_settings
 from pipelines.run_folder_names import STAGES
 
 
@@ -80,37 +88,6 @@ class Stage:
     check: Callable[[Path, Config], None] | None = None
 
 
-@dataclass(frozen=True)
-class StageRecord:
-    """One finished stage in the manifest. files: relative path → [bytes, sha256]."""
-
-    fingerprint: str
-    files: dict[str, tuple[int, str]]
-    seconds: float
-    peak_memory_mb: float
-    figures: dict[str, Any]
-    warnings: list[str]
-    content: str
-    inputs: Any = None
-
-    @staticmethod
-    def from_json(value: dict[str, Any]) -> StageRecord:
-        """Inverse of `asdict` after JSON."""
-        return StageRecord(**{**value, "files": {k: (v[0], v[1]) for k, v in value["files"].items()}})
-
-
-def load_records(run: RunFolder) -> dict[str, StageRecord]:
-    """The finished stages by name."""
-    if not run.manifest_file.exists():
-        return {}
-    return {k: StageRecord.from_json(v) for k, v in read_json(run.manifest_file)["stages"].items()}
-
-
-def load_source(run: RunFolder) -> dict[str, Any]:
-    """What the run was made from: {"path", "digest"}."""
-    return read_json(run.manifest_file)["source"]
-
-
 def run_stages(
     stages: list[Stage],
     run: RunFolder,
@@ -123,27 +100,39 @@ def run_stages(
     """Bring every stage up to `until` up to date; returns their records.
 
     A stage is up to date when its fingerprint (version, own settings, seed, own inputs, content of the stages before
-    it) and its files are unchanged. Raises InputError as the stages do.
+    it) and its files are unchanged. Nothing of the run changes before everything that can be checked is; then the
+    settings are written, and a stage that has to run again is taken out of the manifest, with those after it, before
+    it starts. Raises InputError as the stages do.
     """
     records = load_records(run)
+    origin = {"path": str(source), "digest": source_digest}
     upstream = source_digest
     wanted = stages[: STAGES.index(until) + 1]
     inputs = _check_inputs(wanted, source, config, records, source_digest)
+    if not run.manifest_file.exists():
+        save_manifest(run, origin, records)
+    save_settings(run, config)
     for stage in wanted:
         fingerprint = stage_fingerprint(stage, config, upstream, inputs[stage.name])
         record = records.get(stage.name)
         if record is None or record.fingerprint != fingerprint or not _intact(run.stage(stage.name), record):
-            for later in STAGES[STAGES.index(stage.name) :]:
-                records.pop(later, None)
-            record = replace(_run_one(stage, run, source, config, progress, fingerprint), inputs=inputs[stage.name])
+            if _drop(records, stage.name):
+                save_manifest(run, origin, records)
+            record = _run_one(stage, run, source, config, progress, fingerprint, inputs[stage.name])
             records[stage.name] = record
+            save_manifest(run, origin, records)
             for later in STAGES[STAGES.index(stage.name) + 1 :]:  # made from what is no longer there
                 shutil.rmtree(run.stage(later), ignore_errors=True)
-            _save_manifest(run, source, source_digest, records)
         else:
             log.info("%s: up to date", stage.name)
         upstream = next_upstream(upstream, record)
     return records
+
+
+def _drop(records: dict[str, StageRecord], name: str) -> bool:
+    """Take out this stage and those after it; whether there was any."""
+    dropped = [records.pop(later, None) for later in STAGES[STAGES.index(name) :]]
+    return any(record is not None for record in dropped)
 
 
 def _check_inputs(
@@ -180,7 +169,7 @@ def next_upstream(upstream: str, record: StageRecord) -> str:
 
 
 def _run_one(
-    stage: Stage, run: RunFolder, source: Path, config: Config, progress: Progress, fingerprint: str
+    stage: Stage, run: RunFolder, source: Path, config: Config, progress: Progress, fingerprint: str, inputs: Any
 ) -> StageRecord:
     folder = _open_partial(run.partial(stage.name), fingerprint)
     context = StageContext(run, source, config, folder, progress)
@@ -195,13 +184,20 @@ def _run_one(
         raise
     shutil.rmtree(folder / "snapshot", ignore_errors=True)
     (folder / "fingerprint.json").unlink()
-    files = _checksums(folder)
+    files = checksums(folder)
     shutil.rmtree(run.stage(stage.name), ignore_errors=True)
     os.replace(folder, run.stage(stage.name))
     _flush_folder(run.root)
-    content = hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()
     return StageRecord(
-        fingerprint, files, time.monotonic() - started, peak_memory_mb(), figures, context.warnings, content
+        fingerprint,
+        files,
+        time.monotonic() - started,
+        peak_memory_mb(),
+        plain(figures),
+        context.warnings,
+        content_digest(files),
+        inputs,
+        settings_of(config, stage.name),
     )
 
 
@@ -233,11 +229,6 @@ def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) 
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _checksums(folder: Path) -> dict[str, tuple[int, str]]:
-    paths = sorted(p for p in folder.rglob("*") if p.is_file() and not p.is_symlink())
-    return {str(p.relative_to(folder)): (p.stat().st_size, file_sha256(p)) for p in paths}
-
-
 def _intact(folder: Path, record: StageRecord) -> bool:
     return all(
         (path := folder / name).is_file() and path.stat().st_size == size and file_sha256(path) == digest
@@ -245,12 +236,11 @@ def _intact(folder: Path, record: StageRecord) -> bool:
     )
 
 
-def _save_manifest(run: RunFolder, source: Path, source_digest: str, records: dict[str, StageRecord]) -> None:
-    stages = {name: asdict(records[name]) for name in STAGES if name in records}
-    write_json(run.manifest_file, {"source": {"path": str(source), "digest": source_digest}, "stages": stages})
-
-
 def peak_memory_mb() -> float:
-    """Largest resident memory of this process so far, in MB."""
+    """Largest resident memory of this process so far, in MB; 0 where the system does not tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return 0.0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)

@@ -20,8 +20,8 @@ from pipelines.evaluation.ablation_table import ablation_table
 from pipelines.evaluation.evaluate import evaluate_run
 from pipelines.progress import Progress
 from pipelines.reconstruct import all_stages, reconstruct
+from pipelines.records import load_records
 from pipelines.run_folder import RunFolder
-from pipelines.stages import load_records
 
 COMPLETE = "complete"
 ABLATIONS: dict[str, tuple[str, ...]] = {

@@ -19,8 +19,8 @@ from pipelines.evaluation.write import PATH_FROM_ABOVE, evaluation_file, traject
 from pipelines.export.readme import README
 from pipelines.outcome import Outcome, load_outcome
 from pipelines.progress import Progress, SilentProgress
+from pipelines.records import load_source
 from pipelines.run_folder import RunFolder, read_json
-from pipelines.stages import load_source
 from pipelines.types import LoopEdge, SparseModel
 
 MEASURED_VIEWS = 60
@@ -183,9 +183,11 @@ def _settings_section(outcome: Outcome) -> str:
     changed = [
         (f"{s}.{k}", str(v), str(default[s][k]))
         for s, values in used.items()
+        if s == "run" or s in outcome.records
         for k, v in values.items()
         if v != default[s][k]
     ]
     listed = table(("setting", "here", "default"), changed) if changed else "<p>All at their defaults.</p>"
-    whole = f"<details><summary>All settings</summary><pre>{escape(config_to_toml(outcome.config))}</pre></details>"
+    title = "All settings (of stages that are not done: those of run.toml)"
+    whole = f"<details><summary>{title}</summary><pre>{escape(config_to_toml(outcome.config))}</pre></details>"
     return section("Settings", listed, whole)

@@ -18,7 +18,7 @@ from formats.atomic import atomic_path
 from formats.errors import InputError
 from formats.images import read_rgb, write_rgb
 from formats.video import VideoFrame
-from pipelines.config import FramesConfig
+from pipelines.config import Config, FramesConfig
 from pipelines.correspondence.snapshots import Snapshots
 from pipelines.frames.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes
 from pipelines.frames.pick import sharpest_of_windows
@@ -78,6 +78,14 @@ def _known_camera(context: StageContext, source: AnySource) -> tuple[pycolmap.Ca
     if exif is not None:
         return unknown_camera(width, height, exif * width / source.width, is_prior=True), "exif"
     return unknown_camera(width, height, _FOCAL_GUESS * max(width, height), is_prior=False), "self-calibrated"
+
+
+def check(source: Path, config: Config) -> None:
+    """Raise InputError for a source, or a camera given for it, that cannot be used."""
+    opened = open_source(source, config.run.format)
+    _require_reasonable(config.frames, opened)
+    if config.frames.intrinsics:
+        read_intrinsics(config.frames.intrinsics, opened.width, opened.height)
 
 
 def _require_reasonable(config: FramesConfig, source: AnySource) -> None:
@@ -287,4 +295,4 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
     }
 
 
-STAGE = Stage("frames", 5, run, "pick frames, calibrate the camera, structure from motion over keyframes")
+STAGE = Stage("frames", 5, run, "pick frames, calibrate the camera, structure from motion over keyframes", check=check)

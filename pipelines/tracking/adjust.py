@@ -78,13 +78,15 @@ def adjust_state(
             bundle, ties.depth, ties.reliability = bundle.select(keep), ties.depth[keep], ties.reliability[keep]
     bundle = set_scale(bundle, ties, intrinsics, settings)
     errors = bundle.reprojection_errors(intrinsics)
+    seen = np.isfinite(errors)  # not so of points that the last round has left behind a camera
     write_back(state, bundle, frame_ids)
     follow_others(state, intrinsics, set(frame_ids), ties.factor)
     figures = {
         "adjusted_frames": len(frame_ids),
         "points": len(np.unique(bundle.obs_point)),
         "observations": len(bundle.obs_cam),
-        "reprojection_px": float(np.sqrt(np.mean(errors**2))),
+        "reprojection_px": float(np.sqrt(np.mean(errors[seen] ** 2))) if seen.any() else None,
+        "behind_camera": int((~seen).sum()),
         "cost_before": initial,
         "cost_after": result.cost,
     }

@@ -36,8 +36,8 @@ from pipelines.evaluation.ablation import ABLATIONS as ARTICLE_ABLATIONS
 from pipelines.evaluation.evaluate import evaluate_run
 from pipelines.progress import SilentProgress
 from pipelines.reconstruct import reconstruct
+from pipelines.records import load_records
 from pipelines.run_folder import RunFolder
-from pipelines.stages import load_records
 
 
 @dataclass(frozen=True)

@@ -187,8 +187,8 @@ def run_stages_timed(
     """The stages' records, and what each took; of a stage that is up to date, what it took when it ran."""
     from pipelines.progress import SilentProgress
     from pipelines.reconstruct import reconstruct
+    from pipelines.records import load_records
     from pipelines.run_folder_names import STAGES
-    from pipelines.stages import load_records
 
     stored = run.root.with_suffix(".seconds.json")
     seconds = json.loads(stored.read_text()) if stored.exists() else {}

@@ -16,6 +16,7 @@ from formats.images import write_rgb
 from pipelines.config import Config, MappingConfig, config_to_toml
 from pipelines.gaussian_map import GaussianMap
 from pipelines.geometry.alignment import Similarity
+from pipelines.records import StageRecord
 from pipelines.run_folder import (
     RunFolder,
     proxy_path,
@@ -27,7 +28,6 @@ from pipelines.run_folder import (
     save_trajectory,
     write_json,
 )
-from pipelines.stages import StageRecord
 from pipelines.types import VOID, Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, Trajectory
 
 KEYFRAME_EVERY = 4

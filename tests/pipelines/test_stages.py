@@ -9,9 +9,10 @@ import pytest
 from formats.errors import DiskFullError, InputError
 from pipelines.config import Config, MappingConfig, load_config
 from pipelines.progress import SilentProgress
+from pipelines.records import load_records
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
-from pipelines.stages import Stage, StageContext, load_records, run_stages
+from pipelines.stages import Stage, StageContext, run_stages
 
 
 class Recorder:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from formats.images import read_rgb
 from pipelines.config import Config, config_to_toml
+from pipelines.records import StageRecord
 from pipelines.run_folder import (
     RunFolder,
     proxy_path,
@@ -21,7 +22,6 @@ from pipelines.run_folder import (
     save_trajectory,
     write_json,
 )
-from pipelines.stages import StageRecord
 from pipelines.types import VOID, Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, SparseModel, Trajectory
 
 SIZE = (80, 60)

@@ -1,0 +1,32 @@
+"""Commands in this process, and what a tiny finished run consists of."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from click.testing import CliRunner, Result
+
+from msgs_cli.main import main
+from pipelines.world import ClipOptions
+
+QUICK = (
+    "run.threads=1", "run.device=cpu", "frames.max_features=800", "proxy.stereo_side=160", "mapping.passes=1",
+    "mapping.min_iterations=20", "mapping.max_gaussians=8000", "mapping.snapshot_every=5", "export.voxel=0.05",
+)  # fmt: skip
+OPTIONS = ClipOptions(frames=16, width=160, height=120, fps=10.0, laps=0.3)
+
+
+def invoke(*arguments: object) -> Result:
+    """Run the command in this process. A bug's traceback is not swallowed."""
+    result = CliRunner().invoke(main, [str(a) for a in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """The video, its truth as a data set, and the run folder; copy the folder before changing it."""
+
+    video: Path
+    truth: Path
+    folder: Path
