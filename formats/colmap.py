@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from formats.atomic import write_bytes, write_text
 from formats.colmap_binary import require_whole_files
 from formats.errors import InputError
-from formats.trajectory import nearest_rotation
+from formats.reading import parsing, require_file
+from formats.trajectory import FARTHEST, nearest_rotation, poses_from_quaternions
 
 _PINHOLE_MODEL_ID = 1
 _CAMERA_ID = 1
@@ -86,18 +87,31 @@ def write_colmap_model(
 def read_colmap_model(folder: Path) -> ColmapModel:
     """The registered images, in order of their names, and the points of a binary or text model in `folder`.
 
-    Raises InputError when the folder holds no complete model or a file of it is damaged.
+    Raises InputError when the folder holds no complete model, or a file of it is damaged or holds what cannot be:
+    a pose that is no rigid transform, an image without a size, a value that is not finite.
     """
     folder = Path(folder)
     reconstruction = _load(folder)
+    with parsing(folder, "COLMAP model"):
+        model = _plain_model(reconstruction, folder)
+    _require_sense(model, folder)
+    return model
+
+
+def _plain_model(reconstruction: Any, folder: Path) -> ColmapModel:
     images = sorted((reconstruction.images[i] for i in reconstruction.reg_image_ids()), key=lambda image: image.name)
     camera_ids = sorted({image.camera_id for image in images})
     point_ids = np.array(sorted(reconstruction.points3D), dtype=np.uint64)
     points = [reconstruction.points3D[int(i)] for i in point_ids]
     obs_image, obs_id, obs_xy = _observations(images)
+    poses = [image.cam_from_world() for image in images]
     return ColmapModel(
         names=tuple(image.name for image in images),
-        cam_from_world=np.array([_matrix(image) for image in images], dtype=np.float64).reshape(-1, 4, 4),
+        cam_from_world=poses_from_quaternions(
+            np.array([pose.rotation.quat for pose in poses], dtype=np.float64).reshape(-1, 4),
+            np.array([pose.translation for pose in poses], dtype=np.float64).reshape(-1, 3),
+            str(folder),
+        ),
         cameras=tuple(_plain_camera(reconstruction.cameras[i]) for i in camera_ids),
         camera_index=np.array([camera_ids.index(image.camera_id) for image in images], dtype=np.int64),
         points=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
@@ -106,6 +120,19 @@ def read_colmap_model(folder: Path) -> ColmapModel:
         obs_point=np.searchsorted(point_ids, obs_id).astype(np.int64),
         obs_xy=obs_xy,
     )
+
+
+def _require_sense(model: ColmapModel, folder: Path) -> None:
+    finite = all(np.isfinite(a).all() for a in (model.obs_xy, *(np.array(c[3]) for c in model.cameras)))
+    problems = {
+        "an image name occurs twice": len(set(model.names)) == len(model.names),
+        "a camera has no size": all(width > 0 and height > 0 for _, width, height, _ in model.cameras),
+        "an observation's point is missing": bool((model.obs_point < len(model.points)).all()),
+        "a value is not finite": finite and bool((np.abs(model.points) <= FARTHEST**2).all()),
+    }
+    for problem, holds in problems.items():
+        if not holds:
+            raise InputError(f"the COLMAP model in {folder} is damaged ({problem}): copy or export it again")
 
 
 def model_suffix(folder: Path) -> str | None:
@@ -125,14 +152,13 @@ def _load(folder: Path) -> Any:
             f"no complete COLMAP model in {folder}: expected cameras, images and points3D as .bin or as .txt "
             "(look in sparse/0)"
         )
+    for part in ("cameras", "images", "points3D"):
+        require_file(folder / f"{part}{suffix}")
     if suffix == ".bin":
         require_whole_files(folder)
     reconstruction = pycolmap.Reconstruction()
-    try:
+    with parsing(f"the COLMAP model in {folder}", "such model"):
         (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(str(folder))
-    except (ValueError, RuntimeError, IndexError, KeyError, MemoryError) as error:
-        reason = str(error).splitlines()[-1] if str(error) else type(error).__name__
-        raise InputError(f"the COLMAP model in {folder} is damaged ({reason}): copy or export it again") from error
     return reconstruction
 
 
@@ -143,10 +169,6 @@ def _observations(images: list[Any]) -> tuple[NDArray[np.int64], NDArray[np.uint
     ids = np.array([p[0] for p in flat], dtype=np.uint64)
     xy = np.array([p[1:] for p in flat], dtype=np.float64).reshape(-1, 2)
     return np.repeat(np.arange(len(images)), counts).astype(np.int64), ids, xy
-
-
-def _matrix(image: Any) -> NDArray[np.float64]:
-    return np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
 
 
 def _plain_camera(camera: Any) -> tuple[str, int, int, tuple[float, ...]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-from formats.errors import InputError
+from formats.reading import parsing, read_bytes
 
 # Parameters of each of COLMAP's camera models, in the order of the models' ids (SIMPLE_PINHOLE first).
 _PARAMETER_COUNTS = dict(enumerate((3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)))
@@ -24,13 +24,10 @@ def require_whole_files(folder: Path) -> None:
     """
     for name, walk in (("cameras", _walk_cameras), ("images", _walk_images), ("points3D", _walk_points)):
         path = folder / f"{name}.bin"
-        data = path.read_bytes()
-        try:
-            end = walk(data)
-        except (struct.error, ValueError, KeyError):
-            end = -1
-        if end != len(data):
-            raise InputError(f"{path} is damaged or was not copied completely: copy or export the model again")
+        data = read_bytes(path)
+        with parsing(path, "whole file of a COLMAP model"):
+            if walk(data) != len(data):
+                raise ValueError("it ends elsewhere than its counts say")
 
 
 def _walk_cameras(data: bytes) -> int:

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
-from formats.gaussians import GaussianCloud
+from formats.gaussians import GaussianCloud, unit_quaternions
+from formats.reading import parsing
 from formats.tensors import load_safetensors, save_safetensors
 
 KEPT_CLASSES = 4
@@ -16,6 +17,7 @@ KEPT_CLASSES = 4
 
 _FORMAT = "gaussians-compact-1"
 _STEPS = 65535
+_MOST_CLASSES = 255
 
 
 def write_compact(path: Path, cloud: GaussianCloud, class_names: tuple[str, ...] = ()) -> None:
@@ -48,15 +50,15 @@ def read_compact(path: Path) -> tuple[GaussianCloud, tuple[str, ...]]:
     arrays, meta = load_safetensors(path)
     if meta.get("format") != _FORMAT:
         raise InputError(f"{path} is no compact Gaussian file: expected one written with the map's compact export")
-    try:
+    with parsing(path, "compact Gaussian file", "export it again"):
         cloud = _unpacked(arrays, int(meta["class_count"]))
-    except (KeyError, ValueError, IndexError) as error:
-        raise InputError(f"{path} is damaged ({error}): export it again") from error
     names = meta.get("class_names", "")
     return cloud, tuple(names.split("\n")) if names else ()
 
 
 def _unpacked(arrays: dict[str, NDArray], class_count: int) -> GaussianCloud:
+    if not 0 <= class_count <= _MOST_CLASSES:
+        raise ValueError(f"{class_count} classes")
     low, side = arrays["box"]
     m = len(arrays["means"])
     scales = arrays["log_scales"].astype(np.float32)
@@ -67,7 +69,7 @@ def _unpacked(arrays: dict[str, NDArray], class_count: int) -> GaussianCloud:
     return GaussianCloud(
         means=(arrays["means"] / _STEPS * side + low).astype(np.float32),
         log_scales=np.repeat(scales, 3, axis=1) if scales.shape[1] == 1 else scales,
-        quat_wxyz=arrays["quat_wxyz"].astype(np.float32) if "quat_wxyz" in arrays else identity,
+        quat_wxyz=unit_quaternions(arrays["quat_wxyz"]) if "quat_wxyz" in arrays else identity,
         opacity_logits=arrays["opacity_logits"].astype(np.float32),
         colors=arrays["colors"].astype(np.float32) / np.float32(255),
         class_ids=arrays["top_classes"][:, 0] if probs is not None else None,

@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from formats.compact_gaussians import read_compact
 from formats.errors import InputError
 from formats.gaussian_ply import read_gaussian_ply
-from formats.gaussians import GaussianCloud
+from formats.gaussians import GaussianCloud, unit_quaternions
+from formats.reading import parsing, read_bytes
 from formats.spz import read_spz
 
 _SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
@@ -19,7 +21,7 @@ _SMALLEST_SCALE = 1e-9
 def read_gaussians(path: Path) -> GaussianCloud:
     """The Gaussians of a .ply, .spz, .splat or compact .safetensors file, by its suffix.
 
-    Raises InputError for another suffix and as the reader of each kind does.
+    Raises InputError for another suffix, a missing or damaged file, and values that are not finite.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -37,23 +39,21 @@ def read_gaussians(path: Path) -> GaussianCloud:
 def read_splat(path: Path) -> GaussianCloud:
     """The Gaussians of a .splat file: 32 bytes each, without header, 8 bit colours and rotations.
 
-    Raises InputError when the file is missing or its length is no multiple of 32.
+    Raises InputError when the file is missing, its length is no multiple of 32, or a value is not finite.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"no such file: {path}: check the spelling, and that the disk is mounted")
-    if path.stat().st_size % _SPLAT_ROW.itemsize:
+    data = read_bytes(path)
+    if len(data) % _SPLAT_ROW.itemsize:
         raise InputError(f"{path} is no whole .splat file (32 bytes for each Gaussian): copy or export it again")
-    rows = np.fromfile(path, dtype=_SPLAT_ROW)
-    if not (np.isfinite(rows["mean"]).all() and np.isfinite(rows["scale"]).all()):
-        raise InputError(f"{path} is no .splat file, or damaged: it holds values that are not finite")
+    with parsing(path, ".splat file"):
+        return _unpacked(np.frombuffer(data, dtype=_SPLAT_ROW))
+
+
+def _unpacked(rows: NDArray) -> GaussianCloud:
     opacity = (rows["rgba"][:, 3] / 255.0).clip(1e-4, 1 - 1e-4)
-    quat_wxyz = rows["quat_wxyz"] / 128.0 - 1
-    length = np.linalg.norm(quat_wxyz, axis=1, keepdims=True)
     return GaussianCloud(
         means=rows["mean"].astype(np.float32),
         log_scales=np.log(np.maximum(rows["scale"], _SMALLEST_SCALE)).astype(np.float32),
-        quat_wxyz=np.where(length > 0, quat_wxyz / np.maximum(length, 1e-9), [1.0, 0, 0, 0]).astype(np.float32),
+        quat_wxyz=unit_quaternions(rows["quat_wxyz"] / 128.0 - 1),
         opacity_logits=np.log(opacity / (1 - opacity)).astype(np.float32),
         colors=(rows["rgba"][:, :3] / 255.0).astype(np.float32),
     )

@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from plyfile import PlyData
 
 from formats.errors import InputError
-from formats.gaussians import GaussianCloud
+from formats.gaussians import GaussianCloud, unit_quaternions
 from formats.ply_table import columns, read_ply, write_ply
+from formats.reading import parsing
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * f_dc."""
@@ -72,10 +74,17 @@ def read_gaussian_ply(path: Path) -> GaussianCloud:
     if not set(_SCALES[:1] + _DC) <= set(names):
         kind = "a mesh" if "face" in ply else "a point cloud"
         raise InputError(f"{path} is {kind}, not a Gaussian splat PLY: it lacks f_dc_0..2 and scale_0..2")
+    with parsing(path, "Gaussian splat PLY"):
+        return _cloud(ply, path)
+
+
+def _cloud(ply: PlyData, path: Path) -> GaussianCloud:
+    vertex = ply["vertex"].data
+    names = vertex.dtype.names or ()
     return GaussianCloud(
         means=columns(vertex, _MEANS, path),
         log_scales=_log_scales(vertex, path),
-        quat_wxyz=_unit(columns(vertex, _ROTATION, path)),
+        quat_wxyz=unit_quaternions(columns(vertex, _ROTATION, path)),
         opacity_logits=columns(vertex, ["opacity"], path)[:, 0],
         colors=columns(vertex, _DC, path) * np.float32(SH_C0) + np.float32(0.5),
         class_ids=vertex["class_id"].astype(np.uint8) if "class_id" in names else None,
@@ -99,13 +108,6 @@ def _log_scales(vertex: NDArray[Any], path: Path) -> NDArray[np.float32]:
         scales.min(axis=1, keepdims=True, initial=0) - np.float32(math.log(100)) if len(names) == 2 else scales[:, :0]
     )
     return np.concatenate([scales, thin], axis=1)
-
-
-def _unit(quat_wxyz: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The original stores quaternions as the optimiser left them."""
-    length = np.linalg.norm(quat_wxyz, axis=1, keepdims=True)
-    identity = np.array([1, 0, 0, 0], dtype=np.float32)
-    return np.where(length > 1e-12, quat_wxyz / np.maximum(length, np.float32(1e-12)), identity).astype(np.float32)
 
 
 def _class_probs(vertex: NDArray[Any], comments: list[str], path: Path) -> NDArray[np.float32] | None:

@@ -7,6 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from formats.trajectory import FARTHEST
+
+_LARGEST_LOG = 20.0
+"""exp of it is half a `FARTHEST`: the squares that make a covariance still fit into float32."""
+
 
 @dataclass(frozen=True, eq=False)
 class GaussianCloud:
@@ -43,9 +48,21 @@ class GaussianCloud:
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"GaussianCloud: {name}: got shape {getattr(self, name).shape}, expected {shape}")
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"GaussianCloud: {name} holds a value that is not finite")
+        if m and not (self.log_scales.max() < _LARGEST_LOG and np.abs(self.means).max() < FARTHEST):
+            raise ValueError("GaussianCloud: a Gaussian is too large or too far away to be drawn")
 
     def __len__(self) -> int:
         return len(self.means)
+
+
+def unit_quaternions(quat: NDArray) -> NDArray[np.float32]:
+    """(M, 4) of length 1: trainers store them as the optimiser left them, packed files rounded. Zero is no rotation."""
+    wide = quat.astype(np.float64)
+    length = np.linalg.norm(wide, axis=1, keepdims=True)
+    identity = np.array([1.0, 0, 0, 0])
+    return np.where(length > 1e-12, wide / np.maximum(length, 1e-12), identity).astype(np.float32)
 
 
 def isotropic_cloud(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from formats.errors import InputError
 from formats.images import exif_time
+from formats.reading import reaching
 from formats.textfile import read_rows
 
 _LIST_NAMES = ("timestamps.txt", "times.txt", "rgb.txt")
@@ -20,18 +21,20 @@ def read_image_times(images: list[Path]) -> NDArray[np.float64] | None:
 
     Looks for timestamps.txt, times.txt or rgb.txt in the images' folder, then in the one above: a number a line for
     each image in order, or for each frame number in the images' names; or lines of `seconds name`. Else EXIF.
-    Raises InputError for a list that matches the images in none of these ways.
+    An image that cannot be read gets a time between its neighbours'. Raises InputError for a list that matches the
+    images in none of these ways.
     """
     if not images:
         return None
-    path = times_file(images[0].parent)
-    return _require_increasing(_from_list(path, images), path) if path else _from_exif(images)
+    listed = times_file(images[0].parent)
+    return _from_exif(images) if listed is None else _require_increasing(_from_list(listed, images), listed)
 
 
 def times_file(folder: Path) -> Path | None:
     """The list of times that belongs to the images of a folder, None where there is none."""
-    candidates = (place / name for place in (folder, folder.parent) for name in _LIST_NAMES)
-    return next((path for path in candidates if path.is_file()), None)
+    places = (place / name for place in (folder, folder.parent) for name in _LIST_NAMES)
+    with reaching(folder):
+        return next((path for path in places if path.is_file()), None)
 
 
 def frame_number(path: Path) -> int | None:
@@ -67,11 +70,22 @@ def _require_increasing(times: NDArray[np.float64], path: Path) -> NDArray[np.fl
 
 
 def _from_exif(images: list[Path]) -> NDArray[np.float64] | None:
-    # Cameras often write whole seconds: equal neighbours tell nothing about the order, so such times are not used.
-    times: list[float] = []
-    for path in images:
-        time = exif_time(path)
-        if time is None or (times and time <= times[-1]):
+    """None where an image tells nothing, or times do not increase: cameras that write whole seconds say no order."""
+    stored = np.full(len(images), np.nan)
+    readable = np.zeros(len(images), dtype=bool)
+    for i, path in enumerate(images):
+        try:
+            time = exif_time(path)
+        except InputError:
+            continue  # damaged: left out when it is read, whatever its time
+        if time is None:
             return None
-        times.append(time)
-    return np.array(times, dtype=np.float64) - times[0]
+        stored[i], readable[i] = time, True
+    known = np.flatnonzero(readable)
+    if not len(known) or (np.diff(stored[known]) <= 0).any():
+        return None
+    step = (stored[known[-1]] - stored[known[0]]) / max(known[-1] - known[0], 1) or 1.0
+    index = np.arange(len(images))
+    times = np.interp(index, known, stored[known])
+    times += step * (np.minimum(index - known[0], 0) + np.maximum(index - known[-1], 0))
+    return np.asarray(times - times[0])

@@ -10,18 +10,33 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image, UnidentifiedImageError
 
-from formats.atomic import atomic_path
+from formats.atomic import write_bytes
 from formats.errors import InputError
+from formats.reading import opened, parsing, reaching
 
 MAX_IMAGE_PIXELS = 120_000_000
 """A larger picture is refused by its header, before memory is spent on it (phones go to 108 million)."""
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
+_FORMATS = ("JPEG", "PNG", "BMP", "DIB", "TIFF", "WEBP", "GIF")
+_ADVICE = "copy it again or remove it"
+_TURNS = {
+    1: None,
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""What makes a picture upright, by EXIF's orientation."""
 _UNREADABLE_SUFFIXES = frozenset({".heic", ".heif", ".dng", ".cr2", ".nef", ".arw", ".raw"})
 _FULL_FRAME_WIDTH_MM = 36.0
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
@@ -40,9 +55,10 @@ def list_images(folder: Path) -> list[Path]:
     Raises InputError when there is no such folder or no image in it.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(f"no such folder: {folder}: check the spelling, and that the disk is mounted")
-    files = [p for p in folder.iterdir() if not p.name.startswith(".") and p.is_file()]
+    with reaching(folder):
+        if not folder.is_dir():
+            raise InputError(f"no such folder: {folder}: check the spelling, and that the disk is mounted")
+        files = [p for p in folder.iterdir() if not p.name.startswith(".") and p.is_file()]
     images = [p for p in files if p.suffix.lower() in IMAGE_SUFFIXES]
     if not images:
         raise InputError(_why_no_images(folder, files))
@@ -63,7 +79,25 @@ def image_size(path: Path) -> tuple[int, int]:
     """(width, height) from the header, after the rotation stated in EXIF. Raises InputError as `read_rgb` does."""
     with _opened(Path(path)) as image:
         width, height = image.size
-        return (height, width) if image.getexif().get(ExifTags.Base.Orientation, 1) >= 5 else (width, height)
+        return (height, width) if _orientation(image) >= 5 else (width, height)
+
+
+def is_depth_map(path: Path) -> bool:
+    """Whether the header says one channel of 16 bits; False for a file that cannot be read."""
+    try:
+        with _opened(Path(path)) as image:
+            return image.mode.startswith("I")
+    except InputError:
+        return False
+
+
+def is_plain(path: Path) -> bool:
+    """Whether other programs see the image as it is seen here: neither turned nor transparent, 8 bits a channel.
+
+    Raises InputError as `read_rgb` does.
+    """
+    with _opened(Path(path)) as image:
+        return image.mode in ("RGB", "L") and _orientation(image) == 1
 
 
 def read_rgb(path: Path) -> NDArray[np.uint8]:
@@ -73,7 +107,8 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
     """
     with _opened(Path(path)) as image:
         image.load()
-        upright = ImageOps.exif_transpose(image)
+        turn = _TURNS[_orientation(image)]
+        upright = image if turn is None else image.transpose(turn)
         if upright.mode.startswith("I"):  # one channel of 16 bit; Pillow's own conversion saturates it
             grey = (np.clip(np.asarray(upright), 0, 65535) >> 8).astype(np.uint8)
             return np.repeat(grey[:, :, None], 3, axis=2)
@@ -108,26 +143,31 @@ def write_rgb(path: Path, rgb: NDArray[np.uint8]) -> None:
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
         raise ValueError(f"write_rgb: got {rgb.dtype} {rgb.shape}, expected uint8 (H, W, 3)")
     image = Image.fromarray(np.ascontiguousarray(rgb))
-    with atomic_path(path) as temporary:
-        if path.suffix.lower() in (".jpg", ".jpeg"):
-            image.save(temporary, format="JPEG", quality=95, subsampling=0)
-        elif path.suffix.lower() == ".png":
-            image.save(temporary, format="PNG", compress_level=3)
-        else:
-            raise ValueError(f"write_rgb: {path.name} is neither .jpg nor .png")
+    if path.suffix.lower() in (".jpg", ".jpeg"):
+        _save(path, image, format="JPEG", quality=95, subsampling=0)
+    elif path.suffix.lower() == ".png":
+        _save(path, image, format="PNG", compress_level=3)
+    else:
+        raise ValueError(f"write_rgb: {path.name} is neither .jpg nor .png")
 
 
 def write_grey_png(path: Path, values: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
     """Write (H, W) uint8 or uint16 (labels, depth) as a lossless PNG, atomically."""
     if values.dtype not in (np.uint8, np.uint16) or values.ndim != 2:
         raise ValueError(f"write_grey_png: got {values.dtype} {values.shape}, expected uint8 or uint16 (H, W)")
-    with atomic_path(Path(path)) as temporary:
-        Image.fromarray(np.ascontiguousarray(values)).save(temporary, format="PNG", compress_level=3)
+    _save(Path(path), Image.fromarray(np.ascontiguousarray(values)), format="PNG", compress_level=3)
+
+
+def _save(path: Path, image: Image.Image, **options: Any) -> None:
+    """Encoded in memory first: Pillow's encoders do not notice when a disk takes only a part of what they write."""
+    buffer = io.BytesIO()
+    image.save(buffer, **options)
+    write_bytes(path, buffer.getvalue())
 
 
 def decode_rgb(data: bytes, name: str) -> NDArray[np.uint8]:
     """`read_rgb` for an image held in memory; `name` is what errors call it."""
-    with _explained(name), _quiet_open(io.BytesIO(data)) as image:
+    with parsing(name, "image", _ADVICE), _quiet_open(io.BytesIO(data)) as image:
         _require_sane_size(image, name)
         return np.array(image.convert("RGB"), dtype=np.uint8)
 
@@ -159,8 +199,7 @@ def exif_focal_px(path: Path, width: int, height: int) -> float | None:
 def exif_time(path: Path) -> float | None:
     """Seconds (of the camera's own clock, since 1970) when the picture was taken, from EXIF; None when untold."""
     with _opened(Path(path)) as image:
-        exif = image.getexif()
-        tags = exif.get_ifd(ExifTags.IFD.Exif)
+        tags = dict(image.getexif().get_ifd(ExifTags.IFD.Exif))
     text = tags.get(ExifTags.Base.DateTimeOriginal)
     fraction = str(tags.get(ExifTags.Base.SubsecTimeOriginal, "")).strip("\0 ")
     try:
@@ -169,6 +208,12 @@ def exif_time(path: Path) -> float | None:
         return None
     seconds = (moment - datetime(1970, 1, 1)).total_seconds()
     return seconds + (float(f"0.{fraction}") if fraction.isdecimal() else 0.0)
+
+
+def _orientation(image: Image.Image) -> int:
+    """1 to 8 as EXIF defines them; 1 for whatever else stands there: text, lists, other numbers."""
+    value = image.getexif().get(ExifTags.Base.Orientation, 1)
+    return int(value) if value in _TURNS else 1
 
 
 def _positive(value: object) -> float | None:
@@ -196,20 +241,18 @@ def _read_one_channel(path: Path, what: str) -> NDArray:
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
     """An image whose header is read and checked; whatever goes wrong inside the block is explained."""
-    if not path.is_file():
-        raise InputError(f"no such image: {path}: check the spelling, and that the disk is mounted")
-    with _explained(str(path)):
-        if path.stat().st_size == 0:
-            raise InputError(f"{path} is empty (0 bytes): copy it again or remove it")
-        with _quiet_open(path) as image:
-            _require_sane_size(image, str(path))
-            yield image
+    with opened(path) as file, parsing(path, "image", _ADVICE), _quiet_open(file) as image:
+        _require_sane_size(image, str(path))
+        yield image
 
 
-def _quiet_open(file: Path | io.BytesIO) -> Image.Image:
+def _quiet_open(file: IO[bytes]) -> Image.Image:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own limit follows
-        return Image.open(file)
+        try:
+            return Image.open(file, formats=_FORMATS)
+        except UnidentifiedImageError:  # whose own text shows Python's file object
+            raise ValueError("it begins like no picture that can be read here") from None
 
 
 def _require_sane_size(image: Image.Image, name: str) -> None:
@@ -218,14 +261,3 @@ def _require_sane_size(image: Image.Image, name: str) -> None:
         raise InputError(
             f"{name} is {width}x{height}, over the limit of {MAX_IMAGE_PIXELS / 1e6:.0f} million pixels: scale it down"
         )
-
-
-@contextmanager
-def _explained(name: str) -> Iterator[None]:
-    try:
-        yield
-    except Image.DecompressionBombError as error:
-        raise InputError(f"{name} is too large to decode safely ({error}): scale it down") from error
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
-        # Pillow reports damage under all of these names.
-        raise InputError(f"cannot read {name} as an image ({error}): copy it again or remove it") from error

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,8 @@ from numpy.typing import NDArray
 from formats.atomic import write_bytes
 from formats.errors import InputError
 from formats.ply_table import columns, read_ply, write_ply
+from formats.reading import parsing, read_bytes
+from formats.trajectory import FARTHEST
 
 _LABEL_ATTRIBUTE = "_LABEL"
 _MAX_GLB_BYTES = 4 * 1024**3
@@ -34,6 +38,8 @@ class MeshArrays:
                 raise ValueError(f"MeshArrays: {name}: got shape {getattr(self, name).shape}, expected {shape}")
         if len(self.faces) and not 0 <= self.faces.min() <= self.faces.max() < v:
             raise ValueError(f"MeshArrays: a face points outside the {v} vertices")
+        if not (np.abs(self.vertices) < FARTHEST).all():
+            raise ValueError("MeshArrays: a vertex is not finite, or too far away")
 
 
 def write_mesh_ply(
@@ -80,14 +86,13 @@ def read_mesh_ply(path: Path) -> MeshArrays:
     count = len(vertex)
     has_colors = {"red", "green", "blue"} <= set(names)
     colors = columns(vertex, ["red", "green", "blue"], path) if has_colors else np.full((count, 3), 128, np.float32)
-    labels = vertex["label"] if "label" in names else np.full(count, 255)
-    try:
+    colors = colors.clip(0, 255)
+    labels = columns(vertex, ["label"], path)[:, 0].clip(0, 255) if "label" in names else np.full(count, 255)
+    with parsing(path, "mesh", "export it again"):
         return MeshArrays(
-            columns(vertex, ["x", "y", "z"], path), _triangles(face[indices]), colors.astype(np.uint8),
+            columns(vertex, ["x", "y", "z"], path), _triangles(face[indices], count), colors.astype(np.uint8),
             labels.astype(np.uint8),
         )  # fmt: skip
-    except ValueError as error:
-        raise InputError(f"{path} is a damaged mesh ({error}): export it again") from error
 
 
 def write_mesh_glb(
@@ -129,13 +134,10 @@ def read_mesh_glb(path: Path) -> MeshArrays:
     """A mesh as `write_mesh_glb` wrote it. Raises InputError for a damaged file or one without triangles."""
     import trimesh
 
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"no such file: {path}: check the spelling, or run the export")
-    if path.stat().st_size > _MAX_GLB_BYTES:
-        raise InputError(f"{path} is larger than {_MAX_GLB_BYTES / 1e9:.0f} GB: it is not a mesh of this program")
-    try:
-        scene = trimesh.load_scene(str(path), file_type="glb", process=False)
+    data = read_bytes(path, _MAX_GLB_BYTES)
+    with parsing(path, "GLB with a triangle mesh", "export it again"):
+        _require_own_bytes(data)
+        scene = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False)
         mesh: Any = next(m for m in scene.geometry.values() if isinstance(m, trimesh.Trimesh))
         labels = mesh.vertex_attributes.get(_LABEL_ATTRIBUTE, np.full(len(mesh.vertices), 255))
         return MeshArrays(
@@ -144,16 +146,27 @@ def read_mesh_glb(path: Path) -> MeshArrays:
             np.asarray(mesh.visual.vertex_colors[:, :3], dtype=np.uint8),
             np.asarray(labels).reshape(-1).astype(np.uint8),
         )
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError, StopIteration) as error:
-        raise InputError(f"{path} is damaged or holds no triangle mesh ({error}): export it again") from error
 
 
-def _triangles(polygons: NDArray) -> NDArray[np.int32]:
-    """(F, 3) of faces given as an (F, n) array, or as n indices each in an array of objects."""
+def _require_own_bytes(data: bytes) -> None:
+    """Raise ValueError unless the GLB's arrays all lie in it: a count alone would be filled with zeros."""
+    length = int.from_bytes(data[12:16], "little")
+    header = json.loads(data[20 : 20 + length])
+    accessors = header.get("accessors", [])
+    if any("uri" in buffer for buffer in [*header.get("buffers", []), *header.get("images", [])]):
+        raise ValueError("it names other files")
+    if any("bufferView" not in a or "sparse" in a or a["count"] > len(data) for a in accessors):
+        raise ValueError("an array of it is not in it")
+
+
+def _triangles(polygons: NDArray, vertices: int) -> NDArray[np.int32]:
+    """(F, 3) of faces given as an (F, n) array, or as n indices each in an array of objects; ValueError for others."""
     if polygons.dtype != object:
         listed = polygons.astype(np.int64)
+        if listed.size and not 0 <= listed.min() <= listed.max() < vertices:
+            raise ValueError(f"a face points outside the {vertices} vertices")
         fans = [listed[:, [0, i, i + 1]] for i in range(1, listed.shape[1] - 1)] if listed.ndim == 2 else []
         return np.concatenate(fans).astype(np.int32) if fans else np.zeros((0, 3), dtype=np.int32)
     counts = np.array([len(p) for p in polygons])
-    parts = [_triangles(np.stack(list(polygons[counts == n]))) for n in np.unique(counts) if n >= 3]
+    parts = [_triangles(np.stack(list(polygons[counts == n])), vertices) for n in np.unique(counts) if n >= 3]
     return np.concatenate(parts).astype(np.int32) if parts else np.zeros((0, 3), dtype=np.int32)

@@ -7,31 +7,26 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError, PlyParseError
+from plyfile import PlyData, PlyElementParseError
 
 from formats.atomic import atomic_path
 from formats.errors import InputError
+from formats.reading import opened, parsing
 
 _MAX_HEADER_BYTES = 1 << 20
 _MIN_BYTES_PER_ASCII_VALUE = 2
+_LARGEST = float(np.finfo(np.float32).max)
 
 
 def read_ply(path: Path) -> PlyData:
     """A PLY file by plyfile. Raises InputError when it is missing, a git-LFS pointer, no PLY, or cut short."""
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"no such file: {path}: check the spelling, and that the disk is mounted")
-    with path.open("rb") as file:
+    with opened(path) as file:
         head = file.read(_MAX_HEADER_BYTES)
-    if head.startswith(b"version https://git-lfs"):
-        raise InputError(f"{path} is a git-LFS pointer, not the PLY itself: run `git lfs pull` in its repository")
     if not head.startswith(b"ply"):
         raise InputError(f"{path} is no PLY file (it does not begin with 'ply'): check that it is the right file")
     _require_whole(path, head)
-    try:
+    with parsing(path, "PLY file"):
         return _parsed(path)
-    except (PlyHeaderParseError, PlyParseError, ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is a damaged PLY file ({error}): copy or export it again") from error
 
 
 def _parsed(path: Path) -> PlyData:
@@ -80,12 +75,19 @@ def _packed(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def columns(vertex: NDArray[Any], names: list[str], path: Path) -> NDArray[np.float32]:
-    """(rows, names) float32 of these properties. Raises InputError naming those that are missing."""
+    """(rows, names) float32 of these properties, infinity as the largest number there is.
+
+    Raises InputError naming those that are missing or hold NaN.
+    """
     present = vertex.dtype.names or ()
     missing = [name for name in names if name not in present]
     if missing:
         raise InputError(f"{path} lacks the properties {', '.join(missing)}: it is another kind of PLY")
-    return np.stack([vertex[name].astype(np.float32) for name in names], axis=1)
+    with parsing(path, "PLY of numbers"):
+        values = np.stack([np.clip(vertex[name], -_LARGEST, _LARGEST).astype(np.float32) for name in names], axis=1)
+    if np.isnan(values).any():
+        raise InputError(f"{path}: {', '.join(names)} hold values that are no numbers: export it again")
+    return values
 
 
 def _require_whole(path: Path, head: bytes) -> None:
@@ -93,17 +95,19 @@ def _require_whole(path: Path, head: bytes) -> None:
     end = head.find(b"end_header")
     if end < 0:
         raise InputError(f"{path} has no PLY header end: it is damaged, copy or export it again")
-    available = path.stat().st_size - end
-    needed = 0
+    available = Path(path).stat().st_size - end
     is_ascii = b"format ascii" in head[:end]
-    count = 0
+    counts, row_bytes = [0], [0]
     for line in head[:end].decode("ascii", errors="replace").splitlines():
         words = line.split()
         if len(words) == 3 and words[0] == "element":
-            count = int(words[2]) if words[2].isdecimal() and len(words[2]) < 16 else 1 << 60
+            counts.append(int(words[2]) if words[2].isdecimal() and len(words[2]) < 16 else 1 << 60)
+            row_bytes.append(0)
         elif len(words) >= 3 and words[0] == "property":
             smallest = 1 if words[1] == "list" else _SIZES.get(words[1], 1)
-            needed += count * (_MIN_BYTES_PER_ASCII_VALUE if is_ascii else smallest)
+            row_bytes[-1] += _MIN_BYTES_PER_ASCII_VALUE if is_ascii else smallest
+    # Rows without properties take no space, and have no sense either.
+    needed = sum(count * max(size, 1) for count, size in zip(counts, row_bytes, strict=True))
     if needed > available:
         raise InputError(
             f"{path} promises {needed / 1e6:.1f} MB of data and holds {available / 1e6:.1f}: "

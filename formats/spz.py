@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import io
 import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +12,17 @@ from numpy.typing import NDArray
 
 from formats.atomic import write_bytes
 from formats.errors import InputError
-from formats.gaussians import GaussianCloud
+from formats.gaussians import GaussianCloud, unit_quaternions
+from formats.reading import parsing, require_file
 
 _MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")
 _WRITTEN_VERSION = 2
 _REST_BYTES = {0: 0, 1: 9, 2: 24, 3: 45}
-_MAX_GAUSSIANS = 50_000_000
+_LEAST_BYTES = 19
+_MOST_FRACTION_BITS = 24
+_LEAST_LIMIT, _HIGHEST_RATIO = 32 << 20, 30
+"""Bytes that any file may unpack to, and how often its own size: real maps pack to a half, bombs to a thousandth."""
 _COLOR_SCALE = 0.15
 _SH_C0 = 0.28209479177387814
 # SPZ keeps x right, y up, z back; splat PLYs and this program x right, y down, z forward.
@@ -59,24 +62,19 @@ def write_spz(path: Path, cloud: GaussianCloud) -> None:
 def read_spz(path: Path) -> GaussianCloud:
     """The Gaussians of an SPZ file of version 2 or 3; view-dependent colour is dropped.
 
-    Raises InputError for another version and for a damaged file.
+    Raises InputError for another version, for a damaged file, and for one that would unpack to far more than it is.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"no such file: {path}: check the spelling, and that the disk is mounted")
-    try:
-        with gzip.open(path, "rb") as file:
-            return _read_stream(file, path)
-    except (gzip.BadGzipFile, zlib.error, EOFError, struct.error) as error:
-        raise InputError(f"{path} is damaged or no SPZ file ({error}): copy or export it again") from error
+    size = require_file(path)
+    with parsing(path, "SPZ file"), gzip.open(path, "rb") as file:
+        return _read_stream(file, path, max(_LEAST_LIMIT, size * _HIGHEST_RATIO))
 
 
-def _read_stream(file: gzip.GzipFile, path: Path) -> GaussianCloud:
+def _read_stream(file: gzip.GzipFile, path: Path, most: int) -> GaussianCloud:
     magic, version, count, degree, fraction_bits, _, _ = _HEADER.unpack(file.read(_HEADER.size))
     if magic != _MAGIC or version not in (2, 3) or degree not in _REST_BYTES:
         raise InputError(f"{path} is no SPZ file of version 2 or 3: export it with another program's default settings")
-    if count > _MAX_GAUSSIANS:
-        raise InputError(f"{path} promises {count} Gaussians, more than {_MAX_GAUSSIANS}: it is damaged")
+    if count * _LEAST_BYTES > most or fraction_bits > _MOST_FRACTION_BITS:
+        raise InputError(f"{path} promises {count} Gaussians, more than it can hold: it is damaged")
     positions = _fields(file, count, 9)
     opacity = _fields(file, count, 1)[:, 0] / 255.0
     colors = (_fields(file, count, 3) / 255.0 - 0.5) / _COLOR_SCALE
@@ -87,7 +85,7 @@ def _read_stream(file: gzip.GzipFile, path: Path) -> GaussianCloud:
     return GaussianCloud(
         means=_from_fixed24(positions, fraction_bits) * _FLIP,
         log_scales=log_scales.astype(np.float32),
-        quat_wxyz=(quat_xyzw * np.append(_FLIP, 1))[:, [3, 0, 1, 2]].astype(np.float32),
+        quat_wxyz=unit_quaternions((quat_xyzw * np.append(_FLIP, 1))[:, [3, 0, 1, 2]]),
         opacity_logits=np.log(inside / (1 - inside)).astype(np.float32),
         colors=(colors * _SH_C0 + 0.5).astype(np.float32),
         dropped_sh_degree=degree,

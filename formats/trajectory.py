@@ -15,6 +15,11 @@ from formats.textfile import read_rows, read_table
 _ROTATION_TOLERANCE = 0.05
 """Largest departure of R^T R from the identity that is taken for rounding or drift rather than for another format."""
 
+_LARGEST_ENTRY = 2.0
+
+FARTHEST = 1e9
+"""No camera stands farther from the origin, whatever the unit: beyond, float32 and the squares of lengths break."""
+
 
 def nearest_rotation(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     """The rotations (..., 3, 3) closest to the given matrices in the Frobenius norm (orthogonal Procrustes).
@@ -50,23 +55,46 @@ def write_tum(path: Path, timestamps: NDArray[np.float64], world_from_cam: NDArr
     write_text(path, "\n".join(lines) + "\n")
 
 
+def poses_from_quaternions(
+    quat_xyzw: NDArray[np.float64], translations: NDArray[np.float64], name: str
+) -> NDArray[np.float64]:
+    """(N, 4, 4) rigid transforms of quaternions (N, 4) and translations (N, 3) as the file `name` has them.
+
+    Raises InputError where a value is not finite, or a quaternion so far from length 1 that it is none.
+    """
+    length = np.linalg.norm(quat_xyzw, axis=1)
+    bad = ~((np.abs(length - 1) <= _ROTATION_TOLERANCE) & _is_within_reach(translations))
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise InputError(
+            f"{name}: pose {row + 1} is no rigid transform (quaternion of length {length[row]:.3g}, position "
+            f"{np.array2string(translations[row], precision=3)}): remove it, or correct the order of the columns"
+        )
+    poses = np.tile(np.eye(4), (len(quat_xyzw), 1, 1))
+    if len(quat_xyzw):
+        poses[:, :3, :3] = Rotation.from_quat(quat_xyzw).as_matrix()
+        poses[:, :3, 3] = translations
+    return poses
+
+
+def _is_within_reach(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N,) whether each of (N, 3) is finite and within `FARTHEST`."""
+    return np.asarray((np.abs(positions) <= FARTHEST).all(axis=1))
+
+
 def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(N,) timestamps in file order and (N, 4, 4) world_from_cam of a TUM file.
 
-    Raises InputError for a row of other than 8 numbers, or a quaternion of length 0.
+    Raises InputError for a row of other than 8 numbers, a time that is not finite, or a pose that is none.
     """
     rows = read_rows(path)
     for i, row in enumerate(rows):
         if len(row) != 8:
             raise InputError(f"{path}: row {i + 1} has {len(row)} numbers, a TUM trajectory has 8 (t, xyz, quat xyzw)")
     table = read_table(path, 8)
-    quat_xyzw = table[:, 4:]
-    if not np.isfinite(table).all() or (np.linalg.norm(quat_xyzw, axis=1) < 1e-6).any():
-        raise InputError(f"{path}: a row holds a value that is not finite, or a quaternion of length 0: remove it")
-    world_from_cam = np.tile(np.eye(4), (len(table), 1, 1))
-    world_from_cam[:, :3, :3] = Rotation.from_quat(quat_xyzw).as_matrix()
-    world_from_cam[:, :3, 3] = table[:, 1:4]
-    return table[:, 0], world_from_cam
+    if not np.isfinite(table[:, 0]).all():
+        raise InputError(f"{path}: a row's time is not finite: remove it")
+    return table[:, 0], poses_from_quaternions(table[:, 4:], table[:, 1:4], str(path))
 
 
 def read_matrices(path: Path) -> NDArray[np.float64]:
@@ -97,10 +125,11 @@ def clean_poses(matrices: NDArray[np.float64], name: str) -> NDArray[np.float64]
     """
     result = np.full_like(matrices, np.nan)
     known = np.isfinite(matrices).all(axis=(1, 2))
-    rotations = matrices[known, :3, :3]
+    rotations = matrices[known, :3, :3].clip(-_LARGEST_ENTRY, _LARGEST_ENTRY)
     off = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max(axis=(1, 2), initial=0)
-    bad = (off > _ROTATION_TOLERANCE) | (np.linalg.det(rotations) <= 0)
-    bad |= np.abs(matrices[known, 3] - [0, 0, 0, 1]).max(axis=1, initial=0) > 1e-4
+    # Told by what is good, for NaN is neither: products of huge numbers overflow.
+    good = (off <= _ROTATION_TOLERANCE) & (np.linalg.det(rotations) > 0) & _is_within_reach(matrices[known, :3, 3])
+    bad = ~(good & (np.abs(matrices[known, 3] - [0, 0, 0, 1]).max(axis=1, initial=0) <= 1e-4))
     if bad.any():
         index = int(np.flatnonzero(known)[np.argmax(bad)])
         raise InputError(

@@ -12,6 +12,7 @@ from formats.image_times import times_file
 from formats.images import list_images
 from pipelines.config import Config, load_saved_config
 from pipelines.frames.recording import open_recording
+from pipelines.frames.source import require_source
 from pipelines.lock import LOCK, locked
 from pipelines.progress import Progress, log
 from pipelines.records import StageRecord, load_records, load_source, recorded_config
@@ -100,10 +101,7 @@ def source_digest(source: Path, format: str) -> str:
 
     What else lies in the folder does not count. Raises InputError where there is nothing to read.
     """
-    if source.is_file() and source.stat().st_size == 0:
-        raise InputError(f"{source} is empty (0 bytes). Copy the video again")
-    if not source.exists():
-        raise InputError(f"{source}: there is no such file or folder. Give a video or a folder of images")
+    require_source(source)
     recording = open_recording(source, format)
     if recording is not None and recording.image_paths:
         head = f"{recording.format} {recording.camera}".encode() + recording.timestamps.tobytes()
@@ -111,7 +109,7 @@ def source_digest(source: Path, format: str) -> str:
     if source.is_file():
         return file_sha256(source)
     images, times = list_images(source), times_file(source)
-    return files_sha256((p.name, p) for p in [*images, *([times] if times else [])])
+    return files_sha256(sorted((p.name, p) for p in [*images, *([times] if times else [])]))
 
 
 def _require_run_or_empty(run: RunFolder) -> None:

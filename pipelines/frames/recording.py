@@ -10,7 +10,7 @@ from formats.datasets import Camera, Sequence, open_sequence, recognise_source
 from formats.errors import InputError
 from formats.images import exif_focal_px, image_size
 from formats.video import VideoFrame
-from pipelines.frames.originals import is_plain, written_name
+from pipelines.frames.originals import reusable, written_names
 
 Warn = Callable[[str], None]
 
@@ -35,10 +35,12 @@ class RecordingSource:
     height: int = field(init=False)
     expected_frames: int = field(init=False)
     has_times: bool = field(init=False)
+    _names: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         s = self.sequence
         self.path, self.expected_frames, self.has_times = s.root, len(s), s.timed
+        self._names = written_names(s.names, s.root)
         if s.image_paths:
             self.width, self.height = image_size(s.image_paths[0])
         else:
@@ -67,12 +69,12 @@ class RecordingSource:
 
     def name(self, frame_id: int, index: int) -> str:
         """The image's own name; formats that are not written here become .png."""
-        return written_name(self.sequence.names[index])
+        return self._names[index]
 
     def original(self, index: int) -> Path | None:
         """The image's file, unless other programs would see it turned, transparent or not at all."""
         path = self.sequence.image_paths[index] if self.sequence.image_paths else None
-        return path if path is not None and is_plain(path) else None
+        return path if path is not None and reusable(path) else None
 
     def exif_focal(self) -> float | None:
         """That of the first image."""

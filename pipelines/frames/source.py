@@ -9,13 +9,13 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from formats.errors import InputError
 from formats.image_times import read_image_times
-from formats.images import exif_focal_px, image_size, list_images, read_rgb
+from formats.images import exif_focal_px, image_size, is_depth_map, list_images, read_rgb
+from formats.reading import reaching, require_file
 from formats.video import VideoFrame, VideoReader, probe_video
-from pipelines.frames.originals import is_plain, written_name
+from pipelines.frames.originals import reusable, written_names
 from pipelines.frames.recording import RecordingSource, open_recording
 
 Warn = Callable[[str], None]
@@ -96,9 +96,11 @@ class FolderSource:
     has_times: bool = field(init=False)
     unreadable: list[str] = field(init=False, default_factory=list)
     _images: list[Path] = field(init=False)
+    _names: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         self._images = _without_depth_maps(list_images(self.path))
+        self._names = written_names([path.name for path in self._images], self.path)
         sizes = self._sizes()
         if not sizes:
             raise InputError(
@@ -136,12 +138,12 @@ class FolderSource:
 
     def name(self, frame_id: int, index: int) -> str:
         """The image's own name; formats that are not written here become .png."""
-        return written_name(self._images[index].name)
+        return self._names[index]
 
     def original(self, index: int) -> Path | None:
         """The image's file, unless other programs would see it turned, transparent or not at all."""
         path = self._images[index]
-        return path if is_plain(path) else None
+        return path if reusable(path) else None
 
     def exif_focal(self) -> float | None:
         """That of the first readable image."""
@@ -153,18 +155,8 @@ class FolderSource:
 
 def _without_depth_maps(images: list[Path]) -> list[Path]:
     """All but images of 16 bits in one channel, if there are others: some data sets keep depth beside colour."""
-    depth = {path for path in images if _is_depth_map(path)}
+    depth = {path for path in images if path.suffix.lower() in (".png", ".tif", ".tiff") and is_depth_map(path)}
     return images if len(depth) == len(images) else [path for path in images if path not in depth]
-
-
-def _is_depth_map(path: Path) -> bool:
-    if path.suffix.lower() not in (".png", ".tif", ".tiff"):
-        return False
-    try:
-        with Image.open(path) as image:
-            return image.mode.startswith("I")
-    except (OSError, SyntaxError, ValueError):
-        return False  # damaged: told of when it is read
 
 
 def open_source(path: Path, format: str = "auto") -> VideoSource | FolderSource | RecordingSource:
@@ -172,10 +164,20 @@ def open_source(path: Path, format: str = "auto") -> VideoSource | FolderSource 
 
     Raises InputError when there is no such file, it is no video, it holds no image, or images differ in size.
     """
+    require_source(path)
     recording = open_recording(path, format)
     if recording is not None:
         return RecordingSource(recording)
     return FolderSource(path) if path.is_dir() else VideoSource(path)
+
+
+def require_source(path: Path) -> None:
+    """Raise InputError unless the path is a folder or a file with something in it, and may be read."""
+    with reaching(path):
+        if path.is_dir():
+            next(path.iterdir(), None)
+            return
+    require_file(path)
 
 
 def _require_one_size(folder: Path, sizes: dict[str, tuple[int, int]]) -> None:

@@ -145,6 +145,6 @@ def test_truncated_files_are_refused_before_memory_is_spent(tmp_path: Path, part
         folder = tmp_path / str(keep)
         shutil.copytree(tmp_path / "whole", folder)
         (folder / f"{part}.bin").write_bytes(data[:keep])
-        with pytest.raises(InputError, match="not copied completely"):
+        with pytest.raises(InputError, match=r"is damaged|is empty"):
             read_colmap_model(folder)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000

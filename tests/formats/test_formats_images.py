@@ -110,15 +110,15 @@ def test_unreadable_images_are_explained(tmp_path: Path, picture: np.ndarray) ->
         data = (tmp_path / name).read_bytes()
         cut = tmp_path / f"cut_{name}"
         cut.write_bytes(data[: len(data) * 6 // 10])
-        with pytest.raises(InputError, match="cannot read"):
+        with pytest.raises(InputError, match="is damaged or no image"):
             read_rgb(cut)
     (tmp_path / "empty.png").touch()
     (tmp_path / "text.jpg").write_text("I am no picture")
     with pytest.raises(InputError, match="is empty"):
         read_rgb(tmp_path / "empty.png")
-    with pytest.raises(InputError, match="cannot read"):
+    with pytest.raises(InputError, match="begins like no picture"):
         read_rgb(tmp_path / "text.jpg")
-    with pytest.raises(InputError, match="no such image"):
+    with pytest.raises(InputError, match="no such file"):
         read_rgb(tmp_path / "none.jpg")
 
 
@@ -134,7 +134,7 @@ def _png_claiming(width: int, height: int) -> bytes:
 @pytest.mark.parametrize("side", [11_000, 12_000, 60_000])
 def test_bombs_are_refused_by_their_header(tmp_path: Path, side: int) -> None:
     (tmp_path / "bomb.png").write_bytes(_png_claiming(side, side))
-    with pytest.raises(InputError, match=r"scale it down|too large|truncated"):
+    with pytest.raises(InputError, match=r"scale it down|exceeds limit|truncated"):
         read_rgb(tmp_path / "bomb.png")
 
 

@@ -61,7 +61,7 @@ def test_foreign_tum_files(shared_data: Path) -> None:
     [
         ("0 1 2 3 0 0 0\n", "7 numbers"),
         ("0 1 2 3 0 0 0 0\n", "length 0"),
-        ("0 1 2 nan 0 0 0 1\n", "not finite"),
+        ("0 1 2 nan 0 0 0 1\n", "no rigid transform"),
         ("0 1 2 3 0 0 0 one\n", "must be a number"),
         ("# nothing\n", "no numbers"),
     ],

@@ -161,6 +161,6 @@ def test_a_data_set_is_reconstructed_with_what_it_knows(truth: Sequence, tmp_pat
     result = evaluate_run(run, open_sequence(path))
     assert result["frames"]["with true pose"] == result["frames"]["posed"] == len(run.load_frames())
     assert 0 < result["trajectory"]["se3 all"]["rmse"] < 0.03
-    # The same source under another name is another source.
+    # The same pictures under another name are another source.
     with pytest.raises(InputError, match="another source"):
-        reconstruct(path, run, replace(config, run=replace(config.run, format="images")), SilentProgress())
+        reconstruct(path / "rgb", run, replace(config, run=replace(config.run, format="images")), SilentProgress())

@@ -127,7 +127,7 @@ def test_picked_frames_are_reduced_and_their_table_is_not_made_twice(
         run(context)
     assert read_rgb(context.snapshot / "picked" / "2.png").shape == (96, 128, 3)
     shutil.rmtree(context.snapshot / "picked")
-    with pytest.raises(InputError, match="no such image"):
+    with pytest.raises(InputError, match="no such file"):
         run(context)  # it goes on from the table, and does not pick again
 
 
