@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from formats.errors import InputError
+from pipelines.retired_settings import explain_retired
 
 
-def setting(default: Any, help: str, choices: tuple[str, ...] = ()) -> Any:
-    """A dataclass field that carries its own help text."""
-    return field(default=default, metadata={"help": help, "choices": choices})
+def setting(default: Any, help: str, choices: tuple[str, ...] = (), stages: tuple[str, ...] = ()) -> Any:
+    """A dataclass field that carries its own help text; `stages`: who reads it, where its section is no stage's."""
+    return field(default=default, metadata={"help": help, "choices": choices, "stages": stages})
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,6 @@ class FramesConfig:
     peak_threshold: float = setting(0.004, "contrast of the weakest feature; lower finds more on plain walls")
     overlap: int = setting(8, "each keyframe is matched with this many after it (and a few further ones)")
     loop_candidates: int = setting(4, "each keyframe is also matched with this many that look alike, for loops")
-    max_match_error: float = setting(2.0, "pixels by which a match may miss its epipolar line")
     mapper: str = setting("auto", "structure from motion at once or view by view", ("auto", "global", "incremental"))
 
 
@@ -71,48 +71,21 @@ class ProxyConfig:
         "which depth is fused with multi-view depth: a network's, and files no better than one; all; or none",
         ("learned", "always", "never"),
     )
-    alpha: float = setting(0.7, "eq. (2): how much depth edges lower the reliability")
-    beta: float = setting(0.8, "eq. (2): exponent of the depth's confidence")
-    gamma: float = setting(0.5, "eq. (2): exponent of the frame's semantic agreement")
-    theta_slope: float = setting(10.0, "eq. (3): lambda, steepness of the semantic agreement")
-    theta_middle: float = setting(0.3, "eq. (3): phi, agreement (mean IoU) that counts one half")
     stereo_side: int = setting(320, "multiview matches images of this many pixels on the long side")
     stereo_planes: int = setting(96, "multiview tries this many depths")
     max_classes: int = setting(16, "segments and clusters make at most this many classes")
-    symmetry: bool = setting(True, "look for mirror symmetry and pair the pixels of its two halves")
 
 
 @dataclass(frozen=True)
 class TrackingConfig:
     """Camera poses."""
 
-    flow_window: int = setting(21, "side in pixels of the patch that is followed from a keyframe into a frame")
-    flow_levels: int = setting(3, "pyramid levels of that")
-    flow_error: float = setting(0.7, "a followed point must come back to within this many pixels")
-    flow_sd: float = setting(0.4, "standard deviation of a followed point, pixels")
-    feature_sd: float = setting(0.5, "standard deviation of a feature of structure from motion, pixels")
-    pose_error: float = setting(3.0, "pixels within which a point agrees with a pose")
-    min_inliers: int = setting(20, "a frame with fewer agreeing points is lost")
-    new_points: int = setting(300, "points a new keyframe should have where structure from motion has none")
-    keyframe_share: float = setting(0.6, "there, a frame that sees less than this share of its keyframe's is one")
     new_segments: bool = setting(True, "begin anew from proxy depth after a loss, and join the parts later")
-    relocalise_candidates: int = setting(6, "similar keyframes in which a lost frame is looked for")
     render: str = setting(
         "fallback", "compare with Gaussians, eq. (16): lost frames, all, or never", ("fallback", "all", "never")
     )
-    silhouette: float = setting(0.95, "T_sil of eq. (16)")
-    color_weight: float = setting(1.0, "λ_C of eq. (16)")
-    depth_weight: float = setting(
-        0.0, "λ_D of eq. (16), depths in units of the median; for frames with proxies (proxy.frames=all); 0 = off"
-    )
-    label_weight: float = setting(0.0, "λ_S of eq. (16), likewise; 0 = off")
-    render_loss: float = setting(0.4, "a lost frame is posed by it when less than this share of its contrast is left")
     use_depth: bool = setting(True, "tie triangulated points to metric proxy depths in the adjustment")
-    depth_sd: float = setting(0.05, "relative standard deviation of a reliable proxy depth after its scale is known")
-    grid_rows: int = setting(3, "rows of the scale field of a proxy depth")
-    grid_columns: int = setting(4, "columns of it")
     adjust_frames: int = setting(400, "up to this many frames are adjusted together; of more only the keyframes")
-    adjust_iterations: int = setting(20, "iterations of bundle adjustment")
     snapshot_every: int = setting(50, "frames between two snapshots")
 
 
@@ -123,59 +96,19 @@ class MappingConfig:
     max_side: int = setting(640, "longer keyframes are mapped at this many pixels on the long side; 0 = as they are")
     hold_out: int = setting(0, "every n-th frame is never used for the map, only to measure it; 0 = use all")
     seed_stride: int = setting(2, "pixels between two new Gaussians where the map has a hole")
-    fine_share: float = setting(0.25, "share of a view, that of most detail, with a new Gaussian at every pixel")
-    flat_share: float = setting(0.5, "and that of least detail, where new ones stand twice as far apart")
-    window_steps: int = setting(2, "coarse steps after each keyframe: on it, covisible and random past keyframes")
     passes: float = setting(10.0, "how often each keyframe is visited once all are seeded")
     min_iterations: int = setting(400, "at least this many such visits in all")
-    coarse_share: float = setting(0.25, "share of those visits at half the size, before the others")
     snapshot_every: int = setting(150, "steps between two snapshots")
     max_gaussians: int = setting(1000000, "the map stops growing at this many")
-    color_weight: float = setting(1.0, "λ_C of eq. (18)")
-    ssim_weight: float = setting(0.2, "share of 1 - SSIM in the image loss, eq. (20)")
     depth_weight: float = setting(4.8, "λ_D of eq. (18); 0 = no depth loss")
-    depth_nu: float = setting(1.2, "ν: weight of a proxy depth of reliability U is min(1, ν U)")
     use_proxy_depth: bool = setting(True, "false: the proxies only seed the map, no loss and no condition uses them")
     label_weight: float = setting(0.1, "λ_S of eq. (18); 0 = no semantic loss")
-    label_loss: str = setting("entropy", "semantic loss: cross-entropy, or eq. (20)", ("entropy", "image"))
-    label_every: int = setting(2, "semantic loss at every n-th step only, its weight times n")
-    edge_weight: float = setting(0.02, "λ_E of eq. (18), the edge term (19); 0 = off")
-    edge_sharpness: float = setting(2000.0, "ζ of eq. (19), for depth steps in units of the scene's median depth")
-    size_weight: float = setting(1.0, "λ_R of eq. (18), against over-large Gaussians")
-    size_limit: float = setting(0.03, "radius above which it acts, in units of the scene's median depth")
-    silhouette_weight: float = setting(0.05, "pressure towards an opaque map")
-    kappa: float = setting(0.0, "κ of eq. (7), in units of the scene's median depth; 0 = plain compositing")
-    region_prior: bool = setting(True, "depth prior of eq. (17) where the proxy is unreliable")
-    depth_fields: bool = setting(True, "adjust a smooth scale field of each proxy depth so that the views agree")
-    depth_check: bool = setting(True, "drop proxy depth that stands in what several other views see through")
-    silhouette_threshold: float = setting(0.55, "T_sil: less coverage than this is a hole")
-    depth_tolerance: float = setting(0.05, "T_depth, relative: a proxy nearer than the map by more adds Gaussians")
-    densify_every: int = setting(2, "passes between two rounds of densification and pruning; 0 = never")
-    densify_until: float = setting(0.45, "share of the visits after which the map no longer grows")
-    densify_classes: bool = setting(False, "also where the map shows another class than the label: fixes its noise too")
     split_error: float = setting(
         0.1,
         "Gaussians that answer for more colour error 0..1 than this, summed over a view's pixels, are split; 0 = none",
     )
-    split_radius: float = setting(1.0, "those of a larger radius than this in that view, pixels")
-    prune_opacity: float = setting(0.03, "Gaussians more transparent than this are removed")
-    prune_weight: float = setting(0.03, "and those of less blending weight in every pixel of every keyframe; 0 = off")
-    prune_radius: float = setting(0.15, "and those larger than this, in units of the scene's median depth")
-    mean_rate: float = setting(3e-4, "learning rate of positions, in units of the scene's median depth")
-    radius_rate: float = setting(3e-2, "learning rate of log radii")
-    opacity_rate: float = setting(8e-2, "learning rate of opacity logits")
-    color_rate: float = setting(2.5e-2, "learning rate of colours")
-    class_rate: float = setting(6e-2, "learning rate of class logits")
-    rate_decay: float = setting(0.03, "rates at the end, as a share of those at the start")
     refine_poses: bool = setting(True, "refine keyframe poses together with the map")
-    pose_rate: float = setting(1e-4, "learning rate of rotations (radians); translations times the median depth")
     exposure: bool = setting(True, "a gain and an offset a keyframe and colour")
-    exposure_rate: float = setting(1e-2, "learning rate of gains and offsets")
-    low_trust_step: float = setting(4.0, "steps of Gaussians of unreliable depth, times; of medium, times its root")
-    boundary_clip: float = setting(0.0, "clip gradients beside class boundaries to this times their mean; 0 = off")
-    symmetry_weight: float = setting(0.0, "pull between the two halves of what is mirror-symmetric; 0 = off")
-    time_decay: float = setting(0.1, "τ of eq. (13), a keyframe, while the map is being seeded")
-    reliability_decay: float = setting(1.0, "δ of eq. (14): keyframes of unreliable depth weigh less")
 
 
 @dataclass(frozen=True)
@@ -185,28 +118,11 @@ class GlobalBaConfig:
     use_loops: bool = setting(True, "look for places that are seen again")
     use_semantics: bool = setting(True, "propose loops by semantics too, eqs. (21) to (24)")
     features: int = setting(2000, "SIFT features of a keyframe for finding loops")
-    words: int = setting(32, "words of the vocabulary for appearance")
     loop_gap: int = setting(8, "a loop joins keyframes at least this many apart")
-    loop_shared_points: int = setting(15, "keyframes with this many points in common need no loop")
     loop_candidates: int = setting(2, "candidates a keyframe")
     loop_appearance: float = setting(0.02, "least appearance similarity of a candidate")
-    richness: float = setting(0.9, "keyframes of a richness above this propose loops by semantics, eq. (21)")
-    loop_similarity: float = setting(0.6, "T_loop of eq. (23) on the similarity of eq. (24)")
-    miou_weight: float = setting(0.4, "α₁ of eq. (24)")
-    appearance_weight: float = setting(0.3, "α₂ of eq. (24)")
-    structure_weight: float = setting(0.3, "α₃ of eq. (24)")
-    loop_error: float = setting(4.0, "pixels within which a feature agrees with a loop")
     loop_inliers: int = setting(25, "least agreeing features of a loop, in both directions")
-    loop_share: float = setting(0.3, "least share of agreeing features")
-    loop_sure_inliers: int = setting(80, "with so many a loop needs no support by its neighbours")
-    loop_rotation: float = setting(2.0, "degrees by which a loop's two directions may differ")
-    loop_translation: float = setting(0.05, "and distance, in units of the median depth")
-    loop_drift: float = setting(0.05, "a loop that claims more drift than this share of the path is false")
-    loop_angle_drift: float = setting(10.0, "or more drift in degrees than this")
-    loop_scale_drift: float = setting(1.5, "or more drift of scale than this factor")
-    drift_px: float = setting(6.0, "a loop that is off by more pixels starts a pose graph")
     joint: str = setting("moved", "refine map and poses together", ("moved", "always", "never"))
-    joint_px: float = setting(0.5, "what counts as moved: pixels")
     joint_passes: float = setting(4.0, "how often each keyframe is visited then")
 
 
@@ -215,14 +131,39 @@ class ExportConfig:
     """Files for other programs."""
 
     voxel: float = setting(0.008, "voxel of the mesh, in units of the scene's median depth")
-    truncation: float = setting(4.0, "voxels on either side of a surface that a depth speaks for")
     max_blocks: int = setting(80000, "blocks of 8 x 8 x 8 voxels; voxels grow where more would be needed")
     max_views: int = setting(200, "keyframes the mesh is fused from, evenly spread")
     mesh_side: int = setting(640, "pixels on the long side of their depth images")
-    least_weight: float = setting(1.5, "a voxel seen with less weight, in views at the median depth, has no surface")
     spz: bool = setting(False, "write the map as point_cloud.spz too")
     sh_rest: bool = setting(False, "the splat PLYs hold f_rest_0 to 44 too, all zero, for readers that insist on them")
     least_piece: float = setting(0.01, "connected pieces smaller than this share of the largest one are removed")
+
+
+_MAPPING = ("mapping",)
+
+
+@dataclass(frozen=True)
+class ArticleConfig:
+    """Terms of the article that earned nothing measurable; their modules say the figures."""
+
+    kappa: float = setting(0.0, "κ of eq. (7), in units of the scene's median depth; 0 = off", stages=_MAPPING)
+    edge_weight: float = setting(0.0, "λ_E of eq. (18), the edge term (19), 0.02 in the article", stages=_MAPPING)
+    label_image: bool = setting(False, "eq. (20) for the labels instead of cross-entropy", stages=_MAPPING)
+    class_growth: bool = setting(False, "grow the map where it shows another class than the label", stages=_MAPPING)
+    boundary_clip: float = setting(
+        0.0, "clip gradients beside class boundaries to this times their mean; 0 = off", stages=_MAPPING
+    )
+    symmetry_weight: float = setting(
+        0.0,
+        "look for mirror symmetry, and pull the two halves of what is mirror-symmetric together; 0 = off",
+        stages=("proxy", "mapping"),
+    )
+    tracking_depth_weight: float = setting(
+        0.0,
+        "λ_D of eq. (16), depths in units of the median; for frames with proxies (proxy.frames=all); 0 = off",
+        stages=("tracking",),
+    )
+    tracking_label_weight: float = setting(0.0, "λ_S of eq. (16), likewise; 0 = off", stages=("tracking",))
 
 
 @dataclass(frozen=True)
@@ -236,6 +177,7 @@ class Config:
     mapping: MappingConfig = field(default_factory=MappingConfig)
     global_ba: GlobalBaConfig = field(default_factory=GlobalBaConfig)
     export: ExportConfig = field(default_factory=ExportConfig)
+    article: ArticleConfig = field(default_factory=ArticleConfig)
 
 
 def load_config(file: Path | None = None, overrides: Iterable[str] = (), base: Config | None = None) -> Config:
@@ -281,6 +223,8 @@ def merge_settings(config: Config, changes: Mapping[str, Any], where: str) -> Co
 def _merge_section(section: Any, name: str, values: Mapping[str, Any], where: str) -> Any:
     types = get_type_hints(type(section))
     known = {f.name: f for f in fields(section)}
+    if retired := explain_retired(f"{name}.{key}" for key in values if key not in known):
+        raise InputError(f"{where}: settings of an earlier version: {retired}")
     checked = {}
     for key, value in values.items():
         if key not in known:
@@ -334,6 +278,16 @@ def config_to_dict(config: Any) -> dict[str, Any]:
         f.name: config_to_dict(value) if is_dataclass(value := getattr(config, f.name)) else value
         for f in fields(config)
     }
+
+
+def settings_of_stage(config: Config, stage: str) -> dict[str, Any]:
+    """The settings that a stage reads: its own section, and those beside it that name it."""
+    beside = {
+        f"article.{f.name}": getattr(config.article, f.name)
+        for f in fields(config.article)
+        if stage in f.metadata["stages"]
+    }
+    return config_to_dict(getattr(config, stage)) | beside
 
 
 def config_to_toml(config: Config, comments: bool = True) -> str:

@@ -17,7 +17,7 @@ from formats.atomic import is_disk_full
 from formats.digest import file_sha256
 from formats.errors import DiskFullError, InputError
 from formats.jsonfile import write_json
-from pipelines.config import Config, config_to_dict
+from pipelines.config import Config, settings_of_stage
 from pipelines.progress import Progress, log
 from pipelines.records import (
     StageRecord,
@@ -223,7 +223,7 @@ def _flush_folder(folder: Path) -> None:
 
 def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) -> str:
     """Digest of what a stage's result depends on: its version, its settings, the seed, its inputs, what is before."""
-    own = config_to_dict(getattr(config, stage.name))
+    own = settings_of_stage(config, stage.name)
     beside = [] if inputs is None else [inputs]
     text = json.dumps([stage.name, stage.version, own, config.run.seed, upstream, *beside], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

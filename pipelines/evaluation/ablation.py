@@ -30,7 +30,7 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "without semantic loss": ("mapping.label_weight=0.0",),
     "without loops": ("global_ba.use_loops=false",),
     "without depth loss": ("mapping.depth_weight=0.0",),
-    "colour only": ("mapping.use_proxy_depth=false", "mapping.label_weight=0.0", "mapping.edge_weight=0.0"),
+    "colour only": ("mapping.use_proxy_depth=false", "mapping.label_weight=0.0"),
 }
 """The article's ablations (MSGS-SLAM tables 7 to 10): name → what differs from the complete method."""
 

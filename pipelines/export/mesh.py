@@ -20,6 +20,11 @@ from pipelines.outcome import Outcome
 from pipelines.progress import Progress
 from pipelines.types import VOID, Intrinsics, SemanticMesh
 
+TRUNCATION = 4.0
+"""Voxels on either side of a surface that a depth speaks for."""
+LEAST_WEIGHT = 1.5
+"""A voxel seen with less weight, in views at the median depth, has no surface."""
+
 
 def make_mesh(outcome: Outcome, settings: ExportConfig, progress: Progress) -> SemanticMesh:
     """The surface of the map as the keyframes see it; without a vertex where nothing is seen twice."""
@@ -28,8 +33,8 @@ def make_mesh(outcome: Outcome, settings: ExportConfig, progress: Progress) -> S
     camera = _camera(outcome.calibration.intrinsics, settings.mesh_side)
     views = [depth_view(gaussian_map, p, camera) for p in progress.track(poses, "depth views", len(poses))]
     voxel = settings.voxel * _median_depth(views)
-    volume = fuse(views, voxel, settings.truncation, settings.max_blocks, get_threads())
-    least = settings.least_weight if len(views) >= 4 else 0.5
+    volume = fuse(views, voxel, TRUNCATION, settings.max_blocks, get_threads())
+    least = LEAST_WEIGHT if len(views) >= 4 else 0.5
     vertices, faces = without_floaters(*extract_surface(volume, least), settings.least_piece)
     painted = progress.track(_painted(gaussian_map, views), "painting", len(views))
     colors, labels = paint(vertices, painted, tuple(outcome.label_of_channel.tolist()), 2 * volume.truncation)

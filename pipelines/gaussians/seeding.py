@@ -1,4 +1,4 @@
-"""New Gaussians from the pixels of a view: at the proxy depth or, where that is weak, at the region's depth (17)."""
+"""New Gaussians from the pixels of a view, at its depth."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipelines.gaussian_map import GaussianMap
-from pipelines.types import VOID, Intrinsics
+from pipelines.types import Intrinsics
 
 SEED_OPACITY = 0.73
 SEED_RADIUS = 0.7
@@ -21,8 +21,6 @@ SEED_LOGIT = 3.0
 """Logit of a seed's own class against 0 for the others."""
 LEAST_DETAIL = 8.0
 """Colours that differ by less, of 255, are no detail however little else there is."""
-_MIN_REGION = 64
-_REGION_SAMPLES = 4000
 
 
 @dataclass(frozen=True)
@@ -33,70 +31,16 @@ class SeedDepth:
     trust: NDArray[np.float32]
 
 
-def complete_depth(
-    depth: NDArray[np.float32],
-    reliability: NDArray[np.float32],
-    channels: NDArray[np.uint8],
-    low: float,
-    prior: bool,
-) -> SeedDepth:
-    """A depth for every pixel: reliable proxy, else proxy and region prior weighed, else filled from around.
+def complete_depth(inverse: NDArray[np.float32], trust: NDArray[np.float32]) -> SeedDepth:
+    """A depth for every pixel of (H, W) inverse depths, 0 = unknown: where it is unknown, filled from around.
 
-    depth, reliability U (H, W), channels (H, W). Pixels with U above `low` keep their depth (MSGS-SLAM eq. 17 gives the
-    others the prior of their class and connected region). What only the fill knows has trust 0.
+    trust (H, W) is 0 where the depth is unknown, and stays so.
     """
-    known = depth > 0
-    inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=known)
-    trust = np.where(known, reliability, 0).astype(np.float32)
-    if prior:
-        inverse, trust = _apply_region_priors(inverse, trust, channels, low)
-    if not (inverse > 0).any():
-        return SeedDepth(np.zeros_like(depth), np.zeros_like(depth))
-    filled = np.where(inverse > 0, inverse, fill_smoothly(inverse, trust))
+    known = inverse > 0
+    if not known.any():
+        return SeedDepth(np.zeros_like(inverse), np.zeros_like(inverse))
+    filled = np.where(known, inverse, fill_smoothly(inverse, trust))
     return SeedDepth((1.0 / np.maximum(filled, 1e-9)).astype(np.float32), trust)
-
-
-def _apply_region_priors(
-    inverse: NDArray[np.float32], trust: NDArray[np.float32], channels: NDArray[np.uint8], low: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Eq. (17) with μ_k a plane in inverse depth over the region, so that slanted walls keep their slant."""
-    out, out_trust = inverse.copy(), trust.copy()
-    for channel in np.unique(channels[channels != VOID]):
-        count, regions = cv2.connectedComponents((channels == channel).astype(np.uint8), connectivity=4)
-        for region in range(1, count):
-            rows, columns = np.nonzero(regions == region)
-            weak = trust[rows, columns] <= low
-            reliable = ~weak & (inverse[rows, columns] > 0)
-            if not weak.any() or reliable.sum() < _MIN_REGION:
-                continue
-            mean, spread = _fit_plane(columns, rows, inverse[rows, columns], reliable)
-            rows, columns, mean = rows[weak], columns[weak], mean[weak]
-            seen, weight = inverse[rows, columns], trust[rows, columns]
-            # The proxy's own precision at reliability U is taken as U² / 5 %²; the prior's is its residual spread.
-            proxy_precision = np.where(seen > 0, (weight / (0.05 * np.maximum(seen, 1e-9))) ** 2, 0)
-            prior_precision = 1 / max(spread, 1e-9) ** 2
-            fused = (proxy_precision * seen + prior_precision * mean) / (proxy_precision + prior_precision)
-            good = (mean > 0) & (spread < 0.1 * mean)
-            out[rows[good], columns[good]] = fused[good]
-            out_trust[rows[good], columns[good]] = np.maximum(weight[good], low / 2)
-    return out, out_trust
-
-
-def _fit_plane(
-    columns: NDArray, rows: NDArray, values: NDArray[np.float32], use: NDArray[np.bool_]
-) -> tuple[NDArray[np.float32], float]:
-    """Robust plane a x + b y + c through the used values, at all places, and the spread of its residuals."""
-    picked = np.flatnonzero(use)
-    picked = picked[:: max(len(picked) // _REGION_SAMPLES, 1)]
-    design = np.stack([columns, rows, np.ones(len(rows))], 1) / [1000, 1000, 1]
-    target, weights = values[picked].astype(np.float64), np.ones(len(picked))
-    for _ in range(5):
-        a = design[picked] * weights[:, None]
-        plane = np.linalg.lstsq(a, target * weights, rcond=None)[0]
-        residual = np.abs(design[picked] @ plane - target)
-        spread = 1.4826 * float(np.median(residual))
-        weights = np.sqrt(1 / np.maximum(residual / max(spread, 1e-9), 1))
-    return (design @ plane).astype(np.float32), spread
 
 
 def fill_smoothly(values: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -14,6 +14,15 @@ from pipelines.types import SparseModel
 
 Array = NDArray[np.float64]
 
+SHARED_POINTS = 15
+"""Keyframes with this many points in common need no loop."""
+RICH = 0.9
+"""Keyframes of a richness above this propose loops by semantics, eq. (21)."""
+SIMILAR = 0.6
+"""T_loop of eq. (23) on the similarity of eq. (24)."""
+WEIGHTS = (0.4, 0.3, 0.3)
+"""α₁ to α₃ of eq. (24): mean IoU, appearance, structure."""
+
 
 def shared_points(model: SparseModel) -> NDArray[np.int64]:
     """(N, N): how many points two keyframes both see."""
@@ -39,7 +48,7 @@ def loop_candidates(
     n = len(model.frame_ids)
     index = np.arange(n)
     apart = np.abs(index[:, None] - index[None]) >= settings.loop_gap
-    unrelated = apart & (shared_points(model) < settings.loop_shared_points)
+    unrelated = apart & (shared_points(model) < SHARED_POINTS)
     looks = np.where(unrelated, appearance @ appearance.T, -np.inf)
     scored: dict[tuple[int, int], float] = {}
     for i in range(n):
@@ -54,12 +63,11 @@ def loop_candidates(
 def _semantic_candidates(
     unrelated: NDArray[np.bool_], looks: NDArray, summaries: Sequence[LabelSummary], settings: GlobalBaConfig
 ) -> dict[tuple[int, int], float]:
-    weights = (settings.miou_weight, settings.appearance_weight, settings.structure_weight)
     out: dict[tuple[int, int], float] = {}
-    for i in np.flatnonzero(richness(summaries) > settings.richness).tolist():
+    for i in np.flatnonzero(richness(summaries) > RICH).tolist():
         others = np.flatnonzero(unrelated[i]).tolist()
-        scores = [similarity(summaries[i], summaries[j], float(looks[i, j]), weights) for j in others]
+        scores = [similarity(summaries[i], summaries[j], float(looks[i, j]), WEIGHTS) for j in others]
         for k in np.argsort(-np.array(scores), kind="stable")[: settings.loop_candidates]:
-            if scores[k] > settings.loop_similarity:
+            if scores[k] > SIMILAR:
                 out[(min(i, others[k]), max(i, others[k]))] = float(scores[k])
     return out

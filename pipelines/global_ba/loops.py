@@ -12,11 +12,16 @@ from numpy.typing import NDArray
 from formats.tensors import load_arrays, save_arrays
 from pipelines.config import GlobalBaConfig
 from pipelines.geometry import se3
-from pipelines.global_ba.verify import KeyframeView, Loop, verify_loop
+from pipelines.global_ba.verify import ROTATION, TRANSLATION, KeyframeView, Loop, verify_loop
 from pipelines.tracking.state import Sightings
 from pipelines.types import Intrinsics, LoopEdge
 
 Array = NDArray[np.float64]
+
+SURE_INLIERS = 80
+"""With so many a loop needs no support by its neighbours."""
+DRIFT, ANGLE_DRIFT, SCALE_DRIFT = 0.05, 10.0, 1.5
+"""A loop is false that claims more drift than this share of the path, more degrees, or a larger factor of scale."""
 
 
 @dataclass(frozen=True)
@@ -51,15 +56,14 @@ def find_loops(
         loop = verify_loop(views[first], views[second], intrinsics, settings, seed)
         if loop is None:
             unverified += 1
-        elif not is_plausible(loop, views[first], views[second], float(path[second] - path[first]), settings):
+        elif not is_plausible(loop, views[first], views[second], float(path[second] - path[first])):
             implausible += 1
         else:
             verified[(first, second)] = loop
     supported = {
         pair: loop
         for pair, loop in verified.items()
-        if loop.edge.inliers >= settings.loop_sure_inliers
-        or _has_support(pair, loop, verified, views, intrinsics, settings, seed)
+        if loop.edge.inliers >= SURE_INLIERS or _has_support(pair, loop, verified, views, intrinsics, settings, seed)
     }
     return FoundLoops(list(supported.values()), tried, unverified, implausible, len(verified) - len(supported))
 
@@ -76,15 +80,15 @@ def claimed_drift(loop: Loop, first: KeyframeView, second: KeyframeView) -> tupl
     return float(np.linalg.norm(centre_now - centre_then)), float(se3.rotation_angle(apart))
 
 
-def is_plausible(loop: Loop, first: KeyframeView, second: KeyframeView, path: float, settings: GlobalBaConfig) -> bool:
+def is_plausible(loop: Loop, first: KeyframeView, second: KeyframeView, path: float) -> bool:
     """Whether a path of that length can have drifted as far as the loop claims."""
     distance, angle = claimed_drift(loop, first, second)
     depth = float(np.nanmedian(first.in_cam[:, 2]))
     scale_drift = abs(np.log(loop.edge.scale))
     return (
-        distance <= settings.loop_drift * path + settings.loop_translation * depth
-        and angle <= np.radians(settings.loop_angle_drift)
-        and scale_drift <= np.log(settings.loop_scale_drift)
+        distance <= DRIFT * path + TRANSLATION * depth
+        and angle <= np.radians(ANGLE_DRIFT)
+        and scale_drift <= np.log(SCALE_DRIFT)
     )
 
 
@@ -104,15 +108,14 @@ def _has_support(
     fresh = [(first + 1, second), (first, second - 1), (first - 1, second), (first, second + 1)]
     for other in known + [p for p in fresh if p not in verified and 0 <= p[0] < p[1] < len(views)]:
         candidate = verified.get(other) or verify_loop(views[other[0]], views[other[1]], intrinsics, settings, seed)
-        if candidate is not None and _agree(loop, pair, candidate, other, views, settings):
+        if candidate is not None and _agree(loop, pair, candidate, other, views):
             return True
     return False
 
 
 def _agree(
-    loop: Loop, pair: tuple[int, int], other: Loop, other_pair: tuple[int, int], views: Sequence[KeyframeView],
-    settings: GlobalBaConfig,
-) -> bool:  # fmt: skip
+    loop: Loop, pair: tuple[int, int], other: Loop, other_pair: tuple[int, int], views: Sequence[KeyframeView]
+) -> bool:
     """Carry the other loop over to this pair along the present poses of the neighbours: the same motion?"""
 
     def relative(target: int, source: int) -> Array:
@@ -123,8 +126,7 @@ def _agree(
     depth = float(np.nanmedian(views[pair[1]].in_cam[:, 2]))
     # Two measurements and the steps between neighbours: three times one measurement's tolerance.
     return bool(
-        se3.rotation_angle(apart) < 3 * np.radians(settings.loop_rotation)
-        and np.linalg.norm(apart[:3, 3]) < 3 * settings.loop_translation * depth
+        se3.rotation_angle(apart) < 3 * np.radians(ROTATION) and np.linalg.norm(apart[:3, 3]) < 3 * TRANSLATION * depth
     )
 
 

@@ -37,10 +37,17 @@ from pipelines.tracking.depth_scales import sample_proxy
 from pipelines.tracking.features import extract_features
 from pipelines.tracking.klt import to_grey
 from pipelines.tracking.result import to_sparse_model
-from pipelines.tracking.state import TrackState
+from pipelines.tracking.state import FEATURE_SD, TrackState
 from pipelines.types import VOID, Intrinsics, ProxyMaps, SparseModel, Trajectory
 
 Array = NDArray[np.float64]
+
+WORDS = 32
+"""Of the vocabulary for appearance."""
+DRIFT_PX = 6.0
+"""A loop that is off by more pixels starts a pose graph."""
+JOINT_PX = 0.5
+"""What counts as moved."""
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -74,7 +81,7 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
     views = load_keyframe_views(context, model)
     learned = run.load_descriptors()
     appearance = join_appearances(
-        describe_keyframes([v.features.descriptors for v in views], settings.words, seed),
+        describe_keyframes([v.features.descriptors for v in views], WORDS, seed),
         [learned.get(i) for i in model.frame_ids.tolist()],
     )
     pairs = loop_candidates(model, appearance, load_summaries(run, model), settings)
@@ -116,7 +123,7 @@ def adjust(context: StageContext, model: SparseModel, found: FoundLoops) -> Clos
         return None
     run, config = context.run, context.config
     intrinsics = run.load_calibration().intrinsics
-    state = TrackState.from_backbone(model, config.tracking.feature_sd)
+    state = TrackState.from_backbone(model, FEATURE_SD)
     drift = max(loop_drift_px(loop, state, intrinsics) for loop in found.loops)
 
     def load_proxy(frame_id: int) -> ProxyMaps | None:
@@ -125,7 +132,7 @@ def adjust(context: StageContext, model: SparseModel, found: FoundLoops) -> Clos
     report = run.load_proxy_report()
     metric = bool(report.get("metric", False))
     tracking = without_dependent_depth(config.tracking, report)
-    drifted = drift > config.global_ba.drift_px
+    drifted = drift > DRIFT_PX
     closed = close_loops(state, found.loops, drifted, intrinsics, load_proxy, metric, tracking, config.global_ba)
     if closed.error_after > 1.5 * closed.error_before + 0.05:
         context.warn(
@@ -194,11 +201,11 @@ def largest_motion(context: StageContext, state: TrackState, model: SparseModel)
 def refine(context: StageContext, gaussian_map: GaussianMap, trajectory: Trajectory, moved_px: float) -> Refined | None:
     """Map and poses together where the adjustment has moved them, or always, or never, as the settings say."""
     settings = context.config.global_ba
-    if settings.joint == "never" or (settings.joint == "moved" and moved_px < settings.joint_px):
+    if settings.joint == "never" or (settings.joint == "moved" and moved_px < JOINT_PX):
         return None
     mapping, device = context.config.mapping, context.config.run.device
-    given = load_views(context.run, trajectory, mapping, "cpu" if device == "auto" else device)
-    views = agree_on_depth(given.views, given.anchors) if mapping.depth_fields else given.views
+    given = load_views(context.run, trajectory, mapping, context.config.article, "cpu" if device == "auto" else device)
+    views = agree_on_depth(given.views, given.anchors)
     exposure = context.run.load_exposure()
     gains = {int(i): g for i, g in zip(exposure["frame_ids"], exposure["log_gains"], strict=True)}
     offsets = {int(i): o for i, o in zip(exposure["frame_ids"], exposure["offsets"], strict=True)}

@@ -19,6 +19,13 @@ from pipelines.types import Intrinsics, LoopEdge
 
 Array = NDArray[np.float64]
 
+ERROR = 4.0
+"""Pixels within which a feature agrees with a loop."""
+SHARE = 0.3
+"""Least share of agreeing features."""
+ROTATION, TRANSLATION = 2.0, 0.05
+"""By how much a loop's two directions may differ: degrees, and distance in units of the median depth."""
+
 
 @dataclass(frozen=True)
 class KeyframeView:
@@ -75,9 +82,9 @@ def verify_loop(
     # Backwards the translation comes in the second keyframe's scale.
     back = se3.inverse(backward.cam_from_world)
     disagreement = se3.inverse(back) @ _scaled(forward.cam_from_world, scale)
-    if not (0.5 < scale < 2.0 and se3.rotation_angle(disagreement) < np.radians(settings.loop_rotation)):
+    if not (0.5 < scale < 2.0 and se3.rotation_angle(disagreement) < np.radians(ROTATION)):
         return None
-    if np.linalg.norm(disagreement[:3, 3]) > settings.loop_translation * depth:
+    if np.linalg.norm(disagreement[:3, 3]) > TRANSLATION * depth:
         return None
     inliers = int(min(forward.inliers.sum(), backward.inliers.sum()))
     edge = LoopEdge(first.frame_id, second.frame_id, forward.cam_from_world, scale, inliers)
@@ -109,8 +116,8 @@ def _locate(
     if known.sum() < settings.loop_inliers:
         return None
     xy = target.features.xy[target_index]
-    solved = solve_pose(xy[known], source.in_cam[source_index[known]], intrinsics, seed, None, settings.loop_error, 1.0)
-    if solved is None or solved.inliers.sum() < max(settings.loop_inliers, settings.loop_share * known.sum()):
+    solved = solve_pose(xy[known], source.in_cam[source_index[known]], intrinsics, seed, None, ERROR, 1.0)
+    if solved is None or solved.inliers.sum() < max(settings.loop_inliers, SHARE * known.sum()):
         return None
     inliers = np.zeros(len(xy), bool)
     inliers[known] = solved.inliers

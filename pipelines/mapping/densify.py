@@ -1,4 +1,4 @@
-"""Where the map needs Gaussians (the three conditions of MSGS-SLAM 3.4) and which are useless."""
+"""Where the map needs Gaussians (two of the three conditions of MSGS-SLAM 3.4) and which are useless."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from pipelines.gaussian_map import GaussianMap
-from pipelines.types import VOID
 
 
 def holes(silhouette: Tensor, least: float) -> Tensor:
@@ -21,13 +20,6 @@ def hidden_surfaces(rendered: Tensor, proxy: Tensor, trust: Tensor, tolerance: f
     """
     allowed = tolerance * proxy / trust.clamp(min=0.1)
     return (proxy > 0) & (rendered - proxy > allowed)
-
-
-def wrong_classes(logits: Tensor, channels: Tensor, weight: Tensor) -> Tensor:
-    """(H, W) bool: condition (c), the map shows another class than a confident label."""
-    if logits.shape[-1] == 0:
-        return torch.zeros_like(channels, dtype=torch.bool)
-    return (channels != VOID) & (weight > 0.5) & (logits.argmax(-1) != channels)
 
 
 def useless(gaussian_map: GaussianMap, least_opacity: float, largest_radius: float) -> Tensor:

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pipelines.config import MappingConfig
+from pipelines.config import ArticleConfig, MappingConfig
 from pipelines.gaussians.render import Rendering
 from pipelines.gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
 from pipelines.mapping import densify
+from pipelines.mapping.article.class_growth import wrong_classes
+from pipelines.mapping.region_prior import with_region_prior
 from pipelines.mapping.schedule import Seeding
 from pipelines.mapping.splitting import CHILDREN, Blame, split
 from pipelines.mapping.state import OptimiserState
@@ -22,6 +24,17 @@ GROWN_OPACITY = 0.3
 """Of Gaussians added to a map that is already there: opaque ones would hide what has been learnt."""
 LOW_RELIABILITY = 0.35
 HIGH_RELIABILITY = 0.85
+FINE_SHARE, FLAT_SHARE = 0.25, 0.5
+"""Shares of a view: that of most detail gets a new Gaussian at every pixel, that of least detail twice as far apart."""
+HOLE = 0.55
+"""T_sil: less coverage than this is a hole."""
+DEPTH_TOLERANCE = 0.05
+"""T_depth, relative: a proxy nearer than the map by more adds Gaussians."""
+SPLIT_RADIUS = 1.0
+"""Pixels: smaller Gaussians are not split."""
+PRUNE_OPACITY, PRUNE_WEIGHT, PRUNE_RADIUS = 0.03, 0.03, 0.15
+"""Gaussians go that are more transparent than this, of less blending weight in every pixel of every keyframe (a fifth
+fewer at +0.06 dB), or larger than this in units of the scene's median depth."""
 _SOLID = 0.8
 """Silhouette above which the map knows the depth of a pixel."""
 
@@ -33,6 +46,7 @@ class Growth:
     views: Sequence[View]
     classes: int
     settings: MappingConfig
+    article: ArticleConfig
     state: OptimiserState
     unit: float
 
@@ -58,10 +72,10 @@ class Growth:
     @torch.no_grad()
     def grow(self, index: int, rendering: Rendering) -> None:
         """Add Gaussians by the conditions of the article."""
-        view, s = self.views[index], self.settings
+        view = self.views[index]
         needed = self._needed(view, rendering)
-        if s.densify_classes:
-            needed |= densify.wrong_classes(rendering.features[..., 3:], view.channels, view.label_weight)
+        if self.article.class_growth:
+            needed |= wrong_classes(rendering.features[..., 3:], view.channels, view.label_weight)
         spacing = self._spacing(view)
         depth, trust = self._grown_depth(view, rendering)
         self._append(index, needed & (spacing > 0), depth, trust, spacing, GROWN_OPACITY)
@@ -70,7 +84,7 @@ class Growth:
     def split(self, found: Blame) -> None:
         """Split the Gaussians that answer for the most error, where they are too large: as many as the map may hold."""
         parameters, s = self.state.parameters, self.settings
-        wrong = torch.where(found.footprint > s.split_radius, found.error, 0.0)
+        wrong = torch.where(found.footprint > SPLIT_RADIUS, found.error, 0.0)
         room = max(s.max_gaussians - len(parameters), 0) // (CHILDREN - 1)
         rows = torch.argsort(wrong, descending=True, stable=True)[: min(int((wrong > s.split_error).sum()), room)]
         if len(rows):
@@ -83,36 +97,33 @@ class Growth:
     @torch.no_grad()
     def prune(self, largest_weight: Callable[[], Tensor] | None = None) -> None:
         """Drop the Gaussians that are too transparent, too large or of too low `largest_weight` (M,)."""
-        parameters, s = self.state.parameters, self.settings
-        bad = densify.useless(parameters.to_map(), s.prune_opacity, s.prune_radius * self.unit)
-        if largest_weight is not None and s.prune_weight > 0:
-            bad |= largest_weight() < s.prune_weight
+        parameters = self.state.parameters
+        bad = densify.useless(parameters.to_map(), PRUNE_OPACITY, PRUNE_RADIUS * self.unit)
+        if largest_weight is not None:
+            bad |= largest_weight() < PRUNE_WEIGHT
         if bad.any():
             parameters.keep(~bad)
 
     def _spacing(self, view: View) -> Tensor:
         s = self.settings
         image, depth = view.image.cpu().numpy(), view.depth.cpu().numpy()
-        return torch.from_numpy(seed_spacing(image, depth, s.seed_stride, s.fine_share, s.flat_share)).to(
-            view.image.device
-        )
+        return torch.from_numpy(seed_spacing(image, depth, s.seed_stride, FINE_SHARE, FLAT_SHARE)).to(view.image.device)
 
     def _holes(self, rendering: Rendering) -> Tensor:
         """Condition (a)."""
-        return densify.holes(rendering.silhouette, self.settings.silhouette_threshold)
+        return densify.holes(rendering.silhouette, HOLE)
 
     def _needed(self, view: View, rendering: Rendering) -> Tensor:
         """Conditions (a) and (b)."""
         needed = self._holes(rendering)
         if self.settings.use_proxy_depth:
-            tolerance = self.settings.depth_tolerance
-            needed = needed | densify.hidden_surfaces(rendering.depth, view.depth, view.trust, tolerance)
+            needed = needed | densify.hidden_surfaces(rendering.depth, view.depth, view.trust, DEPTH_TOLERANCE)
         return needed
 
     def _grown_depth(self, view: View, rendering: Rendering) -> tuple[Tensor, Tensor]:
         """(H, W) depth and trust: the proxy where it is reliable, else the map's own; 0 where neither knows."""
         # A trusted proxy is sharp at depth edges, where the map's blended depth lies between the surfaces.
-        nearer = densify.hidden_surfaces(rendering.depth, view.depth, view.trust, self.settings.depth_tolerance)
+        nearer = densify.hidden_surfaces(rendering.depth, view.depth, view.trust, DEPTH_TOLERANCE)
         use_map = (rendering.silhouette > _SOLID) & ~nearer & (view.trust < HIGH_RELIABILITY)
         proxy = torch.where(view.trust > LOW_RELIABILITY, view.depth, 0.0)
         return torch.where(use_map, rendering.depth, proxy), torch.where(use_map, LOW_RELIABILITY, view.trust)
@@ -128,8 +139,8 @@ class Growth:
         return self._complete(view, torch.where(known, rendering.depth, view.depth), trust)
 
     def _complete(self, view: View, depth: Tensor, trust: Tensor) -> SeedDepth:
-        channels, prior = view.channels.cpu().numpy(), self.settings.region_prior
-        return complete_depth(depth.cpu().numpy(), trust.cpu().numpy(), channels, LOW_RELIABILITY, prior)
+        arrays = depth.cpu().numpy(), trust.cpu().numpy(), view.channels.cpu().numpy()
+        return complete_depth(*with_region_prior(*arrays, LOW_RELIABILITY))
 
     def _append(
         self, index: int, pixels: Tensor, depth: Tensor, trust: Tensor, spacing: float | Tensor, opacity: float

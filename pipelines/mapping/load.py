@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipelines.config import MappingConfig
+from pipelines.config import ArticleConfig, MappingConfig
+from pipelines.mapping.article.mirrors import Mirrors
 from pipelines.mapping.depth_fields import Anchors
-from pipelines.mapping.mirrors import Mirrors
 from pipelines.mapping.views import View, make_view, occurring_classes, working_size
 from pipelines.run_folder import RunFolder, read_json
 from pipelines.types import Frame, Intrinsics, ProxyMaps, Trajectory
@@ -29,13 +29,17 @@ class MappingInput:
 
 
 def load_views(
-    run: RunFolder, trajectory: Trajectory, settings: MappingConfig, device: torch.device | str = "cpu"
+    run: RunFolder,
+    trajectory: Trajectory,
+    settings: MappingConfig,
+    article: ArticleConfig | None = None,
+    device: torch.device | str = "cpu",
 ) -> MappingInput:
     """The keyframes of `trajectory` with images and proxies, in order; proxies scaled to the world of tracking."""
     frames = {f.id: f for f in run.load_frames()}
     full = run.load_calibration().intrinsics
     intrinsics = working_size(full, settings.max_side)
-    scales, symmetry = DepthScales.load(run), run.load_symmetry()
+    scales, symmetry = DepthScales.load(run), run.load_symmetry() if article and article.symmetry_weight > 0 else {}
     kept, measured = split_frames(trajectory, settings.hold_out)
     maps = {i: run.load_proxy(i) for i in kept + measured if run.has_proxy(i)}
     class_ids = occurring_classes([maps[i].labels for i in kept if i in maps])

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pipelines.config import MappingConfig
+from pipelines.config import ArticleConfig, MappingConfig
 from pipelines.gaussian_map import GaussianMap
 from pipelines.gaussians.adam import AdamTable, gradients_of
 from pipelines.gaussians.render import Rendering, blending_weights, render
@@ -21,6 +21,13 @@ from pipelines.mapping.splitting import Blame, blame
 from pipelines.mapping.state import Exposures, OptimisedMap, OptimiserState, expose
 from pipelines.mapping.views import View, halved
 from pipelines.progress import Progress, SilentProgress
+
+MAP_RATES = {"means": 3e-4, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2, "class_logits": 6e-2}
+"""Learning rates of Adam, of positions in units of the scene's median depth."""
+POSE_RATE, EXPOSURE_RATE = 1e-4, 1e-2
+"""Of rotations (radians) and translations (times the median depth); of gains and offsets."""
+LOW_TRUST_STEP = 4.0
+"""Steps of Gaussians of unreliable depth are so many times as large, of medium ones by its root."""
 
 
 def optimise_map(
@@ -34,6 +41,7 @@ def optimise_map(
     snapshot: Path | None = None,
     label: str = "mapping",
     exposure: Exposures | None = None,
+    article: ArticleConfig | None = None,
 ) -> OptimisedMap:
     """The map that explains the views (MSGS-SLAM eqs. 17-20), with their poses and exposures refined together.
 
@@ -43,7 +51,7 @@ def optimise_map(
     """
     state = OptimiserState.load(snapshot, views) or OptimiserState.fresh(views, classes, initial, exposure)
     schedule = Schedule.plan(views, settings, seed, seeding=initial is None, passes=passes)
-    optimiser = MapOptimiser(views, classes, settings, state)
+    optimiser = MapOptimiser(views, classes, settings, article or ArticleConfig(), state)
     remaining = range(state.iteration, schedule.total)
     for iteration in (progress or SilentProgress()).track(remaining, label, len(remaining)):
         optimiser.visit(schedule.step(iteration))
@@ -57,12 +65,19 @@ def optimise_map(
 class MapOptimiser:
     """One visit at a time: draw a view, compare, step; and now and then grow and prune."""
 
-    def __init__(self, views: Sequence[View], classes: int, settings: MappingConfig, state: OptimiserState) -> None:
-        self.views, self.settings, self.state = views, settings, state
+    def __init__(
+        self,
+        views: Sequence[View],
+        classes: int,
+        settings: MappingConfig,
+        article: ArticleConfig,
+        state: OptimiserState,
+    ) -> None:
+        self.views, self.settings, self.article, self.state = views, settings, article, state
         self.halves = [halved(v) for v in views]
         self.unit = scene_depth(views)
-        self.objective = Objective(settings, classes, self.unit)
-        self.growth = Growth(views, classes, settings, state, self.unit)
+        self.objective = Objective(settings, article, classes, self.unit)
+        self.growth = Growth(views, classes, settings, article, state, self.unit)
 
     def visit(self, step: Step) -> None:
         """Do what the schedule says: seed, compare, grow, prune."""
@@ -117,7 +132,7 @@ class MapOptimiser:
 
     def draw(self, view: View, table: AdamTable, with_classes: bool = True) -> Rendering:
         """The map as the view's camera sees it now."""
-        parameters, settings = self.state.parameters, self.settings
+        parameters, kappa = self.state.parameters, self.article.kappa
         return render(
             parameters["means"],
             torch.exp(parameters["log_radii"]),
@@ -125,42 +140,32 @@ class MapOptimiser:
             parameters.features(with_classes),
             view.cam_from_world,
             view.intrinsics,
-            proxy_depth=view.depth if settings.kappa > 0 else None,
-            kappa=settings.kappa / self.unit**2,
-            twist=table.values["twist"] if settings.refine_poses else None,
+            proxy_depth=view.depth if kappa > 0 else None,
+            kappa=kappa / self.unit**2,
+            twist=table.values["twist"] if self.settings.refine_poses else None,
         )
 
-    def _shares(self) -> Tensor | None:
+    def _shares(self) -> Tensor:
         """(M,) step sizes by confidence class (MSGS-SLAM 3.4).
 
         The article has small steps where depth is unreliable. Measured, the contrary helps: what stands in the wrong
         place has farther to go, and colours have to lead it there.
         """
-        low = self.settings.low_trust_step
-        if low == 1:
-            return None
         trust = self.state.parameters.trust
-        shares = torch.where(trust > LOW_RELIABILITY, math.sqrt(low), low)
+        shares = torch.where(trust > LOW_RELIABILITY, math.sqrt(LOW_TRUST_STEP), LOW_TRUST_STEP)
         return torch.where(trust > HIGH_RELIABILITY, 1.0, shares)
 
     def _map_rates(self, factor: float) -> dict[str, float]:
-        s = self.settings
-        rates = {
-            "means": s.mean_rate * self.unit,
-            "log_radii": s.radius_rate,
-            "opacity_logits": s.opacity_rate,
-            "colors": s.color_rate,
-            "class_logits": s.class_rate,
-        }
+        rates = {**MAP_RATES, "means": MAP_RATES["means"] * self.unit}
         return {k: v * factor for k, v in rates.items()}
 
     def _view_rates(self, step: Step) -> dict[str, float]:
         s = self.settings
         poses = s.refine_poses and step.refine_pose
         return {
-            "twist": s.pose_rate * step.rate if poses else 0.0,
-            "log_gain": s.exposure_rate * step.rate if s.exposure else 0.0,
-            "offset": s.exposure_rate * step.rate if s.exposure else 0.0,
+            "twist": POSE_RATE * step.rate if poses else 0.0,
+            "log_gain": EXPOSURE_RATE * step.rate if s.exposure else 0.0,
+            "offset": EXPOSURE_RATE * step.rate if s.exposure else 0.0,
         }
 
 

@@ -13,6 +13,19 @@ from pipelines.config import MappingConfig
 from pipelines.mapping.covisibility import keyframe_weights, overlaps
 from pipelines.mapping.views import View
 
+WINDOW_STEPS = 2
+"""Coarse steps after each keyframe while the map is seeded: on it, covisible and random past keyframes."""
+COARSE_SHARE = 0.25
+"""Share of the visits at half the size, before the others."""
+DENSIFY_EVERY, DENSIFY_UNTIL = 2, 0.45
+"""Passes between two rounds of densification and pruning, and the share of the visits after which there are none."""
+RATE_DECAY = 0.03
+"""Learning rates at the end, as a share of those at the start."""
+TIME_DECAY = 0.1
+"""τ of eq. (13), a keyframe, while the map is seeded."""
+RELIABILITY_DECAY = 1.0
+"""δ of eq. (14): keyframes of unreliable depth weigh less."""
+
 
 class Seeding(Enum):
     """What a step seeds before it draws: nothing, the pixels of trusted depth, or whatever is still a hole."""
@@ -45,7 +58,6 @@ class Schedule:
     Seeding goes along the views twice: what is trusted first, for a guess that one view has to make another may know.
     """
 
-    settings: MappingConfig
     seed: int
     views: int
     seeding: int
@@ -61,9 +73,9 @@ class Schedule:
         visits = round(passes * len(views)) if passes is not None else round(settings.passes * len(views))
         if passes is None:
             visits = max(visits, settings.min_iterations)
-        steps = (max(settings.window_steps, 1) + 1) * len(views) if seeding else 0
+        steps = (WINDOW_STEPS + 1) * len(views) if seeding else 0
         reliability = np.array([float(v.trust.mean()) for v in views])
-        return Schedule(settings, seed, len(views), steps, visits, overlaps(views), reliability)
+        return Schedule(seed, len(views), steps, visits, overlaps(views), reliability)
 
     @property
     def total(self) -> int:
@@ -76,7 +88,7 @@ class Schedule:
 
     def _seeding_step(self, iteration: int) -> Step:
         """The new keyframe first, then in turn one that sees the same and one of all past ones."""
-        per_view = max(self.settings.window_steps, 1)
+        per_view = WINDOW_STEPS
         if iteration >= per_view * self.views:
             return self._filling_step(iteration, iteration - per_view * self.views)
         now, nth = divmod(iteration, per_view)
@@ -84,12 +96,12 @@ class Schedule:
         view = now
         if nth > 0 and now > 0:
             view = self._covisible(now, rng) if nth % 2 else int(rng.integers(now))
-        weights = keyframe_weights(now, self.reliability, self.settings.time_decay, self.settings.reliability_decay)
+        weights = keyframe_weights(now, self.reliability, TIME_DECAY, RELIABILITY_DECAY)
         seed = Seeding.TRUSTED if nth == 0 else Seeding.NOTHING
         return Step(iteration, view, float(weights[view]), 1.0, True, seed, False, False, False, False)
 
     def _filling_step(self, iteration: int, view: int) -> Step:
-        weights = keyframe_weights(0, self.reliability, 0.0, self.settings.reliability_decay)
+        weights = keyframe_weights(0, self.reliability, 0.0, RELIABILITY_DECAY)
         return Step(iteration, view, float(weights[view]), 1.0, True, Seeding.REST, False, False, False, False)
 
     def _covisible(self, now: int, rng: np.random.Generator) -> int:
@@ -103,12 +115,12 @@ class Schedule:
     def _kind_of_pass(self, number: int) -> tuple[bool, bool]:
         """Whether the pass is coarse, and whether the map grows in it: by whole passes, or half of the views would get
         Gaussians and the others none."""
-        s, passes = self.settings, self.visits / self.views
-        coarse_passes = round(s.coarse_share * passes) if self.seeding > 0 else 0
+        passes = self.visits / self.views
+        coarse_passes = round(COARSE_SHARE * passes) if self.seeding > 0 else 0
         if number < coarse_passes:
             return True, False
-        turn = s.densify_every > 0 and (number - coarse_passes) % s.densify_every == 0
-        return False, turn and number < s.densify_until * passes
+        turn = (number - coarse_passes) % DENSIFY_EVERY == 0
+        return False, turn and number < DENSIFY_UNTIL * passes
 
     def _follows_new_ones(self, number: int) -> bool:
         """Whether the pass before this one added to the map: pruned any sooner, the new ones would go while they are
@@ -116,18 +128,17 @@ class Schedule:
         return self.seeding > 0 if number == 0 else self._kind_of_pass(number - 1)[1]
 
     def _visit(self, iteration: int) -> Step:
-        s = self.settings
         visit = iteration - self.seeding
         number, place = divmod(visit, self.views)
         view = int(np.random.default_rng([self.seed, 2, number]).permutation(self.views)[place])
         share = visit / max(self.visits, 1)
         coarse, grows = self._kind_of_pass(number)
-        weights = keyframe_weights(0, self.reliability, 0.0, s.reliability_decay)
+        weights = keyframe_weights(0, self.reliability, 0.0, RELIABILITY_DECAY)
         return Step(
             iteration=iteration,
             view=view,
             weight=float(weights[view] / weights.mean()),
-            rate=s.rate_decay**share,
+            rate=RATE_DECAY**share,
             coarse=coarse,
             seed=Seeding.NOTHING,
             grow=grows,

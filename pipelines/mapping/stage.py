@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from formats.errors import InputError
-from pipelines.config import MappingConfig
 from pipelines.mapping.consistency import without_contradicted_depth
 from pipelines.mapping.depth_fields import agree_on_depth
 from pipelines.mapping.load import MappingInput, load_views
@@ -24,13 +23,13 @@ def run(context: StageContext) -> dict[str, Any]:
     """Views, depth that agrees between them, the optimised map; poses and exposures refined with it."""
     settings, seed, device = context.config.mapping, context.config.run.seed, context.config.run.device
     trajectory = context.run.load_trajectory("tracking")
-    given = load_views(context.run, trajectory, settings, "cpu" if device == "auto" else device)
+    given = load_views(context.run, trajectory, settings, context.config.article, "cpu" if device == "auto" else device)
     _require_views(given, context)
 
-    views = prepare_depth(given, settings)
+    views = prepare_depth(given)
     result = optimise_map(
         views, len(given.class_ids), settings, seed,
-        progress=context.progress, snapshot=context.snapshot / "state.safetensors",
+        progress=context.progress, snapshot=context.snapshot / "state.safetensors", article=context.config.article,
     )  # fmt: skip
 
     keyframe_ids = np.array([v.frame_id for v in views])
@@ -43,10 +42,9 @@ def run(context: StageContext) -> dict[str, Any]:
     return figures
 
 
-def prepare_depth(given: MappingInput, settings: MappingConfig) -> list[View]:
-    """The views with proxy depths that agree with each other, as far as the settings ask for it."""
-    views = agree_on_depth(given.views, given.anchors) if settings.depth_fields else given.views
-    return without_contradicted_depth(views) if settings.depth_check else views
+def prepare_depth(given: MappingInput) -> list[View]:
+    """The views with proxy depths that agree with each other; those that others see through are taken out."""
+    return without_contradicted_depth(agree_on_depth(given.views, given.anchors))
 
 
 def _require_views(given: MappingInput, context: StageContext) -> None:

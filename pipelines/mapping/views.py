@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.mapping.mirrors import Mirrors
+from pipelines.mapping.article.mirrors import Mirrors
 from pipelines.run_folder import resize_maps
 from pipelines.types import VOID, Intrinsics, ProxyMaps
 

@@ -7,20 +7,22 @@ from numpy.typing import NDArray
 
 from pipelines.types import VOID, Intrinsics
 
+ALPHA, BETA, GAMMA = 0.7, 0.8, 0.5
+"""Eq. (2): how much depth edges lower the reliability; exponents of the depth's confidence and of the agreement."""
+SLOPE, MIDDLE = 10.0, 0.3
+"""Eq. (3): λ, steepness of the semantic agreement, and φ, the agreement (mean IoU) that counts one half."""
 EDGE_STEP = 0.1
 """Unit of the log-depth gradient: a change of depth by 10 % from one pixel to the next. A wall or floor seen at an
 angle stays far below it, an occlusion edge far above."""
 
 
-def reliability(
-    depth: NDArray[np.float32], confidence: NDArray[np.float32], theta: float, alpha: float, beta: float, gamma: float
-) -> NDArray[np.float32]:
+def reliability(depth: NDArray[np.float32], confidence: NDArray[np.float32], theta: float) -> NDArray[np.float32]:
     """MSGS-SLAM eq. (2): `U = exp(-α‖∇ log D‖²) · Conf^β · θ^γ`, (h, w) in [0, 1]; 0 where the depth is unknown.
 
     The gradient is that of the logarithm, so that U does not depend on the unit of depth, in units of EDGE_STEP.
     """
-    edges = np.exp(-alpha * squared_log_gradient(depth) / EDGE_STEP**2)
-    u = edges * np.power(np.clip(confidence, 0, 1), beta) * theta**gamma
+    edges = np.exp(-ALPHA * squared_log_gradient(depth) / EDGE_STEP**2)
+    u = edges * np.power(np.clip(confidence, 0, 1), BETA) * theta**GAMMA
     return np.where(depth > 0, u, 0).astype(np.float32)
 
 
@@ -53,9 +55,9 @@ def semantic_agreement(labels: NDArray[np.uint8], warped: NDArray[np.uint8]) -> 
     return float((np.diag(joint)[present] / union[present]).mean())
 
 
-def theta(agreement: float, slope: float, middle: float) -> float:
+def theta(agreement: float) -> float:
     """MSGS-SLAM eq. (3): `1 / (1 + exp(-λ(m_t - φ)))`."""
-    return float(1 / (1 + np.exp(-slope * (agreement - middle))))
+    return float(1 / (1 + np.exp(-SLOPE * (agreement - MIDDLE))))
 
 
 def warp_labels(

@@ -72,7 +72,9 @@ def run(context: StageContext) -> dict[str, Any]:
     agreements, descriptors = _maps_pass(context, sequence, frames, semantics, scale, metres)
     save_descriptors(context.folder, descriptors)
     save_frame_scales(context.folder, scale.of_frame, scale.spread_in)
-    mirrors = _symmetry_pass(context, sequence, frames, scale, metres) if context.config.proxy.symmetry else {}
+    mirrors = (
+        _symmetry_pass(context, sequence, frames, scale, metres) if context.config.article.symmetry_weight > 0 else {}
+    )
     report = {
         **_report(context, frames, depths, semantics, agreements),
         **scale_figures(depths, scale, reference),
@@ -176,7 +178,6 @@ def _maps_pass(
 
     `metres` turns the provider's depth into that of the maps.
     """
-    config = context.config.proxy
     agreements: list[float] = []
     descriptors = {}
     previous: Frame | None = None
@@ -190,8 +191,8 @@ def _maps_pass(
         if labels.descriptor is not None:
             descriptors[frame.id] = labels.descriptor
         if not path.exists():
-            trust = theta(m, config.theta_slope, config.theta_middle)
-            u = reliability(depth.depth, depth.confidence, trust, config.alpha, config.beta, config.gamma)
+            trust = theta(m)
+            u = reliability(depth.depth, depth.confidence, trust)
             scaled = (depth.depth * np.float32(metres)).astype(np.float32)
             save_proxy_maps(path, compact(ProxyMaps(scaled, u, labels.labels, labels.confidence)))
         previous = frame

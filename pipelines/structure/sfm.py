@@ -90,7 +90,7 @@ class StructureFromMotion:
         return list(self.progress.track(found, "features", len(keyframe_ids)))
 
     def _pairs(self, features: Sequence[Features]) -> list[VerifiedPair]:
-        options = MatchOptions(max_error=self.config.max_match_error)
+        options = MatchOptions()
         proposed = sorted({*sequential_pairs(len(features), self.config.overlap), *self._loops(features)})
         blocks = [proposed[i : i + _PAIRS_PER_BLOCK] for i in range(0, len(proposed), _PAIRS_PER_BLOCK)]
 

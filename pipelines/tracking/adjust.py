@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 LoadProxy = Callable[[int], ProxyMaps | None]
 OUTLIER_SD = 4.0
 ROUNDS = 3
+ITERATIONS = 20
+"""Of each round's bundle adjustment."""
 
 
 @dataclass
@@ -65,18 +67,18 @@ def adjust_state(
     """
     frame_ids = sorted(state.poses) if len(state.poses) <= settings.adjust_frames else list(state.keyframes)
     bundle = make_bundle(state, frame_ids)
-    ties = sample_depths(bundle, frame_ids, state, intrinsics, load_proxy, metric, settings)
+    ties = sample_depths(bundle, frame_ids, state, intrinsics, load_proxy, metric)
     initial = None
     for round_number in range(ROUNDS):
-        bundle = set_scale(bundle, ties, intrinsics, settings)
+        bundle = set_scale(bundle, ties, intrinsics)
         tied = with_depths(bundle, ties, intrinsics, settings)
-        result = adjust_bundle(tied, intrinsics, settings.adjust_iterations)
+        result = adjust_bundle(tied, intrinsics, ITERATIONS)
         initial = result.initial_cost if initial is None else initial
         bundle = result.bundle
         if round_number < ROUNDS - 1:
             keep = consistent(bundle, intrinsics)
             bundle, ties.depth, ties.reliability = bundle.select(keep), ties.depth[keep], ties.reliability[keep]
-    bundle = set_scale(bundle, ties, intrinsics, settings)
+    bundle = set_scale(bundle, ties, intrinsics)
     errors = bundle.reprojection_errors(intrinsics)
     seen = np.isfinite(errors)  # not so of points that the last round has left behind a camera
     write_back(state, bundle, frame_ids)
@@ -119,7 +121,6 @@ def sample_depths(
     intrinsics: Intrinsics,
     load_proxy: LoadProxy,
     metric: bool,
-    settings: TrackingConfig,
 ) -> DepthTies:
     """Proxy depths of the keyframes at the bundle's observations."""
     depth, reliability = np.zeros(len(bundle.obs_cam)), np.zeros(len(bundle.obs_cam))
@@ -131,24 +132,22 @@ def sample_depths(
         mine = np.flatnonzero(bundle.obs_cam == c)
         depth[mine], reliability[mine] = depth_scales.sample_proxy(maps, bundle.obs_xy[mine], intrinsics)
         has_depth[c] = bool((depth[mine] > 0).sum() >= 5)
-    fields = np.zeros((len(frame_ids), settings.grid_rows, settings.grid_columns))
+    fields = np.zeros((len(frame_ids), depth_scales.ROWS, depth_scales.COLUMNS))
     return DepthTies(depth, reliability, has_depth, fields, metric)
 
 
-def set_scale(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics, settings: TrackingConfig) -> Bundle:
+def set_scale(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics) -> Bundle:
     """Fit the fields; when the proxies are metric, scale the world so that they are right on average."""
     z = bundle.points_in_cam()[:, 2]
     usable = (ties.depth > 0) & (z > 0)
     log_ratio = np.where(usable, np.log(np.where(usable, z, 1) / np.where(usable, ties.depth, 1)), 0.0)
-    basis = depth_scales.bilinear_basis(bundle.obs_xy, intrinsics, settings.grid_rows, settings.grid_columns)
+    basis = depth_scales.bilinear_basis(bundle.obs_xy, intrinsics)
     middles = np.zeros(len(ties.fields))
     for c in np.flatnonzero(ties.has_depth):
         mine = np.flatnonzero(usable & (bundle.obs_cam == c))
         values, weights = log_ratio[mine], ties.reliability[mine]
         middles[c] = depth_scales.keyframe_scale(values, weights)
-        ties.fields[c] = depth_scales.fit_field(
-            basis[mine], values, weights, settings.depth_sd, settings.grid_rows, settings.grid_columns
-        )
+        ties.fields[c] = depth_scales.fit_field(basis[mine], values, weights)
     if not (ties.metric and ties.has_depth.any()):
         return bundle
     ties.world = depth_scales.world_scale(middles[ties.has_depth])
@@ -168,10 +167,10 @@ def with_depths(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics, setting
     """
     if not (settings.use_depth and ties.metric):
         return bundle
-    basis = depth_scales.bilinear_basis(bundle.obs_xy, intrinsics, settings.grid_rows, settings.grid_columns)
+    basis = depth_scales.bilinear_basis(bundle.obs_xy, intrinsics)
     log_scale = np.einsum("og,og->o", basis, ties.fields.reshape(len(ties.fields), -1)[bundle.obs_cam])
     trusted = (ties.depth > 0) & ties.has_depth[bundle.obs_cam]
-    sd = settings.depth_sd / np.sqrt(np.maximum(ties.reliability, depth_scales.MIN_RELIABILITY))
+    sd = depth_scales.DEPTH_SD / np.sqrt(np.maximum(ties.reliability, depth_scales.MIN_RELIABILITY))
     return replace(bundle, obs_depth=np.where(trusted, ties.depth * np.exp(log_scale), 0.0), obs_depth_sd=sd)
 
 

@@ -14,6 +14,10 @@ from pipelines.types import Intrinsics, ProxyMaps
 
 Array = NDArray[np.float64]
 
+ROWS, COLUMNS = 3, 4
+"""Nodes of a field."""
+DEPTH_SD = 0.05
+"""Relative standard deviation of a reliable proxy depth after its scale is known."""
 MIN_RELIABILITY = 0.1
 NODE_SD = 0.06
 """How far, relatively, a node of a field strays from its keyframe's scale."""
@@ -68,7 +72,7 @@ def world_scale(log_scales: Array) -> WorldScale:
     return WorldScale(float(np.exp(-mean)), float(used.std() / np.sqrt(max(independent, 1.0))), n)
 
 
-def bilinear_basis(xy: Array, intrinsics: Intrinsics, rows: int, columns: int) -> Array:
+def bilinear_basis(xy: Array, intrinsics: Intrinsics, rows: int = ROWS, columns: int = COLUMNS) -> Array:
     """(Q, rows * columns) weights of a grid's nodes, which span the picture corner to corner, at pixels (Q, 2)."""
     gx = np.clip(xy[:, 0] / intrinsics.width, 0, 1) * (columns - 1)
     gy = np.clip(xy[:, 1] / intrinsics.height, 0, 1) * (rows - 1)
@@ -77,19 +81,19 @@ def bilinear_basis(xy: Array, intrinsics: Intrinsics, rows: int, columns: int) -
     return (wy[:, :, None] * wx[:, None, :]).reshape(len(xy), rows * columns)
 
 
-def fit_field(basis: Array, log_ratio: Array, weights: Array, depth_sd: float, rows: int, columns: int) -> Array:
-    """(rows, columns) log scales of one keyframe: robust, smooth, near its median where there are few points.
+def fit_field(basis: Array, log_ratio: Array, weights: Array) -> Array:
+    """(ROWS, COLUMNS) log scales of one keyframe: robust, smooth, near its median where there are few points.
 
-    basis (Q, rows * columns), log_ratio (Q,) and weights (Q,) as for `keyframe_scale`.
+    basis (Q, ROWS * COLUMNS), log_ratio (Q,) and weights (Q,) as for `keyframe_scale`.
     """
     middle = keyframe_scale(log_ratio, weights)
-    prior = np.eye(rows * columns) / NODE_SD**2 + _steps(rows, columns) / STEP_SD**2
-    nodes: Array = np.zeros(rows * columns)
+    prior = np.eye(ROWS * COLUMNS) / NODE_SD**2 + _steps(ROWS, COLUMNS) / STEP_SD**2
+    nodes: Array = np.zeros(ROWS * COLUMNS)
     for _ in range(5):
-        residual = (log_ratio - middle - basis @ nodes) / depth_sd
-        weighted = basis * (weights / (1 + residual**2))[:, None] / depth_sd**2
+        residual = (log_ratio - middle - basis @ nodes) / DEPTH_SD
+        weighted = basis * (weights / (1 + residual**2))[:, None] / DEPTH_SD**2
         nodes = np.asarray(np.linalg.solve(prior + weighted.T @ basis, weighted.T @ (log_ratio - middle)))
-    return middle + nodes.reshape(rows, columns)
+    return middle + nodes.reshape(ROWS, COLUMNS)
 
 
 def _steps(rows: int, columns: int) -> Array:

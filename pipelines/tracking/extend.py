@@ -5,31 +5,31 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.config import TrackingConfig
 from pipelines.geometry import se3
 from pipelines.geometry.camera import project, unproject
 from pipelines.tracking.depth_scales import keyframe_scale, sample_proxy
-from pipelines.tracking.klt import corners, follow
+from pipelines.tracking.klt import FLOW_SD, corners, follow
 from pipelines.tracking.pictures import Pictures
+from pipelines.tracking.pnp import MIN_INLIERS, POSE_ERROR
 from pipelines.tracking.state import Sightings, TrackState
 from pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
 
+NEW_POINTS = 300
+"""Points that a new keyframe should have."""
 MIN_ANGLE = np.radians(1.5)
 """Rays that meet at a smaller angle say nothing of the depth."""
 
 
-def promote(
-    frame_id: int, state: TrackState, pictures: Pictures, intrinsics: Intrinsics, settings: TrackingConfig
-) -> int:
+def promote(frame_id: int, state: TrackState, pictures: Pictures, intrinsics: Intrinsics) -> int:
     """Make a posed frame a keyframe with new points; returns how many are new."""
     earlier = [k for k in state.nearest_keyframes(frame_id, 2) if state.segment[k] == state.segment[frame_id]]
     state.keyframes = sorted({*state.keyframes, frame_id})
     added = 0
     if earlier:
-        added += _triangulate(earlier[0], frame_id, state, pictures, intrinsics, settings)
-    return added + _from_proxy(frame_id, state, pictures, intrinsics, settings)
+        added += _triangulate(earlier[0], frame_id, state, pictures, intrinsics)
+    return added + _from_proxy(frame_id, state, pictures, intrinsics)
 
 
 def start_segment(
@@ -38,7 +38,6 @@ def start_segment(
     state: TrackState,
     pictures: Pictures,
     intrinsics: Intrinsics,
-    settings: TrackingConfig,
 ) -> bool:
     """A new beginning from one frame's proxy depth; False, and nothing changed, when it has too few points for that."""
     if pictures.proxy(frame_id) is None:
@@ -47,7 +46,7 @@ def start_segment(
     segment = max(state.segment.values(), default=-1) + 1
     nothing = Sightings(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
     state.add_frame(frame_id, cam_from_world, nothing, True, segment)
-    if _from_proxy(frame_id, state, pictures, intrinsics, settings) >= settings.min_inliers:
+    if _from_proxy(frame_id, state, pictures, intrinsics) >= MIN_INLIERS:
         return True
     for table in (state.poses, state.sightings, state.segment):
         del table[frame_id]
@@ -56,46 +55,40 @@ def start_segment(
     return False
 
 
-def _from_proxy(
-    frame_id: int, state: TrackState, pictures: Pictures, intrinsics: Intrinsics, settings: TrackingConfig
-) -> int:
+def _from_proxy(frame_id: int, state: TrackState, pictures: Pictures, intrinsics: Intrinsics) -> int:
     """Corners that are no points yet, at the proxy depth, scaled to agree with the points the frame sees."""
     maps = pictures.proxy(frame_id)
     if maps is None:
         return 0
     seen = state.sightings[frame_id]
-    xy = corners(pictures.grey(frame_id), seen.xy, max(settings.new_points - len(seen), 0))
+    xy = corners(pictures.grey(frame_id), seen.xy, max(NEW_POINTS - len(seen), 0))
     depth, _ = sample_proxy(maps, xy, intrinsics)
     known, trust = sample_proxy(maps, seen.xy, intrinsics)
     motion = state.poses[frame_id]
     z = state.points[seen.point] @ motion[2, :3] + motion[2, 3]
     both = (known > 0) & (z > 0)
-    enough = int(both.sum()) >= settings.min_inliers
+    enough = int(both.sum()) >= MIN_INLIERS
     scale = np.exp(keyframe_scale(np.log(z[both] / known[both]), trust[both])) if enough else 1.0
     good = depth > 0
     in_cam = unproject(xy[good], depth[good] * scale, intrinsics)
     points = se3.transform(se3.inverse(motion), in_cam)
-    _add(frame_id, None, points, xy[good], None, state, pictures, settings)
+    _add(frame_id, None, points, xy[good], None, state, pictures)
     return int(good.sum())
 
 
-def _triangulate(
-    first: int, second: int, state: TrackState, pictures: Pictures, intrinsics: Intrinsics, settings: TrackingConfig
-) -> int:
+def _triangulate(first: int, second: int, state: TrackState, pictures: Pictures, intrinsics: Intrinsics) -> int:
     """Corners of the first keyframe that are no points yet, followed into the second."""
     taken = state.sightings[first].xy
     grey = pictures.grey(first)
-    xy = corners(grey, taken, settings.new_points)
+    xy = corners(grey, taken, NEW_POINTS)
     motion = state.poses[second] @ se3.inverse(state.poses[first])
     depth = _nearby_depth(first, xy, state)
     guess, _ = project(se3.transform(motion, unproject(xy, depth, intrinsics)), intrinsics)
-    there, found = follow(
-        grey, pictures.grey(second), xy, guess, settings.flow_window, settings.flow_levels, settings.flow_error
-    )
+    there, found = follow(grey, pictures.grey(second), xy, guess)
     xy, there = xy[found], there[found]
-    in_first, good = triangulate(xy, there, motion, intrinsics, settings.pose_error)
+    in_first, good = triangulate(xy, there, motion, intrinsics, POSE_ERROR)
     points = se3.transform(se3.inverse(state.poses[first]), in_first[good])
-    _add(first, second, points, xy[good], there[good], state, pictures, settings)
+    _add(first, second, points, xy[good], there[good], state, pictures)
     return int(good.sum())
 
 
@@ -143,7 +136,6 @@ def _add(
     xy2: Array | None,
     state: TrackState,
     pictures: Pictures,
-    settings: TrackingConfig,
 ) -> None:
     """New points with their sightings in one or two keyframes; colours from the first."""
     image = pictures.color(first)
@@ -151,5 +143,5 @@ def _add(
     index = state.add_points(points, colors)
     for frame_id, pixels in ((first, xy), (second, xy2)):
         if frame_id is not None and pixels is not None:
-            extra = Sightings(index, pixels, np.full(len(index), settings.flow_sd))
+            extra = Sightings(index, pixels, np.full(len(index), FLOW_SD))
             state.sightings[frame_id] = state.sightings[frame_id].joined(extra)

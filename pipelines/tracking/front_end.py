@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from pipelines.config import TrackingConfig
 from pipelines.geometry.camera import project
 from pipelines.tracking.extend import promote, start_segment
-from pipelines.tracking.klt import follow
+from pipelines.tracking.klt import FLOW_SD, follow
 from pipelines.tracking.motion import predict_pose
 from pipelines.tracking.pictures import Pictures
-from pipelines.tracking.pnp import FramePose, solve_pose
-from pipelines.tracking.refine import compare_frame
+from pipelines.tracking.pnp import MIN_INLIERS, FramePose, solve_pose
+from pipelines.tracking.refine import RenderWeights, compare_frame
 from pipelines.tracking.relocalise import relocalise
 from pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
 from pipelines.types import Intrinsics
@@ -23,6 +23,10 @@ Array = NDArray[np.float64]
 
 REACH = 60
 """Frames within which a neighbour still says something of where a frame is."""
+KEYFRAME_SHARE = 0.6
+"""Where structure from motion has none, what sees less than this share of its keyframe's points is a keyframe."""
+RENDER_LOSS = 0.4
+"""A lost frame is posed by rendering when less than this share of its contrast is left."""
 
 
 class FrontEnd:
@@ -36,9 +40,10 @@ class FrontEnd:
         intrinsics: Intrinsics,
         settings: TrackingConfig,
         seed: int,
+        weights: RenderWeights,
     ) -> None:
         self.state, self.pictures, self.times = state, pictures, times
-        self.intrinsics, self.settings, self.seed = intrinsics, settings, seed
+        self.intrinsics, self.settings, self.seed, self.weights = intrinsics, settings, seed, weights
 
     def track(self, frame_id: int, may_start: bool = True) -> None:
         """Pose one frame, or note why it is lost.
@@ -51,7 +56,7 @@ class FrontEnd:
         if not self.is_trusted(seen, solved) and self.extend_before(frame_id):
             seen, solved, start = self.by_flow(frame_id)
         if not self.is_trusted(seen, solved):
-            seen, solved = relocalise(frame_id, self.state, self.pictures, self.intrinsics, self.settings, self.seed)
+            seen, solved = relocalise(frame_id, self.state, self.pictures, self.intrinsics, self.seed)
             reason += f"; {len(seen)} matched in similar keyframes, {_count(solved)} agree"
         if solved is not None and self.is_trusted(seen, solved):
             segment = self.state.segment_of_point(int(seen.point[solved.inliers][0]))
@@ -85,8 +90,8 @@ class FrontEnd:
         start = self.by_flow(frame_id)[2]
         if start is None or not keyframes:
             return False
-        found = compare_frame(frame_id, start, keyframes, self.state, self.pictures, self.intrinsics, self.settings)
-        if found is None or not found.is_better or found.unexplained > self.settings.render_loss:
+        found = compare_frame(frame_id, start, keyframes, self.state, self.pictures, self.intrinsics, self.weights)
+        if found is None or not found.is_better or found.unexplained > RENDER_LOSS:
             return False
         self.state.add_frame(frame_id, found.cam_from_world, NO_SIGHTINGS, False, segment)
         self.state.rendered.append(frame_id)
@@ -105,7 +110,7 @@ class FrontEnd:
         if self.is_inside(frame_id) or not nearest:
             return
         share = len(self.state.sightings[frame_id]) / max(len(self.state.sightings[nearest[0]]), 1)
-        if share < self.settings.keyframe_share:
+        if share < KEYFRAME_SHARE:
             self._promote(frame_id)
 
     def extend_before(self, frame_id: int) -> bool:
@@ -117,13 +122,13 @@ class FrontEnd:
         return True
 
     def _promote(self, frame_id: int) -> None:
-        promote(frame_id, self.state, self.pictures, self.intrinsics, self.settings)
+        promote(frame_id, self.state, self.pictures, self.intrinsics)
 
     def _start(self, frame_id: int, start: Array | None) -> bool:
         if not self.settings.new_segments:
             return False
         pose = np.eye(4) if start is None else start
-        return start_segment(frame_id, pose, self.state, self.pictures, self.intrinsics, self.settings)
+        return start_segment(frame_id, pose, self.state, self.pictures, self.intrinsics)
 
     def correspond(self, frame_id: int, start: Array, keyframes: list[int]) -> Sightings:
         """Points of the keyframes found in the frame by KLT, searched from where `start` (4, 4) puts them."""
@@ -134,21 +139,18 @@ class FrontEnd:
             known = known.select(~np.isin(known.point, seen.point))
             points = self.state.points[known.point]
             guess, _ = project(points @ start[:3, :3].T + start[:3, 3], self.intrinsics)
-            s = self.settings
-            xy, found = follow(
-                self.pictures.grey(keyframe), grey, known.xy, guess, s.flow_window, s.flow_levels, s.flow_error
-            )
-            seen = seen.joined(Sightings(known.point[found], xy[found], np.full(int(found.sum()), s.flow_sd)))
+            xy, found = follow(self.pictures.grey(keyframe), grey, known.xy, guess)
+            seen = seen.joined(Sightings(known.point[found], xy[found], np.full(int(found.sum()), FLOW_SD)))
         return seen
 
     def solve(self, frame_id: int, seen: Sightings, start: Array | None) -> FramePose | None:
         """The pose that most of the sightings agree on."""
         points = self.state.points[seen.point]
-        return solve_pose(seen.xy, points, self.intrinsics, self.seed + frame_id, start, self.settings.pose_error)
+        return solve_pose(seen.xy, points, self.intrinsics, self.seed + frame_id, start)
 
     def is_trusted(self, seen: Sightings, solved: FramePose | None) -> bool:
         """Enough points agree, and not by a small minority, which is how a wrong pose looks."""
-        return _count(solved) >= self.settings.min_inliers and _count(solved) >= 0.4 * len(seen)
+        return _count(solved) >= MIN_INLIERS and _count(solved) >= 0.4 * len(seen)
 
 
 def _count(solved: FramePose | None) -> int:

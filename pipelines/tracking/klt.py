@@ -8,6 +8,12 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+WINDOW, LEVELS = 21, 3
+"""Side in pixels of the patch that is followed, and pyramid levels."""
+RETURN_ERROR = 0.7
+FLOW_SD = 0.4
+"""Pixels: within which a followed point must come back, and how exactly it is then known."""
+
 
 def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """(H, W, 3) RGB -> (H, W) grey."""
@@ -15,43 +21,37 @@ def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def follow(
-    grey_from: NDArray[np.uint8],
-    grey_to: NDArray[np.uint8],
-    xy: Array,
-    guess: Array,
-    window: int = 21,
-    levels: int = 3,
-    max_error: float = 0.7,
+    grey_from: NDArray[np.uint8], grey_to: NDArray[np.uint8], xy: Array, guess: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Where the points (Q, 2) of one picture lie in the other, searched from `guess` (Q, 2), and which were found (Q,).
 
-    A point is found when following it back ends within `max_error` pixels of where it began. Points whose guess is not
+    A point is found when following it back ends within RETURN_ERROR pixels of where it began. Points whose guess is not
     finite or far outside the picture are not found.
     """
     height, width = grey_to.shape
     found: NDArray[np.bool_] = np.asarray(np.isfinite(guess).all(1))
-    found &= (np.where(np.isfinite(guess), guess, -1e9) > -window).all(1)
-    found &= (np.where(np.isfinite(guess), guess, 1e9) < np.array([width, height]) + window).all(1)
+    found &= (np.where(np.isfinite(guess), guess, -1e9) > -WINDOW).all(1)
+    found &= (np.where(np.isfinite(guess), guess, 1e9) < np.array([width, height]) + WINDOW).all(1)
     out = np.full_like(xy, np.nan)
     if not found.any():
         return out, found
     # OpenCV puts the centre of the first pixel at (0, 0).
     start = (xy[found] - 0.5).astype(np.float32)
-    there, ok = _flow(grey_from, grey_to, start, (guess[found] - 0.5).astype(np.float32), window, levels)
-    back, ok_back = _flow(grey_to, grey_from, there, start, window, levels)
+    there, ok = _flow(grey_from, grey_to, start, (guess[found] - 0.5).astype(np.float32))
+    back, ok_back = _flow(grey_to, grey_from, there, start)
     inside = ((there >= 0) & (there <= [width - 1, height - 1])).all(1)
-    good = ok & ok_back & inside & (np.linalg.norm(back - start, axis=1) < max_error)
+    good = ok & ok_back & inside & (np.linalg.norm(back - start, axis=1) < RETURN_ERROR)
     out[found] = there.astype(np.float64) + 0.5
     found[found] = good
     return out, found
 
 
 def _flow(
-    grey_from: NDArray[np.uint8], grey_to: NDArray[np.uint8], xy: NDArray, guess: NDArray, window: int, levels: int
+    grey_from: NDArray[np.uint8], grey_to: NDArray[np.uint8], xy: NDArray, guess: NDArray
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003)
     there, status, _ = cv2.calcOpticalFlowPyrLK(
-        grey_from, grey_to, xy[:, None], guess[:, None].copy(), winSize=(window, window), maxLevel=levels,
+        grey_from, grey_to, xy[:, None], guess[:, None].copy(), winSize=(WINDOW, WINDOW), maxLevel=LEVELS,
         criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
     )  # fmt: skip
     return there.reshape(-1, 2).astype(np.float32), status.reshape(-1).astype(bool)

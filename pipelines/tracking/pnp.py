@@ -14,6 +14,12 @@ from pipelines.types import Intrinsics
 Array = NDArray[np.float64]
 
 
+POSE_ERROR = 3.0
+"""Pixels within which a point agrees with a frame's pose."""
+MIN_INLIERS = 20
+"""A frame with fewer agreeing points is lost."""
+
+
 @dataclass(frozen=True)
 class FramePose:
     """cam_from_world (4, 4) and which correspondences (Q,) bool agree with it."""
@@ -34,7 +40,7 @@ def solve_pose(
     intrinsics: Intrinsics,
     seed: int,
     start: Array | None = None,
-    max_error: float = 3.0,
+    max_error: float = POSE_ERROR,
     sd: float = 0.5,
 ) -> FramePose | None:
     """RANSAC on minimal sets (pycolmap), then motion-only robust adjustment; None where no pose explains six points.

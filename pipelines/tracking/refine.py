@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.config import TrackingConfig
+from pipelines.config import ArticleConfig
 from pipelines.gaussians.render import render, track_gn
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.state import TrackState
@@ -21,6 +21,24 @@ from pipelines.tracking.working_map import View, WorkingMap, seed_map, view_of, 
 from pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
+
+
+SILHOUETTE = 0.95
+"""T_sil of eq. (16): pixels that the map covers less do not count."""
+
+
+@dataclass(frozen=True)
+class RenderWeights:
+    """λ_C, λ_D and λ_S of eq. (16), depths in units of the picture's median depth."""
+
+    color: float = 1.0
+    depth: float = 0.0
+    label: float = 0.0
+
+    @staticmethod
+    def of(article: ArticleConfig) -> RenderWeights:
+        """As the settings say."""
+        return RenderWeights(depth=article.tracking_depth_weight, label=article.tracking_label_weight)
 
 
 @dataclass(frozen=True)
@@ -59,7 +77,7 @@ def compare_frame(
     state: TrackState,
     pictures: Pictures,
     intrinsics: Intrinsics,
-    settings: TrackingConfig,
+    weights: RenderWeights,
 ) -> Comparison | None:
     """The pose near `start` (4, 4) from which the working map looks most like the frame.
 
@@ -72,23 +90,23 @@ def compare_frame(
         return None
     view = view_of(frame_id, start, keyframes, state, pictures, intrinsics)
     pose = torch.from_numpy(np.ascontiguousarray(start))
-    before = tracking_loss(drawn, pose, small, view, settings)
+    before = tracking_loss(drawn, pose, small, view, weights)
     exposed = replace(view, image=((view.image - before.bias) / before.gain).clamp(0, 1))
     fit = track_gn(
         drawn.means, drawn.radii, drawn.opacities, drawn.colors, pose, small, exposed.image, view.depth,
-        view.reliability, settings.color_weight, settings.depth_weight / view.unit, settings.silhouette,
-        labels=None if view.labels is None else (drawn.labels, view.labels), label_weight=settings.label_weight,
+        view.reliability, weights.color, weights.depth / view.unit, SILHOUETTE,
+        labels=None if view.labels is None else (drawn.labels, view.labels), label_weight=weights.label,
     )  # fmt: skip
     if not fit.converged or not np.isfinite(before.total):
         return None
-    after = tracking_loss(drawn, fit.cam_from_world, small, view, settings)
+    after = tracking_loss(drawn, fit.cam_from_world, small, view, weights)
     contrast = float((view.image - view.image.mean((0, 1))).abs().mean())
     return Comparison(fit.cam_from_world.numpy(), before.total, after.total, after.color / max(contrast, 1e-6))
 
 
 @torch.no_grad()
 def tracking_loss(
-    drawn: WorkingMap, cam_from_world: Tensor, intrinsics: Intrinsics, view: View, settings: TrackingConfig
+    drawn: WorkingMap, cam_from_world: Tensor, intrinsics: Intrinsics, view: View, weights: RenderWeights
 ) -> Loss:
     """Eq. (16) over the pixels with Sil > T_sil, depths in units of the picture's median depth.
 
@@ -97,7 +115,7 @@ def tracking_loss(
     """
     features = torch.cat([drawn.colors, drawn.labels], 1)
     image = render(drawn.means, drawn.radii, drawn.opacities, features, cam_from_world, intrinsics)
-    inside = image.silhouette > settings.silhouette
+    inside = image.silhouette > SILHOUETTE
     ones, zeros = torch.ones(3), torch.zeros(3)
     if inside.float().mean() < 0.2:
         return Loss(float("inf"), float("inf"), ones, zeros)
@@ -112,5 +130,5 @@ def tracking_loss(
     label = 0.0
     if view.labels is not None:
         label = float((image.features[..., 3:] - view.labels)[inside].abs().mean())
-    total = settings.color_weight * color + settings.depth_weight * depth + settings.label_weight * label
+    total = weights.color * color + weights.depth * depth + weights.label * label
     return Loss(total, color, gain.float(), bias.float())

@@ -8,16 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pipelines.config import TrackingConfig
 from pipelines.geometry import se3
 from pipelines.tracking.features import match_features
 from pipelines.tracking.pictures import Pictures
-from pipelines.tracking.pnp import FramePose, solve_pose
+from pipelines.tracking.pnp import MIN_INLIERS, FramePose, solve_pose
 from pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
 from pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
 
+CANDIDATES = 6
+"""Similar keyframes in which a lost frame is looked for."""
 RIVAL_SHARE = 0.5
 """Another place with this share of the best one's agreeing points is as good an answer."""
 COMMON_POINTS = 8
@@ -31,7 +32,6 @@ def relocalise(
     state: TrackState,
     pictures: Pictures,
     intrinsics: Intrinsics,
-    settings: TrackingConfig,
     seed: int,
 ) -> tuple[Sightings, FramePose | None]:
     """Sightings from the keyframes that look most like the frame, and the pose they agree on, if any.
@@ -39,8 +39,8 @@ def relocalise(
     None, too, where two places explain the frame about as well and lie apart: things that repeat, such as the doors of
     a corridor, tell nothing of which of them is seen.
     """
-    groups = _candidate_groups(frame_id, state, pictures, settings.relocalise_candidates)
-    return recognise(frame_id, groups, state, pictures, intrinsics, settings, seed)
+    groups = _candidate_groups(frame_id, state, pictures, CANDIDATES)
+    return recognise(frame_id, groups, state, pictures, intrinsics, seed)
 
 
 def recognise(
@@ -49,7 +49,6 @@ def recognise(
     state: TrackState,
     pictures: Pictures,
     intrinsics: Intrinsics,
-    settings: TrackingConfig,
     seed: int,
 ) -> tuple[Sightings, FramePose | None]:
     """What `relocalise` answers, of these groups of keyframes alone."""
@@ -61,7 +60,7 @@ def recognise(
             found = match_keyframe(frame_id, keyframe, state, pictures)
             seen = seen.joined(found.select(~np.isin(found.point, seen.point)))
         points = state.points[seen.point]
-        solved = solve_pose(seen.xy, points, intrinsics, seed + frame_id, None, settings.pose_error)
+        solved = solve_pose(seen.xy, points, intrinsics, seed + frame_id)
         if solved is not None:
             answers.append((seen, solved, state.segment[group[0]]))
         elif len(seen) > len(most):
@@ -71,7 +70,7 @@ def recognise(
     seen, solved, segment = max(answers, key=lambda a: int(a[1].inliers.sum()))
     depth = float(np.median((state.points[seen.point] @ solved.cam_from_world[2, :3]) + solved.cam_from_world[2, 3]))
     for _, other, its_segment in answers:
-        as_good = other.inliers.sum() >= max(RIVAL_SHARE * solved.inliers.sum(), settings.min_inliers)
+        as_good = other.inliers.sum() >= max(RIVAL_SHARE * solved.inliers.sum(), MIN_INLIERS)
         if as_good and its_segment == segment and _apart(other.cam_from_world, solved.cam_from_world, depth):
             return seen, None
     return seen, solved

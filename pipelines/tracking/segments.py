@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from pipelines.config import TrackingConfig
 from pipelines.geometry import se3
 from pipelines.geometry.alignment import Similarity
 from pipelines.tracking.pictures import Pictures
+from pipelines.tracking.pnp import MIN_INLIERS
 from pipelines.tracking.relocalise import group_by_points, recognise
 from pipelines.tracking.state import Sightings, TrackState
 from pipelines.types import Intrinsics
@@ -23,9 +23,7 @@ TRIES = 12
 """Keyframes of a segment that are looked for in another: the nearest in time, then those that look most like it."""
 
 
-def join_segments(
-    state: TrackState, pictures: Pictures, intrinsics: Intrinsics, settings: TrackingConfig, seed: int
-) -> int:
+def join_segments(state: TrackState, pictures: Pictures, intrinsics: Intrinsics, seed: int) -> int:
     """Bring every segment that can be recognised into the largest one's world; returns how many were joined.
 
     One keyframe is not believed: two must be recognised, and say the same of how the worlds lie to each other.
@@ -36,7 +34,7 @@ def join_segments(
         counts = Counter(state.segment.values())
         order = sorted(counts, key=lambda s: (-counts[s], s))
         for segment in order[1:]:
-            if _join(segment, order[0], state, pictures, intrinsics, settings, seed):
+            if _join(segment, order[0], state, pictures, intrinsics, seed):
                 joined, again = joined + 1, True
                 break
     return joined
@@ -68,7 +66,6 @@ def _join(
     state: TrackState,
     pictures: Pictures,
     intrinsics: Intrinsics,
-    settings: TrackingConfig,
     seed: int,
 ) -> bool:
     ours = [k for k in state.keyframes if state.segment[k] == segment]
@@ -80,7 +77,7 @@ def _join(
     for n in near + [i for i in np.argsort(-looks.max(1), kind="stable")[:TRIES].tolist() if i not in near]:
         alike = [theirs[i] for i in np.argsort(-looks[n], kind="stable")[:3]]
         alike += [k for k in sorted(theirs, key=lambda k: abs(k - ours[n]))[:2] if k not in alike]
-        found = _recognise(ours[n], alike, state, pictures, intrinsics, settings, seed)
+        found = _recognise(ours[n], alike, state, pictures, intrinsics, seed)
         if found is None:
             continue
         depth = state.median_depth(ours[n])
@@ -101,13 +98,12 @@ def _recognise(
     state: TrackState,
     pictures: Pictures,
     intrinsics: Intrinsics,
-    settings: TrackingConfig,
     seed: int,
 ) -> tuple[Similarity, Sightings] | None:
     """main_from_segment, and the main segment's points in the frame."""
     groups = group_by_points(keyframes, state)
-    seen, solved = recognise(frame_id, groups, state, pictures, intrinsics, settings, seed)
-    if solved is None or solved.inliers.sum() < max(settings.min_inliers, 0.4 * len(seen)):
+    seen, solved = recognise(frame_id, groups, state, pictures, intrinsics, seed)
+    if solved is None or solved.inliers.sum() < max(MIN_INLIERS, 0.4 * len(seen)):
         return None
     seen = seen.select(solved.inliers)
     scale = _depth_ratio(frame_id, solved.cam_from_world, seen, state)

@@ -8,16 +8,15 @@ import numpy as np
 
 from formats.errors import InputError
 from formats.tensors import save_arrays
-from pipelines.config import TrackingConfig
 from pipelines.run_folder import save_sparse_model, save_trajectory, write_json
 from pipelines.stages import Stage, StageContext
 from pipelines.tracking.adjust import Report, adjust_state, without_dependent_depth
 from pipelines.tracking.front_end import FrontEnd
 from pipelines.tracking.pictures import Pictures
-from pipelines.tracking.refine import compare_frame
+from pipelines.tracking.refine import RenderWeights, compare_frame
 from pipelines.tracking.result import normalise, to_sparse_model, to_trajectory
 from pipelines.tracking.segments import join_segments, split_segments
-from pipelines.tracking.state import TrackState
+from pipelines.tracking.state import FEATURE_SD, TrackState
 from pipelines.types import Frame
 
 
@@ -54,12 +53,12 @@ def run(context: StageContext) -> dict[str, Any]:
 
 def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures) -> TrackState:
     """Every frame visited once; goes on from the last snapshot."""
-    settings = context.config.tracking
+    settings, weights = context.config.tracking, RenderWeights.of(context.config.article)
     snapshot = context.snapshot / "state.npz"
-    state = TrackState.load(snapshot) if snapshot.exists() else start_state(context, settings)
+    state = TrackState.load(snapshot) if snapshot.exists() else start_state(context)
     intrinsics = context.run.load_calibration().intrinsics
     times = {f.id: f.timestamp for f in frames}
-    front_end = FrontEnd(state, pictures, times, intrinsics, settings, context.config.run.seed)
+    front_end = FrontEnd(state, pictures, times, intrinsics, settings, context.config.run.seed, weights)
     for frame in context.progress.track(frames[state.done :], "tracking", len(frames) - state.done):
         if frame.id not in state.poses:
             front_end.track(frame.id)
@@ -69,29 +68,29 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
     # Frames before the first keyframe could not be followed from anywhere; now there are neighbours behind them.
     for frame_id in sorted(state.lost, reverse=True):
         front_end.track(frame_id, may_start=False)
-    join_segments(state, pictures, intrinsics, settings, context.config.run.seed)
+    join_segments(state, pictures, intrinsics, context.config.run.seed)
     return state
 
 
-def start_state(context: StageContext, settings: TrackingConfig) -> TrackState:
+def start_state(context: StageContext) -> TrackState:
     """The backbone, its parts as segments, or nothing yet."""
     backbone = context.run.load_backbone()
     if backbone is None:
         return TrackState()
-    state = TrackState.from_backbone(backbone, settings.feature_sd)
+    state = TrackState.from_backbone(backbone, FEATURE_SD)
     split_segments(state)
     return state
 
 
 def compare_all(context: StageContext, state: TrackState, pictures: Pictures) -> dict[str, Any]:
     """Every frame but the keyframes against Gaussians seeded around it; the new pose stays where the loss falls."""
-    intrinsics, settings = context.run.load_calibration().intrinsics, context.config.tracking
+    intrinsics, weights = context.run.load_calibration().intrinsics, RenderWeights.of(context.config.article)
     others = [i for i in sorted(state.poses) if i not in state.keyframes]
     better = []
     for frame_id in context.progress.track(others, "comparing", len(others)):
         segment = state.segment[frame_id]
         keyframes = [k for k in state.nearest_keyframes(frame_id, 1) if state.segment[k] == segment]
-        found = compare_frame(frame_id, state.poses[frame_id], keyframes, state, pictures, intrinsics, settings)
+        found = compare_frame(frame_id, state.poses[frame_id], keyframes, state, pictures, intrinsics, weights)
         if found is not None and found.is_better:
             state.poses[frame_id] = found.cam_from_world
             better.append(found.loss_after / found.loss_before)

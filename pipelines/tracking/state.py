@@ -39,6 +39,8 @@ class Sightings:
         )
 
 
+FEATURE_SD = 0.5
+"""Pixels: how exactly a feature of structure from motion is known."""
 NO_SIGHTINGS = Sightings(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
 
 

@@ -28,7 +28,7 @@ from mapping import ABLATIONS, noisy_depth, noisy_labels
 from numpy.typing import NDArray
 
 from formats.datasets import Sequence, open_sequence
-from pipelines.config import MappingConfig, load_config
+from pipelines.config import Config, load_config
 from pipelines.evaluation.depth_error import DepthErrorSum
 from pipelines.evaluation.image_quality import psnr, ssim
 from pipelines.evaluation.label_score import count_labels, score
@@ -96,14 +96,14 @@ def _picture(folder: Path, index: int, size: tuple[int, int]) -> NDArray:
     return cv2.resize(picture, size, interpolation=cv2.INTER_NEAREST)
 
 
-def measure(sequence: Sequence, shots: list[Shot], camera: Intrinsics, settings: MappingConfig) -> dict[str, float]:
+def measure(sequence: Sequence, shots: list[Shot], camera: Intrinsics, config: Config) -> dict[str, float]:
     """Map the stretch and compare it with the truth; depth in centimetres."""
     held_out = [s for n, s in enumerate(shots) if n % 8 == 4]
     used = [s for n, s in enumerate(shots) if n % 8 != 4]
     classes = occurring_classes([s.maps.labels for s in used])
     started = time.process_time()
-    views = prepare_depth(MappingInput([s.view(sequence, camera, classes) for s in used], [], classes, {}), settings)
-    result = optimise_map(views, len(classes), settings, 0)
+    views = prepare_depth(MappingInput([s.view(sequence, camera, classes) for s in used], [], classes, {}))
+    result = optimise_map(views, len(classes), config.mapping, 0, article=config.article)
     row: dict[str, float] = {"cpu seconds": time.process_time() - started, "gaussians": len(result.gaussian_map)}
     label_of = np.array([*classes, *[VOID] * (256 - len(classes))], np.uint8)
     depth, count = DepthErrorSum(), len(sequence.classes)
@@ -156,10 +156,10 @@ def main() -> None:
     indices = range(arguments.first, min(arguments.first + arguments.frames, len(sequence)))
     shots = load_shots(sequence, camera, indices, arguments.depth, arguments.labels)
     rows = []
-    variants = {n: s for n, s in ABLATIONS.items() if all(x.startswith("mapping.") for x in s)}
+    variants = {n: s for n, s in ABLATIONS.items() if all(x.startswith(("mapping.", "article.")) for x in s)}
     for name, switches in (variants if arguments.ablation else {"complete": ()}).items():
-        settings = load_config(None, ["mapping.min_iterations=0", *arguments.overrides, *switches]).mapping
-        row = measure(sequence, shots, camera, settings)
+        config = load_config(None, ["mapping.min_iterations=0", *arguments.overrides, *switches])
+        row = measure(sequence, shots, camera, config)
         rows.append({"variant": name, **row})
         print(f"{name:28}", "  ".join(f"{key} {value:.4g}" for key, value in row.items()), flush=True)
     if arguments.json:

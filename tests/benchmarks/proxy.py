@@ -247,7 +247,7 @@ def measure_network(name: str, work: Path) -> dict[str, Any]:
     card_file = write_deeplab_card(work)
     run = RunFolder(work / f"{name}_deeplab.msgs")
     # Depth only carries the votes here: half its size does.
-    run_proxy(VIDEOS[name], run, f'proxy.semantics="onnx:{card_file}"', "proxy.stereo_side=160", "proxy.symmetry=false")
+    run_proxy(VIDEOS[name], run, f'proxy.semantics="onnx:{card_file}"', "proxy.stereo_side=160")
     network = Network(read_card(card_file), 2, "cpu")
     raw: dict[int, NDArray[np.uint8]] = {}
     seconds = cpu_seconds = 0.0
@@ -337,7 +337,7 @@ def run_of(name: str, work: Path, first: int, suffix: str = "") -> RunFolder:
 def measure_embedded(name: str, work: Path, first: int) -> dict[str, Any]:
     """One row: the providers that need no weights."""
     run = run_of(name, work, first)
-    progress = run_proxy(pictures_of(name, work, first), run)
+    progress = run_proxy(pictures_of(name, work, first), run, "article.symmetry_weight=0.05")
     seconds = progress.seconds
     report = run.load_proxy_report()
     row = {

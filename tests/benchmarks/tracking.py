@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 DATA = ROOT.parent / "shared" / "data"
 PLAIN = ("run.format=images",)
 """Pictures named like a data set's, but without what that says of their camera."""
-COARSE = ("proxy.stereo_side=160", "proxy.stereo_planes=32", "proxy.symmetry=false")
+COARSE = ("proxy.stereo_side=160", "proxy.stereo_planes=32")
 """Quick proxies where only poses are judged: multi-view depth takes no part in them."""
 Truth = Callable[[str, int], NDArray[np.float64] | None]
 """(name in the source, index in the source) -> world_from_cam (4, 4), None where it is not known."""

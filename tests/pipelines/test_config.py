@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from formats.errors import InputError
-from pipelines.config import Config, config_to_toml, load_config
+from pipelines.config import Config, config_to_dict, config_to_toml, load_config
+from pipelines.retired_settings import FIXED, MOVED
 
 
 @pytest.mark.parametrize("comments", [True, False])
@@ -55,6 +56,22 @@ def test_wrong_files_are_refused(tmp_path: Path) -> None:
             load_config(file)
     with pytest.raises(InputError, match="cannot read"):
         load_config(tmp_path / "missing.toml")
+
+
+def test_settings_of_earlier_versions_are_refused_with_what_became_of_them(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"mapping\.kappa is article\.kappa now"):
+        load_config(overrides=["mapping.kappa=5"])
+    file = tmp_path / "old.toml"
+    file.write_text("[mapping]\npasses = 3\nmean_rate = 0.1\nprune_weight = 0.0\n")
+    with pytest.raises(InputError, match=r"mapping\.mean_rate, mapping\.prune_weight: fixed at what was the default"):
+        load_config(file)
+
+
+def test_retired_settings_are_retired() -> None:
+    known = {f"{section}.{key}" for section, values in config_to_dict(Config()).items() for key in values}
+    assert not known & {*MOVED, *FIXED}
+    assert set(MOVED.values()) <= known
+    assert len(known) <= 75
 
 
 def test_every_setting_has_help() -> None:

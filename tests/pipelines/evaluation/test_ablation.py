@@ -19,7 +19,7 @@ from pipelines.progress import SilentProgress
 
 SETTINGS = (
     "run.threads=2", "frames.rate=4", "proxy.depth=files", "proxy.semantics=files", "mapping.max_side=120",
-    "mapping.passes=2", "mapping.min_iterations=25", "mapping.window_steps=1",
+    "mapping.passes=2", "mapping.min_iterations=25",
 )  # fmt: skip
 VARIANTS = ("complete", "without depth loss", "without loops")
 SEEDS = (0, 1)

@@ -42,7 +42,6 @@ CONFIG = load_config(
         "global_ba.joint_passes=1",
         "mapping.max_side=128",
         "global_ba.joint=always",
-        "mapping.densify_every=0",
     ]
 )
 

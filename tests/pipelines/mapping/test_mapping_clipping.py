@@ -3,9 +3,8 @@
 import numpy as np
 import torch
 
-from pipelines.mapping.clipping import beside_boundary, clip_beside_boundary
-from pipelines.mapping.losses import label_symmetry_loss, symmetry_loss
-from pipelines.mapping.mirrors import Mirrors, at
+from pipelines.mapping.article.boundary_clip import beside_boundary, clip_beside_boundary
+from pipelines.mapping.article.mirrors import Mirrors, at, label_symmetry_loss, symmetry_loss
 from pipelines.types import VOID, Intrinsics, MirrorPairs
 
 

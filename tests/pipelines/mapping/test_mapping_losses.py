@@ -8,6 +8,8 @@ from skimage.metrics import structural_similarity
 from pipelines.gaussians.entropy import plain_entropy, weighted_entropy
 from pipelines.gaussians.ssim import similarity, ssim_map
 from pipelines.mapping import losses
+from pipelines.mapping.article.edge_term import edge_loss
+from pipelines.mapping.article.label_image import label_image_loss
 from pipelines.types import VOID
 
 
@@ -55,10 +57,9 @@ def test_ssim_gradient() -> None:
 
 def test_image_loss_weighs_its_two_parts() -> None:
     a, b = pictures()
-    plain, mixed = losses.image_loss(a, b, 0.0), losses.image_loss(a, b, 0.2)
-    assert torch.isclose(plain, (a - b).abs().mean())
-    assert torch.isclose(mixed, 0.8 * plain + 0.2 * (1 - ssim_map(a, b).mean()))
-    assert losses.image_loss(a, a, 0.2) < 1e-6
+    expected = 0.8 * (a - b).abs().mean() + 0.2 * (1 - ssim_map(a, b).mean())
+    assert torch.isclose(losses.image_loss(a, b), expected)
+    assert losses.image_loss(a, a) < 1e-6
 
 
 def test_depth_loss_has_no_unit_and_ignores_unknown_depth() -> None:
@@ -68,7 +69,7 @@ def test_depth_loss_has_no_unit_and_ignores_unknown_depth() -> None:
     loss = losses.depth_loss(rendered, proxy, weight, 2.0)
     assert torch.isclose(loss, torch.tensor((0.1 + 0.2 * 0.5) / 4 / 2.0))
     assert torch.isclose(losses.depth_loss(100 * rendered, 100 * proxy, weight, 200.0), loss)
-    assert losses.depth_weight(torch.tensor([0.5, 1.0]), 1.5).tolist() == [0.75, 1.0]
+    assert torch.allclose(losses.depth_weight(torch.tensor([0.5, 1.0])), torch.tensor([0.5 * losses.NU, 1.0]))
 
 
 @pytest.mark.parametrize("image", [False, True])
@@ -77,9 +78,7 @@ def test_label_losses_ignore_void_and_fall_with_the_right_logit(image: bool) -> 
     weight = torch.ones(2, 2)
 
     def loss(logits: torch.Tensor) -> torch.Tensor:
-        return (
-            losses.label_image_loss(logits, labels, weight, 0.2) if image else losses.label_loss(logits, labels, weight)
-        )
+        return label_image_loss(logits, labels, weight) if image else losses.label_loss(logits, labels, weight)
 
     good = torch.nn.functional.one_hot(torch.tensor([[0, 1], [2, 0]]), 3) * 9.0
     other_void = good.clone()
@@ -117,16 +116,14 @@ def test_edge_loss_wants_steps_at_class_edges_and_nowhere_else() -> None:
     labels = torch.tensor([[0, 0, 1, 1]] * 4, dtype=torch.uint8)
     step_at_edge = torch.tensor([[1.0, 1.0, 2.0, 2.0]] * 4)
     step_inside = torch.tensor([[1.0, 2.0, 2.0, 2.0]] * 4)
-    right, flat, wrong = (
-        losses.edge_loss(d, labels, 100.0, 1.0) for d in (step_at_edge, torch.ones(4, 4), step_inside)
-    )
+    right, flat, wrong = (edge_loss(d, labels, 1.0) for d in (step_at_edge, torch.ones(4, 4), step_inside))
     assert right < 1e-6 < flat < wrong
     void = torch.full((4, 4), VOID, dtype=torch.uint8)
-    assert losses.edge_loss(step_inside, void, 100.0, 1.0) == 0
+    assert edge_loss(step_inside, void, 1.0) == 0
 
 
 def test_size_and_silhouette() -> None:
     radii = torch.log(torch.tensor([0.01, 0.1, 0.2]))
-    assert losses.size_loss(radii, 0.3) == 0
-    assert torch.isclose(losses.size_loss(radii, 0.1), torch.log(torch.tensor(2.0)) ** 2 / 3)
+    assert losses.size_loss(radii, 0.3 / losses.SIZE_LIMIT) == 0
+    assert torch.isclose(losses.size_loss(radii, 0.1 / losses.SIZE_LIMIT), torch.log(torch.tensor(2.0)) ** 2 / 3)
     assert torch.isclose(losses.silhouette_loss(torch.tensor([1.0, 0.5])), torch.tensor(0.25))

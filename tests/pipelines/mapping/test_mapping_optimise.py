@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.config import MappingConfig
+from pipelines.config import ArticleConfig, MappingConfig
 from pipelines.geometry import se3
+from pipelines.mapping import growth, optimise, schedule
 from pipelines.mapping.load import MappingInput
 from pipelines.mapping.measure import ViewFigures, measure_view
 from pipelines.mapping.optimise import MapOptimiser, OptimisedMap, optimise_map
@@ -43,13 +44,14 @@ def test_the_map_shows_what_the_frames_show(room: MappingInput, mapped: Optimise
 def test_the_map_is_sound(mapped: OptimisedMap, room: MappingInput) -> None:
     m = mapped.gaussian_map
     assert all(torch.isfinite(getattr(m, n)).all() for n in ("means", "log_radii", "opacity_logits", "colors"))
-    assert m.opacities.min() >= SETTINGS.prune_opacity
+    assert m.opacities.min() >= growth.PRUNE_OPACITY
     assert set(m.anchor_frame_ids.tolist()) <= {v.frame_id for v in room.views}
     assert mapped.iterations == (3 + 6) * len(room.views)
 
 
-def test_splitting_sharpens_a_coarse_map(room: MappingInput) -> None:
-    coarse = replace(SETTINGS, seed_stride=4, fine_share=0.0, passes=8.0)
+def test_splitting_sharpens_a_coarse_map(room: MappingInput, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(growth, "FINE_SHARE", 0.0)
+    coarse = replace(SETTINGS, seed_stride=4, passes=8.0)
     split, unsplit = (
         optimise_map(room.views, len(room.class_ids), replace(coarse, split_error=e), seed=0) for e in (0.1, 0.0)
     )
@@ -62,7 +64,7 @@ def test_splitting_stops_at_the_largest_map(room: MappingInput) -> None:
     few = optimise_map(room.views, len(room.class_ids), replace(SETTINGS, seed_stride=4, split_error=0.0), seed=0)
     classes, most = len(room.class_ids), len(few.gaussian_map) + 31
     state = OptimiserState.fresh(room.views, classes, few.gaussian_map, None)
-    optimiser = MapOptimiser(room.views, classes, replace(SETTINGS, max_gaussians=most), state)
+    optimiser = MapOptimiser(room.views, classes, replace(SETTINGS, max_gaussians=most), ArticleConfig(), state)
     optimiser.growth.split(optimiser._blame())
     assert len(state.parameters) == len(few.gaussian_map) + 30
 
@@ -103,11 +105,11 @@ def test_an_interrupted_map_ends_with_the_same_bytes(
 
 @pytest.fixture(scope="module")
 def quick(room: MappingInput) -> tuple[MappingConfig, OptimisedMap]:
-    settings = replace(SETTINGS, passes=4.0, seed_stride=3, coarse_share=0.3, densify_every=1, densify_until=0.8)
+    settings = replace(SETTINGS, passes=4.0, seed_stride=3)
     return settings, optimise_map(room.views, len(room.class_ids), settings, seed=0)
 
 
-def test_wrong_poses_are_put_right(room: MappingInput, mapped: OptimisedMap) -> None:
+def test_wrong_poses_are_put_right(room: MappingInput, mapped: OptimisedMap, monkeypatch: pytest.MonkeyPatch) -> None:
     """Views moved off a good map come back to it; the first one is held."""
     rng = np.random.default_rng(0)
     off = [torch.from_numpy(np.r_[rng.normal(0, 0.012, 3), rng.normal(0, 0.005, 3)]) for _ in room.views]
@@ -115,8 +117,11 @@ def test_wrong_poses_are_put_right(room: MappingInput, mapped: OptimisedMap) -> 
         replace(v, cam_from_world=se3.exp(t) @ v.cam_from_world) if i else v
         for i, (v, t) in enumerate(zip(room.views, off, strict=True))
     ]
-    settings = replace(SETTINGS, pose_rate=2e-3, mean_rate=0.0, densify_every=0, rate_decay=0.1)
-    result = optimise_map(moved, len(room.class_ids), settings, seed=0, initial=mapped.gaussian_map, passes=10.0)
+    monkeypatch.setattr(optimise, "POSE_RATE", 2e-3)
+    monkeypatch.setitem(optimise.MAP_RATES, "means", 0.0)
+    monkeypatch.setattr(schedule, "DENSIFY_UNTIL", 0.0)
+    monkeypatch.setattr(schedule, "RATE_DECAY", 0.1)
+    result = optimise_map(moved, len(room.class_ids), SETTINGS, seed=0, initial=mapped.gaussian_map, passes=10.0)
     truth = np.stack([v.cam_from_world.numpy() for v in room.views])
     before = np.abs(np.stack([v.cam_from_world.numpy() for v in moved]) - truth)[1:, :3, 3].mean()
     after = np.abs(result.cam_from_world - truth)[1:, :3, 3].mean()
@@ -124,13 +129,16 @@ def test_wrong_poses_are_put_right(room: MappingInput, mapped: OptimisedMap) -> 
     assert np.array_equal(result.cam_from_world[0], truth[0])
 
 
-def test_exposure_is_found(room: MappingInput, mapped: OptimisedMap) -> None:
+def test_exposure_is_found(room: MappingInput, mapped: OptimisedMap, monkeypatch: pytest.MonkeyPatch) -> None:
     """One view darkened by a third: its gain says so, those of the others stay near 0."""
     dark = [
         replace(v, image=(v.image.float() * 0.7).round().to(torch.uint8)) if i == 5 else v
         for i, v in enumerate(room.views)
     ]
-    settings = replace(SETTINGS, exposure_rate=4e-2, densify_every=0, refine_poses=False, color_rate=1e-3)
+    monkeypatch.setattr(optimise, "EXPOSURE_RATE", 4e-2)
+    monkeypatch.setitem(optimise.MAP_RATES, "colors", 1e-3)
+    monkeypatch.setattr(schedule, "DENSIFY_UNTIL", 0.0)
+    settings = replace(SETTINGS, refine_poses=False)
     result = optimise_map(dark, len(room.class_ids), settings, seed=0, initial=mapped.gaussian_map, passes=8.0)
     brightness = np.exp(result.log_gains).mean(1) + result.offsets.mean(1) / 0.4
     others = np.delete(brightness, 5)

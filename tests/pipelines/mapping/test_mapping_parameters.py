@@ -8,7 +8,9 @@ from pipelines.gaussian_map import decided_channels
 from pipelines.gaussians.seeding import complete_depth, fill_smoothly, seed_gaussians, seed_grid, seed_spacing
 from pipelines.geometry.camera import project
 from pipelines.mapping import densify
+from pipelines.mapping.article.class_growth import wrong_classes
 from pipelines.mapping.parameters import KEYS, MapParameters, empty_map
+from pipelines.mapping.region_prior import with_region_prior
 from pipelines.types import VOID, Intrinsics
 
 CAMERA = Intrinsics(40, 30, 35.0, 35.0, 20.0, 15.0)
@@ -89,24 +91,25 @@ def test_region_prior_corrects_unreliable_pixels() -> None:
     depth = np.where(weak, truth * noise.uniform(0.7, 1.4, truth.shape), truth).astype(np.float32)
     reliability = np.where(weak, 0.1, 0.95).astype(np.float32)
     channels = np.zeros(truth.shape, np.uint8)
-    with_prior = complete_depth(depth, reliability, channels, 0.35, prior=True)
-    without = complete_depth(depth, reliability, channels, 0.35, prior=False)
-    error = [np.abs(d.depth / truth - 1)[weak].mean() for d in (with_prior, without)]
+    inverse, trust = with_region_prior(depth, reliability, channels, 0.35)
+    corrected = 1 / inverse
+    error = [np.abs(d / truth - 1)[weak].mean() for d in (corrected, depth)]
     assert 0 < error[0] < 0.02 < 0.1 < error[1]
-    assert np.array_equal(with_prior.depth[~weak] > 0, np.ones((~weak).sum(), bool))
-    assert np.abs(with_prior.depth / depth - 1)[~weak].max() < 1e-5
+    assert np.abs(corrected / depth - 1)[~weak].max() < 1e-5
+    assert (trust[weak] >= 0.35 / 2).all()
+    assert np.array_equal(trust[~weak], reliability[~weak])
 
 
 def test_unknown_depth_is_filled_and_not_trusted() -> None:
     truth = slanted()
     depth = truth.copy()
     depth[25:35, 35:50] = 0
-    void = np.full(truth.shape, VOID, np.uint8)
-    completed = complete_depth(depth, np.ones_like(depth), void, 0.35, prior=True)
+    inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
+    completed = complete_depth(inverse, (depth > 0).astype(np.float32))
     hole = depth == 0
     assert completed.trust[hole].max() == 0
     assert 0 < np.abs(completed.depth / truth - 1)[hole].max() < 0.1
-    nothing = complete_depth(depth * 0, np.ones_like(depth), void, 0.35, prior=True)
+    nothing = complete_depth(depth * 0, depth * 0)
     assert nothing.depth.max() == 0
 
 
@@ -149,7 +152,7 @@ def test_conditions_of_densification() -> None:
     assert densify.hidden_surfaces(rendered, proxy, trust, 0.05).tolist() == [True, False, False, False]
     logits = torch.tensor([[[2.0, 0.0], [0.0, 2.0], [2.0, 0.0]]])
     channels = torch.tensor([[0, 0, VOID]], dtype=torch.uint8)
-    assert densify.wrong_classes(logits, channels, torch.ones(1, 3)).tolist() == [[False, True, False]]
+    assert wrong_classes(logits, channels, torch.ones(1, 3)).tolist() == [[False, True, False]]
 
 
 def test_useless_gaussians() -> None:

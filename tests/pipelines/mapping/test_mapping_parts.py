@@ -15,7 +15,7 @@ from pipelines.mapping.covisibility import keyframe_weights, overlaps
 from pipelines.mapping.depth_fields import Anchors, agree_on_depth
 from pipelines.mapping.load import DepthScales, MappingInput, load_views, scale_field, split_frames
 from pipelines.mapping.poses import interpolate_rows, move_trajectory
-from pipelines.mapping.schedule import Schedule, Seeding
+from pipelines.mapping.schedule import RATE_DECAY, Schedule, Seeding
 from pipelines.mapping.views import channel_table, halved, occurring_classes, working_size
 from pipelines.run_folder import RunFolder
 from pipelines.types import VOID, Intrinsics, Trajectory
@@ -104,7 +104,7 @@ def test_keyframe_weights_fade_with_age_and_unreliability() -> None:
 
 
 def test_schedule_visits_each_view_once_a_pass(room: MappingInput) -> None:
-    settings = MappingConfig(passes=3.0, min_iterations=0, window_steps=2)
+    settings = MappingConfig(passes=3.0, min_iterations=0)
     schedule = Schedule.plan(room.views, settings, seed=1, seeding=True, passes=None)
     n = len(room.views)
     steps = [schedule.step(i) for i in range(schedule.total)]
@@ -115,7 +115,7 @@ def test_schedule_visits_each_view_once_a_pass(room: MappingInput) -> None:
     for first in range(3 * n, 6 * n, n):
         assert Counter(s.view for s in steps[first : first + n]) == Counter(range(n))
     assert steps[3 * n].rate == 1.0
-    assert settings.rate_decay < steps[-1].rate < 1.2 * settings.rate_decay
+    assert RATE_DECAY < steps[-1].rate < 1.2 * RATE_DECAY
     assert not any(s.refine_pose for s in steps if s.view == 0)
     again = Schedule.plan(room.views, settings, seed=1, seeding=True, passes=None)
     assert [again.step(i) for i in (7, 40, 61)] == [steps[i] for i in (7, 40, 61)]
@@ -123,7 +123,7 @@ def test_schedule_visits_each_view_once_a_pass(room: MappingInput) -> None:
 
 def test_the_map_grows_by_whole_passes(room: MappingInput) -> None:
     n = len(room.views)
-    settings = MappingConfig(passes=10.0, min_iterations=0, coarse_share=0.25, densify_every=2, densify_until=0.45)
+    settings = MappingConfig(passes=10.0, min_iterations=0)
     schedule = Schedule.plan(room.views, settings, seed=0, seeding=True, passes=None)
     visits = [schedule.step(i) for i in range(schedule.seeding, schedule.total)]
     assert [i // n for i, s in enumerate(visits) if s.prune] == [0, 3, 5]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipelines.proxy.compact import compact
-from pipelines.proxy.reliability import EDGE_STEP, reliability, semantic_agreement, theta, warp_labels
+from pipelines.proxy.reliability import EDGE_STEP, MIDDLE, reliability, semantic_agreement, theta, warp_labels
 from pipelines.types import VOID, Intrinsics, ProxyMaps
 
 RNG = np.random.default_rng(3)
@@ -13,40 +13,40 @@ CONFIDENCE = RNG.uniform(0, 1, DEPTH.shape).astype(np.float32)
 
 
 def test_reliability_does_not_know_the_unit_of_depth() -> None:
-    metres = reliability(DEPTH, CONFIDENCE, 0.9, 0.7, 0.8, 0.5)
-    millimetres = reliability(DEPTH * 1000, CONFIDENCE, 0.9, 0.7, 0.8, 0.5)
+    metres = reliability(DEPTH, CONFIDENCE, 0.9)
+    millimetres = reliability(DEPTH * 1000, CONFIDENCE, 0.9)
     np.testing.assert_allclose(metres, millimetres, rtol=1e-4)
     assert 0 <= metres.min() < metres.max() <= 1
 
 
 def test_reliability_of_a_flat_depth_is_the_formula() -> None:
     flat = np.full((5, 6), 3.0, np.float32)
-    u = reliability(flat, np.full((5, 6), 0.6, np.float32), 0.7, 0.7, 0.8, 0.5)
+    u = reliability(flat, np.full((5, 6), 0.6, np.float32), 0.7)
     np.testing.assert_allclose(u, 0.6**0.8 * 0.7**0.5, rtol=1e-6)
-    assert reliability(flat, np.ones((5, 6), np.float32), 1.0, 0.7, 0.8, 0.5).min() == 1
+    assert reliability(flat, np.ones((5, 6), np.float32), 1.0).min() == 1
 
 
 def test_an_edge_costs_reliability_on_both_sides_and_a_slope_does_not() -> None:
     edge = np.ones((6, 10), np.float32)
     edge[:, 5:] = np.exp(2 * EDGE_STEP)
-    u = reliability(edge, np.ones_like(edge), 1.0, 0.7, 0.8, 0.5)
+    u = reliability(edge, np.ones_like(edge), 1.0)
     np.testing.assert_allclose(u[:, 4:6], np.exp(-0.7 * 4), rtol=1e-4)
     assert (u[:, [0, 1, 2, 8, 9]] == 1).all()
     slope = np.exp(0.01 * np.arange(10, dtype=np.float32))[None].repeat(6, 0)
-    assert reliability(slope, np.ones_like(slope), 1.0, 0.7, 0.8, 0.5).min() > 0.99
+    assert reliability(slope, np.ones_like(slope), 1.0).min() > 0.99
 
 
 def test_unknown_depth_has_no_reliability_and_harms_no_neighbour() -> None:
     depth = np.full((6, 6), 2.0, np.float32)
     depth[2, 3] = 0
-    u = reliability(depth, np.ones_like(depth), 1.0, 0.7, 0.8, 0.5)
+    u = reliability(depth, np.ones_like(depth), 1.0)
     assert u[2, 3] == 0
     assert (np.delete(u.ravel(), 2 * 6 + 3) == 1).all()
 
 
 def test_theta_is_a_half_in_the_middle_and_grows() -> None:
-    assert theta(0.4, 10, 0.4) == 0.5
-    assert 0 < theta(0.0, 10, 0.4) < theta(0.3, 10, 0.4) < theta(0.9, 10, 0.4) < 1
+    assert theta(MIDDLE) == 0.5
+    assert 0 < theta(0.0) < theta(0.3) < theta(0.9) < 1
 
 
 def test_agreement_is_the_mean_iou_where_neither_is_void() -> None:

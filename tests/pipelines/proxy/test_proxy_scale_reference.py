@@ -22,7 +22,7 @@ from pipelines.stages import StageContext
 from pipelines.tracking.stage import run as track
 
 Make = Callable[..., StageContext]
-EMBEDDED = ("proxy.stereo_side=128", "proxy.stereo_planes=32", "proxy.symmetry=false")
+EMBEDDED = ("proxy.stereo_side=128", "proxy.stereo_planes=32")
 
 
 def known_length(room: Room, frame: int, points: tuple[tuple[float, float], tuple[float, float]]) -> float:
@@ -116,7 +116,7 @@ def test_the_height_of_the_camera_gives_metres(room: Room, make_context: Make) -
     height = float(np.median([v.world_from_cam[2, 3] for v in room.views])) - floor
     report = run(make_context(*EMBEDDED))
     assert (report["metric"], report["scale_from"]) == (False, "nothing: lengths have no unit")
-    report = run(make_context("proxy.symmetry=false", setting(f"height={height:.3f}"), name="again"))
+    report = run(make_context(setting(f"height={height:.3f}"), name="again"))
     assert report["scale_from"] == "reference"
     assert report["metres_per_unit"] == pytest.approx(1 / UNIT, rel=0.015)
 

@@ -160,7 +160,7 @@ def test_a_network_that_sees_another_camera_is_told(
 ) -> None:
     intrinsics = room.calibration.intrinsics
     monkeypatch.setattr(FilesDepth, "figures", lambda self: {"network_focal_px": focal * intrinsics.fx})
-    context = make_context(*FILES, "proxy.symmetry=false")
+    context = make_context(*FILES)
     save_calibration(context.run.stage("frames"), replace(room.calibration, origin=origin, focal_sd=3.0))
     run(context)
     assert any("focal length of" in w for w in context.warnings) == doubted

@@ -16,10 +16,10 @@ def test_weighted_median_counts_weights() -> None:
 
 def test_basis_sums_to_one_and_meets_the_corners() -> None:
     rng = np.random.default_rng(0)
-    basis = depth_scales.bilinear_basis(rng.uniform(0, 1, (50, 2)) * [640, 480], CAMERA, 3, 4)
+    basis = depth_scales.bilinear_basis(rng.uniform(0, 1, (50, 2)) * [640, 480], CAMERA)
     assert np.allclose(basis.sum(1), 1)
     assert (basis >= 0).all()
-    ends = depth_scales.bilinear_basis(np.array([[0.0, 0.0], [640.0, 480.0]]), CAMERA, 3, 4)
+    ends = depth_scales.bilinear_basis(np.array([[0.0, 0.0], [640.0, 480.0]]), CAMERA)
     assert ends[0].argmax() == 0
     assert ends[1].argmax() == 11
 
@@ -30,8 +30,8 @@ def test_field_follows_a_smooth_error_despite_outliers() -> None:
     truth = 0.2 + 0.08 * xy[:, 0] / 640 - 0.05 * xy[:, 1] / 480
     values = truth + rng.normal(size=600) * 0.01
     values[:60] += 1.0
-    basis = depth_scales.bilinear_basis(xy, CAMERA, 3, 4)
-    field = depth_scales.fit_field(basis, values, np.ones(600), 0.03, 3, 4)
+    basis = depth_scales.bilinear_basis(xy, CAMERA)
+    field = depth_scales.fit_field(basis, values, np.ones(600))
     error = np.abs(basis @ field.ravel() - truth)[60:]
     assert 0 < np.median(error) < 0.006
     flat = np.abs(depth_scales.keyframe_scale(values, np.ones(600)) - truth)[60:]
@@ -39,7 +39,7 @@ def test_field_follows_a_smooth_error_despite_outliers() -> None:
 
 
 def test_field_without_points_is_flat() -> None:
-    field = depth_scales.fit_field(np.zeros((0, 12)), np.zeros(0), np.zeros(0), 0.05, 3, 4)
+    field = depth_scales.fit_field(np.zeros((0, 12)), np.zeros(0), np.zeros(0))
     assert np.array_equal(field, np.zeros((3, 4)))
 
 

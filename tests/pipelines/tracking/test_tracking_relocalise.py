@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.config import TrackingConfig
 from pipelines.geometry import se3
 from pipelines.geometry.alignment import Similarity
 from pipelines.geometry.camera import unproject
@@ -59,7 +58,7 @@ def test_a_frame_is_posed_only_where_the_answer_is_unique(places: list[np.ndarra
     state = TrackState()
     for n, place in enumerate(places):
         add_place(state, 10 + 40 * n, place)
-    seen, solved = relocalise(30, state, OnePicture(), CAMERA, TrackingConfig(), 0)  # type: ignore[arg-type]
+    seen, solved = relocalise(30, state, OnePicture(), CAMERA, 0)  # type: ignore[arg-type]
     assert len(seen) > 100
     assert (solved is not None) == found
     if solved is not None:

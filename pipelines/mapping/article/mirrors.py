@@ -1,4 +1,8 @@
-"""Pixels of a view that show the two halves of something mirror-symmetric (MSGS-SLAM 3.1), ready for the loss."""
+"""Pixels of a view that show the two halves of something mirror-symmetric (MSGS-SLAM 3.1), and the pull between them.
+
+Off: the planes found in replica pull at pairs that are not exact. 7 keyframes with true depth: 39.52 dB without, 39.42
+with weight 0.05, 38.83 with 0.5; depth L1 0.761, 0.763, 0.819 cm. With noisy depth it is not measured.
+"""
 
 from __future__ import annotations
 
@@ -47,3 +51,15 @@ class Mirrors:
 def at(image: Tensor, place: Tensor) -> Tensor:
     """(K, ...) the pixels of an (H, W, ...) image at (K, 2) rows and columns."""
     return image[place[:, 0], place[:, 1]]
+
+
+def symmetry_loss(depth: Tensor, mirrors: Mirrors, unit: float) -> Tensor:
+    """Mean over the pairs, weighed by their confidence: how far the second depth is from what the first one says."""
+    expected = mirrors.gain * at(depth, mirrors.first) + mirrors.offset
+    return (mirrors.confidence * (at(depth, mirrors.second) - expected).abs()).mean() / unit
+
+
+def label_symmetry_loss(logits: Tensor, mirrors: Mirrors) -> Tensor:
+    """Mean over the pairs, weighed by their confidence: the total variation between the two pixels' classes."""
+    first, second = at(logits, mirrors.first).softmax(-1), at(logits, mirrors.second).softmax(-1)
+    return (mirrors.confidence * (first - second).abs().sum(-1)).mean() / 2

@@ -1,0 +1,1 @@
+"""Terms of the article that earn nothing measurable, one a module; off unless `[article]` asks for them."""

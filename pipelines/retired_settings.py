@@ -1,0 +1,47 @@
+"""Settings that earlier versions had: what has become of each, for whoever still has them in a file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+MOVED = {
+    "proxy.symmetry": "article.symmetry_weight",
+    "tracking.depth_weight": "article.tracking_depth_weight",
+    "tracking.label_weight": "article.tracking_label_weight",
+    "mapping.boundary_clip": "article.boundary_clip",
+    "mapping.densify_classes": "article.class_growth",
+    "mapping.edge_weight": "article.edge_weight",
+    "mapping.kappa": "article.kappa",
+    "mapping.label_loss": "article.label_image",
+    "mapping.symmetry_weight": "article.symmetry_weight",
+}
+"""Old name → the one that decides it now."""
+
+_FIXED = {
+    "frames": "max_match_error",
+    "proxy": "alpha beta gamma theta_slope theta_middle",
+    "tracking": "flow_window flow_levels flow_error flow_sd feature_sd pose_error min_inliers new_points "
+    "keyframe_share relocalise_candidates silhouette color_weight render_loss depth_sd grid_rows grid_columns "
+    "adjust_iterations",
+    "mapping": "fine_share flat_share window_steps coarse_share color_weight ssim_weight depth_nu label_every "
+    "edge_sharpness size_weight size_limit silhouette_weight depth_fields depth_check silhouette_threshold "
+    "depth_tolerance densify_every densify_until split_radius prune_opacity prune_weight prune_radius mean_rate "
+    "radius_rate opacity_rate color_rate class_rate rate_decay pose_rate exposure_rate low_trust_step time_decay "
+    "reliability_decay region_prior",
+    "global_ba": "words loop_shared_points richness loop_similarity miou_weight appearance_weight structure_weight "
+    "loop_error loop_share loop_sure_inliers loop_rotation loop_translation loop_drift loop_angle_drift "
+    "loop_scale_drift drift_px joint_px",
+    "export": "truncation least_weight",
+}
+FIXED = frozenset(f"{section}.{name}" for section, names in _FIXED.items() for name in names.split())
+"""Constants now, beside the code that uses them, at what was their default."""
+
+
+def explain_retired(keys: Iterable[str]) -> str:
+    """What has become of the settings among `keys` (section.name) that there were once; "" for none of them."""
+    keys = list(keys)
+    moved = [f"{k} is {MOVED[k]} now (off unless set)" for k in keys if k in MOVED]
+    fixed = [k for k in keys if k in FIXED]
+    if fixed:
+        moved.append(f"{', '.join(fixed)}: fixed at what was the default")
+    return "; ".join(moved)
