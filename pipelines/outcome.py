@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from formats.errors import InputError
 from formats.tensors import load_arrays
 from pipelines.config import Config, load_saved_config
+from pipelines.device import settle_device
 from pipelines.gaussian_map import GaussianMap
 from pipelines.mapping.load import load_class_ids
 from pipelines.records import StageRecord, load_records, load_source, recorded_config
@@ -93,8 +94,8 @@ class Outcome:
         return int(np.flatnonzero(self.trajectory.frame_ids == frame_id)[0])
 
 
-def load_outcome(run: RunFolder) -> Outcome:
-    """Raises InputError for a run whose tracking is not done."""
+def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:
+    """What a run has found, its map on `device`. Raises InputError for a run whose tracking is not done."""
     records = load_records(run)
     config = recorded_config(records, load_saved_config(run.settings_file))
     pose_stage = _latest(run, records, _POSE_STAGES, "trajectory.npz")
@@ -114,7 +115,7 @@ def load_outcome(run: RunFolder) -> Outcome:
         pose_stage=pose_stage,
         trajectory=trajectory,
         map_stage=map_stage,
-        gaussian_map=run.load_map(map_stage) if map_stage else None,
+        gaussian_map=run.load_map(map_stage, settle_device(device)) if map_stage else None,
         classes=run.load_classes(),
         label_of_channel=np.array(load_class_ids(run) if map_stage else (), np.uint8),
         exposure=_load_exposure(run, map_stage, trajectory),

@@ -11,10 +11,11 @@ from formats.errors import InputError
 from formats.image_times import times_file
 from formats.images import list_images
 from pipelines.config import Config, load_saved_config
+from pipelines.device import settle_device
 from pipelines.frames.recording import open_recording
 from pipelines.frames.source import require_source
 from pipelines.lock import LOCK, locked
-from pipelines.progress import Progress, log
+from pipelines.progress import Progress
 from pipelines.records import StageRecord, load_records, load_source, recorded_config
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
@@ -132,18 +133,7 @@ def _require_same_source(run: RunFolder, source: Path, digest: str) -> None:
 
 
 def _with_device(config: Config) -> Config:
-    """Settle `auto`, and refuse a GPU that is not there."""
-    import torch
-
-    wanted = config.run.device
-    if wanted == "cuda" and not torch.cuda.is_available():
-        raise InputError(
-            "--device cuda: torch finds no CUDA device here. Use --device cpu, or install a CUDA build of torch"
-        )
-    if wanted == "auto":
-        wanted = "cuda" if torch.cuda.is_available() else "cpu"
-        log.info("device: %s", wanted)
-    return replace(config, run=replace(config.run, device=wanted))
+    return replace(config, run=replace(config.run, device=settle_device(config.run.device)))
 
 
 def _set_threads(threads: int) -> None:

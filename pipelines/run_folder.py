@@ -144,9 +144,10 @@ class RunFolder:
         """frame_ids (N,), log_gains (N, 3), offsets (N, 3) of the mapped keyframes."""
         return load_arrays(self.stage("mapping") / "exposure.npz")
 
-    def load_map(self, stage: str) -> GaussianMap:
+    def load_map(self, stage: str, device: str = "cpu") -> GaussianMap:
         """The Gaussian map as `stage` left it."""
-        return GaussianMap(**load_tensors(self.stage(stage) / "map.safetensors"))
+        tensors = load_tensors(self.stage(stage) / "map.safetensors")
+        return GaussianMap(**{name: tensor.to(device) for name, tensor in tensors.items()})
 
     def load_loops(self) -> list[LoopEdge]:
         """The verified loops of the global adjustment."""

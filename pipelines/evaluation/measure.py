@@ -142,10 +142,10 @@ def refined_pose(outcome: Outcome, frame_id: int, cam_from_world: NDArray[np.flo
     if outcome.exposure is not None:
         photo = outcome.exposure.remove(photo, frame.timestamp)
     fit = track_gn(
-        m.means, m.radii, m.opacities, m.colors, torch.as_tensor(cam_from_world), outcome.calibration.intrinsics,
-        torch.as_tensor(photo),
+        m.means, m.radii, m.opacities, m.colors, torch.as_tensor(cam_from_world, device=m.means.device),
+        outcome.calibration.intrinsics, torch.as_tensor(photo, device=m.means.device),
     )  # fmt: skip
-    return fit.cam_from_world.numpy() if fit.converged else cam_from_world
+    return fit.cam_from_world.cpu().numpy() if fit.converged else cam_from_world
 
 
 def evenly(ids: list[int], most: int) -> list[int]:

@@ -65,10 +65,10 @@ def _camera(intrinsics: Intrinsics, side: int) -> Intrinsics:
 @torch.no_grad()
 def depth_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], camera: Intrinsics) -> DepthView:
     """Median depth with a weight: none where the map is thin or the depth jumps, less far away."""
-    pose = torch.from_numpy(cam_from_world)
     m = gaussian_map
-    depth = median_depth(m.means, m.radii, m.opacities, pose, camera).numpy()
-    silhouette = render(m.means, m.radii, m.opacities, m.colors, pose, camera).silhouette.numpy()
+    pose = torch.as_tensor(cam_from_world, device=m.means.device)
+    depth = median_depth(m.means, m.radii, m.opacities, pose, camera).cpu().numpy()
+    silhouette = render(m.means, m.radii, m.opacities, m.colors, pose, camera).silhouette.cpu().numpy()
     solid = (silhouette > 0.7) & (depth > 0) & ~_jumps(depth)
     typical = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
     # The error of a depth grows with its square.
@@ -98,10 +98,10 @@ def _painted(gaussian_map: GaussianMap, views: Sequence[DepthView]) -> Iterator[
     m = gaussian_map
     features = torch.cat([m.colors, m.class_logits], dim=1)
     for view in views:
-        pose = torch.from_numpy(view.cam_from_world)
+        pose = torch.as_tensor(view.cam_from_world, device=m.means.device)
         shown = render(m.means, m.radii, m.opacities, features, pose, view.intrinsics).features
-        channels = decided_channels(shown[..., 3:]).numpy() if shown.shape[-1] > 3 else None
-        yield PaintedView(view, shown[..., :3].numpy(), channels)
+        channels = decided_channels(shown[..., 3:]).cpu().numpy() if shown.shape[-1] > 3 else None
+        yield PaintedView(view, shown[..., :3].cpu().numpy(), channels)
 
 
 def mesh_figures(mesh: SemanticMesh) -> dict[str, int | float]:

@@ -19,7 +19,7 @@ from pipelines.types import SemanticMesh
 
 def run(context: StageContext) -> dict[str, Any]:
     """All files; a mesh that an interrupted attempt has finished is kept."""
-    outcome, settings = load_outcome(context.run), context.config.export
+    outcome, settings = load_outcome(context.run, context.device), context.config.export
     gaussian_map = outcome.require_map()
     write_all_but_mesh(outcome, settings, context.folder)
     mesh = _finished_mesh(context.folder)

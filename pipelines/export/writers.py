@@ -77,10 +77,9 @@ def map_cloud(outcome: Outcome) -> GaussianCloud:
     probabilities = None
     if len(channels):
         probabilities = np.zeros((len(m), len(outcome.classes)), np.float32)
-        probabilities[:, channels] = torch.softmax(m.class_logits, dim=1).numpy()
-    return isotropic_cloud(
-        m.means.numpy(), m.log_radii.numpy(), m.opacity_logits.numpy(), m.colors.numpy(), probabilities
-    )
+        probabilities[:, channels] = torch.softmax(m.class_logits, dim=1).cpu().numpy()
+    means, log_radii, logits, colors = (x.cpu().numpy() for x in (m.means, m.log_radii, m.opacity_logits, m.colors))
+    return isotropic_cloud(means, log_radii, logits, colors, probabilities)
 
 
 def write_ply(outcome: Outcome, sh_rest: bool, folder: Path) -> list[Path]:

@@ -54,7 +54,7 @@ def run(context: StageContext) -> dict[str, Any]:
     """Find loops; where there are any, adjust everything with them and take the map along; refine both together."""
     model = context.run.load_sparse("tracking")
     trajectory = context.run.load_trajectory("mapping")
-    gaussian_map = context.run.load_map("mapping")
+    gaussian_map = context.run.load_map("mapping", context.device)
     settings = context.config.global_ba
 
     found = search(context, model) if settings.use_loops else FoundLoops([], 0, 0, 0, 0)
@@ -203,8 +203,8 @@ def refine(context: StageContext, gaussian_map: GaussianMap, trajectory: Traject
     settings = context.config.global_ba
     if settings.joint == "never" or (settings.joint == "moved" and moved_px < JOINT_PX):
         return None
-    mapping, device = context.config.mapping, context.config.run.device
-    given = load_views(context.run, trajectory, mapping, context.config.article, "cpu" if device == "auto" else device)
+    mapping = context.config.mapping
+    given = load_views(context.run, trajectory, mapping, context.config.article, context.device)
     views = agree_on_depth(given.views, given.anchors)
     exposure = context.run.load_exposure()
     gains = {int(i): g for i, g in zip(exposure["frame_ids"], exposure["log_gains"], strict=True)}

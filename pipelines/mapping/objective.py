@@ -35,7 +35,8 @@ class Objective:
 
     def uses_labels(self, iteration: int) -> bool:
         """Whether the semantic terms count at this step."""
-        return self.classes > 0 and self.settings.label_weight > 0 and iteration % LABEL_EVERY == 0
+        wanted = max(self.settings.label_weight, self.article.edge_weight, self.article.symmetry_weight) > 0
+        return self.classes > 0 and wanted and iteration % LABEL_EVERY == 0
 
     def of(self, view: View, table: AdamTable, rendering: Rendering, log_radii: Tensor, with_labels: bool) -> Tensor:
         """Scalar; `table` holds the view's exposure, `log_radii` (M,) the map's."""
@@ -52,7 +53,7 @@ class Objective:
             loss = loss + s.depth_weight * losses.depth_loss(rendering.depth, view.depth, weight, self.unit)
         if article.symmetry_weight > 0 and view.mirrors is not None:
             loss = loss + article.symmetry_weight * symmetry_loss(rendering.depth, view.mirrors, self.unit)
-        if with_labels and self.classes > 0:
+        if with_labels:
             loss = loss + LABEL_EVERY * self._semantic(view, rendering.depth, logits)
         # Exposures are relative: without a pull to zero they and the colours drift together.
         values = table.values
@@ -61,8 +62,10 @@ class Objective:
     def _semantic(self, view: View, depth: Tensor, logits: Tensor) -> Tensor:
         """Labels, and what the article has beside them."""
         article, weight = self.article, self.settings.label_weight
-        compare = label_image_loss if article.label_image else losses.label_loss
-        loss = weight * compare(logits, view.channels, view.label_weight)
+        loss = depth.new_zeros(())
+        if weight > 0:
+            compare = label_image_loss if article.label_image else losses.label_loss
+            loss = loss + weight * compare(logits, view.channels, view.label_weight)
         if article.edge_weight > 0:
             loss = loss + article.edge_weight * edge_loss(depth, view.channels, self.unit)
         if article.symmetry_weight > 0 and view.mirrors is not None:

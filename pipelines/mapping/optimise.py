@@ -87,8 +87,8 @@ class MapOptimiser:
         parameters, table = self.state.parameters, self.state.view_tables[step.view]
         if len(parameters) == 0:
             return
-        with_labels = self.objective.uses_labels(step.iteration) or step.grow
-        rendering = self.draw(view, table, with_labels)
+        with_labels = self.objective.uses_labels(step.iteration)
+        rendering = self.draw(view, table, with_labels or (step.grow and self.article.class_growth))
         loss = self.objective.of(view, table, rendering, parameters["log_radii"], with_labels) * step.weight
         of_map, of_view = gradients_of(loss, (parameters.table, table))
         parameters.table.step(of_map, self._map_rates(step.rate), self._shares())

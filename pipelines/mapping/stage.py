@@ -21,9 +21,9 @@ from pipelines.types import Trajectory
 
 def run(context: StageContext) -> dict[str, Any]:
     """Views, depth that agrees between them, the optimised map; poses and exposures refined with it."""
-    settings, seed, device = context.config.mapping, context.config.run.seed, context.config.run.device
+    settings, seed = context.config.mapping, context.config.run.seed
     trajectory = context.run.load_trajectory("tracking")
-    given = load_views(context.run, trajectory, settings, context.config.article, "cpu" if device == "auto" else device)
+    given = load_views(context.run, trajectory, settings, context.config.article, context.device)
     _require_views(given, context)
 
     views = prepare_depth(given)
@@ -96,4 +96,4 @@ def _measure_held_out(
     return [measure_view(result.gaussian_map, *args) for args in zip(held_out, poses, gains, offsets, strict=True)]
 
 
-STAGE = Stage("mapping", 4, run, "the semantic Gaussian map from the keyframes")
+STAGE = Stage("mapping", 5, run, "the semantic Gaussian map from the keyframes")

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from pipelines.config import ArticleConfig, MappingConfig
+from pipelines.gaussians.render import Rendering
 from pipelines.geometry import se3
-from pipelines.mapping import growth, optimise, schedule
+from pipelines.mapping import growth, objective, optimise, schedule
 from pipelines.mapping.load import MappingInput
 from pipelines.mapping.measure import ViewFigures, measure_view
 from pipelines.mapping.optimise import MapOptimiser, OptimisedMap, optimise_map
@@ -67,6 +68,30 @@ def test_splitting_stops_at_the_largest_map(room: MappingInput) -> None:
     optimiser = MapOptimiser(room.views, classes, replace(SETTINGS, max_gaussians=most), ArticleConfig(), state)
     optimiser.growth.split(optimiser._blame())
     assert len(state.parameters) == len(few.gaussian_map) + 30
+
+
+@pytest.mark.parametrize("iteration", [0, 1])
+def test_labels_count_as_often_while_the_map_grows(room: MappingInput, iteration: int) -> None:
+    """At every second step and at no other, whether it grows or not."""
+    plan = schedule.Schedule.plan(room.views, SETTINGS, seed=0, seeding=True, passes=None)
+    growing = next(s for i in range(plan.total) if (s := plan.step(i)).grow)
+    state = OptimiserState.fresh(room.views, len(room.class_ids), None, None)
+    optimiser = MapOptimiser(room.views, len(room.class_ids), SETTINGS, ArticleConfig(), state)
+    optimiser.visit(replace(plan.step(0), view=growing.view))
+    before = state.parameters["class_logits"].clone()
+    optimiser.visit(replace(growing, iteration=iteration))
+    moved = (state.parameters["class_logits"][: len(before)] - before).abs().max() > 0
+    assert bool(moved) == (iteration % objective.LABEL_EVERY == 0)
+
+
+def test_the_edge_term_does_not_need_the_labels(room: MappingInput) -> None:
+    view, losses = room.views[0], []
+    table = OptimiserState.fresh(room.views, 0, None, None).view_tables[0]
+    drawn = Rendering(torch.zeros(*view.depth.shape, 5), view.depth + 0.3 * torch.rand(view.depth.shape), view.trust)
+    for weight in (0.0, 1.0):
+        terms = objective.Objective(replace(SETTINGS, label_weight=0.0), ArticleConfig(edge_weight=weight), 2, 1.0)
+        losses.append(terms.of(view, table, drawn, torch.zeros(1), terms.uses_labels(0)).item())
+    assert losses[1] > losses[0] + 0.01
 
 
 class Killed(Exception):
