@@ -9,6 +9,12 @@ from numpy.typing import NDArray
 
 from formats.errors import InputError
 
+_LARGEST_SIDE = 65535
+_FOCAL_SIDES = 100
+"""Focal lengths beyond this many sides of the picture, or below its inverse, are slips of the unit or damage."""
+_STRONGEST_DISTORTION = 1000.0
+_SAME_SHAPE = 0.01
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -28,7 +34,10 @@ class Camera:
 
     def __post_init__(self) -> None:
         values = np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion], dtype=np.float64)
-        if self.width < 1 or self.height < 1 or self.fx <= 0 or self.fy <= 0 or not np.isfinite(values).all():
+        side = max(self.width, self.height)
+        sane = 1 <= min(self.width, self.height) <= side <= _LARGEST_SIDE and bool(np.isfinite(values).all())
+        sane = sane and all(side / _FOCAL_SIDES <= f <= side * _FOCAL_SIDES for f in (self.fx, self.fy))
+        if not sane or max(abs(k) for k in (0.0, *self.distortion)) > _STRONGEST_DISTORTION:
             raise InputError(f"these are no camera intrinsics: {self}: check the data set's calibration file")
         if not (-self.width < self.cx < 2 * self.width and -self.height < self.cy < 2 * self.height):
             raise InputError(f"the principal point is far outside the image: {self}: is it another camera's file?")
@@ -53,8 +62,19 @@ class Camera:
         return cls(width, height, fx, fy, cx + 0.5, cy + 0.5, distortion)
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same camera after its image is resized to width x height."""
+        """The same camera after its image is resized to width x height.
+
+        Raises InputError for images of another shape, by more than 1 % and a pixel of rounding: no resizing makes one
+        of the other.
+        """
         sx, sy = width / self.width, height / self.height
+        if abs(width * self.height - height * self.width) > max(
+            _SAME_SHAPE * width * self.height, self.width, self.height, width, height
+        ):
+            raise InputError(
+                f"the camera is for images of {self.width}x{self.height}, these are {width}x{height}, another shape: "
+                "is it another camera's file, or are the images cropped or turned?"
+            )
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )

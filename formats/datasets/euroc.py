@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from formats.datasets.camera import Camera
 from formats.datasets.matching import poses_at
@@ -15,7 +14,7 @@ from formats.datasets.sequence import Sequence
 from formats.errors import InputError
 from formats.safe_path import inside
 from formats.textfile import read_rows, read_table, read_text
-from formats.trajectory import clean_poses
+from formats.trajectory import clean_poses, poses_from_quaternions
 
 _NANOSECONDS = 1e-9
 
@@ -62,9 +61,7 @@ def _poses(path: Path, times: NDArray[np.float64], body_from_cam: NDArray[np.flo
     if not path.is_file():
         return None
     table = read_table(path, 8)
-    world_from_body = np.tile(np.eye(4), (len(table), 1, 1))
-    world_from_body[:, :3, :3] = Rotation.from_quat(table[:, [5, 6, 7, 4]]).as_matrix()
-    world_from_body[:, :3, 3] = table[:, 1:4]
+    world_from_body = poses_from_quaternions(table[:, [5, 6, 7, 4]], table[:, 1:4], str(path))
     return poses_at(times, table[:, 0] * _NANOSECONDS, world_from_body @ body_from_cam)
 
 
@@ -74,6 +71,8 @@ def _calibration(path: Path) -> tuple[Camera, NDArray[np.float64]]:
     width, height = _numbers(text, path, "resolution", 2)
     distortion = _numbers(text, path, "distortion_coefficients", 4)
     transform = np.array(_numbers(text, path, "data", 16)).reshape(1, 4, 4)
+    if not np.isfinite([width, height, *transform.ravel()]).all():
+        raise InputError(f"{path}: a number is not finite: unpack the data set again")
     camera = Camera.from_integer_centres(int(width), int(height), fx, fy, cx, cy, tuple(distortion))
     return camera, clean_poses(transform, str(path))[0]
 

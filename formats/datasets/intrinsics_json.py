@@ -33,7 +33,10 @@ def read_intrinsics_json(path: Path, *, integer_centres: bool) -> tuple[Camera, 
         number(table, path, "cy") + shift,
         _distortion(table, path),
     )
-    return camera, optional_number(table, path, "depth_scale", "scale")
+    scale = optional_number(table, path, "depth_scale", "scale")
+    if scale is not None and not scale > 0:
+        raise InputError(f"{path}: depth_scale is {scale:g}, expected raw units a metre: correct it")
+    return camera, scale
 
 
 def _distortion(table: dict, path: Path) -> tuple[float, ...]:
@@ -42,5 +45,5 @@ def _distortion(table: dict, path: Path) -> tuple[float, ...]:
         named = tuple(optional_number(table, path, name) or 0.0 for name in _DISTORTION_NAMES)
         return named if named[4] else named[:4]
     if not isinstance(values, list) or not 0 < len(values) <= 5 or not all(isinstance(v, int | float) for v in values):
-        raise InputError(f"{path}: distortion is {values!r}, expected up to five numbers k1, k2, p1, p2, k3")
+        raise InputError(f"{path}: distortion is {str(values)[:80]}, expected up to five numbers k1, k2, p1, p2, k3")
     return tuple(float(v) for v in values) + (0.0,) * (4 - len(values))

@@ -40,7 +40,8 @@ def open_nerfstudio(path: Path) -> Sequence:
     if file is None:
         raise InputError(f"no transforms.json in {path}: give the folder that holds it")
     table = read_json_object(file)
-    frames = [frame for frame in table.get("frames", []) if isinstance(frame, dict)]
+    listed = table.get("frames")
+    frames = [frame for frame in listed if isinstance(frame, dict)] if isinstance(listed, list) else []
     images = {id(frame): _image(file, frame) for frame in frames}
     kept = [frame for frame in frames if images[id(frame)] is not None]
     if not kept:
@@ -119,6 +120,8 @@ def _camera(
     actual = image_size(image)
     width, height = (int(optional_number(values, file, key) or size) for key, size in zip("wh", actual, strict=True))
     angle = optional_number(values, file, "camera_angle_x")
+    if angle and not 0 < angle < math.pi:
+        raise InputError(f"{file}: camera_angle_x is {angle:g}, expected radians between 0 and pi")
     fx = width / 2 / math.tan(angle / 2) if angle and "fl_x" not in values else number(values, file, "fl_x")
     fy = optional_number(values, file, "fl_y") or fx
     cx, cy = (optional_number(values, file, key) for key in ("cx", "cy"))

@@ -21,6 +21,7 @@ from formats.datasets import (
 from formats.datasets.sequence import Sequence
 from formats.errors import InputError
 from formats.images import IMAGE_SUFFIXES
+from formats.reading import reaching
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,8 @@ FORMATS = ("auto", *_READERS)
 
 def recognise(path: Path) -> str | None:
     """The format of a data set by what lies in it, "folder" for plain images, None for anything else."""
-    found = _recognise(Path(path))
+    with reaching(path):
+        found = _recognise(Path(path))
     return found[0] if found else None
 
 
@@ -63,8 +65,9 @@ def recognise_source(path: Path) -> str | None:
     lies above it, nor because somebody has left a COLMAP model in it.
     """
     path = Path(path)
-    names = [name for name, reader in _READERS.items() if path.exists() and reader.recognises(path)]
-    holds_images = path.is_dir() and any(p.suffix.lower() in IMAGE_SUFFIXES for p in path.iterdir())
+    with reaching(path):
+        names = [name for name, reader in _READERS.items() if path.exists() and reader.recognises(path)]
+        holds_images = path.is_dir() and any(p.suffix.lower() in IMAGE_SUFFIXES for p in path.iterdir())
     return next((name for name in names if not (holds_images and name in _NOT_FROM_INSIDE)), None)
 
 
@@ -90,8 +93,13 @@ def open_sequence(path: Path, format: str = "auto") -> Sequence:
         nearest = get_close_matches(format, FORMATS, 1)
         hint = f", did you mean {nearest[0]!r}?" if nearest else ""
         raise InputError(f"no data set format {format!r}{hint} Known: {', '.join(FORMATS)}")
-    if not path.exists():
-        raise InputError(f"no such file or folder: {path}: check the spelling, and that the disk is mounted")
+    with reaching(path):
+        if not path.exists():
+            raise InputError(f"no such file or folder: {path}: check the spelling, and that the disk is mounted")
+        return _open(path, format)
+
+
+def _open(path: Path, format: str) -> Sequence:
     found = _recognise(path) if format == "auto" else (format, path)
     if found is None:
         raise InputError(

@@ -16,6 +16,7 @@ from formats.images import read_depth_png, read_label_png, read_rgb
 
 VOID_LABEL = 255
 """Label of a pixel without a class."""
+_UNITS_PER_METRE = (1e-3, 1e9)
 
 
 @dataclass(frozen=True)
@@ -79,8 +80,11 @@ class Sequence:
             raise InputError(f"no frames in {self.root}: check that the data set was unpacked completely")
         if len(set(self.names)) != n:
             raise InputError(f"{self.root}: two frames have the same file name: rename one")
-        if self.timestamps.shape != (n,) or not (np.diff(self.timestamps) > 0).all():
+        increasing = self.timestamps.shape == (n,) and bool((np.diff(self.timestamps) > 0).all())
+        if not increasing or not np.isfinite(self.timestamps).all():
             raise InputError(f"{self.root}: the frames' timestamps do not increase: sort the image list by time")
+        if not _UNITS_PER_METRE[0] <= self.depth_per_metre <= _UNITS_PER_METRE[1]:
+            raise InputError(f"{self.root}: {self.depth_per_metre:g} depth units a metre: correct the depth scale")
         for what in ("image_paths", "depth_paths", "label_paths"):
             if len(getattr(self, what)) not in (0, n):
                 raise ValueError(f"Sequence: {len(getattr(self, what))} {what} for {n} frames")

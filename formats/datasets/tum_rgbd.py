@@ -80,11 +80,13 @@ def _depth_paths(path: Path, times: NDArray[np.float64]) -> tuple[Path | None, .
     return tuple(files[i] if ok else None for i, ok in zip(index, near, strict=True))
 
 
-def _camera(path: Path, image: Path) -> tuple[Camera, tuple[str, ...]]:
+def _camera(path: Path, image: Path) -> tuple[Camera | None, tuple[str, ...]]:
     if (path / "intrinsics.json").is_file():
         return read_intrinsics_json(path / "intrinsics.json", integer_centres=True)[0], ()
     width, height = image_size(image)
     found = re.search(r"(?:freiburg|fr)([123])(?![0-9])", path.resolve().name)
     fx, fy, cx, cy, distortion = _FREIBURG[found[1]] if found else _DEFAULT
+    if abs(width / height - 640 / 480) > 0.02:
+        return None, ("the images have not the shape of a Kinect's: the camera is taken to be unknown",)
     notes = () if found else ("the folder's name tells no freiburg camera: a focal length of 525 is assumed",)
     return Camera.from_integer_centres(640, 480, fx, fy, cx, cy, distortion).resized(width, height), notes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from formats.atomic import atomic_path
 from formats.errors import InputError
+from formats.tensors import load_arrays
 
 
 def save_scratch(path: Path, **arrays: NDArray) -> None:
@@ -21,7 +21,6 @@ def save_scratch(path: Path, **arrays: NDArray) -> None:
 def load_scratch(path: Path) -> dict[str, NDArray]:
     """Inverse of `save_scratch`. Raises InputError when the file is damaged."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise InputError(f"{path}: cannot be read ({error}). Delete it and type `msgs-slam resume`") from error
+        return load_arrays(path)
+    except InputError as error:
+        raise InputError(f"{error}; delete it and type `msgs-slam resume`") from error

@@ -7,6 +7,7 @@ from pathlib import Path
 from formats.datasets.camera import Camera
 from formats.datasets.intrinsics_json import read_intrinsics_json
 from formats.errors import InputError
+from formats.reading import reaching
 from formats.textfile import read_rows
 
 _HOW = "give fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file that holds them"
@@ -17,7 +18,6 @@ _PARAMETERS = {
     "RADIAL": "f cx cy k1 k2",
     "OPENCV": "fx fy cx cy k1 k2 p1 p2",
 }
-_SAME_SHAPE = 0.01
 
 
 def read_intrinsics(text: str, width: int, height: int) -> Camera:
@@ -32,9 +32,11 @@ def read_intrinsics(text: str, width: int, height: int) -> Camera:
     numbers = _numbers(text.replace(",", " ").split())
     if numbers is not None:
         return _from_numbers(numbers, width, height, f"intrinsics {text}")
-    path = Path(text).expanduser()
-    if not path.is_file():
-        raise InputError(f"intrinsics {text!r} are neither numbers nor an existing file: {_HOW}")
+    path = Path(text)
+    with reaching(path):
+        path = path.expanduser()
+        if not path.is_file():
+            raise InputError(f"intrinsics {text!r} are neither numbers nor an existing file: {_HOW}")
     return _fit_to_source(_from_file(path, width, height), width, height, path)
 
 
@@ -69,6 +71,8 @@ def _from_colmap(row: list[str], path: Path) -> Camera:
     named = dict(zip(names, numbers[2:], strict=True))
     focal = named.get("f", 0.0)
     distortion = tuple(named.get(name, 0.0) for name in ("k1", "k2", "p1", "p2"))
+    if not all(1 <= side <= 1e6 for side in numbers[:2]):
+        raise InputError(f"{path}: a camera of {numbers[0]:g}x{numbers[1]:g} pixels: check its line")
     return Camera(
         int(numbers[0]), int(numbers[1]), named.get("fx", focal), named.get("fy", focal), named["cx"], named["cy"],
         distortion,
@@ -89,13 +93,10 @@ def _from_numbers(numbers: list[float], width: int, height: int, where: str) -> 
 
 
 def _fit_to_source(camera: Camera, width: int, height: int, path: Path) -> Camera:
-    sx, sy = width / camera.width, height / camera.height
-    if abs(sx / sy - 1) > _SAME_SHAPE:
-        raise InputError(
-            f"{path} is for images of {camera.width}x{camera.height}, the source is {width}x{height}, another shape: "
-            "is it another camera's file, or is the source cropped or turned?"
-        )
-    return camera.resized(width, height)
+    try:
+        return camera.resized(width, height)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def _numbers(words: list[str]) -> list[float] | None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from formats.errors import InputError
+from formats.jsonfile import read_json
+from formats.reading import parsing
+from formats.textfile import read_text
 
 VOID_NAMES = frozenset({"void", "none", "unknown", "undefined", "unlabeled", "unlabelled", "ignore"})
 _FILES = ("classes.json", "info_semantic.json", "classes.txt", "labels.txt", "classes_used.txt")
@@ -38,13 +40,9 @@ def read_class_table(path: Path) -> dict[int, NamedClass]:
     text: a name a line (ids from 0) up to the first empty line, or `id name [anything]` a line; # begins a comment.
     Raises InputError.
     """
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise InputError(f"{path}: {path.stat().st_size} bytes are too many for a table of classes")
-        text = path.read_text(encoding="utf-8")
-        table = _from_json(json.loads(text)) if path.suffix == ".json" else _from_text(text)
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: not a table of classes ({error}). Write a list of {{id, name}}") from error
+    stored = read_json(path, _MAX_BYTES) if path.suffix == ".json" else read_text(path, _MAX_BYTES)
+    with parsing(path, "table of classes", "write a list of {id, name}"):
+        table = _from_text(stored) if isinstance(stored, str) else _from_json(stored)
     if not table or min(table) < 0 or max(table) > MAX_ID:
         raise InputError(f"{path}: class ids must be in 0..{MAX_ID} and at least one is needed")
     return table

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from formats.errors import InputError
 from formats.images import MAX_IMAGE_PIXELS, image_size, read_depth_png, read_grey_png
+from formats.reading import parsing, reaching, require_file
 from pipelines.proxy.files.matching import find_folder, match_files
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.sequence import Sequence, resample_nearest
@@ -110,17 +111,19 @@ def require_size(path: Path, width: int, height: int, sequence: Sequence) -> Non
 
 def _read(path: Path, unit: float) -> NDArray[np.float32]:
     if path.suffix.lower() == ".npy":
-        return np.array(_open_npy(path), dtype=np.float32)
+        with np.errstate(over="ignore"):  # infinite is as unknown as too far
+            return np.array(_open_npy(path), dtype=np.float32)
     stored = read_depth_png(path)
     return np.where(stored == _INVALID_U16, 0, stored).astype(np.float32) * np.float32(unit)
 
 
 def _open_npy(path: Path) -> NDArray[np.floating]:
     """Mapped, not read: (h, w) floats. Raises InputError for anything else."""
-    try:
+    require_file(path)
+    with parsing(path, ".npy of an array", "save it again with numpy.save"):
         stored = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: cannot be read as .npy ({error}). Save it again with numpy.save") from error
+        if not isinstance(stored, np.ndarray):
+            raise ValueError("an archive of several")
     shape = stored.shape
     if not np.issubdtype(stored.dtype, np.floating) or len(shape) != 2 or 0 in shape:
         raise InputError(f"{path}: holds {stored.dtype} {shape}; depth is a float array (height, width) in metres")
@@ -134,6 +137,8 @@ def _match_confidence(depth_folder: Path, sequence: Sequence, is_video: bool) ->
     alike = tuple(depth_folder.name.replace(_NAMES[0], n) for n in _CONFIDENCE_NAMES if _NAMES[0] in depth_folder.name)
     for name in alike + _CONFIDENCE_NAMES:
         folder = depth_folder.parent / name
-        if folder.is_dir() and any(p.suffix.lower() in suffixes for p in folder.iterdir()):
+        with reaching(folder):
+            found = folder.is_dir() and any(p.suffix.lower() in suffixes for p in folder.iterdir())
+        if found:
             return match_files(folder, suffixes, _CONFIDENCE_NAMES, sequence.frames, is_video)
     return {}

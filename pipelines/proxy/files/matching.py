@@ -7,6 +7,7 @@ from pathlib import Path
 
 from formats.errors import InputError
 from formats.images import natural_key
+from formats.reading import reaching
 from pipelines.types import Frame
 
 _KINDS = r"(colou?r|rgb|image|img|depth|disp|labels?|semantic|segmentation|class|conf|confidence)"
@@ -29,8 +30,9 @@ def find_folder(given: str, source: Path, names: tuple[str, ...], suffixes: tupl
     candidates = [root / name for root in roots for name in names]
     candidates += [Path(given).expanduser()] if given else [source]
     for folder in candidates:
-        if folder.is_dir() and _list(folder, suffixes, names):
-            return folder
+        with reaching(folder):
+            if folder.is_dir() and _list(folder, suffixes, names):
+                return folder
     looked = ", ".join(str(c) for c in candidates)
     raise InputError(
         f"no folder with {names[0]} files ({', '.join(suffixes)}) found; looked in {looked}. "
