@@ -112,7 +112,7 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
         if upright.mode.startswith("I"):  # one channel of 16 bit; Pillow's own conversion saturates it
             grey = (np.clip(np.asarray(upright), 0, 65535) >> 8).astype(np.uint8)
             return np.repeat(grey[:, :, None], 3, axis=2)
-        return np.array(upright.convert("RGB"), dtype=np.uint8)
+        return np.array(upright if upright.mode == "RGB" else upright.convert("RGB"), dtype=np.uint8)
 
 
 def read_depth_png(path: Path) -> NDArray[np.uint16]:

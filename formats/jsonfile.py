@@ -17,6 +17,7 @@ from formats.textfile import read_text
 MAX_JSON_BYTES = 32 * 1024 * 1024
 MAX_TOML_BYTES = 1024 * 1024
 _MOST_DIGITS = 40
+_DEEPEST_KEY, _KEY_ENDS = 64, re.compile(r"[=\n,\[{]")
 _HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
 
 
@@ -50,6 +51,8 @@ def read_toml(path: Path) -> dict[str, Any]:
     """The table in a TOML file. Raises InputError when it is missing, too large, damaged or nested too deep."""
     text = read_text(path, MAX_TOML_BYTES)
     with parsing(path, "valid TOML", "correct it"):
+        if any(part.count(".") > _DEEPEST_KEY for part in _KEY_ENDS.split(text)):
+            raise ValueError("a key of too many parts")  # tomllib takes the square of their number in time
         return tomllib.loads(text)
 
 

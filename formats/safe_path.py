@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from formats.errors import InputError
+
+_LONGEST_NAME = 255
 
 
 def inside(root: Path, relative: str, named_by: Path) -> Path:
@@ -14,9 +17,10 @@ def inside(root: Path, relative: str, named_by: Path) -> Path:
     """
     path = root / relative
     try:
-        leads_out = not path.resolve().is_relative_to(root.resolve())
+        too_long = any(len(os.fsencode(part)) > _LONGEST_NAME for part in path.parts)
+        leads_out = too_long or not path.resolve().is_relative_to(root.resolve())
     except (ValueError, OSError, RuntimeError):
         leads_out = True  # a NUL byte, a name beyond the system's limits, a loop of links
     if leads_out:
-        raise InputError(f"{named_by} names the file {relative!r}, outside {root}: correct the entry")
+        raise InputError(f"{named_by} names the file {relative[:300]!r}, outside {root}: correct the entry")
     return path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ MAX_TEXT_BYTES = 48 * 1024 * 1024
 
 def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
     """The text of a UTF-8 file. Raises InputError when it is missing, binary, or larger than `most` bytes."""
-    text = read_bytes(path, most).decode("utf-8-sig", errors="replace")
+    text = read_bytes(path, most).removeprefix(codecs.BOM_UTF8).decode("utf-8", errors="replace")
     if "\0" in text[:4096]:
         raise InputError(f"{path} is not a text file: check that it is the right one")
     return text

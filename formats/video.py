@@ -22,10 +22,21 @@ os.environ.setdefault("OPENCV_VIDEOIO_DEBUG", "0")
 import cv2
 
 from formats.errors import InputError
+from formats.images import IMAGE_SUFFIXES
+from formats.reading import opened
 
 MAX_FRAME_PIXELS = 64_000_000
 """A larger frame is taken for a damaged or hostile header (8K video has 33 million)."""
 
+# The containers of one video each. Left out is what names other files (playlists, scripts, numbered images) or is made
+# into pictures by FFmpeg (text): such a file would show what lies elsewhere on this disk, whatever it is called.
+_CONTAINERS = (
+    "mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "mpegts", "mpeg", "mpegvideo", "m4v", "flv", "live_flv", "asf",
+    "asf_o", "ogg", "gif", "apng", "h264", "hevc", "av1", "obu", "ivf", "vvc", "vc1", "dv", "mxf", "nut", "wtv", "rm",
+    "h263", "mjpeg", "mjpeg_2000", "yuv4mpegpipe", "gxf", "swf", "nsv", "dirac", "cavsvideo", "avs2", "avs3", "r3d",
+)  # fmt: skip
+_OPTIONS_VARIABLE = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+_OPEN_OPTIONS = f"format_whitelist;{','.join(_CONTAINERS)}|protocol_whitelist;file"
 _SNIFFED_BYTES = 4096
 _UNKNOWN_RATE = 30.0
 _SHORTEST_STEP = 1e-6
@@ -178,23 +189,11 @@ def _as_predicate(wanted: Callable[[int], bool] | Container[int] | None) -> Call
 
 
 def _require_video_bytes(path: Path) -> None:
-    """Refuse what is certainly no video before FFmpeg sees it.
-
-    FFmpeg would draw a text file as pictures of text, and follow a playlist to other files and to the network.
-    """
-    if not path.exists():
-        raise InputError(f"no such file: {path}: check the spelling, and that the disk is mounted")
-    if not path.is_file():
-        raise InputError(f"{path} is no file: give a video file, or a folder that holds images")
-    try:
-        with path.open("rb") as file:
-            head = file.read(_SNIFFED_BYTES)
-    except PermissionError:
-        raise InputError(f"cannot read {path}: permission denied: change its rights or copy it") from None
-    if not head:
-        raise InputError(f"{path} is empty (0 bytes): the copy or download did not finish, fetch it again")
-    if head.startswith(b"version https://git-lfs"):
-        raise InputError(f"{path} is a git-LFS pointer, not the video itself: run `git lfs pull` in its repository")
+    """Refuse what is certainly no video before FFmpeg sees it, to say so better than FFmpeg would."""
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        raise InputError(f"{path} is one picture, not a video: give the folder that holds the pictures")
+    with opened(path) as file:
+        head = file.read(_SNIFFED_BYTES)
     if b"\0" not in head and _is_text(head):
         raise InputError(f"{path} is a text file, not a video: give a video file or a folder that holds images")
 
@@ -209,13 +208,17 @@ def _is_text(head: bytes) -> bool:
 
 
 def _open(path: Path) -> cv2.VideoCapture:
-    level = cv2.utils.logging.getLogLevel()
+    level, options = cv2.utils.logging.getLogLevel(), os.environ.get(_OPTIONS_VARIABLE)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    os.environ[_OPTIONS_VARIABLE] = _OPEN_OPTIONS  # OpenCV has no other way to hand them to FFmpeg
     try:
         # Without naming the backend, "img_01.jpg" would open as the start of a numbered image series.
         capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
     finally:
         cv2.utils.logging.setLogLevel(level)
+        del os.environ[_OPTIONS_VARIABLE]
+        if options is not None:
+            os.environ[_OPTIONS_VARIABLE] = options
     if not capture.isOpened():
         raise _undecodable(path)
     return capture

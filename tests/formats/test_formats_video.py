@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from formats.errors import InputError
 from formats.video import _Clock, iter_video, probe_video
+from formats.video_writer import write_video
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -132,7 +133,7 @@ def iter_video_times(path: Path) -> np.ndarray:
         ("d_text.mp4", "is a text file"),
         ("tc_audio_only.mp3", "no video stream"),
         ("not_there.mp4", "no such file"),
-        (".", "is no file"),
+        (".", "is a folder"),
     ],
 )
 def test_bad_files_are_explained(shared_data: Path, name: str, message: str) -> None:
@@ -151,10 +152,31 @@ def test_playlists_pointers_and_long_texts_are_refused(tmp_path: Path) -> None:
             probe_video(tmp_path / name)
 
 
-def test_an_image_is_not_taken_for_a_numbered_series(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["x.m3u8", "x.mp4", "x.ffconcat", "x.avi"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"#EXTM3U\n#\xff\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nsecret.mkv\n#EXT-X-ENDLIST\n",
+        b"#EXTM3U\n#\0\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n%s\n#EXT-X-ENDLIST\n",
+        b"ffconcat version 1.0\n#\xff\nfile secret.mkv\n",
+    ],
+)
+def test_playlists_that_are_no_text_show_no_other_file(tmp_path: Path, name: str, text: bytes) -> None:
+    write_video(tmp_path / "secret.mkv", [np.full((32, 32, 3), 80, np.uint8)] * 3, 10)
+    assert probe_video(tmp_path / "secret.mkv").width == 32
+    (tmp_path / name).write_bytes(text.replace(b"%s", bytes(tmp_path / "secret.mkv")))
+    with pytest.raises(InputError, match="no picture can be decoded"):
+        probe_video(tmp_path / name)
+
+
+def test_one_image_is_no_video(tmp_path: Path) -> None:
     for i in range(3):
         cv2.imwrite(str(tmp_path / f"img_{i:02d}.jpg"), np.full((32, 32, 3), 80 * i, np.uint8))
-    assert len(iter_video_times(tmp_path / "img_00.jpg")) == 1
+    (tmp_path / "img_%02d.mp4").write_bytes((tmp_path / "img_00.jpg").read_bytes())
+    with pytest.raises(InputError, match="folder that holds the pictures"):
+        probe_video(tmp_path / "img_00.jpg")
+    with pytest.raises(InputError, match="no picture can be decoded"):
+        probe_video(tmp_path / "img_%02d.mp4")
 
 
 def test_a_damaged_file_is_silent_on_stderr(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -15,6 +14,8 @@ from typing import Any
 from formats.atomic import atomic_path
 from formats.digest import file_sha256
 from formats.errors import InputError
+from formats.jsonfile import read_json_object, write_json
+from formats.reading import reaching, require_file
 from pipelines.proxy.models.download import fetch
 from pipelines.proxy.networks.card import Card, card_from_values
 
@@ -22,6 +23,7 @@ _TABLE = Path(__file__).with_name("registry.toml")
 _NOT_IN_CARDS = ("suffix", "ade20k", "metres_only")
 """Keys of a family that are the table's own."""
 _ADE20K = Path(__file__).with_name("ade20k.toml")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class ModelStore:
         own = store._load_own()
         pinned = own["pinned"]
         rows = [replace(r, sha256=r.sha256 or pinned.get(r.name, "")) for r in rows]
-        added = [Model(**{**row, "urls": ()}) for row in own["added"]]
+        added = [store._own_model(row) for row in own["added"]]
         return replace(store, models=(*added, *rows))
 
     def path(self, model: Model) -> Path:
@@ -113,10 +115,10 @@ class ModelStore:
     def take(self, folder: Path, models: Sequence[Model]) -> list[Model]:
         """Copy the files of `models` that lie in `folder` into the cache; they are known by their content, whatever
         they are called. Returns those that were found. Raises InputError when there is no such folder."""
-        if not folder.is_dir():
-            raise InputError(f"{folder}: there is no such folder")
         of_size: dict[int, list[Path]] = {}
-        for file in sorted(p for p in folder.iterdir() if p.is_file()):
+        with reaching(folder):
+            files = sorted(p for p in folder.iterdir() if p.is_file())
+        for file in files:
             of_size.setdefault(file.stat().st_size, []).append(file)
         found = []
         for model in models:
@@ -162,15 +164,14 @@ class ModelStore:
         """Copy the user's own file into the cache as a model of `family`. InputError unless it fits the family."""
         if family not in self.families or family in ("head", "dinov2-ade20k"):
             raise InputError(f"there is no family {family!r}; known: {', '.join(self.families)}")
-        if not file.is_file():
-            raise InputError(f"{file}: there is no such file")
+        require_file(file)
         from pipelines.proxy.networks.session import Network
 
         digest, size = file_sha256(file), file.stat().st_size
         model = Model(name or file.stem, family, (), size, digest, "the user's own file", False)
         if any(m.name == model.name and m.urls for m in self.models):
             raise InputError(f"{model.name} is the name of a known model. Give another with --name")
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", model.name):
+        if not _NAME.fullmatch(model.name):
             raise InputError(f"{model.name!r} is no name for a model: letters, digits, dot, dash and underscore")
         values = self._contract(family) | {"model": file.resolve(), "sha256": digest}
         Network(card_from_values(values, _TABLE), 1, "cpu")
@@ -197,17 +198,32 @@ class ModelStore:
 
     def _load_own(self) -> dict[str, Any]:
         path = self.cache / "own.json"
-        if not path.exists():
-            return {"pinned": {}, "added": []}
-        try:
-            own = json.loads(path.read_text(encoding="utf-8"))
-            return {"pinned": dict(own["pinned"]), "added": list(own["added"])}
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path}: is damaged ({error}). Delete it and add your models again") from error
+        with reaching(path):
+            if not path.exists():
+                return {"pinned": {}, "added": []}
+        own = read_json_object(path)
+        pinned, added = own.get("pinned"), own.get("added")
+        if not isinstance(pinned, dict) or not all(isinstance(v, str) for v in pinned.values()):
+            pinned = None
+        if pinned is None or not isinstance(added, list):
+            raise InputError(f"{path}: is damaged. Delete it and add your models again")
+        return {"pinned": pinned, "added": added}
+
+    def _own_model(self, row: Any) -> Model:
+        """A model that the user added, from the list in the cache. Raises InputError where it is not as it was left."""
+        kinds = {"name": str, "family": str, "bytes": int, "sha256": str, "licence": str, "commercial": bool}
+        known = isinstance(row, dict) and row.keys() == kinds.keys()
+        if not known or not all(isinstance(row[k], kind) for k, kind in kinds.items()):
+            raise InputError(f"{self.cache / 'own.json'}: is damaged. Delete it and add your models again")
+        model = Model(**row, urls=())
+        if not _NAME.fullmatch(model.name) or model.family not in self.families:
+            raise InputError(
+                f"{self.cache / 'own.json'}: {model.name!r} is no model of a known family. Delete the file"
+            )
+        return model
 
     def _save_own(self, own: dict[str, Any]) -> None:
-        with atomic_path(self.cache / "own.json") as temporary:
-            temporary.write_text(json.dumps(own, indent=1) + "\n", encoding="utf-8")
+        write_json(self.cache / "own.json", own)
 
 
 def _addresses(row: dict[str, Any]) -> tuple[str, ...]:

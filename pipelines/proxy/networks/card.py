@@ -24,13 +24,14 @@ head = "head.pth"                 # tokens: a linear head for the classes; witho
 
 from __future__ import annotations
 
-import json
-import tomllib
+import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from formats.errors import InputError
+from formats.jsonfile import read_json, read_toml
+from formats.reading import parsing
 from pipelines.proxy.files.classes import read_class_table
 
 _MAX_CARD_BYTES = 1 << 20
@@ -117,7 +118,7 @@ def card_from_values(values: dict[str, Any], path: Path) -> Card:
     known = {f.name: f for f in fields(Card)}
     try:
         card = Card(**{k: _converted(k, v, known[k].type) for k, v in values.items()})
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: {error}") from error
     _check(card, path)
     return card
@@ -125,14 +126,9 @@ def card_from_values(values: dict[str, Any], path: Path) -> Card:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > _MAX_CARD_BYTES:
-            raise InputError(f"{path}: too large for a card; give the card, not the network: onnx:CARD.toml")
-        text = path.read_text(encoding="utf-8")
-        values = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the card of the network ({error.strerror})") from error
-    except (UnicodeDecodeError, json.JSONDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path}: not a card in TOML or JSON ({error}); give the card, not the network") from error
+        values = read_json(path, _MAX_CARD_BYTES) if path.suffix.lower() == ".json" else read_toml(path)
+    except InputError as error:
+        raise InputError(f"{error}; give the card, not the network: onnx:CARD.toml") from error
     if not isinstance(values, dict):
         raise InputError(f"{path}: not a card: a table of keys is expected")
     return values
@@ -141,11 +137,12 @@ def _read(path: Path) -> dict[str, Any]:
 def _beside(path: Path, name: str) -> Path:
     """A file in the card's own folder; a card from elsewhere must not name files all over the disk."""
     folder = path.parent.resolve()
-    target = (folder / name).resolve()
-    if not target.is_relative_to(folder):
-        raise InputError(f"{path}: {name} lies outside the card's folder. Put the file beside the card")
-    if not target.is_file():
-        raise InputError(f"{path}: there is no {name} beside the card. Put it there, or correct the card")
+    with parsing(path, "card that names a file", "correct it"):
+        target = (folder / name).resolve()
+        if not target.is_relative_to(folder):
+            raise InputError(f"{path}: {name} lies outside the card's folder. Put the file beside the card")
+        if not target.is_file():
+            raise InputError(f"{path}: there is no {name} beside the card. Put it there, or correct the card")
     return target
 
 
@@ -165,7 +162,9 @@ def _converted(key: str, value: Any, kind: Any) -> Any:
 
 
 def _check(card: Card, path: Path) -> None:
+    numbers = (card.white, card.canonical_focal, *card.mean, *card.std)
     problems = {
+        "numbers are finite and below a million": all(math.isfinite(n) and abs(n) < 1e6 for n in numbers),
         f"task is {', '.join(_KINDS)}": card.task in _KINDS,
         f"kind is {', '.join(_KINDS.get(card.task, ()))}": card.kind in ("", *_KINDS.get(card.task, ())),
         "mean and std have three numbers, std positive": len(card.mean) == len(card.std) == 3 and min(card.std) > 0,

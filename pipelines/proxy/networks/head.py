@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import struct
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,13 +11,10 @@ import torch
 from numpy.typing import NDArray
 
 from formats.errors import InputError
+from formats.reading import parsing, require_file
 
 _BATCH_NORM_EPSILON = 1e-5
-_DAMAGE = (
-    OSError, RuntimeError, EOFError, LookupError, ValueError, AttributeError, TypeError,
-    struct.error, AssertionError,
-)  # fmt: skip
-"""What reading a damaged or foreign file raises, from torch and from the unpickler under it."""
+_MAX_BYTES = 1 << 28
 
 
 @dataclass(frozen=True)
@@ -37,15 +34,18 @@ def load_linear_head(path: Path, classes: int) -> LinearHead:
 
     Only tensors are read from the file, never code. Raises InputError for anything else than such a head.
     """
-    try:
+    size = require_file(path, _MAX_BYTES)
+    with parsing(path, "linear segmentation head", "pull it again"):
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                size = sum(entry.file_size for entry in archive.infolist())
+        if size > _MAX_BYTES:
+            raise ValueError(f"it unpacks to {size} bytes")
         stored = torch.load(path, map_location="cpu", weights_only=True)
         state = stored.get("state_dict", stored)
         parts = {k: state[f"decode_head.{k}"].double().numpy() for k in _KEYS}
-    except Exception as error:
-        # The unpickler's own error is told by its name: nothing here imports that module.
-        if not isinstance(error, _DAMAGE) and type(error).__name__ != "UnpicklingError":
-            raise
-        raise InputError(f"{path}: is not a linear segmentation head ({error}). Pull it again") from error
+        if not all(np.isfinite(part).all() for part in parts.values()) or not (parts["bn.running_var"] >= 0).all():
+            raise ValueError("a weight is not finite")
     weight = parts["conv_seg.weight"].reshape(len(parts["conv_seg.weight"]), -1)
     features = weight.shape[1]
     if weight.shape[0] != classes or any(parts[k].shape != (features,) for k in _KEYS[:4]):

@@ -14,12 +14,15 @@ from numpy.typing import NDArray
 
 from formats.atomic import atomic_path
 from formats.errors import InputError
+from formats.tensors import load_arrays
 from pipelines.progress import Progress, log
 from pipelines.proxy.scratch import load_scratch, save_scratch
 from pipelines.proxy.sequence import Sequence
 from pipelines.types import Frame
 
 Arrays = dict[str, NDArray]
+_KEY = "key"
+"""Each kept result says what it is of, so that a file moved in its place is seen."""
 _MEASURED = 3
 _LONG = 120.0
 
@@ -32,16 +35,18 @@ class ResultCache:
     megabytes: int
 
     def load(self, key: str) -> Arrays | None:
-        """None where there is none; a damaged one is removed."""
+        """None where there is none; a damaged one, or one of another key, is made again."""
         path = self._path(key)
-        if self.megabytes <= 0 or not path.exists():
-            return None
         try:
-            found = load_scratch(path)
-        except InputError:
-            path.unlink(missing_ok=True)
+            if self.megabytes <= 0 or not path.exists():
+                return None
+            found = load_arrays(path)
+            if found.pop(_KEY, np.array("")).tolist() != key:
+                return None
+            os.utime(path)
+        except (InputError, OSError) as error:
+            log.info("%s: the result is not used (%s)", path, error)
             return None
-        os.utime(path)
         return found
 
     def save(self, key: str, arrays: Arrays) -> None:
@@ -51,14 +56,20 @@ class ResultCache:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             with atomic_path(self._path(key)) as temporary, temporary.open("wb") as stream:
-                np.savez_compressed(stream, allow_pickle=False, **arrays)
-        except OSError as error:
+                np.savez_compressed(stream, allow_pickle=False, **arrays, **{_KEY: np.array(key)})
+        except (InputError, OSError) as error:
             log.info("%s: the result is not kept (%s)", self.folder, error)
 
     def trim(self) -> None:
         """Remove what was used longest ago until the rest fits. Without a cache, that of other runs is left alone."""
         if self.megabytes <= 0:
             return
+        try:
+            self._trim()
+        except OSError as error:
+            log.info("%s: nothing is removed (%s)", self.folder, error)
+
+    def _trim(self) -> None:
         entries = sorted((p.stat().st_mtime_ns, p.stat().st_size, p) for p in self.folder.glob("*.npz"))
         total = sum(size for _, size, _ in entries)
         for _, size, path in entries:
@@ -94,7 +105,7 @@ class NetworkPass:
     def run(self, frames: list[Frame]) -> None:
         """Results of all frames to the disk; what is there stays, what another run has computed is taken over."""
         cache = self._place.cache
-        todo = [f for f in frames if not self._path(f).exists()]
+        todo = [f for f in frames if not self._is_whole(f)]
         computed, seconds = 0, 0.0
         for done, frame in enumerate(self._place.progress.track(todo, "network", len(todo))):
             image = self._place.sequence.image(frame)
@@ -114,6 +125,13 @@ class NetworkPass:
     def load(self, frame: Frame) -> Arrays:
         """What `run` has left."""
         return load_scratch(self._path(frame))
+
+    def _is_whole(self, frame: Frame) -> bool:
+        """A damaged result is made again like a missing one."""
+        try:
+            return self._path(frame).exists() and bool(self.load(frame))
+        except InputError:
+            return False
 
     def _announce(self, seconds: float, left: int) -> None:
         """Said once, after the first frames, when it will be long."""

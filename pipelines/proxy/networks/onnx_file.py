@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from formats.errors import InputError
+from formats.reading import opened, parsing
 
 # Field numbers of onnx.proto: which fields lead to tensors, by message.
 _DESCEND = {
@@ -25,8 +26,8 @@ def require_own_weights(path: Path) -> None:
     """Raise InputError unless `path` is an ONNX file all of whose external weights lie in its own folder."""
     folder = path.parent.resolve()
     for location in external_locations(path):
-        target = (folder / location).resolve()
-        if Path(location).is_absolute() or not target.is_relative_to(folder):
+        target = folder / location
+        if "\0" in location or Path(location).is_absolute() or not target.resolve().is_relative_to(folder):
             raise InputError(
                 f"{path}: keeps weights in {location!r}, outside its own folder. Such a file may read anything on "
                 "this disk; get the network from its makers again"
@@ -37,16 +38,12 @@ def require_own_weights(path: Path) -> None:
 
 def external_locations(path: Path) -> list[str]:
     """Names of the files with weights outside the ONNX file, sorted. Raises InputError when it is no ONNX file."""
-    try:
-        with path.open("rb") as stream:
-            if path.stat().st_size == 0:
-                raise InputError(f"{path}: is empty. Download it again")
-            with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                return sorted(set(_locations(data, 0, len(data), "model", 0)))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except (IndexError, ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: is not an ONNX network, or it is damaged. Download it again") from error
+    with (
+        opened(path) as stream,
+        parsing(path, "ONNX network", "download it again"),
+        mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data,
+    ):
+        return sorted(set(_locations(data, 0, len(data), "model", 0)))
 
 
 def _locations(data: mmap.mmap, start: int, end: int, message: str, depth: int) -> Iterator[str]:

@@ -9,7 +9,7 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from formats.errors import InputError
+from formats.reading import parsing
 from pipelines.progress import log
 from pipelines.proxy.networks.onnx_file import require_own_weights
 from pipelines.proxy.networks.runtime import Port
@@ -23,10 +23,11 @@ class OnnxRuntime:
     def __init__(self, path: Path, threads: int, device: str) -> None:
         """Raises InputError for a file that is no ONNX network, or keeps weights outside its own folder."""
         require_own_weights(path)
-        self._session = _open(path, threads, device)
-        self.inputs = {i.name: Port(tuple(i.shape), _TYPES.get(i.type)) for i in self._session.get_inputs()}
-        self.outputs = {o.name: Port(tuple(o.shape), _TYPES.get(o.type)) for o in self._session.get_outputs()}
-        self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
+        with parsing(path, "ONNX network that onnxruntime can load", "download it again"):
+            self._session = _open(path, threads, device)
+            self.inputs = {i.name: Port(tuple(i.shape), _TYPES.get(i.type)) for i in self._session.get_inputs()}
+            self.outputs = {o.name: Port(tuple(o.shape), _TYPES.get(o.type)) for o in self._session.get_outputs()}
+            self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
 
     def run(self, outputs: Sequence[str], feed: dict[str, NDArray]) -> list[NDArray]:
         """As `Runtime.run`."""
@@ -49,12 +50,7 @@ def _open(path: Path, threads: int, device: str) -> ort.InferenceSession:
     # Threads that spin while they wait steal the cores of whatever else runs.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     providers = [wanted] if wanted == "CPUExecutionProvider" else [wanted, "CPUExecutionProvider"]
-    try:
-        session = ort.InferenceSession(str(path), options, providers=providers)
-    except Exception as error:  # onnxruntime's errors share no narrower base class
-        if type(error).__module__.startswith("onnxruntime"):
-            raise InputError(f"{path}: onnxruntime cannot load it ({error}). Download it again") from error
-        raise
+    session = ort.InferenceSession(str(path), options, providers=providers)
     # It falls back to the CPU without an error when CUDA's libraries are missing.
     if session.get_providers()[0] != wanted:
         log.warning("%s was asked for, the network runs on %s", wanted, session.get_providers()[0])

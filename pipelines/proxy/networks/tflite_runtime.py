@@ -5,7 +5,6 @@ It runs on the CPU whatever the device: the networks it is for take a fraction o
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,12 +16,11 @@ from ai_edge_litert.interpreter import Interpreter
 from numpy.typing import NDArray
 
 from formats.errors import InputError
+from formats.reading import parsing, read_bytes
 from pipelines.proxy.networks.runtime import Port
 
 _MAGIC = b"TFL3"
 _MAX_BYTES = 1 << 30
-_DAMAGE = (struct.error, IndexError, ValueError, TypeError, AttributeError, RuntimeError, OverflowError)
-"""What a damaged file makes of the reader of its table of contents, and of LiteRT."""
 
 
 class TfliteRuntime:
@@ -35,11 +33,9 @@ class TfliteRuntime:
         Raises InputError for a file that is no such network, and for a tensor that it does not have.
         """
         content = _read(path)
-        try:
+        with parsing(path, "TFLite network that LiteRT can load", "download it again"):
             self._interpreter = Interpreter(model_content=_ending_at(path, content, outputs), num_threads=threads)
             self._interpreter.allocate_tensors()
-        except _DAMAGE as error:
-            raise InputError(f"{path}: LiteRT cannot load it ({_first_line(error)}). Download it again") from error
         self._in = {d["name"]: d for d in self._interpreter.get_input_details()}
         self._out = {d["name"]: d for d in self._interpreter.get_output_details()}
         self.inputs = {k: Port(_channels_first(d["shape"]), np.float32) for k, d in self._in.items()}
@@ -64,12 +60,7 @@ class TfliteRuntime:
 
 
 def _read(path: Path) -> bytes:
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise InputError(f"{path}: {path.stat().st_size / 1e6:.0f} MB are too much for a TFLite network")
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    content = read_bytes(path, _MAX_BYTES)
     if content[4:8] != _MAGIC:
         raise InputError(f"{path}: is not a TFLite network (no {_MAGIC.decode()} in its head). Download it again")
     return content

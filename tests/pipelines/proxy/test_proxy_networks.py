@@ -211,7 +211,7 @@ def test_wrong_outputs_and_inputs_are_refused_when_opened(tmp_path: Path) -> Non
     with pytest.raises(InputError, match="too large"):
         Network(card, 1, "cpu")
     (tmp_path / "net.onnx").write_bytes(b"this is no protobuf at all, but text")
-    with pytest.raises(InputError, match="not an ONNX"):
+    with pytest.raises(InputError, match="no ONNX network"):
         Network(card, 1, "cpu")
 
 
@@ -466,7 +466,7 @@ def test_a_head_with_code_in_it_is_refused_and_not_run(tmp_path: Path, monkeypat
     for content in (None, b"text", b""):
         if content is not None:
             (tmp_path / "head.pth").write_bytes(content)
-        with pytest.raises(InputError, match="linear segmentation head"):
+        with pytest.raises(InputError, match=r"linear segmentation head|is empty"):
             load_linear_head(tmp_path / "head.pth", 3)
     assert not (tmp_path / "evil-was-here").exists()
 
