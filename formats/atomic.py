@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Protocol
 
 from formats.errors import DiskFullError, InputError
 
@@ -16,6 +17,29 @@ _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NOT_ALLOWED = {errno.EACCES, errno.EPERM, errno.EROFS}
 _NEARLY_FULL_BYTES = 1 << 20
 _LONGEST_NAME = 255
+
+
+class Watcher(Protocol):
+    """Is told of every file that is written atomically, in whatever thread."""
+
+    def writing(self, path: Path, temporary: Path) -> None:
+        """`temporary` is whole and takes the name `path` next."""
+
+    def written(self, path: Path) -> None:
+        """`path` is there."""
+
+
+_watchers: list[Watcher] = []
+
+
+@contextmanager
+def watched_by(watcher: Watcher) -> Iterator[None]:
+    """In this block `watcher` is told of every file."""
+    _watchers.append(watcher)
+    try:
+        yield
+    finally:
+        _watchers.remove(watcher)
 
 
 @contextmanager
@@ -34,7 +58,11 @@ def atomic_path(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
         yield temporary
         _flush_to_disk(temporary)
+        for watcher in _watchers:
+            watcher.writing(path, temporary)
         os.replace(temporary, path)
+        for watcher in _watchers:
+            watcher.written(path)
     except OSError as error:
         raise _explained(error, path) from error
     finally:

@@ -9,8 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipelines.config import Config
-from pipelines.records import StageRecord, load_records, load_source, save_manifest
-from pipelines.run_folder import RunFolder, save_settings
+from pipelines.records import Manifest, StageRecord, load_records, load_source, write_manifest
+from pipelines.run_folder import RunFolder
+from pipelines.settings_file import load_settings, save_settings
 from pipelines.stages import Stage, next_upstream, stage_fingerprint
 
 
@@ -33,11 +34,11 @@ def branch(
     taken = {name: records[name] for name in names if name in records}
     for name in taken:
         shutil.copytree(origin.stage(name), unfinished.stage(name), copy_function=_link)
-    shutil.copyfile(origin.settings_file, unfinished.settings_file)
+    config = load_settings(origin)
     if accept is not None:
-        taken = _accepted(taken, *accept, source["digest"])
-        save_settings(unfinished, accept[1])
-    save_manifest(unfinished, source, taken)
+        taken, config = _accepted(taken, *accept, source.digest), accept[1]
+    write_manifest(unfinished.manifest_file, Manifest(source, taken))
+    save_settings(unfinished, config)
     os.replace(unfinished.root, target.root)
 
 

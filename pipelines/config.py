@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from formats.errors import InputError
+from formats.jsonfile import read_toml
 from pipelines.retired_settings import explain_retired
 
 
@@ -187,7 +188,7 @@ def load_config(file: Path | None = None, overrides: Iterable[str] = (), base: C
     """
     config = base or Config()
     if file is not None:
-        config = merge_settings(config, _read_toml(file), where=str(file))
+        config = merge_settings(config, read_toml(file), where=str(file))
     for text in overrides:
         key, separator, value = text.partition("=")
         section, dot, name = key.strip().partition(".")
@@ -195,17 +196,6 @@ def load_config(file: Path | None = None, overrides: Iterable[str] = (), base: C
             raise InputError(f"--set {text}: expected section.key=value, for example --set frames.rate=5")
         config = merge_settings(config, {section: {name: _parse_value(value.strip())}}, where=f"--set {text}")
     return config
-
-
-def load_saved_config(file: Path) -> Config:
-    """The settings that a run was made with. Raises InputError that says how to go on where they no longer fit."""
-    try:
-        return load_config(file)
-    except InputError as error:
-        raise InputError(
-            f"{error}\nThe run's settings were written by another version of this program, or edited: remove that line "
-            "from the file (its default then holds), or reconstruct into a new folder"
-        ) from error
 
 
 def merge_settings(config: Config, changes: Mapping[str, Any], where: str) -> Config:
@@ -218,6 +208,18 @@ def merge_settings(config: Config, changes: Mapping[str, Any], where: str) -> Co
             raise InputError(f"{where}: {section} is a section of settings, got {values!r}")
         sections[section] = _merge_section(sections[section], section, values, where)
     return Config(**sections)
+
+
+def merge_known_settings(config: Config, changes: Mapping[str, Any]) -> tuple[Config, list[str]]:
+    """As `merge_settings`, but what is no setting, or no value of it, is left out; returns the names of those too."""
+    dropped = []
+    for section, values in changes.items():
+        for key, value in values.items() if isinstance(values, Mapping) else [("", values)]:
+            try:
+                config = merge_settings(config, {section: {key: value}}, where="")
+            except InputError:
+                dropped.append(f"{section}.{key}")
+    return config, dropped
 
 
 def _merge_section(section: Any, name: str, values: Mapping[str, Any], where: str) -> Any:
@@ -261,15 +263,6 @@ def _parse_value(text: str) -> Any:
 def _nearest(word: str, known: Iterable[str], prefix: str = "") -> str:
     matches = difflib.get_close_matches(word, list(known), n=1, cutoff=0.4)
     return f"; did you mean {prefix}{matches[0]}?" if matches else f"; known: {', '.join(known)}"
-
-
-def _read_toml(file: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{file}: cannot read the settings: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: not a TOML file: {error}") from error
 
 
 def config_to_dict(config: Any) -> dict[str, Any]:

@@ -9,12 +9,12 @@ from typing import Any
 
 from formats.datasets import open_sequence
 from formats.errors import InputError
-from formats.jsonfile import write_json
+from formats.jsonfile import read_json, write_json
 from formats.video_writer import write_video
 from pipelines.evaluation.table import evaluation_table
 from pipelines.evaluation.write import write_evaluation
 from pipelines.progress import Progress
-from pipelines.run_folder import RunFolder, read_json
+from pipelines.run_folder import RunFolder
 from pipelines.world import ClipOptions, iter_clip, make_world, write_sequence
 
 CLIP = ClipOptions(frames=36, width=320, height=240, fps=10.0, laps=0.32)

@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
-from formats.tensors import load_arrays
-from pipelines.config import Config, load_saved_config
+from pipelines.config import Config
 from pipelines.device import settle_device
 from pipelines.gaussian_map import GaussianMap
-from pipelines.mapping.load import load_class_ids
 from pipelines.records import StageRecord, load_records, load_source, recorded_config
 from pipelines.run_folder import RunFolder
+from pipelines.settings_file import load_settings
 from pipelines.types import VOID, Calibration, ClassTable, Frame, SparseModel, Trajectory
 
 _MAP_STAGES = ("global_ba", "mapping")
@@ -73,7 +72,7 @@ class Outcome:
     @property
     def source_is_folder(self) -> bool:
         """Whether frames kept the names of the source's images."""
-        source = Path(load_source(self.run)["path"])
+        source = Path(load_source(self.run).path)
         return source.is_dir() or source.suffix == ""
 
     def require_map(self) -> GaussianMap:
@@ -85,7 +84,7 @@ class Outcome:
     def load_sparse(self) -> SparseModel | None:
         """Points and their observations as the last stage that has any left them."""
         for stage in (self.pose_stage, "tracking"):
-            if (self.run.stage(stage) / "sparse.npz").exists():
+            if self.run.has_sparse(stage):
                 return self.run.load_sparse(stage)
         return None
 
@@ -97,14 +96,14 @@ class Outcome:
 def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:
     """What a run has found, its map on `device`. Raises InputError for a run whose tracking is not done."""
     records = load_records(run)
-    config = recorded_config(records, load_saved_config(run.settings_file))
-    pose_stage = _latest(run, records, _POSE_STAGES, "trajectory.npz")
+    config = recorded_config(records, load_settings(run))
+    pose_stage = next((s for s in _POSE_STAGES if s in records), "")
     if not pose_stage:
         raise InputError(
             f"{run.root}: no camera poses yet (tracking is not done). Type `msgs-slam resume {run.root}` first"
         )
     trajectory = run.load_trajectory(pose_stage)
-    map_stage = _latest(run, records, _MAP_STAGES, "map.safetensors")
+    map_stage = next((s for s in _MAP_STAGES if s in records), "")
     report = run.load_proxy_report()
     return Outcome(
         run=run,
@@ -117,22 +116,17 @@ def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:
         map_stage=map_stage,
         gaussian_map=run.load_map(map_stage, settle_device(device)) if map_stage else None,
         classes=run.load_classes(),
-        label_of_channel=np.array(load_class_ids(run) if map_stage else (), np.uint8),
+        label_of_channel=np.array(run.load_class_ids() if map_stage else (), np.uint8),
         exposure=_load_exposure(run, map_stage, trajectory),
         metric=bool(report.get("metric", False)),
         semantics=str(report.get("semantics", "")),
     )
 
 
-def _latest(run: RunFolder, records: Mapping[str, StageRecord], stages: tuple[str, ...], file: str) -> str:
-    return next((s for s in stages if s in records and (run.stage(s) / file).exists()), "")
-
-
 def _load_exposure(run: RunFolder, map_stage: str, trajectory: Trajectory) -> Exposure | None:
     for stage in (map_stage, "mapping"):
-        path = run.stage(stage) / "exposure.npz"
-        if map_stage and path.exists():
-            arrays = load_arrays(path)
+        if map_stage and run.has_exposure(stage):
+            arrays = run.load_exposure(stage)
             time_of = dict(zip(trajectory.frame_ids.tolist(), trajectory.timestamps.tolist(), strict=True))
             times = np.array([time_of[int(i)] for i in arrays["frame_ids"]])
             order = np.argsort(times, kind="stable")

@@ -10,7 +10,7 @@ from formats.digest import file_sha256, files_sha256
 from formats.errors import InputError
 from formats.image_times import times_file
 from formats.images import list_images
-from pipelines.config import Config, load_saved_config
+from pipelines.config import Config
 from pipelines.device import settle_device
 from pipelines.frames.recording import open_recording
 from pipelines.frames.source import require_source
@@ -19,6 +19,7 @@ from pipelines.progress import Progress
 from pipelines.records import StageRecord, load_records, load_source, recorded_config
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
+from pipelines.settings_file import load_settings
 from pipelines.stages import Stage, run_stages
 
 
@@ -42,12 +43,12 @@ def default_run_folder(source: Path) -> RunFolder:
 
 def existing_config(run: RunFolder) -> Config | None:
     """The settings of run.toml, with which the run goes on, or None where there is no run."""
-    return load_saved_config(run.settings_file) if run.settings_file.exists() else None
+    return load_settings(run) if run.manifest_file.exists() else None
 
 
 def made_with(run: RunFolder) -> Config:
     """The settings that each finished stage was made with; of the others those of run.toml."""
-    return recorded_config(load_records(run), load_saved_config(run.settings_file))
+    return recorded_config(load_records(run), load_settings(run))
 
 
 def reconstruct(
@@ -72,19 +73,19 @@ def resume(
     """Go on with a run from its own settings, or from `config`."""
     require_run(run)
     origin = load_source(run)
-    source = Path(origin["path"])
-    config = _with_device(config or load_saved_config(run.settings_file))
+    source = Path(origin.path)
+    config = _with_device(config or load_settings(run))
     with locked(run):
-        if "frames" not in load_records(run) and source_digest(source, config.run.format) != origin["digest"]:
+        if "frames" not in load_records(run) and source_digest(source, config.run.format) != origin.digest:
             raise InputError(
                 f"{source} has changed since {run.root} was begun. Reconstruct it into another folder: --out NEW"
             )
-        return _run(run, source, origin["digest"], config, progress, until)
+        return _run(run, source, origin.digest, config, progress, until)
 
 
 def require_run(run: RunFolder) -> None:
     """Raise InputError unless the folder holds a run."""
-    if not run.manifest_file.exists() or not run.settings_file.exists():
+    if not run.manifest_file.exists():
         raise InputError(
             f"{run.root} is not a run folder (it has no manifest.json). Runs are made by `msgs-slam reconstruct VIDEO`"
         )
@@ -125,9 +126,9 @@ def _require_same_source(run: RunFolder, source: Path, digest: str) -> None:
     if not run.manifest_file.exists():
         return
     origin = load_source(run)
-    if origin["digest"] != digest:
+    if origin.digest != digest:
         raise InputError(
-            f"{run.root} is the run of another source ({origin['path']}), not of {source}. "
+            f"{run.root} is the run of another source ({origin.path}), not of {source}. "
             "Choose another folder with --out FOLDER, or delete it"
         )
 

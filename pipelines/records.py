@@ -8,13 +8,30 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from formats.digest import file_sha256
-from formats.jsonfile import write_json
-from pipelines.config import Config, config_to_dict, merge_settings
-from pipelines.run_folder import RunFolder, read_json
+from formats.errors import InputError
+from formats.jsonfile import read_json_object, read_toml, write_json
+from formats.reading import parsing
+from pipelines.config import Config, config_to_dict, merge_known_settings, settings_of_stage
+from pipelines.migration import migrated_stages
 from pipelines.run_folder_names import STAGES
+from pipelines.stored import dataclass_from_json
+
+if TYPE_CHECKING:
+    from pipelines.run_folder import RunFolder
+
+FORMAT = 2
+"""Of manifest.json. 1, that of 0.1.0, had neither a checksum nor the settings of the records."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What the run was made from: the path, and the identity of what was there (`source_digest`)."""
+
+    path: str
+    digest: str
 
 
 @dataclass(frozen=True)
@@ -32,41 +49,104 @@ class StageRecord:
     inputs: Any = None
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        wanted: dict[str, Any] = {
+            "fingerprint": str,
+            "content": str,
+            "seconds": int | float,
+            "peak_memory_mb": int | float,
+        }
+        wanted |= {"figures": dict, "files": dict, "settings": dict, "warnings": list}
+        for name, kind in wanted.items():
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(f"{name} is {str(getattr(self, name))[:40]!r}")
+
     @staticmethod
-    def from_json(value: dict[str, Any]) -> StageRecord:
-        """Inverse of `asdict` after JSON."""
-        return StageRecord(**{**value, "files": {k: (v[0], v[1]) for k, v in value["files"].items()}})
+    def from_json(value: Any) -> StageRecord:
+        """Inverse of `asdict` after JSON. Raises TypeError, ValueError or KeyError for anything else."""
+        files = {str(name): (int(size), str(digest)) for name, (size, digest) in value["files"].items()}
+        return StageRecord(
+            **{
+                **value,
+                "files": files,
+                "seconds": float(value["seconds"]),
+                "peak_memory_mb": float(value["peak_memory_mb"]),
+            }
+        )
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What the run was made from, and the finished stages by name, in their order; format of the file it came from."""
+
+    source: Source
+    records: dict[str, StageRecord]
+    format: int = FORMAT
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Raises InputError when it is missing, damaged, or of a newer version."""
+    try:
+        value = read_json_object(path)
+        with parsing(path, "manifest of a run", "it was damaged or edited"):
+            return _manifest(path, value)
+    except InputError as error:
+        raise InputError(
+            f"{error}\nWithout it nothing in the run can be trusted. Its settings are kept beside it: "
+            f"msgs-slam reconstruct SOURCE --out NEW --config {path.with_name('run.toml')}"
+        ) from error
+
+
+def _manifest(path: Path, value: dict[str, Any]) -> Manifest:
+    format, stages = value.get("format", 1), value["stages"]
+    if format == 1:
+        stages = migrated_stages(value, read_toml(path.with_name("run.toml")))
+    elif format != FORMAT:
+        raise InputError(f"{path}: its format is {str(format)[:20]}, this version of the program knows {FORMAT}")
+    elif value.pop("check", None) != _check(value):
+        raise ValueError("its checksum differs")
+    records = {name: StageRecord.from_json(stages[name]) for name in STAGES if name in stages}
+    return Manifest(dataclass_from_json(Source, value["source"]), records, format)
+
+
+def write_manifest(path: Path, manifest: Manifest) -> None:
+    """Atomically, with a checksum over itself. Raises InputError when the disk refuses."""
+    stages = {name: asdict(manifest.records[name]) for name in STAGES if name in manifest.records}
+    value = {"format": FORMAT, "source": asdict(manifest.source), "stages": stages}
+    value = json.loads(json.dumps(value, allow_nan=False))  # tuples are lists when it is read again
+    write_json(path, {**value, "check": _check(value)})
+
+
+def _check(value: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
 def load_records(run: RunFolder) -> dict[str, StageRecord]:
     """The finished stages by name."""
-    if not run.manifest_file.exists():
-        return {}
-    return {k: StageRecord.from_json(v) for k, v in read_json(run.manifest_file)["stages"].items()}
+    manifest = run.manifest()
+    return {} if manifest is None else dict(manifest.records)
 
 
-def load_source(run: RunFolder) -> dict[str, Any]:
-    """What the run was made from: {"path", "digest"}."""
-    return read_json(run.manifest_file)["source"]
-
-
-def save_manifest(run: RunFolder, source: Mapping[str, Any], records: Mapping[str, StageRecord]) -> None:
-    """source: {"path", "digest"}. Raises InputError when the disk refuses."""
-    stages = {name: asdict(records[name]) for name in STAGES if name in records}
-    write_json(run.manifest_file, {"source": dict(source), "stages": stages})
+def load_source(run: RunFolder) -> Source:
+    """What the run was made from. Raises InputError for a folder that is no run."""
+    return read_manifest(run.manifest_file).source
 
 
 def recorded_config(records: Mapping[str, StageRecord], config: Config) -> Config:
     """The settings that each finished stage was made with; of the stages that are not, those of `config`."""
     for name in STAGES:
         if name in records:
-            config = merge_settings(config, records[name].settings, where=f"the record of {name} in manifest.json")
+            config, _ = merge_known_settings(config, records[name].settings)
     return config
 
 
 def settings_of(config: Config, stage: str) -> dict[str, dict[str, Any]]:
     """What a record keeps of the settings."""
-    return {"run": config_to_dict(config.run), stage: config_to_dict(getattr(config, stage))}
+    kept: dict[str, dict[str, Any]] = {"run": config_to_dict(config.run)}
+    for key, value in settings_of_stage(config, stage).items():
+        section, _, name = key.rpartition(".")
+        kept.setdefault(section or stage, {})[name] = value
+    return kept
 
 
 def differing_settings(record: StageRecord, config: Config) -> list[str]:
@@ -80,9 +160,9 @@ def differing_settings(record: StageRecord, config: Config) -> list[str]:
     ]
 
 
-def checksums(folder: Path) -> dict[str, tuple[int, str]]:
-    """Relative path, with slashes, → (bytes, sha256) of every file below."""
-    paths = sorted(p for p in folder.rglob("*") if p.is_file() and not p.is_symlink())
+def checksums(folder: Path, but: tuple[str, ...] = ()) -> dict[str, tuple[int, str]]:
+    """Relative path, with slashes, → (bytes, sha256) of every file below, but for those of these names."""
+    paths = sorted(p for p in folder.rglob("*") if p.is_file() and not p.is_symlink() and p.name not in but)
     return {p.relative_to(folder).as_posix(): (p.stat().st_size, file_sha256(p)) for p in paths}
 
 

@@ -2,36 +2,36 @@
 
     video.msgs/
       run.toml        the complete settings
-      manifest.json   stage → fingerprint, files with sizes and checksums, seconds, figures, warnings
+      manifest.json   source; stage → fingerprint, files with sizes and checksums, settings, seconds, figures, warnings
       frames/  proxy/  tracking/  mapping/  global_ba/  export/
       <stage>.partial/   unfinished; renamed only when the stage ends well
 
-A reader (`load_*`) looks in finished stages. A writer (`save_*`) is given the folder of the running stage.
+A reader (`load_*`) looks in finished stages, and at files only that are still what the stage left. A writer (`save_*`)
+is given the folder of the running stage.
 """
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.atomic import atomic_path, write_text
-from formats.errors import InputError
+from formats.atomic import atomic_path
 from formats.images import read_rgb
-from formats.jsonfile import write_json
-from formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
-from pipelines.config import Config, config_to_toml
-from pipelines.gaussian_map import GaussianMap
+from formats.jsonfile import read_json, read_json_object, write_json
+from formats.tensors import load_tensors, save_arrays, save_tensors
+from pipelines import stored
+from pipelines.finished_files import FinishedFiles
+from pipelines.stored import dataclass_from_json, load_layout, reading
 from pipelines.types import (
+    VOID,
     Calibration,
     ClassTable,
     Frame,
-    Intrinsics,
     LoopEdge,
     MirrorPairs,
     ProxyMaps,
@@ -39,125 +39,153 @@ from pipelines.types import (
     Trajectory,
 )
 
+if TYPE_CHECKING:
+    from pipelines.gaussian_map import GaussianMap
 
-def read_json(path: Path) -> Any:
-    """Raises InputError when the file is missing or torn."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); `msgs-slam resume` makes it again") from error
-    except ValueError as error:
-        raise InputError(f"{path}: is damaged ({error}); delete it and `msgs-slam resume` makes it again") from error
+FRAMES, CALIBRATION, BACKBONE = "frames.json", "calibration.json", "backbone/model.npz"
+CLASSES, SYMMETRY, DESCRIPTORS = "classes.json", "symmetry.npz", "descriptors.npz"
+TRAJECTORY, SPARSE, DEPTH_SCALES = "trajectory.npz", "sparse.npz", "depth_scales.npz"
+MAP, EXPOSURE, LOOPS = "map.safetensors", "exposure.npz", "loops.json"
+MESH, MESH_TO_SHOW = "mesh.ply", "mesh.glb"
 
 
 @dataclass(frozen=True)
-class RunFolder:
-    """One run on disk."""
-
-    root: Path
-
-    def stage(self, name: str) -> Path:
-        """Folder of a finished stage."""
-        return self.root / name
-
-    def partial(self, name: str) -> Path:
-        """Folder of an unfinished stage."""
-        return self.root / f"{name}.partial"
-
-    @property
-    def settings_file(self) -> Path:
-        return self.root / "run.toml"
-
-    @property
-    def manifest_file(self) -> Path:
-        return self.root / "manifest.json"
+class RunFolder(FinishedFiles):
+    """One run on disk: what its finished stages have left."""
 
     # frames -----------------------------------------------------------------------------------------------------
 
     def load_frames(self) -> list[Frame]:
         """All picked frames in order."""
-        return [Frame(**row) for row in read_json(self.stage("frames") / "frames.json")]
+        path = self.file("frames", FRAMES)
+        rows = read_json(path)
+        with reading(path, "table of frames"):
+            frames = [dataclass_from_json(Frame, row) for row in rows]
+            if [f.id for f in frames] != list(range(len(frames))):
+                raise ValueError("the frames are not counted from 0")
+            return frames
 
     def load_calibration(self) -> Calibration:
         """The camera of the undistorted frames."""
-        return calibration_from_json(read_json(self.stage("frames") / "calibration.json"))
+        path = self.file("frames", CALIBRATION)
+        value = read_json(path)
+        with reading(path, "calibration"):
+            return dataclass_from_json(Calibration, value)
 
     def load_backbone(self) -> SparseModel | None:
         """Keyframes and points of structure from motion over the frames; None where it found none."""
-        path = self.stage("frames") / "backbone" / "model.npz"
-        return load_sparse_model(path) if path.exists() else None
+        return load_sparse_model(self.file("frames", BACKBONE)) if self.has("frames", BACKBONE) else None
+
+    def image_file(self, frame: Frame) -> Path:
+        """The picture of a frame, undistorted."""
+        return self.file("frames", frame.name)
 
     def image(self, frame: Frame) -> NDArray[np.uint8]:
         """(H, W, 3) RGB, undistorted."""
-        return read_rgb(self.stage("frames") / frame.name)
+        return read_rgb(self.image_file(frame))
 
     # proxy ------------------------------------------------------------------------------------------------------
 
     def load_classes(self) -> ClassTable:
         """Names and colours of the labels."""
-        rows = read_json(self.stage("proxy") / "classes.json")
-        return ClassTable(tuple(r["name"] for r in rows), tuple(tuple(r["color"]) for r in rows))
+        path = self.file("proxy", CLASSES)
+        rows = read_json(path)
+        with reading(path, "table of classes"):
+            colors = [(int(r), int(g), int(b)) for r, g, b in (row["color"] for row in rows)]
+            if not all(0 <= value <= 255 for color in colors for value in color):
+                raise ValueError("a colour is outside 0..255")
+            return ClassTable(tuple(str(row["name"]) for row in rows), tuple(colors))
 
     def load_proxy_report(self) -> dict[str, Any]:
         """{"depth": provider, "semantics": provider, "metric": bool, ...}."""
-        return read_json(self.stage("proxy") / "proxy.json")
+        return read_json_object(self.file("proxy", "proxy.json"))
 
     def has_proxy(self, frame_id: int) -> bool:
         """Whether the frame has proxy maps."""
-        return proxy_path(self.stage("proxy"), frame_id).exists()
+        return self.has("proxy", proxy_name(frame_id))
 
     def load_proxy(self, frame_id: int) -> ProxyMaps:
         """Proxy maps of one frame; InputError when it has none."""
-        return load_proxy_maps(proxy_path(self.stage("proxy"), frame_id))
+        return load_proxy_maps(self.file("proxy", proxy_name(frame_id)))
 
     def load_symmetry(self) -> dict[int, MirrorPairs]:
         """Frame id → pairs of pixels that show each other's mirror image; {} where no symmetry was found."""
-        path = self.stage("proxy") / "symmetry.npz"
-        return load_mirror_pairs(path) if path.exists() else {}
+        return load_mirror_pairs(self.file("proxy", SYMMETRY)) if self.has("proxy", SYMMETRY) else {}
 
     def load_descriptors(self) -> dict[int, NDArray[np.float32]]:
         """Frame id → (F,) unit vector by which a network tells how the frame looks; {} where none did."""
-        path = self.stage("proxy") / "descriptors.npz"
-        if not path.exists():
+        if not self.has("proxy", DESCRIPTORS):
             return {}
-        arrays = load_arrays(path)
+        arrays = load_layout(self.file("proxy", DESCRIPTORS), stored.DESCRIPTORS)
         return dict(zip(arrays["frame_ids"].tolist(), arrays["vectors"], strict=True))
 
     # tracking, mapping, global_ba -------------------------------------------------------------------------------
 
     def load_trajectory(self, stage: str) -> Trajectory:
         """The poses as `stage` ("tracking", "mapping" or "global_ba") left them."""
-        arrays = load_arrays(self.stage(stage) / "trajectory.npz")
-        reasons = tuple(str(r) for r in arrays.pop("lost_reasons"))
-        return Trajectory(**arrays, lost_reasons=reasons)
+        path = self.file(stage, TRAJECTORY)
+        arrays = load_layout(path, stored.TRAJECTORY)
+        with reading(path, "trajectory"):
+            stored.require_increasing("frame_ids", arrays["frame_ids"])
+            stored.require_rigid("the poses", arrays["cam_from_world"])
+            reasons = tuple(str(r) for r in arrays.pop("lost_reasons"))
+            return Trajectory(**arrays, lost_reasons=reasons)
+
+    def has_sparse(self, stage: str) -> bool:
+        """Whether `stage` has left points."""
+        return self.has(stage, SPARSE)
 
     def load_sparse(self, stage: str) -> SparseModel:
         """Keyframe poses and points as `stage` left them."""
-        return load_sparse_model(self.stage(stage) / "sparse.npz")
+        return load_sparse_model(self.file(stage, SPARSE))
 
     def load_depth_scales(self) -> dict[str, NDArray] | None:
         """frame_ids, scales, grids: depth in the world over proxy depth; None where tracking left none."""
-        path = self.stage("tracking") / "depth_scales.npz"
-        return load_arrays(path) if path.exists() else None
+        if not self.has("tracking", DEPTH_SCALES):
+            return None
+        return load_layout(self.file("tracking", DEPTH_SCALES), stored.DEPTH_SCALES)
 
-    def load_exposure(self) -> dict[str, NDArray]:
+    def has_exposure(self, stage: str) -> bool:
+        """Whether `stage` has left exposures."""
+        return self.has(stage, EXPOSURE)
+
+    def load_exposure(self, stage: str = "mapping") -> dict[str, NDArray]:
         """frame_ids (N,), log_gains (N, 3), offsets (N, 3) of the mapped keyframes."""
-        return load_arrays(self.stage("mapping") / "exposure.npz")
+        return load_layout(self.file(stage, EXPOSURE), stored.EXPOSURE)
+
+    def has_map(self, stage: str) -> bool:
+        """Whether `stage` has left a map."""
+        return self.has(stage, MAP)
 
     def load_map(self, stage: str, device: str = "cpu") -> GaussianMap:
         """The Gaussian map as `stage` left it."""
-        tensors = load_tensors(self.stage(stage) / "map.safetensors")
-        return GaussianMap(**{name: tensor.to(device) for name, tensor in tensors.items()})
+        from pipelines.gaussian_map import GaussianMap  # torch takes seconds to import, and few who read a run need it
+
+        path = self.file(stage, MAP)
+        tensors = load_tensors(path)
+        with reading(path, "Gaussian map"):
+            if not all(bool(t.isfinite().all()) for t in tensors.values()):
+                raise ValueError("it holds numbers that are not finite")
+            return GaussianMap(**{name: tensor.to(device) for name, tensor in tensors.items()})
+
+    def load_class_ids(self) -> tuple[int, ...]:
+        """The label of each class channel of the map."""
+        path = self.file("mapping", "mapping.json")
+        value = read_json_object(path)
+        with reading(path, "table of class channels"):
+            ids = tuple(int(i) for i in value["class_ids"])
+            stored.require_indices("class_ids", np.array(ids, np.int64), VOID)
+            return ids
 
     def load_loops(self) -> list[LoopEdge]:
         """The verified loops of the global adjustment."""
-        rows = read_json(self.stage("global_ba") / "loops.json")
-        return [LoopEdge(**{**r, "frame2_from_frame1": np.array(r["frame2_from_frame1"])}) for r in rows]
-
-
-def save_settings(run: RunFolder, config: Config) -> None:
-    """run.toml. Raises InputError when the disk refuses."""
-    write_text(run.settings_file, config_to_toml(config))
+        path = self.file("global_ba", LOOPS)
+        rows = read_json(path)
+        with reading(path, "table of loops"):
+            edges = [dataclass_from_json(LoopEdge, row) for row in rows]
+            for edge in edges:
+                stored.require_rigid("a loop", edge.frame2_from_frame1)
+            return edges
 
 
 # writers: pure functions of a folder and a value ----------------------------------------------------------------
@@ -165,20 +193,14 @@ def save_settings(run: RunFolder, config: Config) -> None:
 
 def save_frames(folder: Path, frames: list[Frame]) -> None:
     """The table of frames, and their timestamps as text for other programs."""
-    write_json(folder / "frames.json", [asdict(f) for f in frames])
+    write_json(folder / FRAMES, [asdict(f) for f in frames])
     with atomic_path(folder / "timestamps.txt") as temporary:
         temporary.write_text("".join(f"{f.name} {f.timestamp:.9f}\n" for f in frames), encoding="utf-8")
 
 
 def save_calibration(folder: Path, calibration: Calibration) -> None:
     """The camera of the undistorted frames."""
-    write_json(folder / "calibration.json", asdict(calibration))
-
-
-def calibration_from_json(value: dict[str, Any]) -> Calibration:
-    """Inverse of `asdict(calibration)` after JSON."""
-    distortion = tuple(value["distortion"])
-    return Calibration(Intrinsics(**value["intrinsics"]), value["origin"], value["focal_sd"], distortion)
+    write_json(folder / CALIBRATION, asdict(calibration))
 
 
 def save_sparse_model(path: Path, model: SparseModel) -> None:
@@ -188,7 +210,33 @@ def save_sparse_model(path: Path, model: SparseModel) -> None:
 
 def load_sparse_model(path: Path) -> SparseModel:
     """Inverse of `save_sparse_model`."""
-    return SparseModel(**load_arrays(path))
+    arrays = load_layout(path, stored.SPARSE_MODEL)
+    with reading(path, "sparse model"):
+        stored.require_increasing("frame_ids", arrays["frame_ids"])
+        stored.require_rigid("the poses", arrays["cam_from_world"])
+        stored.require_indices("obs_frame", arrays["obs_frame"], len(arrays["frame_ids"]))
+        stored.require_indices("obs_point", arrays["obs_point"], len(arrays["points_in_world"]))
+        return SparseModel(**arrays)
+
+
+def save_backbone(folder: Path, model: SparseModel) -> None:
+    """What structure from motion found over the frames."""
+    save_sparse_model(folder / BACKBONE, model)
+
+
+def save_sparse(folder: Path, model: SparseModel) -> None:
+    """Keyframe poses and points of tracking or of the global adjustment."""
+    save_sparse_model(folder / SPARSE, model)
+
+
+def save_depth_scales(folder: Path, arrays: dict[str, NDArray]) -> None:
+    """frame_ids, scales, grids: see `RunFolder.load_depth_scales`."""
+    save_arrays(folder / DEPTH_SCALES, arrays)
+
+
+def save_figures(folder: Path, stage: str, figures: dict[str, Any]) -> None:
+    """What the stage says of its result, for other programs."""
+    write_json(folder / f"{stage}.json", figures)
 
 
 def save_classes(folder: Path, classes: ClassTable) -> None:
@@ -197,12 +245,17 @@ def save_classes(folder: Path, classes: ClassTable) -> None:
         {"id": i, "name": n, "color": list(c)}
         for i, (n, c) in enumerate(zip(classes.names, classes.colors, strict=True))
     ]
-    write_json(folder / "classes.json", rows)
+    write_json(folder / CLASSES, rows)
 
 
 def proxy_path(folder: Path, frame_id: int) -> Path:
     """Where a frame's proxy maps lie."""
-    return folder / "maps" / f"{frame_id:06d}.npz"
+    return folder / proxy_name(frame_id)
+
+
+def proxy_name(frame_id: int) -> str:
+    """The same, inside the stage's folder."""
+    return f"maps/{frame_id:06d}.npz"
 
 
 def save_proxy_maps(path: Path, maps: ProxyMaps) -> None:
@@ -225,7 +278,7 @@ def save_proxy_maps(path: Path, maps: ProxyMaps) -> None:
 
 def load_proxy_maps(path: Path) -> ProxyMaps:
     """Inverse of `save_proxy_maps`, up to its rounding."""
-    arrays = load_arrays(path)
+    arrays = load_layout(path, stored.PROXY_MAPS)
     inverse = arrays["inverse_depth"].astype(np.float32)
     return ProxyMaps(
         depth=np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse > 0),
@@ -246,7 +299,7 @@ def save_descriptors(folder: Path, vectors: dict[int, NDArray[np.float32]]) -> N
     """One npz; nothing where there are none."""
     if vectors:
         ids = np.array(list(vectors), np.int64)
-        save_arrays(folder / "descriptors.npz", {"frame_ids": ids, "vectors": np.stack(list(vectors.values()))})
+        save_arrays(folder / DESCRIPTORS, {"frame_ids": ids, "vectors": np.stack(list(vectors.values()))})
 
 
 def save_mirror_pairs(folder: Path, pairs_of: dict[int, MirrorPairs]) -> None:
@@ -256,12 +309,12 @@ def save_mirror_pairs(folder: Path, pairs_of: dict[int, MirrorPairs]) -> None:
         return
     arrays = {n: np.concatenate([getattr(p, n) for p in kept.values()]) for n in _PAIR_ARRAYS}
     of_frame = np.repeat(np.array(list(kept), np.int64), [len(p) for p in kept.values()])
-    save_arrays(folder / "symmetry.npz", {"of_frame": of_frame, **arrays})
+    save_arrays(folder / SYMMETRY, {"of_frame": of_frame, **arrays})
 
 
 def load_mirror_pairs(path: Path) -> dict[int, MirrorPairs]:
     """Inverse of `save_mirror_pairs`."""
-    arrays = load_arrays(path)
+    arrays = load_layout(path, stored.MIRROR_PAIRS)
     of_frame = arrays["of_frame"]
     return {int(i): MirrorPairs(*(arrays[n][of_frame == i] for n in _PAIR_ARRAYS)) for i in np.unique(of_frame)}
 
@@ -273,25 +326,25 @@ def save_trajectory(folder: Path, trajectory: Trajectory) -> None:
     """One npz."""
     arrays = dict(trajectory.__dict__)
     arrays["lost_reasons"] = np.array(trajectory.lost_reasons, dtype=np.str_)
-    save_arrays(folder / "trajectory.npz", arrays)
+    save_arrays(folder / TRAJECTORY, arrays)
 
 
 def save_map(folder: Path, gaussian_map: GaussianMap) -> None:
     """One safetensors file."""
-    save_tensors(folder / "map.safetensors", {k: v.detach().cpu().contiguous() for k, v in vars(gaussian_map).items()})
+    save_tensors(folder / MAP, {k: v.detach().cpu().contiguous() for k, v in vars(gaussian_map).items()})
 
 
 def save_exposure(
     folder: Path, frame_ids: NDArray[np.int64], log_gains: NDArray[np.float32], offsets: NDArray[np.float32]
 ) -> None:
     """picture = colours of the map * exp(log gain) + offset, a keyframe and channel."""
-    save_arrays(folder / "exposure.npz", {"frame_ids": frame_ids, "log_gains": log_gains, "offsets": offsets})
+    save_arrays(folder / EXPOSURE, {"frame_ids": frame_ids, "log_gains": log_gains, "offsets": offsets})
 
 
 def save_loops(folder: Path, loops: list[LoopEdge]) -> None:
     """The verified loops."""
     rows = [{**vars(e), "frame2_from_frame1": e.frame2_from_frame1.tolist()} for e in loops]
-    write_json(folder / "loops.json", rows)
+    write_json(folder / LOOPS, rows)
 
 
 def resize_maps(maps: ProxyMaps, width: int, height: int) -> ProxyMaps:

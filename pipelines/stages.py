@@ -13,23 +13,30 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from formats.atomic import is_disk_full
-from formats.digest import file_sha256
+from formats.atomic import is_disk_full, watched_by, write_text
 from formats.errors import DiskFullError, InputError
-from formats.jsonfile import write_json
 from pipelines.config import Config, settings_of_stage
+from pipelines.journal import JOURNAL, Journal, empty
 from pipelines.progress import Progress, log
 from pipelines.records import (
+    FORMAT,
+    Manifest,
+    Source,
     StageRecord,
     checksums,
     content_digest,
     load_records,
     plain,
-    save_manifest,
     settings_of,
+    write_manifest,
 )
-from pipelines.run_folder import RunFolder, read_json, save_settings
+from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
+from pipelines.settings_file import save_settings
+from pipelines.stopping import stop_if_asked
+
+FINGERPRINT = "fingerprint"
+"""File of an unfinished folder: the work it belongs to."""
 
 
 @dataclass(frozen=True)
@@ -105,22 +112,22 @@ def run_stages(
     it starts. Raises InputError as the stages do.
     """
     records = load_records(run)
-    origin = {"path": str(source), "digest": source_digest}
+    origin = Source(str(source), source_digest)
     upstream = source_digest
     wanted = stages[: STAGES.index(until) + 1]
     inputs = _check_inputs(wanted, source, config, records, source_digest)
-    if not run.manifest_file.exists():
-        save_manifest(run, origin, records)
+    if (before := run.manifest()) is None or before.format != FORMAT:
+        write_manifest(run.manifest_file, Manifest(origin, records))
     save_settings(run, config)
     for stage in wanted:
         fingerprint = stage_fingerprint(stage, config, upstream, inputs[stage.name])
         record = records.get(stage.name)
-        if record is None or record.fingerprint != fingerprint or not _intact(run.stage(stage.name), record):
+        if record is None or record.fingerprint != fingerprint or run.damaged(stage.name):
             if _drop(records, stage.name):
-                save_manifest(run, origin, records)
+                write_manifest(run.manifest_file, Manifest(origin, records))
             record = _run_one(stage, run, source, config, progress, fingerprint, inputs[stage.name])
             records[stage.name] = record
-            save_manifest(run, origin, records)
+            write_manifest(run.manifest_file, Manifest(origin, records))
             for later in STAGES[STAGES.index(stage.name) + 1 :]:  # made from what is no longer there
                 shutil.rmtree(run.stage(later), ignore_errors=True)
         else:
@@ -171,11 +178,14 @@ def next_upstream(upstream: str, record: StageRecord) -> str:
 def _run_one(
     stage: Stage, run: RunFolder, source: Path, config: Config, progress: Progress, fingerprint: str, inputs: Any
 ) -> StageRecord:
-    folder = _open_partial(run.partial(stage.name), fingerprint)
+    stop_if_asked()
+    folder = run.partial(stage.name)
+    journal = _open_partial(folder, fingerprint)
     context = StageContext(run, source, config, folder, progress)
     started = time.monotonic()
     try:
-        figures = stage.run(context)
+        with watched_by(journal):
+            figures = stage.run(context)
     except OSError as error:
         if is_disk_full(error, run.root):
             raise DiskFullError(
@@ -183,8 +193,9 @@ def _run_one(
             ) from error
         raise
     shutil.rmtree(folder / "snapshot", ignore_errors=True)
-    (folder / "fingerprint.json").unlink()
-    files = checksums(folder)
+    (folder / FINGERPRINT).unlink()
+    files = checksums(folder, but=(JOURNAL,))
+    journal.close(files)
     shutil.rmtree(run.stage(stage.name), ignore_errors=True)
     os.replace(folder, run.stage(stage.name))
     _flush_folder(run.root)
@@ -201,16 +212,18 @@ def _run_one(
     )
 
 
-def _open_partial(folder: Path, fingerprint: str) -> Path:
-    """The unfinished folder, emptied unless it belongs to exactly this work."""
-    stamp = folder / "fingerprint.json"
-    if not (stamp.exists() and read_json(stamp) == fingerprint):
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        write_json(stamp, fingerprint)
-    for torn in folder.rglob(".*.tmp*"):  # what a killed process was writing
-        torn.unlink()
-    return folder
+def _open_partial(folder: Path, fingerprint: str) -> Journal:
+    """The unfinished folder: what is whole in it where it belongs to exactly this work, else empty."""
+    stamp, journal = folder / FINGERPRINT, Journal(folder)
+    if not (stamp.exists() and stamp.read_text(encoding="utf-8", errors="replace") == fingerprint):
+        empty(folder)
+    elif damaged := journal.discard_damaged(keep=(FINGERPRINT,)):
+        log.warning(
+            "%s: %d files of the interrupted attempt are damaged and made again, the first is %s",
+            folder.name, len(damaged), damaged[0],
+        )  # fmt: skip
+    write_text(stamp, fingerprint)
+    return journal
 
 
 def _flush_folder(folder: Path) -> None:
@@ -227,13 +240,6 @@ def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) 
     beside = [] if inputs is None else [inputs]
     text = json.dumps([stage.name, stage.version, own, config.run.seed, upstream, *beside], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _intact(folder: Path, record: StageRecord) -> bool:
-    return all(
-        (path := folder / name).is_file() and path.stat().st_size == size and file_sha256(path) == digest
-        for name, (size, digest) in record.files.items()
-    )
 
 
 def peak_memory_mb() -> float:

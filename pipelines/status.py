@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from pipelines.config import load_saved_config
 from pipelines.records import StageRecord, differing_settings, load_records, load_source
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
+from pipelines.settings_file import load_settings
 
 DONE, INTERRUPTED, OUTDATED, NOT_YET = "done", "interrupted", "outdated", "not yet"
 
@@ -45,13 +45,13 @@ class RunStatus:
 
 def run_status(run: RunFolder) -> RunStatus:
     """Raises InputError where the manifest or the settings are damaged."""
-    records, config = load_records(run), load_saved_config(run.settings_file)
+    records, config = load_records(run), load_settings(run)
     stages = []
     for name in STAGES:
         record = records.get(name)
         changed = tuple(differing_settings(record, config)) if record else ()
         stages.append(StageStatus(name, _state(run, name, record), record, changed))
-    return RunStatus(load_source(run)["path"], tuple(stages))
+    return RunStatus(load_source(run).path, tuple(stages))
 
 
 def _state(run: RunFolder, name: str, record: Any) -> str:

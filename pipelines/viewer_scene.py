@@ -17,7 +17,7 @@ from pipelines.evaluation.measure import evenly
 from pipelines.gaussian_map import decided_channels
 from pipelines.outcome import Outcome, labels_of_channels, load_outcome
 from pipelines.proxy.palette import class_colors
-from pipelines.run_folder import RunFolder
+from pipelines.run_folder import MESH_TO_SHOW, RunFolder
 from pipelines.types import Frame
 
 MODES = ("colour", "classes", "depth")
@@ -88,7 +88,6 @@ def _from_run(outcome: Outcome) -> ViewerScene:
     world_from_cam = t.world_from_cam
     channels = decided_channels(m.class_logits).cpu().numpy()
     labels = labels_of_channels(channels, outcome.label_of_channel) if m.class_logits.shape[1] else None
-    mesh = outcome.run.stage("export") / "mesh.glb"
     return ViewerScene(
         title=outcome.run.root.name,
         centers=(means * scale).astype(np.float32),
@@ -102,7 +101,7 @@ def _from_run(outcome: Outcome) -> ViewerScene:
             for row in (outcome.frame_row(i) for i in ids)
         ],
         path=centers * scale,
-        mesh_file=mesh if mesh.exists() else None,
+        mesh_file=outcome.run.file("export", MESH_TO_SHOW) if outcome.run.has("export", MESH_TO_SHOW) else None,
         run=outcome.run,
     )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -12,6 +11,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from formats.atomic import write_bytes
+from formats.jsonfile import read_json, write_json
 from formats.tensors import load_arrays, save_arrays
 from pipelines.correspondence.features import Features
 from pipelines.correspondence.matching import VerifiedPair
@@ -50,14 +51,19 @@ class Snapshots:
         order in which an adjustment adds.
         """
         path, scratch = self.folder / name, self.folder / f"{name}.tmp"
-        if not path.exists():
+        listed = path / "files.json"
+        if not listed.exists() or not all((path / n).exists() for n in read_json(listed)):
             shutil.rmtree(scratch, ignore_errors=True)
             (scratch / "work").mkdir(parents=True)
+            (scratch / "model").mkdir()
             model = compute(scratch / "work")
-            shutil.rmtree(scratch / "work")
             if model is not None:
-                model.write_binary(scratch)
-            os.replace(scratch, path)
+                model.write_binary(scratch / "model")
+            files = sorted((scratch / "model").iterdir())
+            for file in files:
+                write_bytes(path / file.name, file.read_bytes())
+            write_json(listed, [file.name for file in files])
+            shutil.rmtree(scratch)
         return pycolmap.Reconstruction(path) if (path / "cameras.bin").exists() else None
 
 

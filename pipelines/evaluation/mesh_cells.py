@@ -20,6 +20,7 @@ from pipelines.evaluation.surface_error import (
 from pipelines.evaluation.trajectory_error import AbsoluteError
 from pipelines.evaluation.truth import MatchedTruth
 from pipelines.outcome import Outcome
+from pipelines.run_folder import MESH
 
 SAMPLES = 200_000
 VIEWS = 60
@@ -30,15 +31,14 @@ CELL = 0.02
 
 def mesh_cells(outcome: Outcome, matched: MatchedTruth, alignment: AbsoluteError | None) -> dict[str, Any]:
     """Accuracy, completeness and F-score, or why not."""
-    path = outcome.run.stage("export") / "mesh.ply"
-    if not path.exists():
+    if not outcome.run.has("export", MESH):
         return {"missing": "no mesh was exported"}
     if alignment is None:
         return {"missing": "the poses could not be aligned with the truth"}
     truth, views = _true_surface(matched)
     if len(truth) == 0:
         return {"missing": "the truth has no depth, or no camera for it"}
-    mesh = _load(path)
+    mesh = _load(outcome.run.file("export", MESH))
     if mesh is None:
         return {"missing": "the mesh is empty"}
     points = alignment.alignment.apply(sample_surface(*mesh, SAMPLES))

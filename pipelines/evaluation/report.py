@@ -9,18 +9,19 @@ from typing import Any
 import numpy as np
 
 from formats.atomic import write_text
+from formats.jsonfile import read_json
 from pipelines.config import Config, config_to_dict, config_to_toml
 from pipelines.evaluation.facts import Capture, advice, lost_stretches, read_capture
 from pipelines.evaluation.html import bullets, chips, page, section, table
 from pipelines.evaluation.plots import RED, Line, plot
 from pipelines.evaluation.report_views import RenderedViews, class_section, quality_section, render_views
 from pipelines.evaluation.table import evaluation_table
-from pipelines.evaluation.write import PATH_FROM_ABOVE, evaluation_file, trajectory_plots
+from pipelines.evaluation.write import PATH_FROM_ABOVE, trajectory_plots
 from pipelines.export.readme import README
 from pipelines.outcome import Outcome, load_outcome
 from pipelines.progress import Progress, SilentProgress
 from pipelines.records import load_source
-from pipelines.run_folder import RunFolder, read_json
+from pipelines.run_folder import RunFolder
 from pipelines.types import LoopEdge, SparseModel
 
 MEASURED_VIEWS = 60
@@ -36,7 +37,7 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
     sparse, loops = outcome.load_sparse(), _load_loops(outcome)
     capture = read_capture(outcome, sparse)
     views = None if outcome.gaussian_map is None else render_views(outcome, progress or SilentProgress())
-    evaluation = read_json(evaluation_file(run)) if evaluation_file(run).exists() else None
+    evaluation = read_json(run.evaluation_file) if run.evaluation_file.exists() else None
     body = "".join(
         [
             _heading(outcome, views, loops),
@@ -52,7 +53,7 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
             _settings_section(outcome),
         ]
     )
-    target = path or run.root / "report.html"
+    target = path or run.report_file
     write_text(target, page(f"{run.root.name} – report", body))
     return target
 
@@ -75,7 +76,7 @@ def _heading(outcome: Outcome, views: RenderedViews | None, loops: list[LoopEdge
     if "global_ba" in outcome.records:
         pairs.append(("loops closed", str(len(loops))))
     pairs.append(("seconds", f"{sum(r.seconds for r in outcome.records.values()):.0f}"))
-    source = escape(str(load_source(outcome.run)["path"]))
+    source = escape(str(load_source(outcome.run).path))
     stage = outcome.map_stage or outcome.pose_stage
     return f'<h1>{escape(outcome.run.root.name)}</h1><p class="sub">from {source}, as {stage} left it</p>{chips(pairs)}'
 
@@ -139,7 +140,7 @@ def _truth_section(evaluation: dict[str, Any], run: RunFolder) -> str:
     if len(errors):
         points = np.stack([errors[:, 0], 100 * errors[:, 1]], axis=1)
         drawn = plot("Distance from the true camera", "frame", "cm", [Line(points, RED, "")])
-    beside = evaluation_file(run).with_name(PATH_FROM_ABOVE)
+    beside = run.evaluation_file.with_name(PATH_FROM_ABOVE)
     drawn += beside.read_text(encoding="utf-8") if beside.exists() else ""
     return section(
         f"Against the truth: {evaluation['truth']}",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,7 +30,6 @@ from pipelines.outcome import Outcome, load_outcome
 from pipelines.progress import Progress
 from pipelines.run_folder import RunFolder
 
-FOLDER = "evaluation"
 PATH_FROM_ABOVE, PATH_FROM_THE_SIDE = "trajectory_top.svg", "trajectory_side.svg"
 SHEET_VIEWS = 6
 TITLES = ("frame", "map", "depth of the map", "true depth", "error, white = 10 %", "labels of the map", "true labels")
@@ -46,8 +44,8 @@ def write_evaluation(
     """
     outcome = load_outcome(run)
     result, _ = evaluate_outcome(outcome, truth, progress, max_views, legacy)
-    folder = run.root / FOLDER
-    write_json(folder / "evaluation.json", result)
+    folder = run.evaluation_file.parent
+    write_json(run.evaluation_file, result)
     write_text(folder / "evaluation.md", evaluation_table(result))
     matched = match_truth(outcome.frames, outcome.source_is_folder, truth)
     top, side = trajectory_plots(outcome, matched)
@@ -136,8 +134,3 @@ def _row(outcome: Outcome, matched: MatchedTruth, pixels: FramePixels, row: int)
         label_picture(view.labels, colors),
         nothing if labels is None else label_picture(pixels.sample(labels), true_colors),
     ]
-
-
-def evaluation_file(run: RunFolder) -> Path:
-    """Where the figures lie."""
-    return run.root / FOLDER / "evaluation.json"

@@ -33,7 +33,7 @@ def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
     names = tuple(name_of[int(i)] for i in trajectory.frame_ids[posed])
     camera = (k.width, k.height, k.fx, k.fy, k.cx, k.cy)
     for name in names:
-        place_image(outcome.run.stage("frames") / name, folder / "frames" / name)
+        place_image(outcome.run.file("frames", name), folder / "frames" / name)
     points = seen_points(outcome.load_sparse(), trajectory.frame_ids[posed])
     write_colmap_model(folder / "sparse" / "0", *camera, names, trajectory.cam_from_world[posed], *points)
     paths = [f"frames/{name}" for name in names]

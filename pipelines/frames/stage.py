@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from formats.atomic import atomic_path
 from formats.errors import InputError
 from formats.images import read_rgb, write_rgb
+from formats.jsonfile import read_json, write_json
 from formats.video import VideoFrame
 from pipelines.config import Config, FramesConfig
 from pipelines.correspondence.snapshots import Snapshots
@@ -25,7 +26,7 @@ from pipelines.frames.pick import sharpest_of_windows
 from pipelines.frames.recording import RecordingSource
 from pipelines.frames.sharpness import reduce_image, reduced_size
 from pipelines.frames.source import FolderSource, VideoSource, open_source
-from pipelines.run_folder import read_json, save_calibration, save_frames, save_sparse_model, write_json
+from pipelines.run_folder import save_backbone, save_calibration, save_frames
 from pipelines.stages import Stage, StageContext
 from pipelines.structure.backbone import to_sparse_model
 from pipelines.structure.calibration import read_intrinsics
@@ -105,14 +106,16 @@ def _pick(context: StageContext, source: AnySource) -> list[Frame]:
     table = context.snapshot / "picked.json"
     if table.exists():
         stored = read_json(table)
-        for message in stored["warnings"]:
-            context.warn(message)
-        return [Frame(**row) for row in stored["frames"]]
+        frames = [Frame(**row) for row in stored["frames"]]
+        if all(_picked(context, f.name).exists() for f in frames):
+            for message in stored["warnings"]:
+                context.warn(message)
+            return frames
     config = context.config.frames
     pictures = source.read(warn=context.warn)
     pictures = context.progress.track(pictures, "picking", source.expected_frames or None)
     rate = config.rate if source.has_times else 0.0
-    frames: list[Frame] = []
+    frames = []
     for picture, score in sharpest_of_windows(pictures, rate):
         if len(frames) == config.max_frames:
             raise InputError(
@@ -253,7 +256,7 @@ def _write_backbone(
     model = to_sparse_model(
         structure.model, keyframes, lens, lambda frame_id: read_rgb(_picked(context, frames[frame_id].name))
     )
-    save_sparse_model(context.folder / "backbone" / "model.npz", model)
+    save_backbone(context.folder, model)
 
 
 def _write_frames(context: StageContext, source: AnySource, frames: list[Frame], lens: Lens) -> None:

@@ -19,16 +19,16 @@ from pipelines.global_ba.move_map import follow_keyframes, move_map
 from pipelines.global_ba.semantics import LabelSummary, summarise_labels
 from pipelines.global_ba.verify import KeyframeView, Loop, make_view
 from pipelines.mapping.depth_fields import agree_on_depth
-from pipelines.mapping.load import DepthScales, load_class_ids, load_views
+from pipelines.mapping.load import DepthScales, load_views
 from pipelines.mapping.poses import move_trajectory
 from pipelines.run_folder import (
     RunFolder,
     save_exposure,
+    save_figures,
     save_loops,
     save_map,
-    save_sparse_model,
+    save_sparse,
     save_trajectory,
-    write_json,
 )
 from pipelines.stages import Stage, StageContext
 from pipelines.tracking.adjust import without_dependent_depth
@@ -210,7 +210,7 @@ def refine(context: StageContext, gaussian_map: GaussianMap, trajectory: Traject
     gains = {int(i): g for i, g in zip(exposure["frame_ids"], exposure["log_gains"], strict=True)}
     offsets = {int(i): o for i, o in zip(exposure["frame_ids"], exposure["offsets"], strict=True)}
     exposures = np.array([gains[v.frame_id] for v in views]), np.array([offsets[v.frame_id] for v in views])
-    classes = len(load_class_ids(context.run))
+    classes = len(context.run.load_class_ids())
     return refine_together(context, gaussian_map, views, exposures, classes, mapping, settings.joint_passes)
 
 
@@ -231,7 +231,7 @@ def save(
         trajectory = move_trajectory(trajectory, exposure["frame_ids"], refined.cam_from_world)
         exposure |= {"log_gains": refined.log_gains, "offsets": refined.offsets}
     save_trajectory(context.folder, trajectory)
-    save_sparse_model(context.folder / "sparse.npz", model)
+    save_sparse(context.folder, model)
     save_map(context.folder, gaussian_map)
     save_exposure(context.folder, exposure["frame_ids"], exposure["log_gains"], exposure["offsets"])
     save_loops(context.folder, [loop.edge for loop in found.loops] if closed is not None else [])
@@ -247,7 +247,7 @@ def save(
         "joint_psnr_before": None if refined is None else round(refined.psnr_before, 3),
         "joint_psnr_after": None if refined is None else round(refined.psnr_after, 3),
     }
-    write_json(context.folder / "global_ba.json", figures)
+    save_figures(context.folder, "global_ba", figures)
     return figures
 
 

@@ -14,7 +14,7 @@ from pipelines.config import ArticleConfig, MappingConfig
 from pipelines.mapping.article.mirrors import Mirrors
 from pipelines.mapping.depth_fields import Anchors
 from pipelines.mapping.views import View, make_view, occurring_classes, working_size
-from pipelines.run_folder import RunFolder, read_json
+from pipelines.run_folder import RunFolder
 from pipelines.types import Frame, Intrinsics, ProxyMaps, Trajectory
 
 
@@ -92,11 +92,6 @@ def split_frames(trajectory: Trajectory, hold_out: int) -> tuple[list[int], list
         return keyframes, []
     held = [i for i in posed if i % hold_out == hold_out // 2]
     return [i for i in keyframes if i not in set(held)], held
-
-
-def load_class_ids(run: RunFolder) -> tuple[int, ...]:
-    """The label of each class channel of the run's map."""
-    return tuple(read_json(run.stage("mapping") / "mapping.json")["class_ids"])
 
 
 @dataclass(frozen=True)

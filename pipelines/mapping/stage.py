@@ -14,7 +14,7 @@ from pipelines.mapping.measure import ViewFigures, mean_figures, measure_view
 from pipelines.mapping.optimise import OptimisedMap, optimise_map
 from pipelines.mapping.poses import interpolate_rows, move_trajectory
 from pipelines.mapping.views import View
-from pipelines.run_folder import save_exposure, save_map, save_trajectory, write_json
+from pipelines.run_folder import save_exposure, save_figures, save_map, save_trajectory
 from pipelines.stages import Stage, StageContext
 from pipelines.types import Trajectory
 
@@ -38,7 +38,7 @@ def run(context: StageContext) -> dict[str, Any]:
     save_trajectory(context.folder, moved)
     save_exposure(context.folder, keyframe_ids, result.log_gains, result.offsets)
     figures = _figures(context, given, views, result, moved)
-    write_json(context.folder / "mapping.json", {**figures, "class_ids": list(given.class_ids)})
+    save_figures(context.folder, "mapping", {**figures, "class_ids": list(given.class_ids)})
     return figures
 
 

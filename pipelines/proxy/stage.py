@@ -29,10 +29,10 @@ from pipelines.run_folder import (
     proxy_path,
     save_classes,
     save_descriptors,
+    save_figures,
     save_frame_scales,
     save_mirror_pairs,
     save_proxy_maps,
-    write_json,
 )
 from pipelines.stages import Stage, StageContext
 from pipelines.types import VOID, Frame, ProxyMaps
@@ -81,7 +81,7 @@ def run(context: StageContext) -> dict[str, Any]:
         **mirrors,
     }
     _warn_of_focal(context, sequence, report.get("network_focal_px"))
-    write_json(context.folder / "proxy.json", report)
+    save_figures(context.folder, "proxy", report)
     return report
 
 

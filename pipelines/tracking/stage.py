@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from formats.errors import InputError
-from formats.tensors import save_arrays
-from pipelines.run_folder import save_sparse_model, save_trajectory, write_json
+from pipelines.run_folder import save_depth_scales as write_depth_scales
+from pipelines.run_folder import save_figures, save_sparse, save_trajectory
 from pipelines.stages import Stage, StageContext
 from pipelines.tracking.adjust import Report, adjust_state, without_dependent_depth
 from pipelines.tracking.front_end import FrontEnd
@@ -41,12 +41,12 @@ def run(context: StageContext) -> dict[str, Any]:
 
     trajectory = to_trajectory(state, frames)
     save_trajectory(context.folder, trajectory)
-    save_sparse_model(context.folder / "sparse.npz", to_sparse_model(state))
+    save_sparse(context.folder, to_sparse_model(state))
     save_depth_scales(context, state, report)
     figures = {**describe(state, frames, report, metric), **compared}
     if "reference_relative_sd" in proxy:  # what the user's reference leaves open; depths agree far better
         figures["scale_relative_sd"] = proxy["reference_relative_sd"]
-    write_json(context.folder / "tracking.json", figures)
+    save_figures(context.folder, "tracking", figures)
     warn_of_losses(context, state)
     return figures
 
@@ -107,7 +107,7 @@ def save_depth_scales(context: StageContext, state: TrackState, report: Report) 
     grids = np.exp(report.ties.fields[keep])
     scales = np.exp(np.median(report.ties.fields[keep].reshape(len(keep), -1), axis=1)) if keep else np.zeros(0)
     frame_ids = np.array([report.frame_ids[c] for c in keep], np.int64)
-    save_arrays(context.folder / "depth_scales.npz", {"frame_ids": frame_ids, "scales": scales, "grids": grids})
+    write_depth_scales(context.folder, {"frame_ids": frame_ids, "scales": scales, "grids": grids})
 
 
 def describe(state: TrackState, frames: list[Frame], report: Report, metric: bool) -> dict[str, Any]:

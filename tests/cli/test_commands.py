@@ -1,5 +1,6 @@
 """The command line through click's runner: exit codes, messages, help."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import click
@@ -7,6 +8,10 @@ import pytest
 from click.testing import CliRunner, Result
 
 from msgs_cli.main import main
+from pipelines.config import Config
+from pipelines.records import Manifest, Source, write_manifest
+from pipelines.run_folder import RunFolder
+from pipelines.settings_file import save_settings
 
 
 def invoke(*arguments: object) -> Result:
@@ -92,32 +97,63 @@ def test_no_gpu_is_said(tmp_path: Path) -> None:
     assert "no CUDA device" in refused(source, tmp_path / "run", "--device", "cuda")
 
 
+def run_of(out: Path, digest: str = "0") -> RunFolder:
+    """A run of another source, of which no stage is done."""
+    run = RunFolder(out)
+    write_manifest(run.manifest_file, Manifest(Source("other.mp4", digest), {}))
+    save_settings(run, Config())
+    return run
+
+
 def test_run_of_another_source_is_not_touched(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    out.mkdir()
-    manifest = '{"source": {"path": "other.mp4", "digest": "0"}, "stages": {}}'
-    (out / "manifest.json").write_text(manifest)
-    (out / "run.toml").write_text("")
+    manifest = run_of(out).manifest_file.read_bytes()
     source = tmp_path / "video.mp4"
     source.write_text("x")
     message = refused(source, out)
     assert "another source" in message
     assert "--out" in message
-    assert (out / "manifest.json").read_text() == manifest
+    assert (out / "manifest.json").read_bytes() == manifest
 
 
-def test_settings_of_an_older_version_are_explained(tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    out.mkdir()
-    (out / "manifest.json").write_text('{"source": {"path": "other.mp4", "digest": "0"}, "stages": {}}')
-    (out / "run.toml").write_text("[mapping]\npasses = 3.0\ndepht_weight = 0.5\n")
-    for command in ("resume", "report", "render", "export"):
-        more = [tmp_path / "out.mp4"] if command == "render" else []
-        result = invoke(command, out, *more)
+def emptied(run: RunFolder) -> None:
+    run.settings_file.write_text("")
+
+
+def edited(run: RunFolder) -> None:
+    run.settings_file.write_text(run.settings_file.read_text().replace("rate = 10.0", "rate = 5.0"))
+
+
+def of_another_run(run: RunFolder) -> None:
+    other = run_of(run.root.parent / "other", digest="1")
+    run.settings_file.write_bytes(other.settings_file.read_bytes())
+
+
+@pytest.mark.parametrize("spoil", [emptied, edited, of_another_run])
+def test_settings_not_as_they_were_left_are_refused(
+    spoil: Callable[[RunFolder], None], tmp_path: Path
+) -> None:
+    run = run_of(tmp_path / "run")
+    spoil(run)
+    for command in ("resume", "status", "report", "render", "export"):
+        result = invoke(command, run.root, *([tmp_path / "out.mp4"] if command == "render" else []))
         assert result.exit_code == 1, (command, result.output)
         assert isinstance(result.exception, SystemExit)
-        assert "there is no setting mapping.depht_weight; did you mean mapping.depth_weight?" in result.stderr
-        assert "remove that line" in result.stderr
+        assert "run.toml is not as the program left it" in result.stderr
+        assert f"msgs-slam resume {run.root}" in result.stderr
+
+
+def test_damaged_manifest_is_refused(tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run")
+    whole = run.manifest_file.read_text()
+    for damaged in ("", whole[:-9], whole.replace("other", "othor"), "[" * 100_000, '{"format": 3}', '{"stages": 5}'):
+        run.manifest_file.write_text(damaged)
+        for command in ("status", "resume", "report"):
+            result = invoke(command, run.root)
+            assert result.exit_code == 1
+            assert isinstance(result.exception, SystemExit)
+            assert "manifest.json" in result.stderr
+            assert "msgs-slam reconstruct" in result.stderr
 
 
 def test_export_with_other_settings_must_say_where_to(tmp_path: Path) -> None:

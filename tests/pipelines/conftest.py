@@ -1,22 +1,20 @@
 """A finished run made from the truth of the synthetic room, without running any stage."""
 
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from finished import note_finished
 from numpy.typing import NDArray
 
-from formats.atomic import write_text
 from formats.datasets import Sequence, open_sequence
 from formats.images import write_rgb
-from pipelines.config import Config, MappingConfig, config_to_toml
+from pipelines.config import Config, MappingConfig
 from pipelines.gaussian_map import GaussianMap
 from pipelines.geometry.alignment import Similarity
-from pipelines.records import StageRecord
 from pipelines.run_folder import (
     RunFolder,
     proxy_path,
@@ -70,11 +68,8 @@ def oracle_run(truth: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Ora
         if mesh:
             _write_mesh(run.stage("export") / "mesh.ply", gaussian_map)
         config = Config(mapping=MappingConfig(hold_out=hold_out))
-        write_text(run.settings_file, config_to_toml(config))
-        record = asdict(StageRecord("", {}, 2.0, 100.0, {}, [], ""))
-        stages = dict.fromkeys(("frames", "proxy", "tracking", "mapping", "export"), record)
         source = "walk.mp4" if video else str(truth.root / "rgb")
-        write_json(run.manifest_file, {"source": {"path": source, "digest": ""}, "stages": stages})
+        note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"), config, source, seconds=2.0)
         return run
 
     return make

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from formats.atomic import write_text
 from formats.errors import DiskFullError, InputError
 from pipelines.config import Config, MappingConfig, load_config
 from pipelines.progress import SilentProgress
@@ -31,10 +32,10 @@ class Recorder:
             self.ran.append(name)
             before = STAGES[STAGES.index(name) - 1] if name != STAGES[0] else None
             text = (context.run.stage(before) / "result.txt").read_text() if before else "source"
-            (context.snapshot / "half.txt").write_text("half")
+            write_text(context.snapshot / "half.txt", "half")
             if name == self.fail_in:
                 raise self.error
-            (context.folder / "result.txt").write_text(f"{text} > {name} {getattr(context.config, name)}")
+            write_text(context.folder / "result.txt", f"{text} > {name} {getattr(context.config, name)}")
             return {"length": len(text)}
 
         return run
@@ -99,6 +100,13 @@ def test_damaged_file_is_made_again(recorder: Recorder, tmp_path: Path) -> None:
     bring_up_to_date(recorder, tmp_path / "r")
     damaged = tmp_path / "r" / "global_ba" / "result.txt"
     damaged.write_text(damaged.read_text()[:-1] + "?")
+    run = RunFolder(tmp_path / "r")
+    assert run.damaged("global_ba") == ["result.txt"]
+    with pytest.raises(InputError, match=r"result.txt is not as the program left it.*msgs-slam resume"):
+        run.file("global_ba", "result.txt")
+    (tmp_path / "r" / "export" / "result.txt").unlink()
+    with pytest.raises(InputError, match=r"result.txt is gone"):
+        run.file("export", "result.txt")
     assert bring_up_to_date(recorder, tmp_path / "r") == ["global_ba", "export"]
 
 
@@ -123,6 +131,46 @@ def test_interrupted_stage_keeps_its_snapshot(recorder: Recorder, tmp_path: Path
     assert bring_up_to_date(recorder, tmp_path / "r") == ["mapping", "global_ba", "export"]
     assert not list(run.root.glob("*.partial"))
     assert not list(run.root.rglob(".torn*"))
+
+
+def test_damaged_snapshot_is_dropped_and_what_is_whole_stays(
+    recorder: Recorder, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    recorder.fail_in = "mapping"
+    with pytest.raises(KeyboardInterrupt):
+        bring_up_to_date(recorder, tmp_path / "r")
+    snapshot = RunFolder(tmp_path / "r").partial("mapping") / "snapshot" / "half.txt"
+    with pytest.raises(KeyboardInterrupt):
+        bring_up_to_date(recorder, tmp_path / "r")
+    assert "damaged" not in caplog.text
+    snapshot.write_text("hulf")
+    (snapshot.parent / "foreign.txt").write_text("of nobody")
+    with pytest.raises(KeyboardInterrupt):
+        bring_up_to_date(recorder, tmp_path / "r")
+    assert (
+        "1 files of the interrupted attempt are damaged and made again, the first is snapshot/half.txt" in caplog.text
+    )
+    assert [p.name for p in snapshot.parent.iterdir()] == ["half.txt"]
+    assert snapshot.read_text() == "half"
+
+
+def test_file_that_the_disk_has_cut_is_not_sealed(recorder: Recorder, tmp_path: Path) -> None:
+    class Cutting(Recorder):
+        def make(self, name: str) -> Any:
+            whole = super().make(name)
+
+            def run(context: StageContext) -> dict[str, Any]:
+                figures = whole(context)
+                if name == "proxy":
+                    (context.folder / "result.txt").write_text("so")
+                return figures
+
+            return run
+
+    with pytest.raises(InputError, match="is not what was written there"):
+        bring_up_to_date(Cutting(), tmp_path / "r")
+    assert list(load_records(RunFolder(tmp_path / "r"))) == ["frames"]
+    assert bring_up_to_date(recorder, tmp_path / "r") == list(STAGES[1:])
 
 
 def test_snapshot_of_other_settings_is_dropped(recorder: Recorder, tmp_path: Path) -> None:

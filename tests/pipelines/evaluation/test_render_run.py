@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from finished import note_finished
 
 from formats.datasets import Sequence
 from formats.errors import InputError
@@ -50,7 +51,7 @@ def test_unknown_kinds_and_runs_without_a_map_are_refused(oracle_run: OracleRun,
     (tmp_path / "taken.txt").write_text("x")
     with pytest.raises(InputError, match="is a file"):
         render_run(run, tmp_path / "taken.txt")
-    (run.stage("mapping") / "map.safetensors").unlink()
+    note_finished(run, ("frames", "proxy", "tracking"))
     with pytest.raises(InputError, match="no map yet"):
         render_run(run, tmp_path / "x")
     assert not (tmp_path / "x").exists()

@@ -8,6 +8,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from finished import note_finished
 
 from formats.datasets import Sequence
 from formats.errors import InputError
@@ -53,6 +54,7 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
     classes = json.loads((run.stage("proxy") / "classes.json").read_text())
     classes[0]["name"] = "<script>alert(1)</script>"
     (run.stage("proxy") / "classes.json").write_text(json.dumps(classes))
+    note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
     html = write_report(run).read_text()
     parsed = Balanced()
     parsed.feed(html)
@@ -69,13 +71,11 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
 
 def test_report_of_a_run_without_a_map_and_with_lost_frames(oracle_run: OracleRun) -> None:
     run = oracle_run()
-    manifest = json.loads(run.manifest_file.read_text())
-    manifest["stages"] = {k: manifest["stages"][k] for k in ("frames", "proxy", "tracking")}
-    run.manifest_file.write_text(json.dumps(manifest))
     t = run.load_trajectory("tracking")
     reasons = tuple("too few matches" if 5 <= i < 8 else ("blurred" if i == 8 else "") for i in range(32))
     lost = replace(t, is_keyframe=t.is_keyframe & ~np.array([bool(r) for r in reasons]), lost_reasons=reasons)
     save_trajectory(run.stage("tracking"), lost)
+    note_finished(run, ("frames", "proxy", "tracking"))
     outcome = load_outcome(run)
     assert [(s.first, s.last, s.reason) for s in lost_stretches(outcome)] == [
         (5, 7, "too few matches"),
@@ -84,7 +84,7 @@ def test_report_of_a_run_without_a_map_and_with_lost_frames(oracle_run: OracleRu
     html = write_report(run).read_text()
     assert "frames 5–7 (0.50–0.70 s): too few matches" in html
     assert "4 of 32 frames have no pose" in html
-    run.manifest_file.write_text(json.dumps(manifest | {"stages": {}}))
+    note_finished(run, ())
     with pytest.raises(InputError, match="not done"):
         write_report(run)
 

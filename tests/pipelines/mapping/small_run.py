@@ -1,16 +1,14 @@
 """A run folder of the synthetic room as the stages before mapping would leave it, with exact poses and proxies."""
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 
 import cv2
 import numpy as np
+from finished import note_finished
 from numpy.typing import NDArray
 
 from formats.images import read_rgb
-from pipelines.config import Config, config_to_toml
-from pipelines.records import StageRecord
 from pipelines.run_folder import (
     RunFolder,
     proxy_path,
@@ -60,18 +58,8 @@ def make_run(root: Path, sequence: Path, every: int = 2) -> RunFolder:
     trajectory = Trajectory(np.arange(n), times, cam_from_world, np.ones(n, bool), ("",) * n)
     save_trajectory(root / "tracking", trajectory)
     save_sparse_model(root / "tracking" / "sparse.npz", points_seen_twice(k, cam_from_world, depths))
-    run.settings_file.write_text(config_to_toml(Config()))
-    note_stages(run, "frames", "proxy", "tracking")
+    note_finished(run, ("frames", "proxy", "tracking"), source=str(root))
     return run
-
-
-def note_stages(run: RunFolder, *stages: str) -> None:
-    """A manifest that says these stages are done."""
-    record = asdict(StageRecord("", {}, 0.0, 0.0, {}, [], ""))
-    write_json(
-        run.manifest_file,
-        {"source": {"path": str(run.root), "digest": ""}, "stages": {name: record for name in stages}},
-    )
 
 
 def grey(path: Path) -> NDArray:

@@ -8,10 +8,11 @@ import plyfile
 import pycolmap
 import pytest
 import trimesh
+from finished import note_finished
 
 from formats.errors import InputError
 from formats.trajectory import read_tum
-from pipelines.config import Config, ExportConfig, MappingConfig, RunConfig, config_to_toml
+from pipelines.config import Config, ExportConfig, MappingConfig, RunConfig
 from pipelines.export import stage as export_stage
 from pipelines.export.stage import export_run
 from pipelines.mapping import stage as mapping_stage
@@ -19,7 +20,7 @@ from pipelines.progress import SilentProgress
 from pipelines.run_folder import RunFolder
 from pipelines.stages import StageContext
 from pipelines.types import VOID
-from tests.pipelines.mapping.small_run import make_run, note_stages
+from tests.pipelines.mapping.small_run import make_run
 
 CONFIG = Config(
     run=RunConfig(device="cpu"),
@@ -37,9 +38,8 @@ def context(run: RunFolder, stage: str, config: Config = CONFIG) -> StageContext
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory, world_sequence: Path) -> tuple[RunFolder, dict, dict]:
     run = make_run(tmp_path_factory.mktemp("finished") / "run", world_sequence)
-    run.settings_file.write_text(config_to_toml(CONFIG))
     mapped = mapping_stage.run(context(run, "mapping"))
-    note_stages(run, "frames", "proxy", "tracking", "mapping")
+    note_finished(run, ("frames", "proxy", "tracking", "mapping"), CONFIG)
     return run, mapped, export_stage.run(context(run, "export"))
 
 
