@@ -130,9 +130,7 @@ def of_another_run(run: RunFolder) -> None:
 
 
 @pytest.mark.parametrize("spoil", [emptied, edited, of_another_run])
-def test_settings_not_as_they_were_left_are_refused(
-    spoil: Callable[[RunFolder], None], tmp_path: Path
-) -> None:
+def test_settings_not_as_they_were_left_are_refused(spoil: Callable[[RunFolder], None], tmp_path: Path) -> None:
     run = run_of(tmp_path / "run")
     spoil(run)
     for command in ("resume", "status", "report", "render", "export"):

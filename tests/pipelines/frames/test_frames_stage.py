@@ -14,13 +14,16 @@ import pytest
 
 from formats.errors import InputError
 from formats.images import read_rgb, write_rgb
+from formats.jsonfile import read_json
 from pipelines.config import load_config
 from pipelines.frames.stage import run
 from pipelines.geometry.alignment import align_points
 from pipelines.progress import SilentProgress
-from pipelines.run_folder import RunFolder, calibration_from_json, load_sparse_model, read_json
+from pipelines.run_folder import RunFolder, load_sparse_model
 from pipelines.stages import StageContext
+from pipelines.stored import dataclass_from_json
 from pipelines.structure import sfm
+from pipelines.types import Calibration
 from tests.pipelines.frames.conftest import QUICK, WALK_FRAMES, Walk, render, sideways, turn, write_walk
 
 T = TypeVar("T")
@@ -129,7 +132,7 @@ def test_given_intrinsics_are_kept(bent_walk: Walk, make_context: Callable[..., 
     intrinsics = f"{bent_walk.focal},{bent_walk.focal},160,120,{bent_walk.k1},0,0,0"
     context = make_context(bent_walk.folder, f"frames.intrinsics={intrinsics}")
     figures = run(context)
-    calibration = calibration_from_json(read_json(context.folder / "calibration.json"))
+    calibration = dataclass_from_json(Calibration, read_json(context.folder / "calibration.json"))
     assert (calibration.origin, calibration.focal_sd) == ("given", 0.0)
     assert calibration.distortion == (bent_walk.k1, 0.0, 0.0, 0.0)
     assert calibration.intrinsics.fx == pytest.approx(bent_walk.focal)  # barrel distortion needs no zoom
