@@ -131,7 +131,7 @@ def open_learned_semantics(around: Surroundings, choice: Choice) -> FilesLabels 
     place = _workplace(around, "network_labels")
     if choice.card.is_clustered:
         return OnnxClusters(choice.card, place, around.config.max_classes)
-    return OnnxLabels(choice.card, place)
+    return OnnxLabels(choice.card, place, around.config.max_classes)
 
 
 def open_depth_files(around: Surroundings, folder: str) -> FilesDepth | RecordingDepth:

@@ -279,5 +279,5 @@ def _report(
 
 
 STAGE = Stage(
-    "proxy", 6, run, "depth, reliability and classes of the keyframes", inputs=proxy_inputs, check=check_proxy
+    "proxy", 7, run, "depth, reliability and classes of the keyframes", inputs=proxy_inputs, check=check_proxy
 )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.proxy.networks.card import Card
-from pipelines.proxy.networks.labels import class_token, patch_features
+from pipelines.proxy.networks.labels import class_token, patch_features, softmax
 from pipelines.proxy.networks.labels_provider import OnnxLabels
 from pipelines.proxy.networks.network_pass import Arrays, Workplace
 from pipelines.types import Frame
@@ -22,8 +24,7 @@ class OnnxClusters(OnnxLabels):
 
     def __init__(self, card: Card, place: Workplace, most: int) -> None:
         """`most` clusters at the most. Raises InputError as `OnnxLabels`."""
-        super().__init__(card, place)
-        self._most = most
+        super().__init__(card, place, most)
         self._centres = np.empty((0, 0), np.float32)
 
     def _compute(self, image: NDArray[np.uint8]) -> Arrays:
@@ -50,12 +51,11 @@ class OnnxClusters(OnnxLabels):
         features = self._pass.load(frame)["features"].astype(np.float32)
         return features / np.maximum(np.linalg.norm(features, axis=-1, keepdims=True), 1e-6)
 
-    def _raw(self, frame: Frame) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    def _probabilities(self, frame: Frame) -> NDArray[np.float32]:
         camera = self._sequence.intrinsics
         box = self._network.box(camera.width, camera.height)
-        scores = box.take((self._features(frame) @ self._centres.T) / np.float32(_SOFTNESS))
-        best = scores.max(-1)
-        return scores.argmax(-1), (1 / np.exp(scores - best[..., None]).sum(-1)).astype(np.float32)
+        small = replace(box, width=max(1, camera.width // 4), height=max(1, camera.height // 4))
+        return softmax(small.take((self._features(frame) @ self._centres.T) / np.float32(_SOFTNESS)))
 
 
 def spherical_kmeans(vectors: NDArray[np.float32], most: int, rng: np.random.Generator) -> NDArray[np.float32]:

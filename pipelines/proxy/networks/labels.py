@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,15 +14,17 @@ from pipelines.proxy.networks.letterbox import Letterbox
 from pipelines.proxy.networks.session import Network
 
 
-def network_labels(
-    network: Network, output: NDArray, width: int, height: int
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """(class ids (h, w), -1 for void; probability of that class (h, w)) from the network's output for a picture.
+def network_probabilities(network: Network, output: NDArray, width: int, height: int, side: int = 0) -> NDArray:
+    """(h, w, C) float32 probability of every class from the network's output for a picture of width x height; at the
+    picture's own pixels, or at `side` samples along its longer side. All 0 where the network says nothing.
 
     Raises InputError for an output that is no image of classes, or one without any number.
     """
     card = network.card
     box = network.box(width, height)
+    if side and side < max(width, height):
+        share = side / max(width, height)
+        box = replace(box, width=max(1, round(width * share)), height=max(1, round(height * share)))
     if card.kind == "argmax":
         return _from_ids(network, output, box)
     scores = _scores(network, output, box)
@@ -31,16 +36,29 @@ def network_labels(
         scores = _grouped(card, scores)
     # Interpolated before the softmax: boundaries between two classes then run through between the samples.
     scores = box.take(scores, card.align_corners)
-    ids = scores.argmax(-1)
-    best = scores.max(-1)
     is_probability = card.kind == "probabilities" or bool(card.groups)
-    likely = np.clip(best, 0, 1) if is_probability else 1 / np.exp(scores - best[..., None]).sum(-1)
-    probability = np.asarray(likely, np.float32)
-    ids = np.where(np.isin(ids, card.void), -1, ids)
+    found = np.clip(scores, 0, 1) if is_probability else softmax(scores)
     if broken.any():
-        lost = box.take(broken.astype(np.float32), card.align_corners) > 0.5
-        ids, probability = np.where(lost, -1, ids), np.where(lost, 0, probability)
-    return ids, np.where(ids < 0, 0, probability).astype(np.float32)
+        found[box.take(broken.astype(np.float32), card.align_corners) > 0.5] = 0
+    return np.asarray(found, np.float32)
+
+
+def softmax(scores: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(..., C) → probabilities of the same shape."""
+    raised = np.exp(scores - scores.max(-1, keepdims=True))
+    return np.asarray(raised / raised.sum(-1, keepdims=True), np.float32)
+
+
+def best_classes(probabilities: NDArray[np.float32], void: Sequence[int]) -> tuple[NDArray[np.int64], NDArray]:
+    """(class ids (h, w), -1 where one of `void` or nothing at all is likeliest; probability of that class (h, w))."""
+    ids, best = probabilities.argmax(-1), probabilities.max(-1)
+    ids = np.where(np.isin(ids, list(void)) | (best <= 0), -1, ids)
+    return ids, np.where(ids < 0, 0, best).astype(np.float32)
+
+
+def network_labels(network: Network, output: NDArray, width: int, height: int) -> tuple[NDArray[np.int64], NDArray]:
+    """What the network alone says of a picture: `best_classes` at its pixels."""
+    return best_classes(network_probabilities(network, output, width, height), network.card.void)
 
 
 def _scores(network: Network, output: NDArray, box: Letterbox) -> NDArray[np.float32]:
@@ -87,19 +105,17 @@ def class_token(network: Network, output: NDArray, width: int, height: int) -> N
 def _grouped(card: Card, scores: NDArray[np.float32]) -> NDArray[np.float32]:
     """(h', w', G) probabilities of the groups: the sum over their classes."""
     if card.kind != "probabilities":
-        scores = np.exp(scores - scores.max(-1, keepdims=True))
-        scores /= scores.sum(-1, keepdims=True)
+        scores = softmax(scores)
     labels = card.labels
     member = np.zeros((len(card.classes), len(labels)), np.float32)
     member[np.arange(len(card.classes)), [labels.index(g) for g in card.groups]] = 1
     return (scores @ member).astype(np.float32)
 
 
-def _from_ids(network: Network, output: NDArray, box: Letterbox) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def _from_ids(network: Network, output: NDArray, box: Letterbox) -> NDArray[np.float32]:
     plane = output[0] if output.ndim == 3 and output.shape[0] == 1 else output
     if plane.ndim != 2:
         raise InputError(f"{network.card.model}: gave {output.shape} where an image of class ids is expected")
     rows, columns = box.indices(plane.shape[0], plane.shape[1])
     ids = plane[rows[:, None], columns[None, :]].astype(np.int64)
-    known = (ids >= 0) & (ids < len(network.card.classes)) & ~np.isin(ids, network.card.void)
-    return np.where(known, ids, -1), known.astype(np.float32)
+    return np.asarray(ids[..., None] == np.arange(len(network.card.classes)), np.float32)

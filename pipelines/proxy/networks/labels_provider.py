@@ -1,8 +1,9 @@
-"""Classes by a network that a card describes, made steady over the video by votes in the world."""
+"""Classes by a network that a card describes, brought together over the video in the world."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,23 +12,30 @@ from numpy.typing import NDArray
 from formats.errors import InputError
 from pipelines.proxy.networks.card import Card
 from pipelines.proxy.networks.identity import card_identity
-from pipelines.proxy.networks.labels import class_token, network_labels
+from pipelines.proxy.networks.labels import best_classes, class_token, network_probabilities
 from pipelines.proxy.networks.network_pass import Arrays, NetworkPass, Workplace
 from pipelines.proxy.networks.session import Network
 from pipelines.proxy.palette import class_colors
 from pipelines.proxy.providers import DepthEstimate, LabelEstimate
-from pipelines.proxy.regions.votes import WorldVotes
+from pipelines.proxy.regions.named import NamedScene, Vocabulary
+from pipelines.proxy.regions.provider import SegmentLabels
+from pipelines.proxy.sequence import resample_linear
 from pipelines.types import VOID, ClassTable, Frame
 
 _LEAST_SHARE = 0.001
 """A class on a smaller share of all pixels is noise of the network and becomes void."""
+_SIDE = 160
+"""Samples of the probabilities that are kept along the longer side of a picture: networks give 33 to 128."""
+_STEPS = 16
+"""Steps of the stored probabilities in each halving: 4 %; 255 of them reach down to 2e-5."""
 
 
 class OnnxLabels:
     """Only the classes that occur in the video are kept."""
 
-    def __init__(self, card: Card, place: Workplace) -> None:
-        """Opens the network. Raises InputError when it cannot be what the card says."""
+    def __init__(self, card: Card, place: Workplace, most: int) -> None:
+        """Opens the network; `most` numbered objects of what has no name. Raises InputError when the network cannot be
+        what the card says."""
         if card.task != "segmentation":
             raise InputError(
                 f"{card.model}: its card says {card.task}, but proxy.semantics needs a segmentation network"
@@ -35,10 +43,12 @@ class OnnxLabels:
         self._network = Network(card, place.threads, place.device)
         self._sequence = place.sequence
         self.name = card.name
-        self._names = card.labels
-        self._label_of = np.empty(0, np.uint8)
+        self._names, self._void = card.labels, card.void
+        self._most = most
+        self._progress = place.progress
         self._classes = ClassTable((), ())
-        self._votes: WorldVotes | None = None
+        self._label_of = np.empty(0, np.uint8)
+        self._scene: NamedScene | None = None
         identity = f"{card_identity(card)} {place.sequence.intrinsics.width}x{place.sequence.intrinsics.height}"
         self._pass = NetworkPass(self.name, identity, place, self._compute)
 
@@ -51,52 +61,73 @@ class OnnxLabels:
         return []
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
-        """Run the network, settle the classes, and let all frames vote on the classes of the places they see."""
+        """Run the network, let all frames vote on the names of the places they see, and settle the classes."""
         self._pass.run(frames)
         self._learn(frames)
+        if self._has_world(frames, depth_of):
+            segments = SegmentLabels(self._sequence, self._most, self._progress)
+            vocabulary = Vocabulary(self._names, self._void, self._most)
+            self._scene = NamedScene.gather(segments, frames, depth_of, self._probabilities, vocabulary)
+            names, kept = self._scene.names, self._scene.kept
+        else:
+            kept = self._settle_alone(frames)
+            names = tuple(self._names[i] for i in kept)
+        if not 0 < len(names) < VOID:
+            raise InputError(f"{self.name}: {len(names)} classes occur; 1 to {VOID - 1} are needed. Check the card")
+        # By the place in the network's own list: a name has the same colour in every video.
+        colors = class_colors(len(self._names) + len(names))
+        self._classes = ClassTable(
+            names, tuple(colors[i if i >= 0 else len(self._names) + n] for n, i in enumerate(kept))
+        )
+
+    def _has_world(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> bool:
+        """Whether two frames or more with a pose have depth that can be relied on."""
+        posed = [f for f in frames if f.id in self._sequence.cam_from_world]
+        return sum(bool((depth_of(f).confidence > 0.3).any()) for f in posed[:: max(1, len(posed) // 10)]) >= 2
+
+    def _settle_alone(self, frames: list[Frame]) -> NDArray[np.int64]:
+        """(K,) the classes that occur in the frames by themselves."""
         counts = np.zeros(len(self._names) + 1, np.int64)
         for frame in frames:
-            counts += np.bincount(self._raw(frame)[0].ravel() + 1, minlength=len(counts))
+            counts += np.bincount(
+                best_classes(self._probabilities(frame), self._void)[0].ravel() + 1, None, len(counts)
+            )
         kept = np.flatnonzero(counts[1:] >= _LEAST_SHARE * counts.sum())
-        if not 0 < len(kept) < VOID:
-            raise InputError(f"{self.name}: {len(kept)} classes occur; 1 to {VOID - 1} are needed. Check the card")
         # Index 0 of the table is void: ids are stored plus one.
         self._label_of = np.full(len(self._names) + 1, VOID, np.uint8)
         self._label_of[kept + 1] = np.arange(len(kept), dtype=np.uint8)
-        self._classes = ClassTable(tuple(self._names[i] for i in kept), class_colors(len(kept)))
-        self._votes = WorldVotes.gather(self._sequence, frames, depth_of, self._labels, len(kept))
+        return kept
 
     def _compute(self, image: NDArray[np.uint8]) -> Arrays:
-        output = self._network.run(image, self._network.box(image.shape[1], image.shape[0]))["output"]
-        ids, probability = network_labels(self._network, output, image.shape[1], image.shape[0])
-        arrays: Arrays = {
-            "ids": (ids + 1).astype(np.uint16),
-            "probability": np.round(probability * 255).astype(np.uint8),
-        }
-        token = class_token(self._network, output, image.shape[1], image.shape[0])
+        height, width = image.shape[:2]
+        output = self._network.run(image, self._network.box(width, height))["output"]
+        halvings = -np.log2(np.maximum(network_probabilities(self._network, output, width, height, _SIDE), 1e-9))
+        arrays: Arrays = {"halvings": np.minimum(np.round(halvings * _STEPS), 255).astype(np.uint8)}
+        token = class_token(self._network, output, width, height)
         return arrays if token is None else {**arrays, "descriptor": token}
 
     def _learn(self, frames: list[Frame]) -> None:
-        """What has to be known of all frames before `_raw`: nothing, the network knows its classes."""
+        """What has to be known of all frames before `_probabilities`: nothing, the network knows its classes."""
 
-    def _raw(self, frame: Frame) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Class ids (-1 void) and probabilities (h, w)."""
-        stored = self._pass.load(frame)
-        return stored["ids"].astype(np.int64) - 1, stored["probability"].astype(np.float32) / np.float32(255)
-
-    def _labels(self, frame: Frame) -> LabelEstimate:
-        ids, probability = self._raw(frame)
-        labels = self._label_of[ids + 1]
-        confidence = np.where(labels == VOID, 0, probability).astype(np.float32)
-        return LabelEstimate(labels, confidence, self._pass.load(frame).get("descriptor"))
+    def _probabilities(self, frame: Frame) -> NDArray[np.float32]:
+        """(rows, columns, C) over the whole picture; 0 where the network says nothing."""
+        halvings = self._pass.load(frame)["halvings"]
+        said = np.exp2(-halvings.astype(np.float32) / np.float32(_STEPS))
+        return np.where(halvings.min(-1, keepdims=True) < 255, said, 0).astype(np.float32)
 
     def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
-        """The network's labels and the votes of the other frames together."""
-        own = self._labels(frame)
-        return own if self._votes is None else self._votes.combine(frame, depth, own)
+        """What all frames say of the places that this one shows; what it says itself where there is no world."""
+        own = self._probabilities(frame)
+        if self._scene is not None:
+            found = self._scene.estimate(frame, depth, own)
+        else:
+            ids, probability = best_classes(resample_linear(own, *depth.depth.shape), self._void)
+            labels = self._label_of[ids + 1]
+            found = LabelEstimate(labels, np.where(labels == VOID, 0, probability).astype(np.float32))
+        return replace(found, descriptor=self._pass.load(frame).get("descriptor"))
 
     def classes(self) -> ClassTable:
-        """The classes that occur, in the network's order."""
+        """The classes that occur, in the network's order, then the objects that it has no name for."""
         return self._classes
 
     def figures(self) -> dict[str, Any]:

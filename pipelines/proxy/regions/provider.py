@@ -22,10 +22,9 @@ from pipelines.proxy.regions.spread import spread_votes
 from pipelines.proxy.regions.structure import FLOOR, NAMES, OTHER, Gravity, find_gravity, name_structure
 from pipelines.proxy.regions.voxels import (
     Voxels,
-    find,
+    find_near,
     gather_frame,
     merge,
-    neighbour_keys,
     select,
     voxel_keys,
 )
@@ -54,7 +53,7 @@ class SegmentLabels:
                 "regions of the scene need camera poses, and structure from motion found none: the camera stands still "
                 "or only turns. Move it sideways, or give classes with --semantics files:FOLDER or onnx:CARD"
             )
-        self._sequence, self._most, self._progress = sequence, most, progress
+        self.sequence, self._most, self._progress = sequence, most, progress
         self._size = 1.0
         self._keys = np.empty(0, np.int64)
         self._label = np.empty(0, np.uint8)
@@ -72,12 +71,12 @@ class SegmentLabels:
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Gather all frames and cut the scene."""
-        voxels, gravity, kind = self._structure(frames, depth_of)
+        voxels, gravity, kind = self.structure(frames, depth_of)
         self._name(kind, cut_parts(select(voxels, kind == OTHER), self._most - len(NAMES) - 1))
         self._keys = voxels.keys
         self._gravity = [round(float(v), 4) for v in gravity.up] if gravity.is_sure else []
 
-    def _structure(
+    def structure(
         self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]
     ) -> tuple[Voxels, Gravity, NDArray[np.int64]]:
         """All frames' surface in voxels (V,), which way is up, and floor, ceiling, wall, surface or other (V,)."""
@@ -92,7 +91,7 @@ class SegmentLabels:
 
     def heights(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> NDArray[np.float64]:
         """(N,) height of each posed camera over the floor, in the unit of the depth; (0,) without a sure floor."""
-        voxels, gravity, kind = self._structure(frames, depth_of)
+        voxels, gravity, kind = self.structure(frames, depth_of)
         floor, weight = voxels.position[kind == FLOOR], voxels.weight[kind == FLOOR]
         if len(floor) < 3:
             return np.empty(0)
@@ -107,14 +106,14 @@ class SegmentLabels:
         return np.asarray((centres - middle) @ normal)
 
     def _gather(self, frame: Frame, estimate: DepthEstimate) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        camera = self._sequence.intrinsics
+        camera = self.sequence.intrinsics
         scale = min(1.0, _GATHER_SIDE / max(camera.width, camera.height))
         small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
         confidence = resample_nearest(estimate.confidence, small.height, small.width)
         return gather_frame(
             resample_nearest(estimate.depth, small.height, small.width),
             np.where(confidence >= _LEAST_CONFIDENCE, confidence, 0).astype(np.float32),
-            resample_nearest(self._sequence.image(frame), small.height, small.width),
+            resample_nearest(self.sequence.image(frame), small.height, small.width),
             small,
             self._world_from_cam[frame.id],
             self._size,
@@ -142,33 +141,17 @@ class SegmentLabels:
 
     def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
         """Votes of the voxels under the pixels, spread along like colours to where the depth is unsure."""
-        camera = self._sequence.intrinsics
+        camera = self.sequence.intrinsics
         if frame.id not in self._world_from_cam or len(self._keys) == 0:
             return LabelEstimate(np.full(depth.depth.shape, VOID, np.uint8), np.zeros(depth.depth.shape, np.float32))
         world_from_cam = self._world_from_cam[frame.id]
         points = unproject_depth(depth.depth, camera) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
-        label = self._lookup(voxel_keys(points, self._size))
-        known = (label != VOID) & (depth.depth > 0)
+        at = find_near(self._keys, voxel_keys(points, self._size))
+        label = np.where((at >= 0) & (depth.depth > 0), self._label[at], VOID)
         votes = np.zeros((*label.shape, len(self._classes)), np.float32)
-        rows, columns = np.nonzero(known)
-        votes[rows, columns, label[known]] = _LEAST_VOTE + depth.confidence[known] ** 2
-        votes = spread_votes(votes, self._sequence.image(frame), _REACH, _COLOR_SD)
-        total = votes.sum(-1)
-        best = votes.argmax(-1).astype(np.uint8)
-        share = votes.max(-1) / np.maximum(total, 1e-9)
-        best[total < 1e-4] = VOID
-        return LabelEstimate(best, np.where(best == VOID, 0, share * np.minimum(1, 2 * total)).astype(np.float32))
-
-    def _lookup(self, keys: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Label of the voxel of every key, else of a neighbouring voxel, else VOID."""
-        at = find(self._keys, keys)
-        lost = np.flatnonzero((at < 0) & (keys >= 0))
-        around = find(self._keys, neighbour_keys(keys.ravel()[lost]))
-        first = (around >= 0).argmax(1)
-        flat = at.ravel()
-        flat[lost] = around[np.arange(len(lost)), first]
-        at = flat.reshape(keys.shape)
-        return np.where(at >= 0, self._label[at], VOID).astype(np.uint8)
+        rows, columns = np.nonzero(label != VOID)
+        votes[rows, columns, label[rows, columns]] = 1
+        return label_pixels(votes, depth.confidence, self.sequence.image(frame))
 
     def classes(self) -> ClassTable:
         """Named structure first, then the objects by size."""
@@ -177,6 +160,17 @@ class SegmentLabels:
     def figures(self) -> dict[str, Any]:
         """The up direction in the world, when a dominant plane made it sure."""
         return {"up": self._gravity} if self._gravity else {}
+
+
+def label_pixels(votes: NDArray[np.float32], trust: NDArray[np.float32], image: NDArray[np.uint8]) -> LabelEstimate:
+    """Labels (h, w) from votes (h, w, C) that count by the `trust` (h, w) in the place they are of, spread along like
+    colours of the image to where it is low; VOID where nothing is known from near or far."""
+    total = spread_votes(votes * (_LEAST_VOTE + trust**2)[..., None], image, _REACH, _COLOR_SD)
+    heard = total.sum(-1)
+    best = total.argmax(-1).astype(np.uint8)
+    best[heard < 1e-4] = VOID
+    share = total.max(-1) / np.maximum(heard, 1e-9)
+    return LabelEstimate(best, np.where(best == VOID, 0, share * np.minimum(1, 2 * heard)).astype(np.float32))
 
 
 def _scene_depth(estimates: list[DepthEstimate]) -> float:

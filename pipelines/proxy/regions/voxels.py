@@ -52,6 +52,16 @@ def find(sorted_keys: NDArray[np.int64], keys: NDArray[np.int64]) -> NDArray[np.
     return np.where(sorted_keys[at] == keys, at, -1)
 
 
+def find_near(sorted_keys: NDArray[np.int64], keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """As `find`; where a key is not there, the index of a neighbouring cube that is."""
+    at = find(sorted_keys, keys)
+    lost = np.flatnonzero((at < 0) & (keys >= 0))
+    around = find(sorted_keys, neighbour_keys(keys.ravel()[lost]))
+    flat = at.ravel()
+    flat[lost] = around[np.arange(len(lost)), (around >= 0).argmax(1)]
+    return flat.reshape(keys.shape)
+
+
 def normals_in_cam(depth: NDArray[np.float32], intrinsics: Intrinsics) -> NDArray[np.float64]:
     """(h, w, 3) unit normals that face the camera, from central differences; 0 beside unknown depth and at edges."""
     points = unproject_depth(depth, intrinsics)

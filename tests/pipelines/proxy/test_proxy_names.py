@@ -1,0 +1,134 @@
+"""Names brought together in the world, against the known room; what geometry and the scene say of them."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from proxy_room import UNIT, Room
+
+from pipelines.evaluation.label_score import count_labels, score
+from pipelines.progress import SilentProgress
+from pipelines.proxy.networks.labels import best_classes
+from pipelines.proxy.providers import DepthEstimate
+from pipelines.proxy.regions.belonging import one_name_each, place_likelihood
+from pipelines.proxy.regions.named import NamedScene, Vocabulary
+from pipelines.proxy.regions.posture import name_likelihood
+from pipelines.proxy.regions.provider import SegmentLabels
+from pipelines.proxy.regions.structure import FLOOR, OTHER, Gravity
+from pipelines.proxy.regions.voxels import Voxels, voxel_keys
+from pipelines.proxy.sequence import resample_linear
+from pipelines.types import VOID, Frame
+from pipelines.world.room import CLASSES
+
+NAMES = tuple(name for name, _ in CLASSES)
+UP = Gravity(np.array([0.0, 0, 1]), True)
+
+
+def coarse(labels: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.float32]:
+    """(12, 16, C): what a network with samples 16 pixels apart would say, with a mistake in every tenth."""
+    small = cv2.blur((labels[..., None] == np.arange(len(NAMES))).astype(np.float32), (24, 24))[8::16, 8::16] + 0.01
+    rows, columns = np.nonzero(rng.random(small.shape[:2]) < 0.1)
+    small[rows, columns, rng.integers(1, len(NAMES), len(rows))] += 1.5
+    return small / small.sum(-1, keepdims=True)
+
+
+def miou(room: Room, shown: dict[int, NDArray]) -> float:
+    classes = len(NAMES)
+    total = sum(count_labels(found, room.views[i].labels, classes, classes) for i, found in shown.items())
+    found = score(np.asarray(total))
+    assert found is not None
+    return found.mean_iou
+
+
+def depth_of(room: Room, frame: Frame) -> DepthEstimate:
+    depth = (room.views[frame.id].depth * UNIT).astype(np.float32)
+    return DepthEstimate(depth, (depth > 0).astype(np.float32) * 0.8)
+
+
+def gather(room: Room, said: dict[int, NDArray[np.float32]], vocabulary: Vocabulary) -> NamedScene:
+    segments = SegmentLabels(room.sequence(), vocabulary.most, SilentProgress())
+    return NamedScene.gather(segments, room.frames, lambda f: depth_of(room, f), lambda f: said[f.id], vocabulary)
+
+
+def test_frames_together_name_the_room_better_than_each_alone(room: Room) -> None:
+    rng = np.random.default_rng(3)
+    said = {f.id: coarse(room.views[f.id].labels, rng) for f in room.frames}
+    scene = gather(room, said, Vocabulary(NAMES, (0,), 16))
+    index = np.array([*(NAMES.index(n) if n in NAMES else VOID for n in scene.names)] + [VOID] * 256, np.uint8)
+    together, alone = {}, {}
+    for frame in room.frames:
+        together[frame.id] = index[scene.estimate(frame, depth_of(room, frame), said[frame.id]).labels]
+        shape = room.views[frame.id].labels.shape
+        alone[frame.id] = best_classes(resample_linear(said[frame.id], *shape), (0,))[0].astype(np.uint8)
+    assert miou(room, alone) + 0.1 < miou(room, together) < 0.99
+
+
+def test_what_has_no_name_becomes_numbered_objects(room: Room) -> None:
+    """The network knows the walls and the floor alone; the rest is "none" to it."""
+    known = [i for i, n in enumerate(NAMES) if n in ("wall", "floor")]
+    said = {}
+    for frame in room.frames:
+        labels = np.where(np.isin(room.views[frame.id].labels, known), room.views[frame.id].labels, 0).astype(np.uint8)
+        said[frame.id] = coarse(labels, np.random.default_rng(0)) * np.isin(np.arange(len(NAMES)), [0, *known])
+    scene = gather(room, said, Vocabulary(NAMES, (0,), 6))
+    assert set(scene.names[:2]) == {"wall", "floor"}
+    assert scene.names[2:] == tuple(f"object {i + 1}" for i in range(4))
+    assert (scene.kept[2:] == -1).all()
+    assert (scene.kept[:2] == [NAMES.index(n) for n in scene.names[:2]]).all()
+    found = scene.estimate(room.frames[5], depth_of(room, room.frames[5]), said[5])
+    assert len(np.unique(found.labels[found.labels != VOID])) >= 4
+
+
+def test_a_frame_without_pose_keeps_what_it_said(room: Room) -> None:
+    said = {f.id: coarse(room.views[f.id].labels, np.random.default_rng(1)) for f in room.frames}
+    scene = gather(room, said, Vocabulary(NAMES, (0,), 16))
+    scene = replace(scene, sequence=replace(room.sequence(), read_image=lambda frame: room.views[0].rgb))
+    known = room.views[0].labels
+    found = scene.estimate(Frame(99, "lost.png", 9.9, 99, 1.0), depth_of(room, room.frames[0]), said[0])
+    names = np.array([*scene.names, "void"])[np.minimum(found.labels, len(scene.names))]
+    assert 0.7 < (names == np.array(NAMES)[known]).mean() < 0.99
+    assert found.confidence.max() < 0.5
+
+
+def voxels_of(positions: list[tuple[float, float, float]], normals: list[tuple[float, float, float]]) -> Voxels:
+    points = np.array(positions, float)
+    keys = voxel_keys(points, 1.0)
+    order = np.argsort(keys)
+    normal = np.array(normals, float)
+    return Voxels(1.0, keys[order], np.ones(len(keys)), points[order], normal[order], np.zeros((len(keys), 3)))
+
+
+def test_floors_lie_and_walls_stand() -> None:
+    names = ("floor", "wall", "ceiling", "chair")
+    voxels = voxels_of([(0, 0, 0), (1, 0, 5), (2, 0, 9)], [(0, 0, 1), (1, 0, 0), (0, 0, -1)])
+    likely = name_likelihood(names, voxels, UP, np.array([FLOOR, OTHER, OTHER]), 5.0)
+    assert (likely[:, 0] == [1, likely[1, 0], likely[2, 0]]).all()
+    assert likely[1, 0] < 0.2
+    assert likely[0, 1] < 0.2
+    assert likely[1, 1] == 1
+    assert likely[0, 2] < 0.2
+    assert likely[2, 2] == 1
+    assert (likely[1:, 3] == 1).all()
+    assert (name_likelihood(names, voxels, Gravity(UP.up, False), np.zeros(3, np.int64), 5.0) == 1).all()
+
+
+def test_a_thing_has_one_name_and_its_neighbour_another() -> None:
+    names = ("sofa", "armchair", "floor")
+    places = [(x, 0, 0) for x in range(4)] + [(x, 0, 0) for x in range(8, 10)]
+    voxels = voxels_of(places, [(0, 0, 1)] * 6)
+    share = np.array(
+        [[0.7, 0.3, 0], [0.6, 0.4, 0], [0.4, 0.6, 0], [0.1, 0.0, 0.9], [0.3, 0.7, 0], [0.2, 0.8, 0]], np.float32
+    )
+    one_name_each(share, names, voxels)
+    assert share.argmax(1).tolist() == [0, 0, 0, 2, 1, 1]
+    assert np.allclose(share.sum(1), 1)
+
+
+def test_rooms_hold_no_cars_and_streets_do() -> None:
+    names, weight = ("wall", "car", "chair"), np.full(10, 0.1)
+    room = np.eye(3, dtype=np.float32)[[0] * 7 + [2] * 2 + [1]]
+    street = np.eye(3, dtype=np.float32)[[1] * 5 + [0] * 5]
+    assert place_likelihood(room, names, weight)[1] < 0.2
+    assert (place_likelihood(room, names, weight)[[0, 2]] == 1).all()
+    assert (place_likelihood(street, names, weight) == 1).all()
