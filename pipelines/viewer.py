@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from formats.errors import InputError
+from formats.mesh import read_mesh_glb
+from pipelines.viewer_door import guarding
 from pipelines.viewer_scene import MODES, ViewerCamera, ViewerScene, load_scene
 
 _FRUSTUM = 0.09
@@ -30,7 +33,8 @@ def open_viewer(path: Path, host: str = "127.0.0.1", port: int = 8080) -> Viewer
     except ImportError as error:
         raise InputError("the viewer needs viser: pip install 'msgs-slam[viewer]'") from error
     try:
-        server = viser.ViserServer(host=host, port=port, label=f"MSGS-SLAM {scene.title}", verbose=False)
+        with guarding(host):
+            server = viser.ViserServer(host=host, port=port, label=f"MSGS-SLAM {plain(scene.title)}", verbose=False)
     except OSError as error:
         raise InputError(f"port {port} cannot be used ({error.strerror}): choose another with --port") from error
     return Viewer(server, scene)
@@ -88,7 +92,7 @@ class Viewer:
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        gui.add_markdown(f"**{self.scene.title}**: {len(self.scene.centers):,} Gaussians")
+        gui.add_markdown(f"**{plain(self.scene.title)}**: {len(self.scene.centers):,} Gaussians")
         modes = tuple(m for m in MODES if m in self.scene.colors or m == "depth")
         self.mode = gui.add_dropdown("Gaussians", modes)
         self.mode.on_update(lambda event: self.show(self.mode.value, event.client))
@@ -137,7 +141,7 @@ class Viewer:
                 self.show("depth", client)
         if self.scene.run is not None:
             self.preview.image = _reduced(self.scene.run.image(camera.frame))
-            self.preview.label = f"{camera.frame.name}, {camera.frame.timestamp:.2f} s"
+            self.preview.label = f"{plain(camera.frame.name)}, {camera.frame.timestamp:.2f} s"
 
     def _move(self, client: Any, camera: ViewerCamera) -> None:
         wxyz, position = self._pose(camera)
@@ -172,10 +176,14 @@ class Viewer:
     def _add_mesh(self) -> Any:
         if self.scene.mesh_file is None:
             return None
-        mesh = trimesh.load(self.scene.mesh_file, force="mesh")
-        if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-            return None
+        found = read_mesh_glb(self.scene.mesh_file)
+        mesh = trimesh.Trimesh(found.vertices, found.faces, vertex_colors=found.colors, process=False)
         return self.server.scene.add_mesh_trimesh("/mesh", mesh, scale=self.scene.scale, visible=False)
+
+
+def plain(name: str) -> str:
+    """A name without what Markdown, HTML or the page's scripts could take for their own."""
+    return re.sub(r"[^\w .,()-]", "?", name)
 
 
 def _reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -1,0 +1,117 @@
+"""Servers that mean no good, or are broken: what they send never hangs the downloader and never leads elsewhere."""
+
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from formats.errors import InputError
+from pipelines.proxy.models import download
+from pipelines.proxy.models.download import fetch
+
+Serve = Callable[..., str]
+OK = b"HTTP/1.1 200 OK\r\n"
+
+
+@pytest.fixture
+def serve() -> Iterator[Serve]:
+    """A server that answers every request with these pieces, a pause before each."""
+    listening: list[socket.socket] = []
+
+    def start(*pieces: bytes, pause: float = 0) -> str:
+        server = socket.create_server(("127.0.0.1", 0))
+        listening.append(server)
+
+        def answer() -> None:
+            with suppress(OSError):
+                while True:
+                    line, _ = server.accept()
+                    with suppress(OSError), line:
+                        line.recv(65536)
+                        for piece in pieces:
+                            time.sleep(pause)
+                            line.sendall(piece)
+
+        threading.Thread(target=answer, daemon=True).start()
+        return f"http://127.0.0.1:{server.getsockname()[1]}/m"
+
+    yield start
+    for server in listening:
+        server.close()
+
+
+def refused(urls: list[str], target: Path) -> str:
+    with pytest.raises(InputError) as error:
+        fetch(urls, target, 1000, "", lambda done, size: None)
+    assert not target.is_file()
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    "location",
+    [
+        b"http://example.invalid/m", b"ftp://127.0.0.1/m", b"file:///etc/passwd", b"http://[::1/x y",
+        b"http://127.0.0.1.example.invalid/m", b"data:,x",
+    ],
+)  # fmt: skip
+def test_redirects_lead_to_https_only(serve: Serve, tmp_path: Path, location: bytes) -> None:
+    url = serve(b"HTTP/1.1 302 Found\r\nLocation: " + location + b"\r\nContent-Length: 0\r\n\r\n")
+    assert re.search("only https|not allowed|makes no sense", refused([url], tmp_path / "m"))
+
+
+def test_this_machine_is_reached_from_itself_alone() -> None:
+    assert download._is_safe("http://localhost:8000/m")
+    for url in (
+        "http://127.0.0.1.example.invalid/m",
+        "http://example.invalid/m",
+        "ftp://example.invalid/m",
+        "https://",
+    ):
+        assert not download._is_safe(url)
+    assert not download._is_safe("http://localhost:8000/m", from_own_host=False)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        OK + b"Transfer-Encoding: chunked\r\n\r\n-5\r\nabc\r\n",
+        OK + b"Transfer-Encoding: chunked\r\n\r\n" + b"f" * 5000 + b"\r\n",
+        OK + b"Content-Length: " + b"9" * 5000 + b"\r\n\r\nabc",
+        OK + b"Content-Length: -3\r\n\r\nabc",
+        OK + b"X: 1\r\n" * 1000 + b"\r\n",
+        b"HTTP/1.1 999999999999999999999 x\r\n\r\n",
+        b"\xff" * 100_000,
+        b"",
+    ],
+)
+def test_answers_that_make_no_sense_are_reasons(serve: Serve, tmp_path: Path, answer: bytes) -> None:
+    assert "no mirror delivered" in refused([serve(answer)], tmp_path / "m")
+
+
+@pytest.mark.parametrize("head", [OK + b"Content-Length: 1000\r\n\r\n", b"HTTP/1.1 200 OK\r\nX: "])
+def test_a_server_that_drips_is_left(
+    serve: Serve, tmp_path: Path, head: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(download, "_WINDOW", 0.1)
+    monkeypatch.setattr(download, "_ANSWER_SECONDS", 0.2)
+    monkeypatch.setattr(download, "_ATTEMPTS", 1)
+    url = serve(head, *[b"x"] * 1000, pause=0.02)
+    assert "no mirror delivered" in refused([url], tmp_path / "m")
+
+
+def test_a_strange_tag_and_folders_in_the_way(serve: Serve, tmp_path: Path) -> None:
+    url = serve(OK + b"Content-Length: 1000\r\n\r\n" + b"x" * 1000)
+    for text in ('{"etag": "\\"a\\r\\nHost: b\\""}', '{"etag": ' + "[" * 100_000, "[]", '{"etag": 3}'):
+        (tmp_path / "m.part").write_bytes(b"begun")
+        (tmp_path / "m.part.json").write_text(text)
+        fetch([url], tmp_path / "m", 1000, "", lambda done, size: None)
+        assert (tmp_path / "m").read_bytes() == b"x" * 1000
+    for name in ("n", "o.part", "p.part.json"):
+        (tmp_path / name).mkdir()
+        assert "is a folder" in refused([url], tmp_path / name.split(".")[0])
+    assert "choose another cache" in refused([url], tmp_path / "m" / "below a file")
