@@ -22,7 +22,7 @@ section{background:var(--card);border:1px solid var(--line);border-radius:12px;p
 .chip{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:8px 14px;min-width:120px}
 .chip b{display:block;font-size:20px}.chip span{color:var(--soft);font-size:12px}
 .two{display:grid;grid-template-columns:repeat(auto-fill,minmax(440px,1fr));gap:14px}
-svg.plot{width:100%;height:auto;display:block}
+.plot{width:100%;height:auto;display:block}
 table{border-collapse:collapse;width:100%;font-size:14px}
 th,td{text-align:left;padding:6px 10px;border-bottom:1px solid var(--line);vertical-align:top}
 th{color:var(--soft);font-weight:600}
@@ -71,6 +71,12 @@ def chips(pairs: Iterable[tuple[str, str]]) -> str:
     """(name, value) pairs as a row of little cards."""
     cards = (f'<div class="chip"><b>{escape(value)}</b><span>{escape(name)}</span></div>' for name, value in pairs)
     return f'<div class="chips">{"".join(cards)}</div>'
+
+
+def drawing(svg: bytes, description: str) -> str:
+    """An SVG file inside the page as a picture, in which nothing of it can act."""
+    text = base64.b64encode(svg).decode("ascii")
+    return f'<img class="plot" alt="{escape(description)}" src="data:image/svg+xml;base64,{text}">'
 
 
 def image(picture: NDArray[np.uint8], description: str, quality: int = 85) -> str:

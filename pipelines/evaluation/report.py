@@ -10,9 +10,10 @@ import numpy as np
 
 from formats.atomic import write_text
 from formats.jsonfile import read_json
+from formats.reading import read_bytes
 from pipelines.config import Config, config_to_dict, config_to_toml
 from pipelines.evaluation.facts import Capture, advice, lost_stretches, read_capture
-from pipelines.evaluation.html import bullets, chips, page, section, table
+from pipelines.evaluation.html import bullets, chips, drawing, page, section, table
 from pipelines.evaluation.plots import RED, Line, plot
 from pipelines.evaluation.report_views import RenderedViews, class_section, quality_section, render_views
 from pipelines.evaluation.table import evaluation_table
@@ -141,7 +142,7 @@ def _truth_section(evaluation: dict[str, Any], run: RunFolder) -> str:
         points = np.stack([errors[:, 0], 100 * errors[:, 1]], axis=1)
         drawn = plot("Distance from the true camera", "frame", "cm", [Line(points, RED, "")])
     beside = run.evaluation_file.with_name(PATH_FROM_ABOVE)
-    drawn += beside.read_text(encoding="utf-8") if beside.exists() else ""
+    drawn += drawing(read_bytes(beside), "The camera path from above") if beside.exists() else ""
     return section(
         f"Against the truth: {evaluation['truth']}",
         f'<div class="two">{drawn}</div>',

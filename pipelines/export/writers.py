@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -61,14 +60,9 @@ def seen_points(
 
 
 def place_image(source: Path, target: Path) -> None:
-    """A hard link where the disk allows it, else a copy."""
-    if target.exists() and target.samefile(source):
-        return
+    """A copy, not a link: what is given away may be edited without changing the run that it came from."""
     with atomic_path(target) as temporary:
-        try:
-            os.link(source, temporary)
-        except OSError:
-            shutil.copyfile(source, temporary)
+        shutil.copyfile(source, temporary)
 
 
 def map_cloud(outcome: Outcome) -> GaussianCloud:

@@ -15,7 +15,7 @@ from formats.errors import InputError
 from pipelines.evaluation.facts import Capture, advice, lost_stretches
 from pipelines.evaluation.plots import Line, plot, ticks
 from pipelines.evaluation.report import write_report
-from pipelines.evaluation.write import write_evaluation
+from pipelines.evaluation.write import PATH_FROM_ABOVE, write_evaluation
 from pipelines.outcome import load_outcome
 from pipelines.run_folder import RunFolder, save_trajectory
 from pipelines.types import LoopEdge, SparseModel
@@ -51,6 +51,8 @@ class Balanced(HTMLParser):
 def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, truth: Sequence) -> None:
     run = oracle_run()
     write_evaluation(run, truth, max_views=1)
+    svg = '<svg xmlns="http://www.w3.org/2000/svg" onload="alert(1)"><script>alert(1)</script></svg>'
+    run.evaluation_file.with_name(PATH_FROM_ABOVE).write_text(svg)
     classes = json.loads((run.stage("proxy") / "classes.json").read_text())
     classes[0]["name"] = "<script>alert(1)</script>"
     (run.stage("proxy") / "classes.json").write_text(json.dumps(classes))
@@ -59,11 +61,12 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
     parsed = Balanced()
     parsed.feed(html)
     assert parsed.open == []
-    assert parsed.images == 4 * 8
+    assert parsed.images == 4 * 8 + 1
     for heading in ("Advice", "What was found", "Camera path", "Against the truth", "Stages", "Settings"):
         assert heading in parsed.text
     assert "ATE Sim(3)" in parsed.text
     assert "<script" not in html
+    assert "onload" not in html
     assert re.findall(r'(?:src|href)="(?!data:)', html) == []
     assert re.findall(r"https?://(?!www\.w3\.org/2000/svg)", html) == []
     assert len(html) < 3_000_000

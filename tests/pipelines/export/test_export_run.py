@@ -42,12 +42,20 @@ def test_poses_are_the_same_everywhere(run: RunFolder, folder: Path) -> None:
     assert len(names) == len(t.frame_ids)
     for frame, pose in zip(run.load_frames(), t.cam_from_world, strict=True):
         np.testing.assert_allclose(names[frame.name], pose[:3], atol=1e-9)
-        assert (folder / "frames" / frame.name).exists()
+        given, kept = folder / "frames" / frame.name, run.stage("frames") / frame.name
+        assert given.read_bytes() == kept.read_bytes()
+        assert not given.samefile(kept)  # who edits the one leaves the other as it was
     tum = file_interface.read_tum_trajectory_file(str(folder / "trajectory.txt"))
     np.testing.assert_allclose(tum.timestamps, t.timestamps, atol=1e-6)
     np.testing.assert_allclose(tum.positions_xyz, t.centers, atol=1e-6)
     nerfstudio = open_sequence(folder / "transforms.json")
     np.testing.assert_allclose(nerfstudio.world_from_cam, t.world_from_cam, atol=1e-6)
+
+
+def test_all_files_have_the_same_rights(folder: Path) -> None:
+    files = [p for p in folder.rglob("*") if p.is_file()]
+    assert len({p.stat().st_mode for p in files}) == 1
+    assert any(p.suffix == ".safetensors" for p in files)
 
 
 def test_map_is_the_same_everywhere(run: RunFolder, folder: Path) -> None:
