@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import difflib
 import json
+import math
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -18,35 +19,59 @@ from formats.jsonfile import read_toml
 from pipelines.retired_settings import explain_retired
 
 
-def setting(default: Any, help: str, choices: tuple[str, ...] = (), stages: tuple[str, ...] = ()) -> Any:
-    """A dataclass field that carries its own help text; `stages`: who reads it, where its section is no stage's."""
-    return field(default=default, metadata={"help": help, "choices": choices, "stages": stages})
+def setting(
+    default: Any,
+    help: str,
+    choices: tuple[str, ...] = (),
+    stages: tuple[str, ...] = (),
+    within: tuple[float, float] | None = None,
+    or_zero: bool = False,
+) -> Any:
+    """A dataclass field that carries its own help text and what it may be: one of `choices`, or a number `within` two
+    (both allowed) `or_zero`; `stages`: who reads it, where its section is no stage's."""
+    allowed = {"choices": choices, "within": within, "or_zero": or_zero}
+    return field(default=default, metadata={"help": help, "stages": stages, **allowed})
 
 
 @dataclass(frozen=True)
 class RunConfig:
     """The whole run."""
 
-    seed: int = setting(0, "seed of every random choice")
-    threads: int = setting(0, "CPU threads, 0 = all cores; the same count gives the same bytes")
+    seed: int = setting(0, "seed of every random choice", within=(0, 2**31 - 1))
+    threads: int = setting(0, "CPU threads, 0 = all cores; the same count gives the same bytes", within=(0, 1024))
     format: str = setting("auto", "layout of the source: a data set's; images = a video or plain images; auto looks")
     device: str = setting("auto", "where dense work runs; auto takes a GPU if there is one", ("auto", "cpu", "cuda"))
-    cache_mb: int = setting(2000, "results of networks are kept over runs, at most this many megabytes; 0 = none")
+    cache_mb: int = setting(
+        2000, "results of networks are kept over runs, at most this many megabytes; 0 = none", within=(0, 1_000_000)
+    )
 
 
 @dataclass(frozen=True)
 class FramesConfig:
     """Picking frames and finding the camera's intrinsics."""
 
-    rate: float = setting(10.0, "frames per second to keep of a video; the sharpest of each window. 0 = all")
-    max_side: int = setting(960, "longer images are reduced to this many pixels on the long side")
-    max_frames: int = setting(5000, "more picked frames than this are refused")
+    rate: float = setting(
+        10.0,
+        "frames per second to keep of a video; the sharpest of each window. 0 = all",
+        within=(0.1, 1000),
+        or_zero=True,
+    )
+    max_side: int = setting(960, "longer images are reduced to this many pixels on the long side", within=(64, 8192))
+    max_frames: int = setting(5000, "more picked frames than this are refused", within=(2, 1_000_000))
     intrinsics: str = setting("", "fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file; empty = find them")
-    parallax: float = setting(0.025, "a new keyframe when points have moved by this fraction of the image width")
-    max_features: int = setting(3000, "SIFT features of a keyframe, at most about this many")
-    peak_threshold: float = setting(0.004, "contrast of the weakest feature; lower finds more on plain walls")
-    overlap: int = setting(8, "each keyframe is matched with this many after it (and a few further ones)")
-    loop_candidates: int = setting(4, "each keyframe is also matched with this many that look alike, for loops")
+    parallax: float = setting(
+        0.025, "a new keyframe when points have moved by this fraction of the image width", within=(0.001, 0.5)
+    )
+    max_features: int = setting(3000, "SIFT features of a keyframe, at most about this many", within=(50, 100_000))
+    peak_threshold: float = setting(
+        0.004, "contrast of the weakest feature; lower finds more on plain walls", within=(0.0001, 0.1)
+    )
+    overlap: int = setting(
+        8, "each keyframe is matched with this many after it (and a few further ones)", within=(1, 1000)
+    )
+    loop_candidates: int = setting(
+        4, "each keyframe is also matched with this many that look alike, for loops", within=(0, 1000)
+    )
     mapper: str = setting("auto", "structure from motion at once or view by view", ("auto", "global", "incremental"))
 
 
@@ -59,8 +84,8 @@ class ProxyConfig:
     frames: str = setting(
         "keyframes", "which frames get maps; all needs depth that needs no poses", ("keyframes", "all")
     )
-    max_side: int = setting(640, "the maps are at most this many pixels on the long side")
-    depth_scale: float = setting(0.001, "metres per unit of integer depth files")
+    max_side: int = setting(640, "the maps are at most this many pixels on the long side", within=(64, 8192))
+    depth_scale: float = setting(0.001, "metres per unit of integer depth files", within=(1e-9, 1000))
     scale_ref: str = setting(
         "",
         "what makes metres without metric depth: PICTURE:X1,Y1,X2,Y2=METRES, two pixels of one picture of the source "
@@ -72,9 +97,9 @@ class ProxyConfig:
         "which depth is fused with multi-view depth: a network's, and files no better than one; all; or none",
         ("learned", "always", "never"),
     )
-    stereo_side: int = setting(320, "multiview matches images of this many pixels on the long side")
-    stereo_planes: int = setting(96, "multiview tries this many depths")
-    max_classes: int = setting(16, "segments and clusters make at most this many classes")
+    stereo_side: int = setting(320, "multiview matches images of this many pixels on the long side", within=(32, 4096))
+    stereo_planes: int = setting(96, "multiview tries this many depths", within=(4, 1024))
+    max_classes: int = setting(16, "segments and clusters make at most this many classes", within=(1, 254))
 
 
 @dataclass(frozen=True)
@@ -86,27 +111,40 @@ class TrackingConfig:
         "fallback", "compare with Gaussians, eq. (16): lost frames, all, or never", ("fallback", "all", "never")
     )
     use_depth: bool = setting(True, "tie triangulated points to metric proxy depths in the adjustment")
-    adjust_frames: int = setting(400, "up to this many frames are adjusted together; of more only the keyframes")
-    snapshot_every: int = setting(50, "frames between two snapshots")
+    adjust_frames: int = setting(
+        400, "up to this many frames are adjusted together; of more only the keyframes", within=(2, 100_000)
+    )
+    snapshot_every: int = setting(50, "frames between two snapshots", within=(1, 100_000))
 
 
 @dataclass(frozen=True)
 class MappingConfig:
     """The Gaussian map."""
 
-    max_side: int = setting(640, "longer keyframes are mapped at this many pixels on the long side; 0 = as they are")
-    hold_out: int = setting(0, "every n-th frame is never used for the map, only to measure it; 0 = use all")
-    seed_stride: int = setting(2, "pixels between two new Gaussians where the map has a hole")
-    passes: float = setting(10.0, "how often each keyframe is visited once all are seeded")
-    min_iterations: int = setting(400, "at least this many such visits in all")
-    snapshot_every: int = setting(150, "steps between two snapshots")
-    max_gaussians: int = setting(1000000, "the map stops growing at this many")
-    depth_weight: float = setting(4.8, "λ_D of eq. (18); 0 = no depth loss")
+    max_side: int = setting(
+        640,
+        "longer keyframes are mapped at this many pixels on the long side; 0 = as they are",
+        within=(16, 8192),
+        or_zero=True,
+    )
+    hold_out: int = setting(
+        0,
+        "every n-th frame is never used for the map, only to measure it; 0 = use all",
+        within=(2, 1_000_000),
+        or_zero=True,
+    )
+    seed_stride: int = setting(2, "pixels between two new Gaussians where the map has a hole", within=(1, 64))
+    passes: float = setting(10.0, "how often each keyframe is visited once all are seeded", within=(0, 1000))
+    min_iterations: int = setting(400, "at least this many such visits in all", within=(0, 10_000_000))
+    snapshot_every: int = setting(150, "steps between two snapshots", within=(1, 1_000_000))
+    max_gaussians: int = setting(1000000, "the map stops growing at this many", within=(100, 50_000_000))
+    depth_weight: float = setting(4.8, "λ_D of eq. (18); 0 = no depth loss", within=(0, 1000))
     use_proxy_depth: bool = setting(True, "false: the proxies only seed the map, no loss and no condition uses them")
-    label_weight: float = setting(0.1, "λ_S of eq. (18); 0 = no semantic loss")
+    label_weight: float = setting(0.1, "λ_S of eq. (18); 0 = no semantic loss", within=(0, 1000))
     split_error: float = setting(
         0.1,
         "Gaussians that answer for more colour error 0..1 than this, summed over a view's pixels, are split; 0 = none",
+        within=(0, 1_000_000),
     )
     refine_poses: bool = setting(True, "refine keyframe poses together with the map")
     exposure: bool = setting(True, "a gain and an offset a keyframe and colour")
@@ -118,26 +156,30 @@ class GlobalBaConfig:
 
     use_loops: bool = setting(True, "look for places that are seen again")
     use_semantics: bool = setting(True, "propose loops by semantics too, eqs. (21) to (24)")
-    features: int = setting(2000, "SIFT features of a keyframe for finding loops")
-    loop_gap: int = setting(8, "a loop joins keyframes at least this many apart")
-    loop_candidates: int = setting(2, "candidates a keyframe")
-    loop_appearance: float = setting(0.02, "least appearance similarity of a candidate")
-    loop_inliers: int = setting(25, "least agreeing features of a loop, in both directions")
+    features: int = setting(2000, "SIFT features of a keyframe for finding loops", within=(10, 100_000))
+    loop_gap: int = setting(8, "a loop joins keyframes at least this many apart", within=(1, 1_000_000))
+    loop_candidates: int = setting(2, "candidates a keyframe", within=(1, 1000))
+    loop_appearance: float = setting(0.02, "least appearance similarity of a candidate", within=(-1, 1))
+    loop_inliers: int = setting(25, "least agreeing features of a loop, in both directions", within=(4, 100_000))
     joint: str = setting("moved", "refine map and poses together", ("moved", "always", "never"))
-    joint_passes: float = setting(4.0, "how often each keyframe is visited then")
+    joint_passes: float = setting(4.0, "how often each keyframe is visited then", within=(0, 1000))
 
 
 @dataclass(frozen=True)
 class ExportConfig:
     """Files for other programs."""
 
-    voxel: float = setting(0.008, "voxel of the mesh, in units of the scene's median depth")
-    max_blocks: int = setting(80000, "blocks of 8 x 8 x 8 voxels; voxels grow where more would be needed")
-    max_views: int = setting(200, "keyframes the mesh is fused from, evenly spread")
-    mesh_side: int = setting(640, "pixels on the long side of their depth images")
+    voxel: float = setting(0.008, "voxel of the mesh, in units of the scene's median depth", within=(0.0005, 1))
+    max_blocks: int = setting(
+        80000, "blocks of 8 x 8 x 8 voxels; voxels grow where more would be needed", within=(10, 10_000_000)
+    )
+    max_views: int = setting(200, "keyframes the mesh is fused from, evenly spread", within=(1, 100_000))
+    mesh_side: int = setting(640, "pixels on the long side of their depth images", within=(16, 8192))
     spz: bool = setting(False, "write the map as point_cloud.spz too")
     sh_rest: bool = setting(False, "the splat PLYs hold f_rest_0 to 44 too, all zero, for readers that insist on them")
-    least_piece: float = setting(0.01, "connected pieces smaller than this share of the largest one are removed")
+    least_piece: float = setting(
+        0.01, "connected pieces smaller than this share of the largest one are removed", within=(0, 1)
+    )
 
 
 _MAPPING = ("mapping",)
@@ -147,24 +189,35 @@ _MAPPING = ("mapping",)
 class ArticleConfig:
     """Terms of the article that earned nothing measurable; their modules say the figures."""
 
-    kappa: float = setting(0.0, "κ of eq. (7), in units of the scene's median depth; 0 = off", stages=_MAPPING)
-    edge_weight: float = setting(0.0, "λ_E of eq. (18), the edge term (19), 0.02 in the article", stages=_MAPPING)
+    kappa: float = setting(
+        0.0, "κ of eq. (7), in units of the scene's median depth; 0 = off", stages=_MAPPING, within=(0, 1000)
+    )
+    edge_weight: float = setting(
+        0.0, "λ_E of eq. (18), the edge term (19), 0.02 in the article", stages=_MAPPING, within=(0, 1000)
+    )
     label_image: bool = setting(False, "eq. (20) for the labels instead of cross-entropy", stages=_MAPPING)
     class_growth: bool = setting(False, "grow the map where it shows another class than the label", stages=_MAPPING)
     boundary_clip: float = setting(
-        0.0, "clip gradients beside class boundaries to this times their mean; 0 = off", stages=_MAPPING
+        0.0,
+        "clip gradients beside class boundaries to this times their mean; 0 = off",
+        stages=_MAPPING,
+        within=(0, 1_000_000),
     )
     symmetry_weight: float = setting(
         0.0,
         "look for mirror symmetry, and pull the two halves of what is mirror-symmetric together; 0 = off",
         stages=("proxy", "mapping"),
+        within=(0, 1000),
     )
     tracking_depth_weight: float = setting(
         0.0,
         "λ_D of eq. (16), depths in units of the median; for frames with proxies (proxy.frames=all); 0 = off",
         stages=("tracking",),
+        within=(0, 1000),
     )
-    tracking_label_weight: float = setting(0.0, "λ_S of eq. (16), likewise; 0 = off", stages=("tracking",))
+    tracking_label_weight: float = setting(
+        0.0, "λ_S of eq. (16), likewise; 0 = off", stages=("tracking",), within=(0, 1000)
+    )
 
 
 @dataclass(frozen=True)
@@ -205,7 +258,7 @@ def merge_settings(config: Config, changes: Mapping[str, Any], where: str) -> Co
         if section not in sections:
             raise InputError(f"{where}: there is no section {section!r}{_nearest(section, sections)}")
         if not isinstance(values, Mapping):
-            raise InputError(f"{where}: {section} is a section of settings, got {values!r}")
+            raise InputError(f"{where}: {section} is a section of settings, got {values!r:.80}")
         sections[section] = _merge_section(sections[section], section, values, where)
     return Config(**sections)
 
@@ -231,8 +284,21 @@ def _merge_section(section: Any, name: str, values: Mapping[str, Any], where: st
     for key, value in values.items():
         if key not in known:
             raise InputError(f"{where}: there is no setting {name}.{key}{_nearest(key, known, name + '.')}")
-        checked[key] = _checked(value, types[key], known[key].metadata.get("choices", ()), f"{where}: {name}.{key}")
+        checked[key] = _checked(value, types[key], known[key].metadata["choices"], f"{where}: {name}.{key}")
+        _require_within(checked[key], known[key], f"{where}: {name}.{key}")
     return replace(section, **checked)
+
+
+def _require_within(value: Any, known: Field[Any], where: str) -> None:
+    if (within := known.metadata["within"]) is None or (known.metadata["or_zero"] and value == 0):
+        return
+    if not within[0] <= value <= within[1]:  # not so of NaN either
+        raise InputError(f"{where} is {_range_text(known)}; got {value!r:.40}")
+
+
+def _range_text(known: Field[Any]) -> str:
+    low, high = known.metadata["within"]
+    return f"{low:.10g} to {high:.10g}" + (", or 0" if known.metadata["or_zero"] else "")
 
 
 def _checked(value: Any, wanted: Any, choices: tuple[str, ...], where: str) -> Any:
@@ -242,13 +308,11 @@ def _checked(value: Any, wanted: Any, choices: tuple[str, ...], where: str) -> A
             raise InputError(f"{where} expects a list, got {value!r}")
         return tuple(_checked(v, element, (), where) for v in value)
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
+        value = float(value) if abs(value) < 2**53 else math.inf
     if not isinstance(value, wanted) or (wanted is int and isinstance(value, bool)):
-        raise InputError(f"{where} expects {wanted.__name__}, got {value!r}")
+        raise InputError(f"{where} expects {wanted.__name__}, got {value!r:.80}")
     if choices and value not in choices:
         raise InputError(f"{where} is one of {', '.join(choices)}; got {value!r}{_nearest(value, choices)}")
-    if wanted is float and value != value:
-        raise InputError(f"{where} must be a number, got nan")
     return value
 
 
@@ -256,7 +320,7 @@ def _parse_value(text: str) -> Any:
     """A TOML value, or the bare text itself where it is no TOML (so that strings need no quotes)."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return text
 
 
@@ -293,8 +357,8 @@ def config_to_toml(config: Config, comments: bool = True) -> str:
         lines.append(f"[{section.name}]")
         for f in fields(values):
             if comments:
-                choices = f.metadata.get("choices")
-                lines.append(f"# {f.metadata['help']}" + (f" ({' | '.join(choices)})" if choices else ""))
+                allowed = " | ".join(f.metadata["choices"]) or (_range_text(f) if f.metadata["within"] else "")
+                lines.append(f"# {f.metadata['help']}" + (f" ({allowed})" if allowed else ""))
             lines.append(f"{f.name} = {_toml_value(getattr(values, f.name))}")
         lines.append("")
     return "\n".join(lines)

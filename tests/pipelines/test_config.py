@@ -1,5 +1,6 @@
 """Settings: round trip, precedence, and refusals that name the nearest key."""
 
+import dataclasses
 import itertools
 from pathlib import Path
 
@@ -32,7 +33,13 @@ def test_override_beats_file_beats_default(tmp_path: Path) -> None:
         ("frame.rate=5", "did you mean frames?"),
         ("frames.rate=fast", "frames.rate expects float, got 'fast'"),
         ("frames.rate=true", "frames.rate expects float, got True"),
-        ("frames.rate=nan", "must be a number"),
+        ("frames.rate=nan", "frames.rate is 0.1 to 1000, or 0; got nan"),
+        ("frames.rate=-1", "0.1 to 1000, or 0"),
+        ("mapping.passes=inf", "mapping.passes is 0 to 1000; got inf"),
+        ("mapping.hold_out=1", "mapping.hold_out is 2 to 1000000, or 0"),
+        ("export.voxel=1e-9", "export.voxel is 0.0005 to 1"),
+        (f"run.seed={10**30}", "run.seed is 0 to 2147483647"),
+        ("proxy.depth_scale=1" + "0" * 5000, "proxy.depth_scale expects float"),
         ("run.seed=1.5", "run.seed expects int, got 1.5"),
         ("run.device=gpu", "one of auto, cpu, cuda"),
         ("rate=5", "expected section.key=value"),
@@ -79,3 +86,20 @@ def test_every_setting_has_help() -> None:
     for before, line in itertools.pairwise(lines):
         if " = " in line and not line.startswith("#"):
             assert before.startswith("# "), line
+
+
+def test_every_number_has_a_range_around_its_default_that_config_shows() -> None:
+    shown = config_to_toml(Config())
+    for section in dataclasses.fields(Config):
+        for known in dataclasses.fields(type(getattr(Config(), section.name))):
+            if isinstance(known.default, bool) or not isinstance(known.default, int | float):
+                continue
+            name = f"{section.name}.{known.name}"
+            low, high = known.metadata["within"]
+            assert load_config(overrides=[f"{name}={known.default}"]) == Config()
+            for value in (low, high, *((0,) if known.metadata["or_zero"] else ())):
+                load_config(overrides=[f"{name}={value}"])
+            for value in (low - 1, high * 2 + 1):
+                with pytest.raises(InputError, match=f"{name} is {low:.10g} to {high:.10g}".replace(".", r"\.")):
+                    load_config(overrides=[f"{name}={value if isinstance(known.default, float) else int(value)}"])
+            assert f"{low:.10g} to {high:.10g}" in shown

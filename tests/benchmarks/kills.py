@@ -1,0 +1,177 @@
+"""SIGKILL at random moments, and right before or after every kind of call that changes the disk: same bytes, always.
+
+    python tests/benchmarks/kills.py --kills 1000 --work DIR [--seed 0]
+
+A process that has everything imported and compiled forks one child after another; the child reconstructs, or resumes, a
+tiny clip of the synthetic room, and is killed. Half of the kills come after a random time, half inside the child's n-th
+call of os.replace, os.fsync, os.unlink, os.rmdir, os.mkdir or os.open, before or after it. When a child ends by itself,
+the stages are compared, file by file, with those of a run that nobody has killed; then a setting is changed, which
+makes a stage and what follows out of date, and it goes on. Says how many kills there were, in which stages, and what
+differed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from formats.digest import file_sha256
+from formats.video_writer import write_video
+from pipelines.config import Config, load_config
+from pipelines.progress import SilentProgress
+from pipelines.reconstruct import reconstruct, resume
+from pipelines.run_folder import RunFolder
+from pipelines.run_folder_names import STAGES
+from pipelines.world import ClipOptions, iter_clip, make_world
+
+SETTINGS = (
+    "run.threads=1", "run.device=cpu", "frames.max_features=800", "proxy.stereo_side=160", "mapping.passes=1",
+    "mapping.min_iterations=20", "mapping.max_gaussians=6000", "mapping.snapshot_every=5", "export.voxel=0.08",
+)  # fmt: skip
+CHANGES = (
+    (), ("export.spz=true",), ("global_ba.use_loops=false",), ("mapping.min_iterations=24",), ("export.mesh_side=100",),
+    ("tracking.render=never",), (),
+)  # fmt: skip
+"""Settings of one round after the other, each beside SETTINGS: rounds begin at different stages."""
+CALLS = ("replace", "fsync", "unlink", "rmdir", "mkdir", "open")
+FIRST_WAIT = 0.35
+
+
+def make_clip(path: Path) -> Path:
+    """16 frames of 160 x 120."""
+    options = ClipOptions(frames=16, width=160, height=120, fps=10.0, laps=0.3)
+    return write_video(path, [f.rgb for f in iter_clip(make_world(texel=0.02), options)], options.fps)
+
+
+def settings(change: tuple[str, ...]) -> Config:
+    """Of one round."""
+    return load_config(overrides=[*SETTINGS, *change])
+
+
+def digests(run: RunFolder) -> dict[str, str]:
+    """Of every file of every stage."""
+    files = [p for stage in STAGES for p in sorted(run.stage(stage).rglob("*")) if p.is_file()]
+    return {str(p.relative_to(run.root)): file_sha256(p) for p in files}
+
+
+def in_child(work: Callable[[], Any], kill_call: tuple[str, int, bool] | None) -> int:
+    """Fork; the child does the work and exits 0, or 1 with its traceback on stderr. Returns its process id."""
+    child = os.fork()
+    if child:
+        return child
+    try:
+        if kill_call is not None:
+            arm(*kill_call)
+        work()
+        os._exit(0)
+    except BaseException:
+        traceback.print_exc()
+        os._exit(1)
+
+
+def arm(name: str, count: int, before: bool) -> None:
+    """Make this process kill itself at its `count`-th call of os.`name`."""
+    real, left = getattr(os, name), [count]
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        left[0] -= 1
+        if left[0] == 0 and before:
+            os.kill(os.getpid(), signal.SIGKILL)
+        result = real(*args, **kwargs)
+        if left[0] == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return result
+
+    setattr(os, name, call)
+
+
+def stage_at(run: RunFolder) -> str:
+    """The unfinished stage, "between" where there is none."""
+    return next((s for s in STAGES if run.partial(s).exists()), "between")
+
+
+def unbroken(clip: Path, root: Path, change: tuple[str, ...]) -> dict[str, str]:
+    """Digests of a run that nobody kills."""
+    shutil.rmtree(root, ignore_errors=True)
+    child = in_child(lambda: reconstruct(clip, RunFolder(root), settings(change), SilentProgress()), None)
+    assert os.waitpid(child, 0)[1] == 0
+    return digests(RunFolder(root))
+
+
+def one_round(clip: Path, run: RunFolder, config: Config, rng: random.Random, counts: collections.Counter[str]) -> None:
+    """Kill until a child ends by itself. Waits grow while nothing gets done, so that every piece of work fits."""
+
+    def start() -> Any:
+        return reconstruct(clip, RunFolder(run.root), config, SilentProgress())
+
+    def go_on() -> Any:
+        return resume(RunFolder(run.root), SilentProgress(), config)
+
+    stuck = 0
+    while True:
+        at_call = (rng.choice(CALLS), rng.randint(1, 12 + 4 * stuck), rng.random() < 0.5)
+        kill_call = at_call if rng.random() < 0.5 else None
+        work = go_on if run.manifest_file.exists() and rng.random() < 0.7 else start
+        before = sum(p.is_file() for p in run.root.rglob("*")) if run.root.exists() else 0
+        child = in_child(work, kill_call)
+        deadline = time.monotonic() + (rng.expovariate(1 / (FIRST_WAIT * (1 + stuck))) if kill_call is None else 600)
+        while (ended := os.waitpid(child, os.WNOHANG)) == (0, 0) and time.monotonic() < deadline:
+            time.sleep(0.002)
+        if ended == (0, 0):
+            os.kill(child, signal.SIGKILL)
+            ended = os.waitpid(child, 0)
+        if os.WIFSIGNALED(ended[1]):
+            counts[stage_at(run)] += 1
+            after = sum(p.is_file() for p in run.root.rglob("*")) if run.root.exists() else 0
+            stuck = 0 if after > before else stuck + 1
+            continue
+        if os.WEXITSTATUS(ended[1]) != 0:
+            counts["failed"] += 1
+            raise SystemExit(f"a child failed; the run is kept in {run.root}")
+        return
+
+
+def main() -> None:
+    """See the top of this file."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=1000)
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    rng, counts = random.Random(options.seed), collections.Counter[str]()
+    options.work.mkdir(parents=True, exist_ok=True)
+    clip = make_clip(options.work / "clip.avi")
+
+    whole = {change: unbroken(clip, options.work / "whole.msgs", change) for change in dict.fromkeys(CHANGES)}
+    run = RunFolder(options.work / "killed.msgs")
+    differing, rounds = 0, 0
+    while (killed := sum(counts.values())) < options.kills:
+        if rounds % len(CHANGES) == 0:
+            shutil.rmtree(run.root, ignore_errors=True)
+        change = CHANGES[rounds % len(CHANGES)]
+        one_round(clip, run, settings(change), rng, counts)
+        rounds += 1
+        found = digests(run)
+        if found != whole[change]:
+            differing += 1
+            wrong = [n for n in {*found, *whole[change]} if found.get(n) != whole[change].get(n)]
+            print(f"round {rounds}: {len(wrong)} files differ: {sorted(wrong)[:5]}", flush=True)
+            shutil.copytree(run.root, options.work / f"differs{rounds}.msgs", dirs_exist_ok=True)
+        print(json.dumps({"kills": sum(counts.values()), "rounds": rounds, "differing": differing}), flush=True)
+    print(json.dumps({"kills": killed, "rounds": rounds, "differing": differing, "by stage": counts}, indent=1))
+    sys.exit(differing > 0)
+
+
+if __name__ == "__main__":
+    main()
