@@ -57,6 +57,11 @@ _SOURCE_OPTIONS = {
         "The camera, in pixels of the source (first pixel's centre at 0.5, 0.5). Default: the data set's, EXIF, else "
         "self-calibrated.",
     ),
+    "masks": (
+        "frames.masks", "FOLDER",
+        "What is no part of the scene: NAME.png for a picture NAME, or the frame's number in the video; black is left "
+        "out.",
+    ),
     "scale-ref": (
         "proxy.scale_ref", "REF",
         "Metres without metric depth: PICTURE:X1,Y1,X2,Y2=METRES, two pixels of one picture, or height=METRES.",

@@ -72,6 +72,11 @@ class FramesConfig:
     loop_candidates: int = setting(
         4, "each keyframe is also matched with this many that look alike, for loops", within=(0, 1000)
     )
+    masks: str = setting("", "folder of masks, NAME.png for each picture or some: black is no part of the scene")
+    people: str = setting(
+        "auto", "auto leaves people out where networks for them are in the cache; keep takes them for scene",
+        ("auto", "keep"),
+    )  # fmt: skip
     mapper: str = setting("auto", "structure from motion at once or view by view", ("auto", "global", "incremental"))
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.atomic import atomic_path
-from formats.images import read_rgb
+from formats.images import read_grey_png, read_rgb, write_grey_png
 from formats.jsonfile import read_json, read_json_object, write_json
 from formats.tensors import load_tensors, save_arrays, save_tensors
 from pipelines import stored
@@ -83,6 +83,16 @@ class RunFolder(FinishedFiles):
     def image(self, frame: Frame) -> NDArray[np.uint8]:
         """(H, W, 3) RGB, undistorted."""
         return read_rgb(self.image_file(frame))
+
+    def left_out(self, frame: Frame) -> NDArray[np.bool_] | None:
+        """(H, W) what of the undistorted frame is no part of the scene; None where all of it is."""
+        path = self.mask_file(frame.name)
+        return None if path is None else read_mask(path)
+
+    def mask_file(self, name: str) -> Path | None:
+        """The mask of the frame's picture `name`; None where all of it is scene."""
+        mask = f"masks/{name}.png"
+        return self.file("frames", mask) if self.has("frames", mask) else None
 
     # proxy ------------------------------------------------------------------------------------------------------
 
@@ -196,6 +206,23 @@ def save_frames(folder: Path, frames: list[Frame]) -> None:
     write_json(folder / FRAMES, [asdict(f) for f in frames])
     with atomic_path(folder / "timestamps.txt") as temporary:
         temporary.write_text("".join(f"{f.name} {f.timestamp:.9f}\n" for f in frames), encoding="utf-8")
+
+
+def save_left_out(folder: Path, frame: Frame, left_out: NDArray[np.bool_]) -> None:
+    """NAME.png, as COLMAP reads masks: black is left out."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_grey_png(folder / f"{frame.name}.png", np.where(left_out, 0, 255).astype(np.uint8))
+
+
+def load_left_out(folder: Path, frame: Frame) -> NDArray[np.bool_] | None:
+    """Inverse of `save_left_out`; None where there is none."""
+    path = folder / f"{frame.name}.png"
+    return read_mask(path) if path.exists() else None
+
+
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """(H, W) where a mask is black."""
+    return read_grey_png(path) == 0
 
 
 def save_calibration(folder: Path, calibration: Calibration) -> None:

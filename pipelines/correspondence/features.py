@@ -28,6 +28,14 @@ class Features:
     def __len__(self) -> int:
         return len(self.keypoints)
 
+    def outside(self, left_out: NDArray[np.bool_] | None) -> Features:
+        """Those that do not lie in a mask (H, W)."""
+        if left_out is None or len(self) == 0:
+            return self
+        column, row = self.keypoints[:, :2].astype(np.int64).T
+        kept = ~left_out[row.clip(0, left_out.shape[0] - 1), column.clip(0, left_out.shape[1] - 1)]
+        return Features(self.keypoints[kept], self.descriptors[kept])
+
     @property
     def xy(self) -> NDArray[np.float64]:
         """(F, 2) pixels."""

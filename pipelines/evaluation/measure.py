@@ -167,6 +167,9 @@ def _measure(
     row = outcome.frame_row(frame_id)
     frame = outcome.frames[row]
     picture, photo = view.exposed(outcome.exposure, frame.timestamp), outcome.run.image(frame)
+    left_out = outcome.run.left_out(frame)
+    if left_out is not None:  # what is no part of the scene is not judged
+        photo = np.where(left_out[..., None], picture, photo)
     depth_l1 = accuracy = float("nan")
     # At other poses only the picture is compared: depth and labels count once a frame.
     if matched.image[row] >= 0 and not kind.endswith((AT_TRUE_POSES, AT_REFINED_POSES)):
@@ -176,7 +179,8 @@ def _measure(
         if (labels := matched.sequence.labels(index)) is not None:
             accuracy = _add_labels(measured, outcome, view, pixels.sample(labels))
     perceived = float("nan") if isinstance(measured.lpips, str) else measured.lpips(picture, photo)
-    return MeasuredView(frame_id, kind, psnr(picture, photo), ssim(picture, photo), perceived, depth_l1, accuracy)
+    likeness = psnr(picture, photo, None if left_out is None else ~left_out)
+    return MeasuredView(frame_id, kind, likeness, ssim(picture, photo), perceived, depth_l1, accuracy)
 
 
 def _add_depth(measured: Measured, view: MapView, truth: NDArray[np.float32]) -> float:

@@ -6,6 +6,8 @@ What is in this folder
 sparse/0/                 camera, poses and points as a COLMAP model, binary and text; pinhole, no distortion left.
                           Opens in COLMAP, pycolmap, and any Gaussian splatting trainer.
 frames/                   the undistorted frames that the model names.
+masks/                    only where people or --masks leave something out: NAME.png for the frame NAME, black is left
+                          out (colmap feature_extractor --ImageReader.mask_path masks).
 transforms.json           the same cameras for nerfstudio.
 trajectory.txt            poses in TUM format: timestamp tx ty tz qx qy qz qw (camera in the world); evo reads it.
 point_cloud.ply           the map: Gaussians in the layout of the original 3D Gaussian splatting, with class_id and

@@ -25,7 +25,8 @@ from pipelines.types import SparseModel
 
 
 def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
-    """`sparse/0` (binary and text) and transforms.json, with the posed frames beside them in `frames/`."""
+    """`sparse/0` (binary and text) and transforms.json, with the posed frames beside them in `frames/`, and their masks
+    in `masks/` where they have any."""
     trajectory, k = outcome.trajectory, outcome.calibration.intrinsics
     posed = np.flatnonzero(trajectory.is_posed)
     name_of = {f.id: f.name for f in outcome.frames}
@@ -33,6 +34,8 @@ def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
     camera = (k.width, k.height, k.fx, k.fy, k.cx, k.cy)
     for name in names:
         place_image(outcome.run.file("frames", name), folder / "frames" / name)
+        if (mask := outcome.run.mask_file(name)) is not None:
+            place_image(mask, folder / "masks" / mask.name)
     points = seen_points(outcome.load_sparse(), trajectory.frame_ids[posed])
     write_colmap_model(folder / "sparse" / "0", *camera, names, trajectory.cam_from_world[posed], *points)
     paths = [f"frames/{name}" for name in names]

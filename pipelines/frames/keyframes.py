@@ -43,19 +43,22 @@ class KeyframeChoice:
         return float(self.displacement.max(initial=0.0))
 
 
-def choose_keyframes(frames: Iterable[NDArray[np.uint8]], options: KeyframeOptions) -> KeyframeChoice:
-    """Keyframes of grey frames (H, W) in order of time; the first is one, and the last where it adds a view."""
+def choose_keyframes(
+    frames: Iterable[tuple[NDArray[np.uint8], NDArray[np.bool_] | None]], options: KeyframeOptions
+) -> KeyframeChoice:
+    """Keyframes of grey frames (H, W) in order of time, each with a mask (H, W) of what is no part of the scene; the
+    first is one, and the last where it adds a view."""
     tracker = _Tracker()
     keyframes: list[int] = []
     displacement: list[float] = []
     count = 0
-    for i, frame in enumerate(frames):
+    for i, (frame, left_out) in enumerate(frames):
         gray = reduce_image(frame, _TRACKED_SIDE)
         moved, survivors = tracker.advance(gray)
         displacement.append(moved)
         if i == 0 or moved > options.parallax or survivors < options.min_survivors:
             keyframes.append(i)
-            tracker.restart(gray)
+            tracker.restart(gray, left_out)
         count = i + 1
     if keyframes and keyframes[-1] != count - 1 and displacement[-1] > options.parallax / 3:
         keyframes.append(count - 1)
@@ -71,9 +74,12 @@ class _Tracker:
         self._points = np.zeros((0, 2), np.float32)
         self._started = 0
 
-    def restart(self, gray: NDArray[np.uint8]) -> None:
+    def restart(self, gray: NDArray[np.uint8], left_out: NDArray[np.bool_] | None) -> None:
         """Take `gray`, the frame advanced to last, as the keyframe."""
-        corners = cv2.goodFeaturesToTrack(gray, _MAX_CORNERS, 0.005, 6)
+        scene = None
+        if left_out is not None:
+            scene = cv2.resize((~left_out).astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        corners = cv2.goodFeaturesToTrack(gray, _MAX_CORNERS, 0.005, 6, mask=scene)
         found = np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2)
         self._origin = found.astype(np.float32)
         self._points = self._origin

@@ -22,6 +22,7 @@ from formats.video import VideoFrame
 from pipelines.config import Config, FramesConfig
 from pipelines.correspondence.snapshots import Snapshots
 from pipelines.frames.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes
+from pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
 from pipelines.frames.pick import sharpest_of_windows
 from pipelines.frames.recording import RecordingSource
 from pipelines.frames.sharpness import reduce_image, reduced_size
@@ -51,15 +52,20 @@ def run(context: StageContext) -> dict[str, Any]:
     camera, origin = _known_camera(context, source)
     _require_reasonable(config, source)
     frames = _pick(context, source)
-    keyframes = _keyframes(context, frames)
-    structure = _structure(context, camera, origin == "given", frames, keyframes)
+    masks = FrameMasks(
+        context.config, source, context.snapshot / "people", context.snapshot / "picked", context.threads
+    )
+    keyframes = _keyframes(context, frames, masks)
+    masks.find_people([frames[k] for k in keyframes], context.progress)
+    structure = _structure(context, camera, origin == "given", frames, keyframes, masks)
     lens = make_lens(structure.model.cameras[1])
     calibration = _calibration(context, lens, origin, structure.focal_sd)
     _write_backbone(context, structure, keyframes, lens, frames)
     _write_frames(context, source, frames, lens)
+    masked = masks.write(context.folder / "masks", frames, lens)
     save_calibration(context.folder, calibration)
     save_frames(context.folder, frames)
-    return _figures(frames, structure, calibration)
+    return _figures(frames, structure, calibration) | masked
 
 
 def _known_camera(context: StageContext, source: AnySource) -> tuple[pycolmap.Camera, str]:
@@ -85,6 +91,7 @@ def check(source: Path, config: Config) -> None:
     """Raise InputError for a source, or a camera given for it, that cannot be used."""
     opened = open_source(source, config.run.format)
     _require_reasonable(config.frames, opened)
+    check_masks(source, config)
     if config.frames.intrinsics:
         read_intrinsics(config.frames.intrinsics, opened.width, opened.height)
 
@@ -159,19 +166,23 @@ def _copy(source: Path, target: Path) -> None:
 # keyframes and structure ----------------------------------------------------------------------------------------
 
 
-def _keyframes(context: StageContext, frames: list[Frame]) -> list[int]:
+def _keyframes(context: StageContext, frames: list[Frame], masks: FrameMasks) -> list[int]:
     """Ids of keyframes by parallax; of a short walk closer ones, so that there are enough for a reconstruction."""
     table = context.snapshot / "keyframes.json"
     if not table.exists():
-        write_json(table, _choose(context, frames).keyframes)
+        write_json(table, _choose(context, frames, masks).keyframes)
     return read_json(table)
 
 
-def _choose(context: StageContext, frames: list[Frame]) -> KeyframeChoice:
+def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks) -> KeyframeChoice:
+    def pictures() -> Iterator[tuple[NDArray[np.uint8], NDArray[np.bool_] | None]]:
+        for frame in context.progress.track(frames, "keyframes", len(frames)):
+            gray = _gray(context, frame)
+            yield gray, masks.left_out(frame, gray.shape[1], gray.shape[0])
+
     parallax = context.config.frames.parallax
     while True:
-        grays = (_gray(context, f) for f in context.progress.track(frames, "keyframes", len(frames)))
-        choice = choose_keyframes(grays, KeyframeOptions(parallax=parallax))
+        choice = choose_keyframes(pictures(), KeyframeOptions(parallax=parallax))
         require_motion(choice.largest_displacement)
         if len(choice.keyframes) >= min(_FEW_KEYFRAMES, len(frames)) or parallax < context.config.frames.parallax / 3:
             return choice
@@ -183,13 +194,19 @@ def _gray(context: StageContext, frame: Frame) -> NDArray[np.uint8]:
 
 
 def _structure(
-    context: StageContext, camera: pycolmap.Camera, is_fixed: bool, frames: list[Frame], keyframes: list[int]
+    context: StageContext,
+    camera: pycolmap.Camera,
+    is_fixed: bool,
+    frames: list[Frame],
+    keyframes: list[int],
+    masks: FrameMasks,
 ) -> Structure:
     structure = StructureFromMotion(
         config=context.config.frames,
         camera=camera,
         is_fixed=is_fixed,
         load_gray=lambda frame_id: _gray(context, frames[frame_id]),
+        left_out=lambda frame_id: masks.left_out(frames[frame_id], camera.width, camera.height),
         snapshots=Snapshots(context.snapshot),
         progress=context.progress,
         threads=_threads(context),
@@ -298,4 +315,7 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
     }
 
 
-STAGE = Stage("frames", 5, run, "pick frames, calibrate the camera, structure from motion over keyframes", check=check)
+STAGE = Stage(
+    "frames", 6, run, "pick frames, calibrate the camera, structure from motion over keyframes",
+    inputs=mask_inputs, check=check,
+)  # fmt: skip

@@ -100,7 +100,10 @@ def load_keyframe_views(context: StageContext, model: SparseModel) -> list[Keyfr
     state = TrackState.from_backbone(model, 1.0)
     views = []
     for k, frame_id in enumerate(context.progress.track(model.frame_ids.tolist(), "features", len(model.frame_ids))):
-        features = extract_features(to_grey(run.image(frames[frame_id])), context.config.global_ba.features)
+        frame = frames[frame_id]
+        features = extract_features(
+            to_grey(run.image(frame)), context.config.global_ba.features, run.left_out(frame)
+        )  # fmt: skip
         depth = np.zeros(len(features.xy))
         if run.has_proxy(frame_id) and (maps := scales.apply(frame_id, run.load_proxy(frame_id))) is not None:
             depth, _ = sample_proxy(maps, features.xy, intrinsics)

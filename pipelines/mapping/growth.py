@@ -105,9 +105,11 @@ class Growth:
             parameters.keep(~bad)
 
     def _spacing(self, view: View) -> Tensor:
+        """(H, W) distance in pixels to the next seed, 0 = no seed here; none in what is no part of the scene."""
         s = self.settings
         image, depth = view.image.cpu().numpy(), view.depth.cpu().numpy()
-        return torch.from_numpy(seed_spacing(image, depth, s.seed_stride, FINE_SHARE, FLAT_SHARE)).to(view.image.device)
+        spacing = seed_spacing(image, depth, s.seed_stride, FINE_SHARE, FLAT_SHARE)
+        return view.of_scene(torch.from_numpy(spacing).to(view.image.device))
 
     def _holes(self, rendering: Rendering) -> Tensor:
         """Condition (a)."""

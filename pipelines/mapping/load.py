@@ -67,7 +67,8 @@ def load_view(
     device: torch.device | str,
 ) -> View:
     """One frame as a view."""
-    return make_view(frame.id, intrinsics, cam_from_world, run.image(frame), maps, 1.0, class_ids, device)
+    image, left_out = run.image(frame), run.left_out(frame)
+    return make_view(frame.id, intrinsics, cam_from_world, image, maps, 1.0, class_ids, device, left_out)
 
 
 def load_anchors(run: RunFolder, intrinsics: Intrinsics) -> dict[int, Anchors]:

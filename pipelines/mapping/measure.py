@@ -35,16 +35,19 @@ def measure_view(
     log_gain: NDArray[np.float32],
     offset: NDArray[np.float32],
 ) -> ViewFigures:
-    """Compare the map, seen from `cam_from_world` (4, 4) with the given exposure (3,), with the view."""
+    """Compare the map, seen from `cam_from_world` (4, 4) with the given exposure (3,), with what the view shows of the
+    scene."""
     rendering = draw_map(gaussian_map, view, cam_from_world)
     colors = rendering.features[..., :3] * torch.exp(torch.as_tensor(log_gain)).to(view.image.device)
     colors = (colors + torch.as_tensor(offset).to(view.image.device)).clamp(0, 1)
-    error = (colors - view.colors).square().mean().clamp(min=1e-10)
+    photo = view.of_scene(view.colors, colors)
+    shown = 1.0 if view.scene is None else view.scene.float().mean().clamp(min=1e-6)
+    error = ((colors - photo).square().mean() / shown).clamp(min=1e-10)
     known = view.depth > 0
     depth_l1 = (rendering.depth - view.depth).abs()[known].mean() if known.any() else torch.tensor(float("nan"))
     return ViewFigures(
         psnr=float(-10 * torch.log10(error)),
-        ssim=float(ssim_map(colors, view.colors).mean()),
+        ssim=float(ssim_map(colors, photo).mean()),
         depth_l1=float(depth_l1),
         label_agreement=_label_agreement(rendering, view),
     )

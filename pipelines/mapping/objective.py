@@ -45,8 +45,10 @@ class Objective:
             clip_beside_boundary(rendering.features, view.channels, article.boundary_clip)
         # split, not slices: the gradient of each slice would be a whole image of zeros around it.
         shown, logits = rendering.features.split([3, rendering.features.shape[-1] - 3], dim=-1)
-        loss = losses.image_loss(expose(shown, table), view.colors)
-        loss = loss + SILHOUETTE_WEIGHT * losses.silhouette_loss(rendering.silhouette)
+        colors = expose(shown, table)
+        beside = colors.detach()  # what is no part of the scene looks as the map does, and asks for nothing
+        loss = losses.image_loss(view.of_scene(colors, beside), view.of_scene(view.colors, beside))
+        loss = loss + SILHOUETTE_WEIGHT * losses.silhouette_loss(view.of_scene(rendering.silhouette, 1.0))
         loss = loss + losses.size_loss(log_radii, self.unit)
         if s.depth_weight > 0 and s.use_proxy_depth:
             weight = losses.depth_weight(view.trust)

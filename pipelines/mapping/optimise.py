@@ -118,7 +118,8 @@ class MapOptimiser:
     @torch.no_grad()
     def _color_errors(self, index: int, colors: Tensor) -> Tensor:
         """(H, W) mean difference between the view's photo and the (H, W, 3) colours of the map."""
-        return (expose(colors, self.state.view_tables[index]) - self.views[index].colors).abs().mean(-1)
+        view = self.views[index]
+        return view.of_scene((expose(colors, self.state.view_tables[index]) - view.colors).abs().mean(-1))
 
     def _blending_weights(self) -> Tensor:
         """(M,) the largest weight with which each Gaussian stands in any pixel of any view."""

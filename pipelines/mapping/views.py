@@ -21,7 +21,8 @@ class View:
 
     cam_from_world (4, 4) float64; image (H, W, 3) uint8; depth (H, W) float32 in the world's unit, 0 = unknown;
     reliability U (H, W) uint8 0..255; channels (H, W) uint8: the class *channel* of each pixel, VOID where unknown;
-    channel_confidence (H, W) uint8; mirrors: where a symmetry was found. Kept in bytes: a run has hundreds of views.
+    channel_confidence (H, W) uint8; mirrors: where a symmetry was found; scene (H, W) bool: False where the picture
+    shows what is no part of the scene, None where all of it is. Kept in bytes: a run has hundreds of views.
     """
 
     frame_id: int
@@ -33,6 +34,7 @@ class View:
     channels: Tensor
     channel_confidence: Tensor
     mirrors: Mirrors | None = None
+    scene: Tensor | None = None
 
     @property
     def colors(self) -> Tensor:
@@ -48,6 +50,13 @@ class View:
     def label_weight(self) -> Tensor:
         """(H, W) float32 in 0..1."""
         return self.channel_confidence.float() / 255
+
+    def of_scene(self, values: Tensor, elsewhere: Tensor | float = 0.0) -> Tensor:
+        """(H, W) or (H, W, channels) `values` where the picture shows the scene."""
+        if self.scene is None:
+            return values
+        scene = self.scene if values.ndim == 2 else self.scene[..., None]
+        return torch.where(scene, values, elsewhere)
 
     def with_scaled_depth(self, scale: Tensor) -> View:
         """The same view with its depth multiplied by an (H, W) field."""
@@ -68,8 +77,10 @@ def make_view(
     depth_scale: float,
     class_ids: tuple[int, ...],
     device: torch.device | str = "cpu",
+    left_out: NDArray[np.bool_] | None = None,
 ) -> View:
-    """A view of the size of `intrinsics`; `maps` None stands for a frame of which no provider said anything."""
+    """A view of the size of `intrinsics`; `maps` None stands for a frame of which no provider said anything, `left_out`
+    (any size) is what of it is no part of the scene."""
     width, height = intrinsics.width, intrinsics.height
     if image.shape[:2] != (height, width):
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
@@ -89,7 +100,11 @@ def make_view(
     colors, depth, reliability, channels, confidence = (
         torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays
     )
-    return View(frame_id, intrinsics, pose, colors, depth, reliability, channels, confidence)
+    scene = None
+    if left_out is not None:
+        shown = cv2.resize(left_out.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) == 0
+        scene = torch.from_numpy(shown).to(device)
+    return View(frame_id, intrinsics, pose, colors, depth, reliability, channels, confidence, scene=scene)
 
 
 def channel_table(class_ids: tuple[int, ...]) -> NDArray[np.uint8]:
@@ -116,7 +131,14 @@ def halved(view: View) -> View:
         channels=sampled(view.channels),
         channel_confidence=sampled(view.channel_confidence),
         mirrors=None if view.mirrors is None else view.mirrors.halved(size[1], size[0]),
+        scene=None if view.scene is None else halved_scene(view.scene, size),
     )
+
+
+def halved_scene(scene: Tensor, size: tuple[int, int]) -> Tensor:
+    """(height, width) of `size` (width, height): scene where all of what a pixel averages is."""
+    shown = cv2.resize(scene.cpu().numpy().astype(np.float32), size, interpolation=cv2.INTER_AREA) == 1
+    return torch.from_numpy(shown).to(scene.device)
 
 
 def working_size(intrinsics: Intrinsics, max_side: int) -> Intrinsics:

@@ -52,7 +52,7 @@ def check_proxy(source: Path, config: Config) -> None:
         require_reference_in(open_source(source, config.run.format), config.proxy.scale_ref)
     depth, semantics = choose_depth(config.proxy), choose_semantics(config.proxy)
     if config.proxy.semantics == "auto" and (line := missing_networks()):
-        log.info(line)
+        log.warning(line)
     if not {depth.kind, semantics.kind} & {"files", "onnx"}:
         return
     around = _before_frames(source, config)

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.types import ClassTable, Frame, require_shape
+from pipelines.types import VOID, ClassTable, Frame, require_shape
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,14 @@ class DepthEstimate:
         if self.normals is not None:
             require_shape("normals", self.normals, (*self.depth.shape, 3))
 
+    def without(self, left_out: NDArray[np.bool_] | None) -> DepthEstimate:
+        """Unknown in a mask (h, w)."""
+        if left_out is None:
+            return self
+        normals = None if self.normals is None else np.where(left_out[..., None], np.int8(0), self.normals)
+        depth, confidence = (np.where(left_out, np.float32(0), a) for a in (self.depth, self.confidence))
+        return DepthEstimate(depth, confidence, self.invalid, normals)
+
 
 @dataclass(frozen=True)
 class LabelEstimate:
@@ -46,6 +54,13 @@ class LabelEstimate:
     def __post_init__(self) -> None:
         require_shape("labels", self.labels, (None, None))
         require_shape("confidence", self.confidence, self.labels.shape)
+
+    def without(self, left_out: NDArray[np.bool_] | None) -> LabelEstimate:
+        """Void in a mask (h, w)."""
+        if left_out is None:
+            return self
+        labels = np.where(left_out, np.uint8(VOID), self.labels)
+        return LabelEstimate(labels, np.where(left_out, np.float32(0), self.confidence), self.descriptor)
 
 
 class DepthProvider(Protocol):

@@ -22,6 +22,7 @@ class Sequence:
     intrinsics: Intrinsics
     backbone: SparseModel | None
     read_image: Callable[[Frame], NDArray[np.uint8]]
+    read_left_out: Callable[[Frame], NDArray[np.bool_] | None] = lambda frame: None
 
     @cached_property
     def cam_from_world(self) -> dict[int, NDArray[np.float64]]:
@@ -33,6 +34,15 @@ class Sequence:
     def image(self, frame: Frame) -> NDArray[np.uint8]:
         """(h, w, 3) RGB at map size."""
         return resize_area(self.read_image(frame), self.intrinsics.width, self.intrinsics.height)
+
+    def left_out(self, frame: Frame, width: int = 0, height: int = 0) -> NDArray[np.bool_] | None:
+        """(h, w) at map size, or another: the pixels that show anything which is no part of the scene; None where all
+        of the frame is scene."""
+        full = self.read_left_out(frame)
+        if full is None:
+            return None
+        size = width or self.intrinsics.width, height or self.intrinsics.height
+        return np.asarray(cv2.resize(full.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0)
 
 
 def resize_area(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:

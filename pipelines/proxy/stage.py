@@ -59,7 +59,7 @@ def run(context: StageContext) -> dict[str, Any]:
     frames = _frames_to_do(context, sequence, config, depths)
     _warn_of_missing(context, frames, depths, semantics)
     _warn_of_distortion(context, sequence, depths, semantics)
-    _depth_pass(context, frames, depths)
+    _depth_pass(context, sequence, frames, depths)
     scale = measure_scale(sequence, frames, lambda frame: _load_depth(context.snapshot, frame))
     reference = reference_scale(
         context, sequence, frames, depths, scale, lambda frame: _load_depth(context.snapshot, frame)
@@ -88,7 +88,8 @@ def run(context: StageContext) -> dict[str, Any]:
 def _load_sequence(context: StageContext) -> Sequence:
     calibration = context.run.load_calibration()
     camera = map_intrinsics(calibration.intrinsics, context.config.proxy.max_side)
-    return Sequence(context.run.load_frames(), calibration, camera, context.run.load_backbone(), context.run.image)
+    run = context.run
+    return Sequence(run.load_frames(), calibration, camera, run.load_backbone(), run.image, run.left_out)
 
 
 def _threads(context: StageContext) -> int:
@@ -141,13 +142,13 @@ def _warn_of_focal(context: StageContext, sequence: Sequence, network_focal: flo
 # depth ----------------------------------------------------------------------------------------------------------
 
 
-def _depth_pass(context: StageContext, frames: list[Frame], depths: DepthProvider) -> None:
-    """Depth of every frame to the snapshot; what is there stays."""
+def _depth_pass(context: StageContext, sequence: Sequence, frames: list[Frame], depths: DepthProvider) -> None:
+    """Depth of what every frame shows of the scene, to the snapshot; what is there stays."""
     depths.prepare(frames)
     for frame in context.progress.track(frames, "depth", len(frames)):
         path = _depth_path(context.snapshot, frame)
         if not path.exists():
-            estimate = depths.estimate(frame)
+            estimate = depths.estimate(frame).without(sequence.left_out(frame))
             arrays = {"depth": estimate.depth, "confidence": estimate.confidence, "invalid": np.array(estimate.invalid)}
             normals = {} if estimate.normals is None else {"normals": estimate.normals}
             save_scratch(path, **arrays, **normals)
@@ -185,7 +186,7 @@ def _maps_pass(
         path = proxy_path(context.folder, frame.id)
         depth = _load_depth(context.snapshot, frame)
         seen = scale.in_backbone_unit(depth)
-        labels = semantics.estimate(frame, seen)
+        labels = semantics.estimate(frame, seen).without(sequence.left_out(frame))
         m = _agreement(context, sequence, frame, previous, seen, labels)
         agreements.append(m)
         if labels.descriptor is not None:

@@ -82,6 +82,11 @@ class Lens:
         x, y = self._maps()
         return cv2.remap(rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.uint8, copy=False)
 
+    def undistort_mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(H, W) of the source as the pinhole sees it."""
+        x, y = self._maps()
+        return cv2.remap(mask.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) > 0
+
     def _maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         columns, rows = np.meshgrid(np.arange(self.pinhole.width) + 0.5, np.arange(self.pinhole.height) + 0.5)
         source = _distort(self.camera, self.pinhole, np.stack([columns.ravel(), rows.ravel()], axis=1))

@@ -50,13 +50,15 @@ class Structure:
 
 @dataclass(frozen=True)
 class StructureFromMotion:
-    """`load_gray(frame_id)` gives an (H, W) uint8 frame; `camera` is what is known of the camera before, and
-    `is_fixed` says that it is known exactly."""
+    """`load_gray(frame_id)` gives an (H, W) uint8 frame, `left_out(frame_id)` what of it is no part of the scene
+    (H, W), None where all of it is; `camera` is what is known of the camera before, and `is_fixed` says that it is
+    known exactly."""
 
     config: FramesConfig
     camera: pycolmap.Camera
     is_fixed: bool
     load_gray: Callable[[int], NDArray[np.uint8]]
+    left_out: Callable[[int], NDArray[np.bool_] | None]
     snapshots: Snapshots
     progress: Progress
     threads: int
@@ -81,7 +83,7 @@ class StructureFromMotion:
         def extract(frame_id: int) -> Features:
             if not hasattr(local, "extractor"):
                 local.extractor = FeatureExtractor(self.config.max_features, self.config.peak_threshold)
-            return local.extractor(self.load_gray(frame_id))
+            return local.extractor(self.load_gray(frame_id)).outside(self.left_out(frame_id))
 
         def stored(frame_id: int) -> Features:
             return self.snapshots.features(frame_id, lambda: extract(frame_id))

@@ -61,7 +61,8 @@ def _from_proxy(frame_id: int, state: TrackState, pictures: Pictures, intrinsics
     if maps is None:
         return 0
     seen = state.sightings[frame_id]
-    xy = corners(pictures.grey(frame_id), seen.xy, max(NEW_POINTS - len(seen), 0))
+    count = max(NEW_POINTS - len(seen), 0)
+    xy = corners(pictures.grey(frame_id), seen.xy, count, left_out=pictures.left_out(frame_id))
     depth, _ = sample_proxy(maps, xy, intrinsics)
     known, trust = sample_proxy(maps, seen.xy, intrinsics)
     motion = state.poses[frame_id]
@@ -80,11 +81,12 @@ def _triangulate(first: int, second: int, state: TrackState, pictures: Pictures,
     """Corners of the first keyframe that are no points yet, followed into the second."""
     taken = state.sightings[first].xy
     grey = pictures.grey(first)
-    xy = corners(grey, taken, NEW_POINTS)
+    xy = corners(grey, taken, NEW_POINTS, left_out=pictures.left_out(first))
     motion = state.poses[second] @ se3.inverse(state.poses[first])
     depth = _nearby_depth(first, xy, state)
     guess, _ = project(se3.transform(motion, unproject(xy, depth, intrinsics)), intrinsics)
     there, found = follow(grey, pictures.grey(second), xy, guess)
+    found &= pictures.is_scene(second, there)
     xy, there = xy[found], there[found]
     in_first, good = triangulate(xy, there, motion, intrinsics, POSE_ERROR)
     points = se3.transform(se3.inverse(state.poses[first]), in_first[good])

@@ -19,9 +19,11 @@ class Features:
     descriptors: NDArray[np.float32]
 
 
-def extract_features(grey: NDArray[np.uint8], count: int = 2000) -> Features:
-    """The strongest `count` SIFT features (Lowe 2004), as RootSIFT (Arandjelović and Zisserman 2012)."""
-    keypoints, descriptors = cv2.SIFT.create(nfeatures=count, contrastThreshold=0.015).detectAndCompute(grey, None)
+def extract_features(grey: NDArray[np.uint8], count: int = 2000, left_out: NDArray[np.bool_] | None = None) -> Features:
+    """The strongest `count` SIFT features (Lowe 2004), as RootSIFT (Arandjelović and Zisserman 2012), none of them
+    in a mask (H, W)."""
+    scene = None if left_out is None else (~left_out).astype(np.uint8)
+    keypoints, descriptors = cv2.SIFT.create(nfeatures=count, contrastThreshold=0.015).detectAndCompute(grey, scene)
     if not keypoints:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     normalised = np.asarray(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-12), np.float32)

@@ -140,6 +140,7 @@ class FrontEnd:
             points = self.state.points[known.point]
             guess, _ = project(points @ start[:3, :3].T + start[:3, 3], self.intrinsics)
             xy, found = follow(self.pictures.grey(keyframe), grey, known.xy, guess)
+            found &= self.pictures.is_scene(frame_id, xy)
             seen = seen.joined(Sightings(known.point[found], xy[found], np.full(int(found.sum()), FLOW_SD)))
         return seen
 

@@ -57,11 +57,20 @@ def _flow(
     return there.reshape(-1, 2).astype(np.float32), status.reshape(-1).astype(bool)
 
 
-def corners(grey: NDArray[np.uint8], taken: Array, count: int, distance: float = 10.0) -> Array:
-    """Up to `count` new corners (Q, 2), subpixel, none within `distance` pixels of those taken (R, 2) or each other."""
+def corners(
+    grey: NDArray[np.uint8],
+    taken: Array,
+    count: int,
+    distance: float = 10.0,
+    left_out: NDArray[np.bool_] | None = None,
+) -> Array:
+    """Up to `count` new corners (Q, 2), subpixel, none within `distance` pixels of those taken (R, 2) or each other,
+    and none in a mask (H, W)."""
     if count <= 0:  # OpenCV takes 0 for "as many as there are"
         return np.zeros((0, 2))
     mask = np.full(grey.shape, 255, np.uint8)
+    if left_out is not None:
+        mask[left_out] = 0
     for x, y in np.asarray(taken).reshape(-1, 2):
         cv2.circle(mask, (int(x), int(y)), int(distance), 0, -1)
     found = cv2.goodFeaturesToTrack(grey, count, 0.005, distance, mask=mask, blockSize=5)

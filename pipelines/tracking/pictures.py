@@ -40,7 +40,8 @@ class Pictures:
         self.run = run
         self.frames = {f.id: f for f in frames}
         self._grey = _Recent(lambda i: to_grey(self.color(i)), kept)
-        self._features = _Recent(lambda i: extract_features(self.grey(i)), 4 * kept)
+        self._left_out = _Recent(lambda i: run.left_out(self.frames[i]), kept)
+        self._features = _Recent(lambda i: extract_features(self.grey(i), left_out=self.left_out(i)), 4 * kept)
         # 32 x 24 x 3 numbers a frame: 9 MB for a thousand frames.
         self._descriptor = _Recent(lambda i: frame_descriptor(self.color(i)), 20000)
 
@@ -51,6 +52,19 @@ class Pictures:
     def grey(self, frame_id: int) -> NDArray[np.uint8]:
         """(H, W)."""
         return self._grey(frame_id)
+
+    def left_out(self, frame_id: int) -> NDArray[np.bool_] | None:
+        """(H, W) what is no part of the scene; None where all of it is."""
+        return self._left_out(frame_id)
+
+    def is_scene(self, frame_id: int, xy: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(Q,) whether pixels (Q, 2) show the scene; also where they are not finite."""
+        left_out = self.left_out(frame_id)
+        if left_out is None:
+            return np.ones(len(xy), bool)
+        column, row = np.nan_to_num(xy, nan=-1.0).astype(np.int64).T
+        inside = (column >= 0) & (row >= 0) & (column < left_out.shape[1]) & (row < left_out.shape[0])
+        return ~(inside & left_out[np.where(inside, row, 0), np.where(inside, column, 0)])
 
     def features(self, frame_id: int) -> Features:
         """SIFT features."""

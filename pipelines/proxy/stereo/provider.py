@@ -96,8 +96,8 @@ class MultiviewDepth:
         limits = depth_range(self._model, index, companions)
         if len(companions) == 0 or limits is None:
             return np.zeros((camera.height, camera.width), np.float32)
-        image = self._grey(int(self._model.frame_ids[index]))
-        others = np.stack([self._grey(int(self._model.frame_ids[j])) for j in companions])
+        image, left_out = self._grey(int(self._model.frame_ids[index]))
+        others = np.stack([_blanked(*self._grey(int(self._model.frame_ids[j]))) for j in companions])
         warps = self._warps(index, companions)
         planes = np.linspace(1 / limits[1], 1 / limits[0], s.planes)
         step = planes[1] - planes[0]
@@ -108,7 +108,8 @@ class MultiviewDepth:
         inverse = cv2.bilateralFilter(inverse, 7, step, 2.0)
         inverse, _ = refine_inverse_depth(image, others, warps, inverse, step / 3, 2, s.stiffness, s.best, self._bands)
         inverse = cv2.bilateralFilter(inverse, 7, 0.7 * step, 2.0)
-        return np.clip(inverse, planes[0], planes[-1]).astype(np.float32)
+        inverse = np.clip(inverse, planes[0], planes[-1]).astype(np.float32)
+        return inverse if left_out is None else np.where(left_out, np.float32(0), inverse)
 
     # second pass ------------------------------------------------------------------------------------------------
 
@@ -155,15 +156,21 @@ class MultiviewDepth:
         matrix, poses = self._camera.matrix, self._model.cam_from_world
         return warps_to(matrix, poses[index], [matrix] * len(others), [poses[j] for j in others])
 
-    def _read_grey(self, frame_id: int) -> NDArray[np.float32]:
+    def _read_grey(self, frame_id: int) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
         rgb = self._sequence.read_image(self._frame[frame_id])
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-        small = resize_area(np.asarray(grey, np.uint8), self._camera.width, self._camera.height)
-        return small.astype(np.float32) / np.float32(255)
+        size = self._camera.width, self._camera.height
+        small = resize_area(np.asarray(grey, np.uint8), *size)
+        return small.astype(np.float32) / np.float32(255), self._sequence.left_out(self._frame[frame_id], *size)
 
     def _load_raw(self, index: int) -> NDArray[np.float32]:
         inverse = load_scratch(self._path(int(self._model.frame_ids[index])))["inverse_depth"]
         return invert(inverse)
+
+
+def _blanked(grey: NDArray[np.float32], left_out: NDArray[np.bool_] | None) -> NDArray[np.float32]:
+    """Another view's picture with NaN where it shows no scene: no window that touches it is compared."""
+    return grey if left_out is None else np.where(left_out, np.float32(np.nan), grey)
 
 
 def invert(values: NDArray[np.float32]) -> NDArray[np.float32]:

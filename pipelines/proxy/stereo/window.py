@@ -78,7 +78,7 @@ def correlate_row(
     score: NDArray[np.float32],
 ) -> None:
     """Into `score` (W,) the weighted correlation of one row's windows with the samples `warped` (2 RADIUS + 1,
-    W + 2 RADIUS) of another view; OUTSIDE where `seen` is 0. `sums` (3, W) is room to work in."""
+    W + 2 RADIUS) of another view; OUTSIDE where `seen` is 0 or a sample is NaN. `sums` (3, W) is room to work in."""
     width = len(score)
     sums[:] = 0
     for j in range(SIDE):
@@ -95,7 +95,8 @@ def correlate_row(
         variance = max(sums[1, x] - mean * mean, np.float32(0))
         covariance = sums[2, x] - mean * moments[0, x]
         value = covariance / np.sqrt((variance + floor) * (moments[1, x] + floor))
-        score[x] = value if seen[x] else np.float32(OUTSIDE)
+        # Samples of what is no scene are NaN, and so is what is made of them.
+        score[x] = value if seen[x] and value == value else np.float32(OUTSIDE)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -148,10 +148,10 @@ def test_features_of_a_blank_image_are_none() -> None:
     assert len(FeatureExtractor(400, 0.004)(np.full((100, 120), 128, np.uint8))) == 0
 
 
-def _sliding(step: float, count: int) -> list[np.ndarray]:
+def _sliding(step: float, count: int) -> list[tuple[np.ndarray, None]]:
     wide = cv2.cvtColor(render(np.zeros(3), turn(0.0)), cv2.COLOR_RGB2GRAY)
     shifts = [np.float32([[1, 0, -step * i], [0, 1, 0]]) for i in range(count)]
-    return [cv2.warpAffine(wide, s, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT) for s in shifts]
+    return [(cv2.warpAffine(wide, s, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT), None) for s in shifts]
 
 
 def test_keyframes_follow_the_displacement() -> None:
@@ -169,7 +169,7 @@ def test_no_displacement_gives_no_second_keyframe() -> None:
 
 def test_unrelated_frames_are_all_keyframes() -> None:
     rng = np.random.default_rng(0)
-    frames = [cv2.resize(rng.integers(0, 255, (30, 40), dtype=np.uint8), (WIDTH, HEIGHT)) for _ in range(4)]
+    frames = [(cv2.resize(rng.integers(0, 255, (30, 40), dtype=np.uint8), (WIDTH, HEIGHT)), None) for _ in range(4)]
     assert choose_keyframes(frames, KeyframeOptions()).keyframes == [0, 1, 2, 3]
 
 

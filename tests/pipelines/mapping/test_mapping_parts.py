@@ -205,8 +205,9 @@ def test_exposure_between_keyframes_is_interpolated() -> None:
 
 def test_a_view_without_proxy_counts_by_its_colours(small_run: RunFolder) -> None:
     run = SimpleNamespace(
-        **{n: getattr(small_run, n) for n in dir(small_run) if n.startswith("load")}, image=small_run.image
-    )
+        **{n: getattr(small_run, n) for n in dir(small_run) if n.startswith("load")},
+        image=small_run.image, left_out=small_run.left_out,
+    )  # fmt: skip
     run.has_proxy = lambda i: i != 2
     loaded = load_views(run, small_run.load_trajectory("tracking"), MappingConfig())  # type: ignore[arg-type]
     assert loaded.views[2].depth.max() == 0

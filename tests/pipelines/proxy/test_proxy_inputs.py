@@ -129,7 +129,7 @@ def wrong_weights(folder: Path) -> str:
         (another_shape, "not the shape of the frames"),
         (one_of_another_shape, "000007.png is 100x100, which is not the shape"),
         (eight_bits, "depth"),
-        (no_card, "cannot read the card"),
+        (no_card, r"no such file: .*card\.toml"),
         (no_weights, r"no net\.onnx beside the card"),
         (wrong_weights, "its inputs are x"),
         (lambda folder: "radar", "no provider 'radar'"),

@@ -63,12 +63,13 @@ def write_tflite(
     last: str = "",
     size: tuple[int, int] = (24, 32),
     called: tuple[str, str] = ("image", "scores"),
+    answer: str = "logistic",
 ) -> Path:
     """scores = weight (C, 3) @ rgb + bias at every pixel; the input is RGB in −1..1 as uint8 (scale 1/128, zero 128).
 
     `last` is what the file answers with: the "scores" as float, "uint8" scores (scale 1/16, zero 128), "argmax" of
     those, or the "logistic" of the scores. All that comes before can be asked for by its name; `called` names the
-    input and the scores.
+    input and the scores, `answer` the logistic.
     """
     (rows, columns), count = size, len(weight)
     build = Builder()
@@ -92,7 +93,7 @@ def write_tflite(
         build.operator(OPERATORS.ARG_MAX, [end, axis], [best], choice, "ArgMaxOptions")
         end = best
     if last == "logistic":
-        end = build.tensor("logistic", [1, rows, columns, count], FLOAT)
+        end = build.tensor(answer, [1, rows, columns, count], FLOAT)
         build.operator(OPERATORS.LOGISTIC, [scores], [end])
     path.write_bytes(build.bytes([image], [end]))
     return path

@@ -1,0 +1,79 @@
+"""What of the frames is not part of the scene, while the stage is at work on them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.images import read_rgb
+from pipelines.config import Config
+from pipelines.frames.source import Source, open_source
+from pipelines.masks.files import MaskFiles, open_masks
+from pipelines.masks.people import PeopleCards, PeopleFinder, people_cards
+from pipelines.progress import Progress
+from pipelines.proxy.models.registry import ModelStore
+from pipelines.run_folder import load_left_out, save_left_out
+from pipelines.structure.lens import Lens
+from pipelines.types import Frame
+
+
+def mask_inputs(source: Path, config: Config) -> dict[str, str] | None:
+    """What changes with the user's masks and with the networks for people; None without any."""
+    folder, cards = config.frames.masks, _cards(config)
+    found = {"masks": open_masks(Path(folder), open_source(source, config.run.format)).digest()} if folder else {}
+    return found | ({"people": cards.identity()} if cards else {}) or None
+
+
+def check_masks(source: Path, config: Config) -> None:
+    """InputError for masks of another name or size than the pictures, and networks that are not what they should be."""
+    if config.frames.masks:
+        open_masks(Path(config.frames.masks), open_source(source, config.run.format))
+    if cards := _cards(config):
+        PeopleFinder(cards, 1)
+
+
+def _cards(config: Config) -> PeopleCards | None:
+    return people_cards(ModelStore.open()) if config.frames.people == "auto" else None
+
+
+class FrameMasks:
+    """The user's masks of all frames, and people in those in which they were looked for, all before undistortion.
+
+    `folder` keeps what was found; `picked` names the picture of a frame.
+    """
+
+    def __init__(self, config: Config, source: Source, folder: Path, picked: Path, threads: int) -> None:
+        self._files = open_masks(Path(config.frames.masks), source) if config.frames.masks else MaskFiles({})
+        self._cards = _cards(config)
+        self._folder, self._picked, self._threads = folder, picked, threads
+
+    def find_people(self, frames: Sequence[Frame], progress: Progress) -> None:
+        """Look for people in these frames; what is on disk stays."""
+        if self._cards is None:
+            return
+        finder = PeopleFinder(self._cards, self._threads)
+        todo = [f for f in frames if load_left_out(self._folder, f) is None]
+        for frame in progress.track(todo, "people", len(todo)):
+            save_left_out(self._folder, frame, finder.left_out(read_rgb(self._picked / frame.name)))
+
+    def left_out(self, frame: Frame, width: int, height: int) -> NDArray[np.bool_] | None:
+        """(height, width) of a picked frame; None where all of it is scene."""
+        given = self._files.left_out(frame.source_index, width, height)
+        people = load_left_out(self._folder, frame)
+        parts = [p for p in (given, people) if p is not None]
+        both = np.logical_or.reduce(parts) if parts else None
+        return both if both is not None and both.any() else None
+
+    def write(self, folder: Path, frames: Sequence[Frame], lens: Lens) -> dict[str, Any]:
+        """The masks of the undistorted frames that have any; how many these are, and how much they leave out."""
+        shares = []
+        for frame in frames:
+            left_out = self.left_out(frame, lens.pinhole.width, lens.pinhole.height)
+            if left_out is not None:
+                save_left_out(folder, frame, lens.undistort_mask(left_out))
+                shares.append(float(left_out.mean()))
+        return {"masked_frames": len(shares), "masked_share": round(float(np.mean(shares)), 4)} if shares else {}

@@ -1,0 +1,82 @@
+"""The user's masks: one PNG a picture, black is left out (the convention of COLMAP's image reader)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.digest import files_sha256
+from formats.errors import InputError
+from formats.images import image_size, natural_key, read_rgb
+from pipelines.frames.source import Source, VideoSource
+
+_LAST_NUMBER = re.compile(r"(\d+)(?!.*\d)")
+
+
+@dataclass(frozen=True)
+class MaskFiles:
+    """paths: index of a picture in the source → its mask."""
+
+    paths: dict[int, Path]
+
+    def left_out(self, index: int, width: int, height: int) -> NDArray[np.bool_] | None:
+        """(height, width) of the source's picture `index`; None where it has no mask. What is black in half of a pixel
+        is left out."""
+        path = self.paths.get(index)
+        if path is None:
+            return None
+        scene = (read_rgb(path).max(-1) > 0).astype(np.float32)
+        return np.asarray(cv2.resize(scene, (width, height), interpolation=cv2.INTER_AREA) <= 0.5)
+
+    def digest(self) -> str:
+        """Changes with the names and contents."""
+        return files_sha256((p.name, p) for p in self.paths.values())
+
+
+def open_masks(folder: Path, source: Source) -> MaskFiles:
+    """The masks of a source's pictures: NAME.jpg.png or NAME.png for the image NAME.jpg, or the number of the frame in
+    the video (from 0). Not every picture needs one.
+
+    Raises InputError for a folder without any, a mask that belongs to no picture, and one of another size.
+    """
+    if not folder.is_dir():
+        raise InputError(f"--masks {folder}: there is no such folder")
+    files = sorted((p for p in folder.glob("*.png") if p.is_file()), key=lambda p: natural_key(p.name))
+    if not files:
+        raise InputError(f"--masks {folder}: holds no PNG files. A mask is an 8 bit PNG, black is left out")
+    paths, strangers = _by_number(files, source) if isinstance(source, VideoSource) else _by_name(files, source)
+    if strangers:
+        rule = (
+            "the number of the frame in the video, the first is 0"
+            if isinstance(source, VideoSource)
+            else "that of the image with .png after it"
+        )
+        raise InputError(
+            f"--masks {folder}: {len(strangers)} of {len(files)} files belong to no picture, the first is "
+            f"{strangers[0].name}. The name of a mask is {rule}"
+        )
+    for path in paths.values():
+        if (size := image_size(path)) != (source.width, source.height):
+            raise InputError(
+                f"{path} is {size[0]}x{size[1]}, the pictures are {source.width}x{source.height}: make masks of the "
+                "pictures as they are"
+            )
+    return MaskFiles(paths)
+
+
+def _by_number(files: list[Path], source: Source) -> tuple[dict[int, Path], list[Path]]:
+    numbered = [(m.group(1), p) if (m := _LAST_NUMBER.search(p.name.split(".")[0])) else ("", p) for p in files]
+    last = source.expected_frames or 1 << 62
+    paths = {int(n): p for n, p in numbered if n and int(n) < last}
+    return paths, [p for n, p in numbered if not n or int(n) >= last]
+
+
+def _by_name(files: list[Path], source: Source) -> tuple[dict[int, Path], list[Path]]:
+    names = [source.name(i, i) for i in range(source.expected_frames)]
+    whose = {f"{Path(n).stem}.png": i for i, n in enumerate(names)} | {f"{n}.png": i for i, n in enumerate(names)}
+    return {whose[p.name]: p for p in files if p.name in whose}, [p for p in files if p.name not in whose]

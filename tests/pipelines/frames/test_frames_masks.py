@@ -1,0 +1,61 @@
+"""The whole stage with masks: something large that moves by itself leaves no trace."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from formats.images import read_grey_png, read_rgb, write_grey_png, write_rgb
+from pipelines.frames.stage import run
+from pipelines.geometry.alignment import align_points
+from pipelines.run_folder import load_sparse_model
+from pipelines.stages import StageContext
+from tests.pipelines.frames.conftest import HEIGHT, WIDTH, Walk
+
+Moving = tuple[Path, Path, list[np.ndarray]]
+
+
+@pytest.fixture
+def crossing(bent_walk: Walk, tmp_path: Path) -> Moving:
+    """The walk, with a textured board that crosses it the other way, and masks of the board."""
+    board = np.random.default_rng(5).integers(0, 255, (40, 30, 3), dtype=np.uint8)
+    board = np.kron(board, np.ones((4, 4, 1), np.uint8)).astype(np.uint8)
+    covered = []
+    for i, path in enumerate(sorted(bent_walk.folder.iterdir())):
+        image, left_out = read_rgb(path), np.zeros((HEIGHT, WIDTH), bool)
+        x = 10 + 15 * i
+        image[40:200, x : x + 120] = board
+        left_out[38:202, max(x - 2, 0) : x + 122] = True
+        write_rgb(tmp_path / "pictures" / path.name, image)
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        write_grey_png(tmp_path / "masks" / f"{path.name}.png", np.where(left_out, 0, 255).astype(np.uint8))
+        covered.append(left_out)
+    return tmp_path / "pictures", tmp_path / "masks", covered
+
+
+def test_a_board_that_crosses_the_picture_leaves_no_trace(
+    crossing: Moving, bent_walk: Walk, make_context: Callable[..., StageContext]
+) -> None:
+    pictures, masks, covered = crossing
+    context = make_context(pictures, f'frames.masks="{masks}"')
+    figures = run(context)
+    assert figures["masked_frames"] == len(covered)
+    assert 0.2 < figures["masked_share"] < 0.3
+    model = load_sparse_model(context.folder / "backbone" / "model.npz")
+    assert len(model.frame_ids) == len(covered)
+    centres = np.linalg.inv(model.cam_from_world)[:, :3, 3]
+    aligned = align_points(centres, bent_walk.centers[model.frame_ids])
+    assert np.linalg.norm(aligned.apply(centres) - bent_walk.centers[model.frame_ids], axis=1).max() < 0.05
+    for n, frame_id in enumerate(model.frame_ids.tolist()):
+        name = sorted(p.name for p in pictures.iterdir())[frame_id]
+        left_out = read_grey_png(context.folder / "masks" / f"{name}.png") == 0
+        seen = model.obs_xy[model.obs_frame == n].astype(int)  # some beyond the border of the undistorted frame
+        seen = seen[((seen >= 0) & (seen < [WIDTH, HEIGHT])).all(1)]
+        # A feature on the border may be undistorted to the other side of it.
+        inner = left_out & np.roll(left_out, 2, 1) & np.roll(left_out, -2, 1)
+        assert not inner[seen[:, 1], seen[:, 0]].any()
+        # The lens has been taken out of the masks as out of the pictures: what was straight is no longer.
+        assert (left_out != covered[frame_id]).any()
+        board = read_rgb(context.folder / name)[left_out].std()
+        assert board > 50

@@ -1,0 +1,217 @@
+"""What is no part of the scene: the user's masks, people by two networks, and who keeps clear of both."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from formats.errors import InputError
+from formats.images import read_rgb, write_grey_png, write_rgb
+from pipelines.config import ArticleConfig, MappingConfig, load_config
+from pipelines.correspondence.features import FeatureExtractor
+from pipelines.frames.keyframes import KeyframeOptions, choose_keyframes
+from pipelines.frames.masks import check_masks, mask_inputs
+from pipelines.frames.source import open_source
+from pipelines.gaussians.adam import AdamTable
+from pipelines.gaussians.render import Rendering
+from pipelines.mapping.objective import Objective
+from pipelines.mapping.views import View, make_view
+from pipelines.masks.files import open_masks
+from pipelines.masks.people import PeopleFinder, join_people, people_cards
+from pipelines.proxy.models.registry import ModelStore
+from pipelines.tracking.features import extract_features
+from pipelines.tracking.klt import corners
+from pipelines.types import Intrinsics
+from tests.pipelines.proxy.tiny_tflite import write_tflite
+
+HEIGHT, WIDTH = 96, 128
+
+
+def noise(seed: int = 0) -> NDArray[np.uint8]:
+    coarse = np.random.default_rng(seed).integers(0, 255, (HEIGHT // 4, WIDTH // 4, 3), dtype=np.uint8)
+    return np.asarray(cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC), np.uint8)
+
+
+def left_half() -> NDArray[np.bool_]:
+    return np.arange(WIDTH)[None].repeat(HEIGHT, 0) < WIDTH // 2
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    for i in range(3):
+        write_rgb(tmp_path / "pictures" / f"view{i}.jpg", noise(i))
+    return tmp_path / "pictures"
+
+
+def write_mask(path: Path, left_out: NDArray[np.bool_]) -> None:
+    path.parent.mkdir(exist_ok=True)
+    write_grey_png(path, np.where(left_out, 0, 255).astype(np.uint8))
+
+
+def test_masks_are_found_by_both_names_and_reduced(pictures: Path, tmp_path: Path) -> None:
+    write_mask(tmp_path / "masks" / "view0.jpg.png", left_half())
+    write_mask(tmp_path / "masks" / "view2.png", ~left_half())
+    masks = open_masks(tmp_path / "masks", open_source(pictures))
+    first, second, third = (masks.left_out(i, WIDTH // 2, HEIGHT // 2) for i in range(3))
+    assert first is not None
+    assert third is not None
+    assert second is None
+    np.testing.assert_array_equal(first, left_half()[::2, ::2])
+    np.testing.assert_array_equal(third, ~first)
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "said"),
+    [
+        ("view7.jpg.png", (HEIGHT, WIDTH), "1 of 1 files belong to no picture, the first is view7.jpg.png"),
+        ("view1.png", (HEIGHT, WIDTH - 1), "is 127x96, the pictures are 128x96"),
+        ("view1.jpg", (HEIGHT, WIDTH), "holds no PNG files"),
+    ],
+)
+def test_masks_of_another_name_or_size_are_refused_before_anything_slow(
+    pictures: Path, tmp_path: Path, name: str, size: tuple[int, int], said: str
+) -> None:
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    cv2.imwrite(str(folder / name), np.zeros(size, np.uint8))
+    config = load_config(overrides=[f'frames.masks="{folder}"'])
+    with pytest.raises(InputError, match=said):
+        check_masks(pictures, config)
+    with pytest.raises(InputError, match="no such folder"):
+        check_masks(pictures, load_config(overrides=[f'frames.masks="{tmp_path / "none"}"']))
+
+
+def test_changed_masks_are_seen(pictures: Path, tmp_path: Path) -> None:
+    write_mask(tmp_path / "masks" / "view0.png", left_half())
+    config = load_config(overrides=[f'frames.masks="{tmp_path / "masks"}"'])
+    before = mask_inputs(pictures, config)
+    write_mask(tmp_path / "masks" / "view0.png", ~left_half())
+    assert mask_inputs(pictures, config) != before
+    assert mask_inputs(pictures, load_config()) is None
+
+
+# who keeps clear ------------------------------------------------------------------------------------------------
+
+
+def test_features_corners_and_keyframes_keep_clear() -> None:
+    grey = np.asarray(cv2.cvtColor(noise(), cv2.COLOR_RGB2GRAY), np.uint8)
+    found = FeatureExtractor(500, 0.004)(grey)
+    kept = found.outside(left_half())
+    assert 5 < len(kept) < len(found)
+    assert (kept.xy[:, 0] >= WIDTH // 2).all()
+    assert (extract_features(grey, 200, left_half()).xy[:, 0] >= WIDTH // 2 - 1).all()
+    assert (corners(grey, np.zeros((0, 2)), 50, left_out=left_half())[:, 0] > WIDTH // 2 - 4).all()
+    # Only what is masked moves: by it alone every frame would be a keyframe.
+    shown = [np.where(left_half(), np.roll(grey, 9 * i, 1), grey) for i in range(4)]
+    still = choose_keyframes([(g, left_half()) for g in shown], KeyframeOptions())
+    assert still.largest_displacement < 0.01
+    assert choose_keyframes([(g, ~left_half()) for g in shown], KeyframeOptions()).largest_displacement > 0.05
+
+
+# people -----------------------------------------------------------------------------------------------------------
+
+
+def test_people_are_what_both_networks_are_sure_of() -> None:
+    box = np.zeros((100, 100), np.float32)
+    box[20:80, 30:60] = 0.9
+    assert join_people(box, box)[50, 45]
+    assert not join_people(box, np.roll(box, 50, 1)).any()
+    assert not join_people(box, 0.6 * box).any()
+    wider = np.zeros_like(box)
+    wider[20:81, 28:61] = 0.9
+    found = join_people(wider, box)
+    assert found[80, 45]  # the feet that only the person network sees
+    assert not found[90, 45]
+    assert found.mean() < 1.4 * (box > 0).mean()
+
+
+@pytest.fixture
+def stand_ins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModelStore:
+    """Networks of the real ones' contracts to which blue is a person."""
+    monkeypatch.setenv("MSGS_SLAM_CACHE", str(tmp_path / "cache"))
+    store = ModelStore.open()
+    blue = write_tflite(
+        tmp_path / "p.tflite", [[-4, -4, 8.0]], [-3.0], "logistic", (256, 256), ("input_1", "raw"), "activation_10"
+    )
+    store.add(blue, "selfie-person", "my-person")
+    weight = np.zeros((32, 3))
+    weight[13] = 5 * np.array([-2, -2, 4.0])
+    bias = np.full(32, -20.0)
+    bias[1], bias[13] = 0.0, -15.0
+    names = ("MobilenetV2/MobilenetV2/input", "logits/semantic/BiasAdd")
+    classes = write_tflite(tmp_path / "c.tflite", weight.tolist(), bias.tolist(), "argmax", (512, 512), names)
+    store.add(classes, "deeplab-ade20k", "my-classes")
+    return ModelStore.open()
+
+
+def test_stand_ins_of_the_networks_find_the_blue_person(stand_ins: ModelStore, pictures: Path) -> None:
+    cards = people_cards(stand_ins)
+    assert cards is not None
+    image = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+    image[20:80, 40:70] = (0, 0, 255)
+    found = PeopleFinder(cards, 1).left_out(image)
+    assert found[25:75, 45:65].all()
+    assert found.mean() < 1.4 * 60 * 30 / found.size
+    inputs = mask_inputs(pictures, load_config())
+    assert inputs is not None
+    assert set(inputs) == {"people"}
+    assert mask_inputs(pictures, load_config(overrides=['frames.people="keep"'])) is None
+    model = stand_ins.get("my-person")
+    stand_ins.path(model).write_bytes(bytes(model.bytes))
+    with pytest.raises(InputError, match="Download it again"):
+        check_masks(pictures, load_config())
+
+
+def test_the_real_networks_find_the_woman_and_leave_rooms_alone(shared_data: Path, tmp_path: Path) -> None:
+    store = ModelStore.open(tmp_path / "cache")
+    store.take(shared_data / "models", store.with_needed([]))
+    cards = people_cards(store)
+    assert cards is not None
+    finder = PeopleFinder(cards, 1)
+    woman = finder.left_out(read_rgb(shared_data / "people" / "0030.jpg"))
+    assert 0.08 < woman.mean() < 0.2
+    assert woman[:, 350:700].sum() == woman.sum()
+    for room in ("whiteroom/rgb/000150.jpg", "kitchen/frame-000150.color.jpg", "replica_office0/rgb/000000.jpg"):
+        if (shared_data / room).exists():
+            assert not finder.left_out(read_rgb(shared_data / room)).any(), room
+
+
+# the map ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_loss_of_a_view_does_not_see_what_is_left_out(a_view: tuple[View, Callable]) -> None:
+    view, loss_of = a_view
+    masked = replace(view, scene=torch.arange(view.image.shape[1])[None].repeat(view.image.shape[0], 1) >= 40)
+    painted = masked.image.clone()
+    painted[:, :40] = 255 - painted[:, :40]
+    losses, gradients = zip(*(loss_of(v) for v in (masked, replace(masked, image=painted))), strict=True)
+    assert losses[0] == losses[1]
+    assert torch.equal(gradients[0], gradients[1])
+    assert losses[0] != loss_of(view)[0]
+
+
+@pytest.fixture
+def a_view() -> tuple[View, Callable]:
+    """A view of random colours, and the loss with its gradient of a picture of it that is a bit off."""
+    camera = Intrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
+    image = np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8)
+    view = make_view(0, camera, np.eye(4), image, None, 1.0, ())
+
+    def loss_of(seen: View) -> tuple[float, torch.Tensor]:
+        shown = (view.colors * 0.9 + 0.03).requires_grad_()
+        rendering = Rendering(shown, torch.ones(60, 80), torch.full((60, 80), 0.9))
+        values = {"log_gain": torch.zeros(3), "offset": torch.zeros(3)}
+        objective = Objective(MappingConfig(), ArticleConfig(), 0, 1.0)
+        loss = objective.of(seen, AdamTable(values), rendering, torch.zeros(4), False)
+        loss.backward()
+        assert shown.grad is not None
+        if seen.scene is not None:
+            assert (shown.grad[:, :40] == 0).all()
+        return float(loss.detach()), shown.grad
+
+    return view, loss_of
