@@ -105,7 +105,7 @@ def write_mesh_glb(
 ) -> None:
     """Write a GLB with vertex colours, the labels as vertex attribute _LABEL, class names in the mesh's extras.
 
-    Arguments and errors as `write_mesh_ply`. The coordinates stay those of the world: y need not be up.
+    Arguments and errors as `write_mesh_ply`. glTF wants y up: the caller turns the vertices.
     """
     import trimesh  # slow to import, and only the export needs it
 

@@ -16,7 +16,7 @@ KEY_FIGURES = {
     "tracking": ("posed", "keyframes", "lost", "scale", "scale_relative_sd"),
     "mapping": ("gaussians", "keyframe_psnr"),
     "global_ba": ("loops",),
-    "export": ("images", "vertices", "faces"),
+    "export": ("images", "vertices", "faces", "up", "floor"),
 }
 """What a person wants to know first; `status -v` says all."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from formats.errors import InputError
 from pipelines.config import Config
 from pipelines.device import settle_device
 from pipelines.gaussian_map import GaussianMap
+from pipelines.geometry.alignment import Similarity
 from pipelines.records import StageRecord, load_records, load_source, recorded_config
 from pipelines.run_folder import RunFolder
 from pipelines.settings_file import load_settings
@@ -52,7 +53,7 @@ class Exposure:
 class Outcome:
     """config: the settings that each finished stage was made with. map_stage is "" and gaussian_map None before mapping
     is done; label_of_channel (C,) takes a class channel of the map to its label. `metric`: whether the world's unit is
-    the metre of the proxy depth."""
+    the metre of the proxy depth. `move`: how all of it has been moved out of the run's own world."""
 
     run: RunFolder
     records: Mapping[str, StageRecord]
@@ -68,6 +69,7 @@ class Outcome:
     exposure: Exposure | None
     metric: bool
     semantics: str
+    move: Similarity | None = None
 
     @property
     def source_is_folder(self) -> bool:
@@ -85,8 +87,28 @@ class Outcome:
         """Points and their observations as the last stage that has any left them."""
         for stage in (self.pose_stage, "tracking"):
             if self.run.has_sparse(stage):
-                return self.run.load_sparse(stage)
+                return self._in_this_world(self.run.load_sparse(stage))
         return None
+
+    def _in_this_world(self, model: SparseModel) -> SparseModel:
+        if self.move is None:
+            return model
+        points, poses = self.move.apply(model.points_in_world), self.move.apply_to_poses(model.cam_from_world)
+        return replace(model, points_in_world=points, cam_from_world=poses)
+
+    def moved(self, other_from_run: Similarity) -> Outcome:
+        """The same in another world: cameras, map and points. Raises ValueError where it has been moved before."""
+        if self.move is not None:
+            raise ValueError("this outcome is no longer in the run's own world")
+        poses = other_from_run.apply_to_poses(self.trajectory.cam_from_world)
+        # A lost frame keeps its identity: it stands nowhere.
+        poses = np.where(self.trajectory.is_posed[:, None, None], poses, self.trajectory.cam_from_world)
+        return replace(
+            self,
+            trajectory=replace(self.trajectory, cam_from_world=poses),
+            gaussian_map=None if self.gaussian_map is None else self.gaussian_map.moved(other_from_run),
+            move=other_from_run,
+        )
 
     def frame_row(self, frame_id: int) -> int:
         """Row of a frame in the trajectory."""

@@ -17,6 +17,7 @@ from pipelines.evaluation.pictures import Picture, depth_picture, depth_range, l
 from pipelines.outcome import Outcome, load_outcome
 from pipelines.progress import Progress, SilentProgress
 from pipelines.run_folder import RunFolder
+from pipelines.upright.world import up_in_run
 
 KINDS = ("color", "depth", "labels", "side-by-side")
 PATHS = ("own", "smooth", "orbit")
@@ -68,7 +69,7 @@ def _path(outcome: Outcome, path: str, fps: float, frames: int, scene_depth: flo
     own = t.world_from_cam[t.is_posed]
     times = t.timestamps[t.is_posed]
     if path == "orbit":
-        return orbit(own, scene_depth, frames or round(10 * fps))
+        return orbit(own, scene_depth, frames or round(10 * fps), up_in_run(outcome))
     seconds = float(times[-1] - times[0]) if len(times) > 1 else 1.0
     dense = resampled(own, frames or max(2, round(seconds * fps)))
     return dense if path == "own" else smoothed(dense, _SMOOTHING_SECONDS * len(dense) / max(seconds, 1e-6))

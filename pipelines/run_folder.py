@@ -46,7 +46,7 @@ FRAMES, CALIBRATION, BACKBONE = "frames.json", "calibration.json", "backbone/mod
 CLASSES, SYMMETRY, DESCRIPTORS = "classes.json", "symmetry.npz", "descriptors.npz"
 TRAJECTORY, SPARSE, DEPTH_SCALES = "trajectory.npz", "sparse.npz", "depth_scales.npz"
 MAP, EXPOSURE, LOOPS = "map.safetensors", "exposure.npz", "loops.json"
-MESH, MESH_TO_SHOW = "mesh.ply", "mesh.glb"
+MESH, WORLD = "mesh.ply", "world.json"
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from formats.errors import InputError
 from formats.gaussian_files import read_gaussians
-from pipelines.evaluation.camera_paths import upward
 from pipelines.evaluation.measure import evenly
 from pipelines.gaussian_map import decided_channels
 from pipelines.outcome import Outcome, labels_of_channels, load_outcome
 from pipelines.proxy.palette import class_colors
-from pipelines.run_folder import MESH_TO_SHOW, RunFolder
+from pipelines.run_folder import MESH, RunFolder
 from pipelines.types import Frame
+from pipelines.upright.world import load_world, up_in_run
 
 MODES = ("colour", "classes", "depth")
 MOST_CAMERAS = 60
@@ -78,6 +78,8 @@ def load_scene(path: Path) -> ViewerScene:
 
 
 def _from_run(outcome: Outcome) -> ViewerScene:
+    world, up = load_world(outcome.run), up_in_run(outcome)
+    outcome = outcome if world is None else outcome.moved(world.exported_from_run)
     m = outcome.require_map()
     t, k = outcome.trajectory, outcome.calibration.intrinsics
     means, radii = m.means.cpu().numpy(), m.radii.detach().cpu().numpy()
@@ -95,13 +97,13 @@ def _from_run(outcome: Outcome) -> ViewerScene:
         opacities=m.opacities.detach().cpu().numpy()[:, None].astype(np.float32),
         colors=_colors(m.colors.cpu().numpy(), labels, list(outcome.classes.colors)),
         scale=scale,
-        up=upward(world_from_cam[t.is_posed]),
+        up=up if world is None else world.exported_from_run.rotation @ up,
         cameras=[
             ViewerCamera(outcome.frames[row], world_from_cam[row], fov, aspect)
             for row in (outcome.frame_row(i) for i in ids)
         ],
         path=centers * scale,
-        mesh_file=outcome.run.file("export", MESH_TO_SHOW) if outcome.run.has("export", MESH_TO_SHOW) else None,
+        mesh_file=outcome.run.file("export", MESH) if outcome.run.has("export", MESH) else None,
         run=outcome.run,
     )
 

@@ -34,12 +34,12 @@ def smoothed(world_from_cam: Array, sigma: float) -> Array:
     return path
 
 
-def orbit(world_from_cam: Array, scene_depth: float, count: int) -> Array:
+def orbit(world_from_cam: Array, scene_depth: float, count: int, up: Array) -> Array:
     """(count, 4, 4) once round the place the cameras look at, at their usual distance and height.
 
-    scene_depth: the usual distance of the scene, which stands in where the cameras do not look at one place.
+    scene_depth: the usual distance of the scene, which stands in where the cameras do not look at one place; up (3,)
+    unit vector in the world.
     """
-    up = upward(world_from_cam)
     focus, radius, height = _focus(world_from_cam, up, scene_depth)
     start = world_from_cam[0, :3, 3] - focus
     first = start - (start @ up) * up
@@ -48,15 +48,6 @@ def orbit(world_from_cam: Array, scene_depth: float, count: int) -> Array:
     angle = 2 * np.pi * np.arange(count) / count
     centers = focus + radius * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second) + height * up
     return _looking_at(centers, focus, up)
-
-
-def upward(world_from_cam: Array) -> Array:
-    """(3,) unit vector across the cameras' right axes, which people hold level, on the side of their upward axes."""
-    right = world_from_cam[:, :3, 0]
-    # Alone, the mean upward axis leans as the cameras look down; the little weight settles what one direction of view
-    # leaves open.
-    up = np.linalg.solve(right.T @ right / len(right) + 0.01 * np.eye(3), -world_from_cam[:, :3, 1].mean(axis=0))
-    return np.asarray(up / max(float(np.linalg.norm(up)), 1e-12))
 
 
 def _focus(world_from_cam: Array, up: Array, scene_depth: float) -> tuple[Array, float, float]:

@@ -21,6 +21,7 @@ from pipelines.evaluation.trajectory_error import AbsoluteError
 from pipelines.evaluation.truth import MatchedTruth
 from pipelines.outcome import Outcome
 from pipelines.run_folder import MESH
+from pipelines.upright.world import FIRST, load_world
 
 SAMPLES = 200_000
 VIEWS = 60
@@ -35,13 +36,15 @@ def mesh_cells(outcome: Outcome, matched: MatchedTruth, alignment: AbsoluteError
         return {"missing": "no mesh was exported"}
     if alignment is None:
         return {"missing": "the poses could not be aligned with the truth"}
-    truth, views = _true_surface(matched)
+    truth, views = true_surface(matched)
     if len(truth) == 0:
         return {"missing": "the truth has no depth, or no camera for it"}
     mesh = _load(outcome.run.file("export", MESH))
     if mesh is None:
         return {"missing": "the mesh is empty"}
-    points = alignment.alignment.apply(sample_surface(*mesh, SAMPLES))
+    world = load_world(outcome.run) or FIRST
+    points = sample_surface(*mesh, SAMPLES)
+    points = alignment.alignment.apply(world.exported_from_run.inverse().apply(points))
     points = points[_seen(points, views)]
     if len(points) == 0:
         return {"missing": "no camera with true depth sees the mesh"}
@@ -58,7 +61,7 @@ def _load(path: Path) -> tuple[NDArray, NDArray] | None:
 _SeenView = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]
 
 
-def _true_surface(matched: MatchedTruth) -> tuple[NDArray[np.float64], list[_SeenView]]:
+def true_surface(matched: MatchedTruth) -> tuple[NDArray[np.float64], list[_SeenView]]:
     """Points of the true depth of up to `VIEWS` frames, thinned; and (depth, matrix, cam_from_world) of each.
 
     A lens with distortion is left out: its depth does not follow the pinhole that the points are made with.

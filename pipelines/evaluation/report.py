@@ -18,12 +18,13 @@ from pipelines.evaluation.plots import RED, Line, plot
 from pipelines.evaluation.report_views import RenderedViews, class_section, quality_section, render_views
 from pipelines.evaluation.table import evaluation_table
 from pipelines.evaluation.write import PATH_FROM_ABOVE, trajectory_plots
-from pipelines.export.readme import README
+from pipelines.export.readme import readme
 from pipelines.outcome import Outcome, load_outcome
 from pipelines.progress import Progress, SilentProgress
 from pipelines.records import load_source
 from pipelines.run_folder import RunFolder
 from pipelines.types import LoopEdge, SparseModel
+from pipelines.upright.world import FIRST, load_world
 
 MEASURED_VIEWS = 60
 SHOWN_VIEWS = 8
@@ -177,7 +178,8 @@ def _export_section(outcome: Outcome) -> str:
         for p in sorted(folder.rglob("*"))
         if p.is_file() and p.parent.name != "frames"
     ]
-    return section("Files for other programs", f"<pre>{escape(README)}</pre>", table(("in export/", "size"), sizes))
+    notes = readme(load_world(outcome.run) or FIRST, outcome.metric)
+    return section("Files for other programs", f"<pre>{escape(notes)}</pre>", table(("in export/", "size"), sizes))
 
 
 def _settings_section(outcome: Outcome) -> str:

@@ -11,14 +11,16 @@ from numpy.typing import NDArray
 
 from formats.mesh import write_mesh_glb, write_mesh_ply
 from pipelines.config import ExportConfig
+from pipelines.export.depth_views import depth_view, spread
 from pipelines.export.paint import PaintedView, paint
 from pipelines.export.surface import extract_surface, without_floaters
 from pipelines.export.volume import DepthView, fuse
 from pipelines.gaussian_map import GaussianMap, decided_channels
-from pipelines.gaussians.render import get_threads, median_depth, render
+from pipelines.gaussians.render import get_threads, render
 from pipelines.outcome import Outcome
 from pipelines.progress import Progress
-from pipelines.types import VOID, Intrinsics, SemanticMesh
+from pipelines.proxy.sequence import map_intrinsics
+from pipelines.types import VOID, SemanticMesh
 
 TRUNCATION = 4.0
 """Voxels on either side of a surface that a depth speaks for."""
@@ -29,8 +31,8 @@ LEAST_WEIGHT = 1.5
 def make_mesh(outcome: Outcome, settings: ExportConfig, progress: Progress) -> SemanticMesh:
     """The surface of the map as the keyframes see it; without a vertex where nothing is seen twice."""
     trajectory, gaussian_map = outcome.trajectory, outcome.require_map()
-    poses = _spread(list(trajectory.cam_from_world[trajectory.is_keyframe]), settings.max_views)
-    camera = _camera(outcome.calibration.intrinsics, settings.mesh_side)
+    poses = spread(list(trajectory.cam_from_world[trajectory.is_keyframe]), settings.max_views)
+    camera = map_intrinsics(outcome.calibration.intrinsics, settings.mesh_side)
     views = [depth_view(gaussian_map, p, camera) for p in progress.track(poses, "depth views", len(poses))]
     voxel = settings.voxel * _median_depth(views)
     volume = fuse(views, voxel, TRUNCATION, settings.max_blocks, get_threads())
@@ -41,51 +43,16 @@ def make_mesh(outcome: Outcome, settings: ExportConfig, progress: Progress) -> S
     return SemanticMesh(vertices, faces, colors, labels)
 
 
-def write_mesh(mesh: SemanticMesh, class_names: tuple[str, ...], folder: Path) -> list[Path]:
-    """mesh.ply and, where there is a triangle at all, mesh.glb."""
-    arrays = (mesh.vertices, mesh.faces, mesh.colors, mesh.labels, class_names)
-    write_mesh_ply(folder / "mesh.ply", *arrays)
+def write_mesh(
+    mesh: SemanticMesh, class_names: tuple[str, ...], folder: Path, gltf_from_world: NDArray[np.float64]
+) -> list[Path]:
+    """mesh.ply and, where there is a triangle at all, mesh.glb in axes that gltf_from_world (3, 3) turns to."""
+    arrays = (mesh.faces, mesh.colors, mesh.labels, class_names)
+    write_mesh_ply(folder / "mesh.ply", mesh.vertices, *arrays)
     if len(mesh.faces) == 0:
         return [folder / "mesh.ply"]
-    write_mesh_glb(folder / "mesh.glb", *arrays)
+    write_mesh_glb(folder / "mesh.glb", (mesh.vertices @ gltf_from_world.T).astype(np.float32), *arrays)
     return [folder / "mesh.ply", folder / "mesh.glb"]
-
-
-def _spread(poses: Sequence[NDArray[np.float64]], most: int) -> list[NDArray[np.float64]]:
-    """At most `most` poses, evenly spread."""
-    picked = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), most)).round().astype(int))
-    return [poses[i] for i in picked]
-
-
-def _camera(intrinsics: Intrinsics, side: int) -> Intrinsics:
-    scale = min(1.0, side / max(intrinsics.width, intrinsics.height))
-    return intrinsics.resized(max(round(intrinsics.width * scale), 1), max(round(intrinsics.height * scale), 1))
-
-
-@torch.no_grad()
-def depth_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], camera: Intrinsics) -> DepthView:
-    """Median depth with a weight: none where the map is thin or the depth jumps, less far away."""
-    m = gaussian_map
-    pose = torch.as_tensor(cam_from_world, device=m.means.device)
-    depth = median_depth(m.means, m.radii, m.opacities, pose, camera).cpu().numpy()
-    silhouette = render(m.means, m.radii, m.opacities, m.colors, pose, camera).silhouette.cpu().numpy()
-    solid = (silhouette > 0.7) & (depth > 0) & ~_jumps(depth)
-    typical = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
-    # The error of a depth grows with its square.
-    weight = np.where(solid, np.clip(typical / np.maximum(depth, 1e-9), 0.2, 1.5) ** 2 * silhouette, 0)
-    return DepthView(camera, cam_from_world, depth.astype(np.float32), weight.astype(np.float32))
-
-
-def _jumps(depth: NDArray[np.float32], tolerance: float = 0.08) -> NDArray[np.bool_]:
-    """Pixels beside a step of the depth, where neither side can be trusted to a pixel."""
-    out = np.zeros(depth.shape, bool)
-    for axis in (0, 1):
-        a, b = np.moveaxis(depth, axis, 0)[:-1], np.moveaxis(depth, axis, 0)[1:]
-        step = np.abs(a - b) > tolerance * np.minimum(a, b)
-        view = np.moveaxis(out, axis, 0)
-        view[:-1] |= step
-        view[1:] |= step
-    return out
 
 
 def _median_depth(views: Sequence[DepthView]) -> float:

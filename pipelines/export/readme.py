@@ -1,6 +1,10 @@
 """What the files of an export are for."""
 
-README = """\
+from __future__ import annotations
+
+from pipelines.upright.world import World
+
+_FILES = """\
 What is in this folder
 
 sparse/0/                 camera, poses and points as a COLMAP model, binary and text; pinhole, no distortion left.
@@ -19,7 +23,30 @@ point_cloud.spz           only with --set export.spz=true: the colours of the ma
 mesh.ply, mesh.glb        the surface with a colour and a label (PLY: property label, GLB: attribute _LABEL) at each
                           vertex. MeshLab, Blender, trimesh.
 classes.json              number, name and colour of each class; 255 is "unknown".
+world.json                what the axes are, what told which way is up, and how this world lies to the run's own.
 
-Axes: the world is the first keyframe: x right, y down, z forward. Lengths are metres where the proxy depth
-is metric or a reference was given (--scale-ref); otherwise their unit is free, and `msgs-slam status` says so.
 """
+
+_UPRIGHT = """\
+Axes: z is up, told by the {told_by}; {height}; x and y count from the middle of the
+camera's path, and y points where the first camera looked. The two formats that lay down which way is up follow their
+own rule: in mesh.glb and point_cloud.spz y is up. A splat viewer that takes y for up shows the PLY files on their
+back: turn them by -90 degrees about x.
+"""
+
+_FIRST = """\
+Axes: the run's own, about those of the first posed camera: x right, y down, z forward{why}.
+"""
+
+_METRES = "Lengths are metres.\n"
+_FREE = "The unit of lengths is free: one camera cannot tell metres. Metric depth or --scale-ref makes them metres.\n"
+
+
+def readme(world: World, metric: bool) -> str:
+    """The text of README.txt for files in that world."""
+    if world.axes == "up":
+        height = "the floor is at z = 0" if world.has_floor else "no floor was found, so z counts from that path too"
+        axes = _UPRIGHT.format(told_by=world.told_by, height=height)
+    else:
+        axes = _FIRST.format(why=", since nothing told which way is up or nobody asked (export.axes)")
+    return _FILES + axes + (_METRES if metric else _FREE)

@@ -9,38 +9,60 @@ from typing import Any
 from formats.mesh import read_mesh_ply
 from pipelines.config import ExportConfig
 from pipelines.export.mesh import make_mesh, mesh_figures, write_mesh
-from pipelines.export.writers import write_colmap, write_notes, write_ply, write_spz_file, write_trajectory
+from pipelines.export.writers import (
+    write_colmap,
+    write_notes,
+    write_ply,
+    write_spz_file,
+    write_trajectory,
+    write_world,
+)
 from pipelines.outcome import Outcome, load_outcome
 from pipelines.progress import Progress, SilentProgress
 from pipelines.run_folder import RunFolder
 from pipelines.stages import Stage, StageContext
 from pipelines.types import SemanticMesh
+from pipelines.upright.find import find_upright
+from pipelines.upright.world import FIRST, World, load_world, upright_world, world_figures
 
 
 def run(context: StageContext) -> dict[str, Any]:
     """All files; a mesh that an interrupted attempt has finished is kept."""
-    outcome, settings = load_outcome(context.run, context.device), context.config.export
-    gaussian_map = outcome.require_map()
-    write_all_but_mesh(outcome, settings, context.folder)
+    found, settings = load_outcome(context.run, context.device), context.config.export
+    found.require_map()
+    world = find_world(found, settings)
+    if settings.axes == "up" and world.axes != "up":
+        context.warn(
+            "neither a floor nor upright lines tell which way is up: the files keep the axes of the run, about "
+            "those of the first posed camera"
+        )
+    outcome = found.moved(world.exported_from_run)
+    write_all_but_mesh(outcome, world, settings, context.folder)
     mesh = _finished_mesh(context.folder)
     if mesh is None:
         mesh = make_mesh(outcome, settings, context.progress)
-        write_mesh(mesh, outcome.classes.names, context.folder)
+        write_mesh(mesh, outcome.classes.names, context.folder, world.gltf_from_exported)
     if len(mesh.faces) == 0:
         context.warn("the mesh is empty: no surface is seen by enough keyframes")
     return {
         "images": int(outcome.trajectory.is_posed.sum()),
-        "gaussians": len(gaussian_map),
+        "gaussians": len(outcome.require_map()),
         "compact_map_mb": round((context.folder / "point_cloud_compact.safetensors").stat().st_size / 1e6, 2),
         **mesh_figures(mesh),
+        **world_figures(world),
     }
 
 
-def write_all_but_mesh(outcome: Outcome, settings: ExportConfig, folder: Path) -> list[Path]:
-    """COLMAP model, PLYs, trajectory, notes; the SPZ where the settings want it."""
+def find_world(outcome: Outcome, settings: ExportConfig) -> World:
+    """The world for the files of a run whose map is done."""
+    return upright_world(outcome, find_upright(outcome)) if settings.axes == "up" else FIRST
+
+
+def write_all_but_mesh(outcome: Outcome, world: World, settings: ExportConfig, folder: Path) -> list[Path]:
+    """COLMAP model, PLYs, trajectory, notes; the SPZ where the settings want it. `outcome` stands in `world`."""
     paths = write_colmap(outcome, folder) + write_ply(outcome, settings.sh_rest, folder)
-    paths += write_spz_file(outcome, folder) if settings.spz else []
-    return paths + write_trajectory(outcome, folder) + write_notes(outcome, folder)
+    paths += write_spz_file(outcome, world, folder) if settings.spz else []
+    return paths + write_trajectory(outcome, folder) + write_notes(outcome, world, folder)
 
 
 def _finished_mesh(folder: Path) -> SemanticMesh | None:
@@ -61,22 +83,31 @@ def export_run(
 
     Settings are the run's own where none are given. Raises InputError for a run without a map.
     """
-    outcome = load_outcome(run)
-    outcome.require_map()
-    settings = settings or outcome.config.export
+    found = load_outcome(run)
+    found.require_map()
+    settings = settings or found.config.export
+    world = _kept_world(found, settings) or find_world(found, settings)
+    outcome = found.moved(world.exported_from_run)
 
     def mesh() -> list[Path]:
-        found = make_mesh(outcome, settings, progress or SilentProgress())
-        return write_mesh(found, outcome.classes.names, folder)
+        made = make_mesh(outcome, settings, progress or SilentProgress())
+        return write_mesh(made, outcome.classes.names, folder, world.gltf_from_exported)
 
     writers: dict[str, Callable[[], list[Path]]] = {
         "colmap": lambda: write_colmap(outcome, folder),
         "ply": lambda: write_ply(outcome, settings.sh_rest, folder),
-        "spz": lambda: write_spz_file(outcome, folder),
+        "spz": lambda: write_spz_file(outcome, world, folder),
         "mesh": mesh,
         "tum": lambda: write_trajectory(outcome, folder),
     }
-    return writers[only]() if only else write_all_but_mesh(outcome, settings, folder) + mesh()
+    if only:
+        return [*writers[only](), write_world(outcome, world, folder)]
+    return write_all_but_mesh(outcome, world, settings, folder) + mesh()
 
 
-STAGE = Stage("export", 1, run, "COLMAP model, Gaussian PLY, labelled mesh, trajectory")
+def _kept_world(outcome: Outcome, settings: ExportConfig) -> World | None:
+    """That of the run's own export, so that what is written later or elsewhere fits; None for other axes."""
+    return load_world(outcome.run) if settings.axes == outcome.config.export.axes else None
+
+
+STAGE = Stage("export", 2, run, "COLMAP model, Gaussian PLY, labelled mesh, trajectory")

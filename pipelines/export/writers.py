@@ -18,10 +18,11 @@ from formats.gaussians import GaussianCloud, isotropic_cloud
 from formats.nerfstudio import write_transforms
 from formats.spz import write_spz
 from formats.trajectory import write_tum
-from pipelines.export.readme import README
+from pipelines.export.readme import readme
 from pipelines.outcome import Outcome
 from pipelines.run_folder import save_classes
 from pipelines.types import SparseModel
+from pipelines.upright.world import World, save_world
 
 
 def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
@@ -89,9 +90,14 @@ def write_ply(outcome: Outcome, sh_rest: bool, folder: Path) -> list[Path]:
     return paths
 
 
-def write_spz_file(outcome: Outcome, folder: Path) -> list[Path]:
-    """The map's colours in a tenth of the space of the PLY, without classes: the format has no room for them."""
-    write_spz(folder / "point_cloud.spz", map_cloud(outcome))
+def write_spz_file(outcome: Outcome, world: World, folder: Path) -> list[Path]:
+    """The map's colours in a tenth of the space of the PLY, without classes: the format has no room for them.
+
+    SPZ says which way is up, so the scene stands upright in its viewers.
+    """
+    cloud = map_cloud(outcome)
+    turned = replace(cloud, means=(cloud.means @ world.image_axes_from_exported.T).astype(np.float32))
+    write_spz(folder / "point_cloud.spz", turned)
     return [folder / "point_cloud.spz"]
 
 
@@ -109,8 +115,13 @@ def write_trajectory(outcome: Outcome, folder: Path) -> list[Path]:
     return [folder / "trajectory.txt"]
 
 
-def write_notes(outcome: Outcome, folder: Path) -> list[Path]:
-    """The class table and what each file is for."""
+def write_world(outcome: Outcome, world: World, folder: Path) -> Path:
+    """world.json: what the coordinates of the other files mean."""
+    return save_world(folder, world, "metre" if outcome.metric else "free")
+
+
+def write_notes(outcome: Outcome, world: World, folder: Path) -> list[Path]:
+    """The class table, the world, and what each file is for."""
     save_classes(folder, outcome.classes)
-    write_text(folder / "README.txt", README)
-    return [folder / "classes.json", folder / "README.txt"]
+    write_text(folder / "README.txt", readme(world, outcome.metric))
+    return [folder / "classes.json", write_world(outcome, world, folder), folder / "README.txt"]

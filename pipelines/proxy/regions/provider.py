@@ -19,7 +19,7 @@ from pipelines.proxy.palette import class_colors
 from pipelines.proxy.providers import DepthEstimate, LabelEstimate
 from pipelines.proxy.regions.parts import cut_parts
 from pipelines.proxy.regions.spread import spread_votes
-from pipelines.proxy.regions.structure import FLOOR, NAMES, OTHER, Gravity, find_gravity, name_structure
+from pipelines.proxy.regions.structure import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
 from pipelines.proxy.regions.voxels import (
     Voxels,
     find_near,
@@ -92,18 +92,11 @@ class SegmentLabels:
     def heights(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> NDArray[np.float64]:
         """(N,) height of each posed camera over the floor, in the unit of the depth; (0,) without a sure floor."""
         voxels, gravity, kind = self.structure(frames, depth_of)
-        floor, weight = voxels.position[kind == FLOOR], voxels.weight[kind == FLOOR]
-        if len(floor) < 3:
+        floor = floor_plane(voxels, kind, gravity.up)
+        if floor is None:
             return np.empty(0)
-        # Up is good to a degree or two, which is centimetres at the feet: the floor's own plane is exact.
-        for _ in range(5):
-            middle = np.average(floor, 0, weight)
-            normal = np.linalg.eigh((floor - middle).T @ ((floor - middle) * weight[:, None]))[1][:, 0]
-            normal *= np.sign(normal @ gravity.up)
-            off = np.abs((floor - middle) @ normal)
-            weight = voxels.weight[kind == FLOOR] / (1 + (off / (np.median(off) + 1e-12)) ** 2)
         centres = np.array([self._world_from_cam[f.id][:3, 3] for f in frames if f.id in self._world_from_cam])
-        return np.asarray((centres - middle) @ normal)
+        return np.asarray((centres - floor.point) @ floor.normal)
 
     def _gather(self, frame: Frame, estimate: DepthEstimate) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         camera = self.sequence.intrinsics

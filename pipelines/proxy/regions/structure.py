@@ -77,6 +77,32 @@ def name_structure(voxels: Voxels, gravity: Gravity, cameras: NDArray[np.float64
     return kind
 
 
+@dataclass(frozen=True)
+class FloorPlane:
+    """`normal` (3,) unit vector upwards, and a `point` (3,) of the floor, in the world."""
+
+    normal: NDArray[np.float64]
+    point: NDArray[np.float64]
+
+
+def floor_plane(voxels: Voxels, kinds: NDArray[np.int64], up: NDArray[np.float64]) -> FloorPlane | None:
+    """The plane of the voxels that `name_structure` called floor, robustly; None without a floor.
+
+    Up by normals is good to a degree or two, which is centimetres at the feet: the floor's own plane is exact.
+    """
+    floor, share = voxels.position[kinds == FLOOR], voxels.weight[kinds == FLOOR]
+    if len(floor) < 3:
+        return None
+    weight = share
+    for _ in range(5):
+        middle = np.average(floor, 0, weight)
+        normal = np.linalg.eigh((floor - middle).T @ ((floor - middle) * weight[:, None]))[1][:, 0]
+        normal *= np.sign(normal @ up)
+        off = np.abs((floor - middle) @ normal)
+        weight = share / (1 + (off / (np.median(off) + 1e-12)) ** 2)
+    return FloorPlane(normal, middle)
+
+
 def _levels(value: NDArray[np.float64], share: NDArray[np.float64], size: float) -> list[float]:
     """Peaks of a weighted histogram of `value`, largest first, each with a share worth naming."""
     if share.sum() < _LEAST_SHARE:

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pipelines.evaluation.camera_paths import orbit, resampled, smoothed
+from pipelines.upright.cameras import cameras_up
 from pipelines.world import make_world, walk
 
 
@@ -46,7 +47,7 @@ def test_smoothing_takes_tremble_out_and_leaves_the_walk(room_walk: NDArray) -> 
 
 
 def test_an_orbit_goes_round_what_the_cameras_look_at(room_walk: NDArray) -> None:
-    path = orbit(room_walk, 2.5, 36)
+    path = orbit(room_walk, 2.5, 36, cameras_up(room_walk))
     require_rigid(path)
     centers = path[:, :3, 3]
     # The walk goes round a table in the middle of the room.
@@ -63,7 +64,7 @@ def test_an_orbit_goes_round_what_the_cameras_look_at(room_walk: NDArray) -> Non
 def test_cameras_that_look_apart_still_have_an_orbit() -> None:
     poses = np.tile(np.eye(4), (10, 1, 1))
     poses[:, 0, 3] = np.linspace(0, 1, 10)  # side by side, parallel: no common point
-    path = orbit(poses, 3.0, 12)
+    path = orbit(poses, 3.0, 12, cameras_up(poses))
     require_rigid(path)
     assert np.isfinite(path).all()
     np.testing.assert_allclose(path[:, 2, 3].mean(), 3.0, atol=0.5)

@@ -7,17 +7,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from finished import note_finished
 from scipy.spatial.transform import Rotation
 
 from formats.datasets import Sequence, open_sequence
 from formats.errors import InputError
-from pipelines.evaluation.evaluate import evaluate_run
+from pipelines.evaluation.evaluate import evaluate_run, trajectory_cells
+from pipelines.evaluation.mesh_cells import mesh_cells
 from pipelines.evaluation.truth import match_truth, true_trajectory
 from pipelines.evaluation.write import write_evaluation
 from pipelines.geometry.alignment import Similarity
+from pipelines.outcome import load_outcome
 from pipelines.run_folder import RunFolder
 from pipelines.types import Frame
+from pipelines.upright.world import World, save_world
 
 OracleRun = Callable[..., RunFolder]
 
@@ -132,3 +136,20 @@ def test_without_a_map_the_poses_are_still_judged(oracle_run: OracleRun, truth: 
     assert result["trajectory"]["sim3 all"]["max"] < 1e-6
     assert "mapping is not done" in result["images"]["missing"]
     assert not (run.root / "evaluation" / "views.png").exists()
+
+
+def test_a_mesh_exported_into_another_world_is_brought_back(oracle_run: OracleRun, truth: Sequence) -> None:
+    run = oracle_run(metric=False, mesh=True)
+    outcome = load_outcome(run)
+    matched = match_truth(outcome.frames, outcome.source_is_folder, truth)
+    alignment = trajectory_cells(outcome, matched)[1]
+    plain = mesh_cells(outcome, matched, alignment)
+    file = run.stage("export") / "mesh.ply"
+    mesh = trimesh.load(file, force="mesh", process=False)
+    mesh.vertices = MOVE.apply(mesh.vertices)
+    mesh.export(file)
+    save_world(run.stage("export"), World("up", "floor", True, MOVE), "free")
+    note_finished(run, outcome.records)
+    moved = mesh_cells(load_outcome(run), matched, alignment)
+    assert moved["accuracy"] == pytest.approx(plain["accuracy"], rel=0.05)
+    assert moved["completeness"] == pytest.approx(plain["completeness"], rel=0.02)

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from finished import note_finished
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -170,7 +171,8 @@ def test_page_shows_the_map_and_every_control_changes_it(oracle_run: OracleRun, 
     run = oracle_run(metric=False, pixel_stride=8, mesh=True)
     box = trimesh.creation.box((30, 30, 0.1))
     box.visual.vertex_colors = np.tile([250, 240, 20, 255], (len(box.vertices), 1))
-    box.export(run.stage("export") / "mesh.glb")
+    box.export(run.stage("export") / "mesh.ply")
+    note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
     viewer = open_viewer(run.root, port=0)
     try:
         with browser(tmp_path / "profile") as page:

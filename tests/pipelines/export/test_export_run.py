@@ -15,9 +15,10 @@ from formats.errors import InputError
 from formats.spz import read_spz
 from pipelines.config import ExportConfig
 from pipelines.export.stage import export_run
-from pipelines.outcome import load_outcome
+from pipelines.outcome import Outcome, load_outcome
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import EXPORTS
+from pipelines.upright.world import read_world
 
 OracleRun = Callable[..., RunFolder]
 
@@ -35,8 +36,16 @@ def folder(run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_poses_are_the_same_everywhere(run: RunFolder, folder: Path) -> None:
-    t = load_outcome(run).trajectory
+@pytest.fixture(scope="module")
+def exported(run: RunFolder, folder: Path) -> Outcome:
+    """What the run ended with, in the world of the files."""
+    world = read_world(folder / "world.json")
+    assert world.axes == "up"
+    return load_outcome(run).moved(world.exported_from_run)
+
+
+def test_poses_are_the_same_everywhere(run: RunFolder, folder: Path, exported: Outcome) -> None:
+    t = exported.trajectory
     model = pycolmap.Reconstruction(folder / "sparse" / "0")
     names = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
     assert len(names) == len(t.frame_ids)
@@ -58,24 +67,33 @@ def test_all_files_have_the_same_rights(folder: Path) -> None:
     assert any(p.suffix == ".safetensors" for p in files)
 
 
-def test_map_is_the_same_everywhere(run: RunFolder, folder: Path) -> None:
-    m = load_outcome(run).require_map()
+def test_map_is_the_same_everywhere(folder: Path, exported: Outcome) -> None:
+    m = exported.require_map()
     vertex = plyfile.PlyData.read(str(folder / "point_cloud.ply"))["vertex"]
     np.testing.assert_allclose(vertex["scale_0"], m.log_radii, atol=1e-6)
     np.testing.assert_allclose(vertex["opacity"], m.opacity_logits, atol=1e-6)
+    np.testing.assert_allclose(vertex["z"], m.means[:, 2], atol=1e-6)
     small = read_spz(folder / "point_cloud.spz")
-    np.testing.assert_allclose(small.means, m.means, atol=1e-3)
+    # The reader gives x right, y down, z forward.
+    np.testing.assert_allclose(small.means[:, [0, 2]], m.means[:, :2], atol=1e-3)
+    np.testing.assert_allclose(small.means[:, 1], -m.means[:, 2], atol=1e-3)
     assert 0 < np.abs(small.log_scales[:, 0] - m.log_radii.numpy()).max() <= 1 / 32 + 1e-6
     assert (folder / "point_cloud.spz").stat().st_size < 0.2 * (folder / "point_cloud.ply").stat().st_size
 
 
-def test_mesh_lies_on_the_map(run: RunFolder, folder: Path) -> None:
-    mesh = trimesh.load(folder / "mesh.glb", force="mesh")
-    means = load_outcome(run).require_map().means.numpy()
+def test_mesh_lies_on_the_map_and_stands_upright(folder: Path, exported: Outcome) -> None:
+    mesh = trimesh.load(folder / "mesh.ply", force="mesh")
+    means = exported.require_map().means.numpy()
     assert len(mesh.faces) > 1000
     extent = np.ptp(means, axis=0).max()
     low, high = means.min(axis=0) - 0.05 * extent, means.max(axis=0) + 0.05 * extent
     assert ((mesh.vertices > low) & (mesh.vertices < high)).all()
+    # Of the surface within a hand's breadth of the lowest, most is the floor at 0; glTF's y is up.
+    heights = mesh.vertices[:, 2]
+    assert abs(np.median(heights[heights < np.quantile(heights, 0.02) + 0.1])) < 0.03
+    glb = trimesh.load(folder / "mesh.glb", force="mesh")
+    np.testing.assert_allclose(glb.vertices[:, 1], heights, atol=1e-5)
+    np.testing.assert_allclose(glb.vertices[:, 2], -mesh.vertices[:, 1], atol=1e-5)
 
 
 def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:

@@ -15,11 +15,13 @@ from formats.trajectory import read_tum
 from pipelines.config import Config, ExportConfig, MappingConfig, RunConfig
 from pipelines.export import stage as export_stage
 from pipelines.export.stage import export_run
+from pipelines.geometry.alignment import Similarity
 from pipelines.mapping import stage as mapping_stage
 from pipelines.progress import SilentProgress
 from pipelines.run_folder import RunFolder
 from pipelines.stages import StageContext
 from pipelines.types import VOID
+from pipelines.upright.world import read_world
 from tests.pipelines.mapping.small_run import make_run
 
 CONFIG = Config(
@@ -69,15 +71,19 @@ def test_colmap_takes_the_model(finished: tuple[RunFolder, dict, dict]) -> None:
     assert np.abs(poses[0][:3] - first).max() < 1e-6
 
 
+def exported_from_run(run: RunFolder) -> Similarity:
+    return read_world(run.stage("export") / "world.json").exported_from_run
+
+
 def test_splat_viewers_take_the_map(finished: tuple[RunFolder, dict, dict]) -> None:
     run = finished[0]
     vertex = plyfile.PlyData.read(run.stage("export") / "point_cloud.ply")["vertex"]
     names = [p.name for p in vertex.properties]
     assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     assert names[9:18] == ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "class_id"]
-    gaussian_map = run.load_map("mapping")
+    gaussian_map = run.load_map("mapping").moved(exported_from_run(run))
     assert len(vertex) == len(gaussian_map)
-    assert np.allclose(vertex["x"], gaussian_map.means[:, 0])
+    assert np.allclose(vertex["x"], gaussian_map.means[:, 0], atol=1e-6)
     assert np.allclose(vertex["scale_2"], gaussian_map.log_radii)
     ids = json.loads((run.stage("mapping") / "mapping.json").read_text())["class_ids"]
     assert np.array_equal(vertex["class_id"], np.array(ids)[gaussian_map.class_logits.argmax(1)])
@@ -93,7 +99,7 @@ def test_the_mesh_is_the_room(finished: tuple[RunFolder, dict, dict]) -> None:
     glb = trimesh.load(run.stage("export") / "mesh.glb", force="mesh")
     assert len(glb.faces) == len(mesh.faces)
     # Every triangulated point is exact and lies on a surface that two keyframes see.
-    points = run.load_sparse("tracking").points_in_world[::9]
+    points = exported_from_run(run).apply(run.load_sparse("tracking").points_in_world[::9])
     distance = np.linalg.norm(points[:, None] - np.asarray(mesh.vertices)[None], axis=2).min(1)
     assert 0 < np.median(distance) < 0.06
 

@@ -1,0 +1,1 @@
+"""Which way is up, and the world that the exported files stand in."""

@@ -1,0 +1,92 @@
+"""Up and the floor of a finished run: by what stands upright in its pictures and lies level in its map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.export.depth_views import depth_view, spread
+from pipelines.outcome import Outcome
+from pipelines.proxy.regions.structure import Gravity, find_gravity, floor_plane, name_structure
+from pipelines.proxy.regions.voxels import Voxels, gather_frame, merge, select
+from pipelines.proxy.sequence import map_intrinsics
+from pipelines.upright.cameras import cameras_up
+from pipelines.upright.lines import up_of_lines
+
+Array = NDArray[np.float64]
+
+_PICTURES, _VIEWS = 40, 24
+_SIDE = 200
+_VOXELS_PER_DEPTH = 60
+_LEAST_WEIGHT = 1.0
+_AGREE = 3.0
+"""Degrees: a floor that leans more against sure upright lines is a ramp, or badly seen; the lines are believed."""
+
+
+@dataclass(frozen=True)
+class Upright:
+    """`up` (3,) unit vector in the run's world and what told it, "" where nothing did; `floor` (3,) a point of the
+    floor, None without one; `against`: degrees between up and what each witness says alone."""
+
+    up: Array
+    told_by: str
+    floor: Array | None
+    against: dict[str, float] = field(default_factory=dict)
+
+
+def find_upright(outcome: Outcome) -> Upright:
+    """Up by the floor's plane, upright lines or level surfaces, the surest there is.
+
+    The cameras' own up only chooses among the directions of a room: alone it is no evidence, since a phone is held as
+    it pleases.
+    """
+    trajectory = outcome.trajectory
+    prior = cameras_up(trajectory.world_from_cam[trajectory.is_posed])
+    rows = spread(np.flatnonzero(trajectory.is_keyframe).tolist(), _PICTURES)
+    poses = trajectory.cam_from_world[rows]
+    pictures = (outcome.run.image(outcome.frames[row]) for row in rows)
+    lines = up_of_lines(pictures, poses, outcome.calibration.intrinsics, prior)
+    voxels = surface_voxels(outcome, spread(list(poses), _VIEWS))
+    level = find_gravity(voxels, prior) if len(voxels) else Gravity(prior, False)
+    if not (lines.is_sure or level.is_sure):
+        return Upright(prior, "", None)
+    first = lines.up if lines.is_sure else level.up
+    kinds = name_structure(voxels, Gravity(first, True), trajectory.centers[trajectory.is_posed])
+    floor = floor_plane(voxels, kinds, first)
+    witnesses = {"cameras": prior, "level surfaces": level.up}
+    witnesses |= {"upright lines": lines.up} if lines.is_sure else {}
+    witnesses |= {"floor": floor.normal} if floor else {}
+    up, told_by = _verdict(witnesses)
+    against = {name: round(_degrees(up, w), 2) for name, w in witnesses.items()}
+    return Upright(up, told_by, floor.point if floor else None, against)
+
+
+def _verdict(witnesses: dict[str, Array]) -> tuple[Array, str]:
+    """Up and what told it. Floor and lines err for different reasons, depth and poses: the middle of both is better."""
+    floor, lines = witnesses.get("floor"), witnesses.get("upright lines")
+    if floor is not None and lines is not None and _degrees(floor, lines) < _AGREE:
+        return (floor + lines) / float(np.linalg.norm(floor + lines)), "floor and upright lines"
+    told_by = "upright lines" if lines is not None else "floor" if floor is not None else "level surfaces"
+    return witnesses[told_by], told_by
+
+
+def surface_voxels(outcome: Outcome, cam_from_world: Sequence[Array]) -> Voxels:
+    """The surface that the map shows from poses (N, 4, 4), as voxels a sixtieth of its usual depth wide."""
+    gaussian_map, camera = outcome.require_map(), map_intrinsics(outcome.calibration.intrinsics, _SIDE)
+    views = [depth_view(gaussian_map, pose, camera) for pose in cam_from_world]
+    seen = np.concatenate([np.zeros(0), *(v.depth[v.weight > 0] for v in views)])
+    size = float(np.median(seen)) / _VOXELS_PER_DEPTH if len(seen) else 1.0
+    black = np.zeros((camera.height, camera.width, 3), np.uint8)
+    rows = [
+        gather_frame(v.depth, v.weight, black, camera, np.linalg.inv(v.cam_from_world).astype(np.float64), size)
+        for v in views
+    ]
+    voxels = merge(size, rows)
+    return select(voxels, voxels.weight > _LEAST_WEIGHT)
+
+
+def _degrees(a: Array, b: Array) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))

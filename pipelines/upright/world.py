@@ -1,0 +1,134 @@
+"""The world of the exported files, and how it lies to the run's own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.jsonfile import read_json_object, write_json
+from pipelines.geometry.alignment import Similarity
+from pipelines.outcome import Outcome
+from pipelines.run_folder import WORLD, RunFolder
+from pipelines.stored import reading
+from pipelines.upright.cameras import cameras_up
+from pipelines.upright.find import Upright
+
+Array = NDArray[np.float64]
+
+SAME = Similarity(1.0, np.eye(3), np.zeros(3))
+Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""glTF's axes (y up, z towards the viewer) from those of the exported world."""
+_Y_DOWN_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+
+
+@dataclass(frozen=True)
+class World:
+    """axes "up" (z up) or "first" (the run's own); what told up ("" where nothing did), whether z = 0 is a floor, and
+    by how many degrees each other witness of up differs."""
+
+    axes: str
+    told_by: str
+    has_floor: bool
+    exported_from_run: Similarity
+    against: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def gltf_from_exported(self) -> Array:
+        """(3, 3) rotation into glTF's y up; identity where the world does not stand upright."""
+        return Y_UP_FROM_Z_UP if self.axes == "up" else np.eye(3)
+
+    @property
+    def image_axes_from_exported(self) -> Array:
+        """(3, 3) rotation into x right, y down, z forward, as splats of unknown origin have them."""
+        return _Y_DOWN_FROM_Z_UP if self.axes == "up" else np.eye(3)
+
+
+FIRST = World("first", "", False, SAME)
+
+
+def upright_world(outcome: Outcome, found: Upright) -> World:
+    """z up, the floor at 0, x and y counted from the middle of the camera's path; y is where the first camera looked.
+
+    Without a floor z counts from the middle of the path too. `FIRST` where nothing told up.
+    """
+    if not found.told_by:
+        return FIRST
+    trajectory = outcome.trajectory
+    world_from_cam = trajectory.world_from_cam[trajectory.is_posed]
+    rotation = _level_axes(found.up, world_from_cam[0])
+    middle = rotation @ world_from_cam[:, :3, 3].mean(axis=0)
+    if found.floor is not None:
+        middle[2] = (rotation @ found.floor)[2]
+    return World("up", found.told_by, found.floor is not None, Similarity(1.0, rotation, -middle), found.against)
+
+
+def _level_axes(up: Array, world_from_cam: Array) -> Array:
+    """(3, 3) exported_from_run: rows x, y, z; y is the level part of the camera's view (of its up if it looks down)."""
+    forward = world_from_cam[:3, 2]
+    if abs(forward @ up) > 0.95:
+        forward = -world_from_cam[:3, 1] * np.sign(-(forward @ up))
+    y = forward - (forward @ up) * up
+    y /= np.linalg.norm(y)
+    return np.stack([np.cross(y, up), y, up])
+
+
+def world_figures(world: World) -> dict[str, Any]:
+    """For the table of the run."""
+    return {"up": world.told_by or "unknown", "floor": world.has_floor, "degrees_from_up": world.against}
+
+
+def save_world(folder: Path, world: World, unit: str) -> Path:
+    """world.json: what the axes mean, how sure, and exported = scale * rotation @ run + translation."""
+    move = world.exported_from_run
+    path = folder / WORLD
+    write_json(
+        path,
+        {
+            "axes": world.axes,
+            "up": "z" if world.axes == "up" else "unknown",
+            "up_told_by": world.told_by,
+            "floor_at_zero": world.has_floor,
+            "unit": unit,
+            "degrees_from_up": world.against,
+            "exported_from_run": {
+                "scale": move.scale, "rotation": move.rotation.tolist(), "translation": move.translation.tolist()
+            },
+        },
+    )  # fmt: skip
+    return path
+
+
+def load_world(run: RunFolder) -> World | None:
+    """The world of the files in the run's export; None where nothing, or an older version, has exported it."""
+    return read_world(run.file("export", WORLD)) if run.has("export", WORLD) else None
+
+
+def read_world(path: Path) -> World:
+    """Inverse of `save_world`. Raises InputError for a file that is missing or damaged."""
+    value = read_json_object(path)
+    with reading(path, "world of the exported files"):
+        move = value["exported_from_run"]
+        return World(
+            axes=str(value["axes"]),
+            told_by=str(value["up_told_by"]),
+            has_floor=bool(value["floor_at_zero"]),
+            exported_from_run=Similarity(
+                float(move["scale"]),
+                np.array(move["rotation"], dtype=np.float64),
+                np.array(move["translation"], dtype=np.float64),
+            ),
+            against={str(name): float(v) for name, v in value["degrees_from_up"].items()},
+        )
+
+
+def up_in_run(outcome: Outcome) -> Array:
+    """(3,) up in the run's world: as it was exported, else as the cameras were held."""
+    world = load_world(outcome.run)
+    if world is not None and world.axes == "up":
+        return np.asarray(world.exported_from_run.rotation[2])
+    trajectory = outcome.trajectory
+    return cameras_up(trajectory.world_from_cam[trajectory.is_posed])
