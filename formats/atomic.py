@@ -54,6 +54,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     path = Path(path)
     temporary = path.with_name(_temporary_name(path))
     try:
+        if path.exists() and not path.is_file():  # renaming would take the place of a device
+            raise InputError(f"{path} is a folder, a device or a pipe: name a file that may be written")
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.unlink(missing_ok=True)
         yield temporary
@@ -97,7 +99,7 @@ def _explained(error: OSError, path: Path) -> Exception:
     """The same failure in the user's words, where the user can do something about it."""
     if is_disk_full(error, path.parent):
         return DiskFullError(
-            f"disk full while writing {path.name}, {_free_bytes(path.parent) / 1e6:.0f} MB are free in {path.parent}: "
+            f"disk full while writing {path.name}, {free_bytes(path.parent) / 1e6:.0f} MB are free in {path.parent}: "
             "free some space (or point the output at another disk), then run the same command again"
         )
     if error.errno in _NOT_ALLOWED:
@@ -112,10 +114,11 @@ def _explained(error: OSError, path: Path) -> Exception:
 def is_disk_full(error: OSError, folder: Path) -> bool:
     """Whether a write below `folder` failed for want of room (or of quota, or of the largest file allowed)."""
     # numpy's tofile reports a short write without an errno; the disk itself tells what happened.
-    return error.errno in _NO_ROOM or (error.errno is None and _free_bytes(folder) < _NEARLY_FULL_BYTES)
+    return error.errno in _NO_ROOM or (error.errno is None and free_bytes(folder) < _NEARLY_FULL_BYTES)
 
 
-def _free_bytes(folder: Path) -> int:
+def free_bytes(folder: Path) -> int:
+    """Room on the disk that a folder lies on, or would lie on."""
     while not folder.exists():
         folder = folder.parent
     return shutil.disk_usage(folder).free

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.atomic import atomic_path
-from formats.errors import InputError
+from formats.atomic import atomic_path, free_bytes
+from formats.errors import DiskFullError, InputError
 
 CODECS = {".mp4": "mp4v", ".avi": "FFV1", ".mkv": "FFV1"}
 """By the file's ending: MPEG-4 plays everywhere, FFV1 loses nothing."""
@@ -27,7 +27,7 @@ def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> 
         raise InputError(f"{path}: the ending of a video is one of {', '.join(CODECS)}; choose one of them")
     with atomic_path(path) as temporary:
         writer: cv2.VideoWriter | None = None
-        size = (0, 0)
+        size, written = (0, 0), 0
         try:
             for frame in frames:
                 even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
@@ -36,13 +36,29 @@ def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> 
                     writer = _open_writer(temporary, codec, fps, size)
                 if (even.shape[1], even.shape[0]) != size:
                     raise ValueError(f"write_video: a frame of {even.shape[1]}x{even.shape[0]} among those of {size}")
+                written += 1
                 writer.write(cv2.cvtColor(np.ascontiguousarray(even), cv2.COLOR_RGB2BGR))
         finally:
             if writer is not None:
                 writer.release()
         if writer is None:
             raise InputError(f"{path}: there is no frame to write")
+        _require_all(temporary, path, written)
     return path
+
+
+def _require_all(temporary: Path, path: Path, written: int) -> None:
+    """OpenCV says nothing of a disk that has become full: look whether every frame can be read again."""
+    capture = cv2.VideoCapture(str(temporary))
+    found = 0
+    while capture.grab():
+        found += 1
+    capture.release()
+    if found != written:
+        raise DiskFullError(
+            f"{path}: only {found} of {written} frames could be written, {free_bytes(path.parent) / 1e6:.0f} MB are "
+            "free: free some space, or choose another place"
+        )
 
 
 def _open_writer(path: Path, codec: str, fps: float, size: tuple[int, int]) -> cv2.VideoWriter:

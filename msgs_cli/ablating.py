@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import click
@@ -14,8 +13,10 @@ from msgs_cli.options import (
     settings_options,
     source_options,
     source_settings,
+    stopping_softly,
     verbosity_options,
 )
+from msgs_cli.text import say
 
 
 @click.command()
@@ -65,16 +66,13 @@ def ablate(
     config = load_config(config_file, texts)
     folder = out or default_run_folder(source).root.with_suffix(".ablation")
     numbers = _seeds(seeds)
-    try:
+    with stopping_softly("The same command goes on."):
         result = ablate(
             source, open_sequence(truth, truth_format), folder, config, numbers, make_progress(quiet),
             only or tuple(ABLATIONS),
         )  # fmt: skip
-    except KeyboardInterrupt:
-        click.echo("\nStopped. The same command goes on.", err=True)
-        sys.exit(130)
-    click.echo(ablation_table(result))
-    click.echo(f"also in {folder / 'ablation.md'} and {folder / 'ablation.json'}", err=True)
+    say(ablation_table(result))
+    say(f"also in {folder / 'ablation.md'} and {folder / 'ablation.json'}", err=True)
 
 
 def _seeds(text: str) -> tuple[int, ...]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from msgs_cli.options import RUN_ARGUMENT, make_progress, open_run, set_up_logging, verbosity_options
+from msgs_cli.text import say
 
 
 @click.command()
@@ -31,7 +32,7 @@ def evaluate(run_path: Path, truth: Path, truth_format: str, protocol: str, quie
     run = open_run(run_path)
     sequence = open_sequence(truth, truth_format)
     figures = write_evaluation(run, sequence, make_progress(quiet), legacy=protocol == "splatam")
-    click.echo(evaluation_table(figures))
+    say(evaluation_table(figures))
 
 
 @click.command()
@@ -45,7 +46,7 @@ def report(run_path: Path, to: Path | None, quiet: bool, verbose: bool) -> None:
     set_up_logging(quiet, verbose)
     from pipelines.evaluation.report import write_report
 
-    click.echo(write_report(open_run(run_path), to, make_progress(quiet)))
+    say(write_report(open_run(run_path), to, make_progress(quiet)))
 
 
 @click.command()
@@ -66,7 +67,7 @@ def render(run_path: Path, target: Path, kind: str, camera_path: str, fps: float
     set_up_logging(quiet, verbose)
     from pipelines.render_run import render_run
 
-    click.echo(render_run(open_run(run_path), target, kind, camera_path, fps, progress=make_progress(quiet)))
+    say(render_run(open_run(run_path), target, kind, camera_path, fps, progress=make_progress(quiet)))
 
 
 @click.command()
@@ -81,7 +82,7 @@ def view(path: Path, port: int, host: str) -> None:
     from pipelines.viewer import open_viewer
 
     viewer = open_viewer(path, host, port)
-    click.echo(f"open {viewer.url} in a browser; Ctrl-C ends it", err=True)
+    say(f"open {viewer.url} in a browser; Ctrl-C ends it", err=True)
     try:
         viewer.wait()
     except KeyboardInterrupt:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import errno
 import os
-import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +25,10 @@ from msgs_cli.options import (
     settings_options,
     source_options,
     source_settings,
+    stopping_softly,
     verbosity_options,
 )
+from msgs_cli.text import flush_output, prepare_streams, printable, say
 from pipelines.run_folder_names import EXPORTS, STAGES
 
 
@@ -37,9 +38,22 @@ class FriendlyGroup(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command inside the one error boundary."""
         try:
-            return super().invoke(ctx)
+            result = super().invoke(ctx)
+            flush_output()
+            return result
         except InputError as error:
-            raise click.ClickException(str(error)) from error
+            raise click.ClickException(printable(str(error))) from error
+        except OSError as error:
+            if error.errno not in _SYSTEM_REFUSES:
+                raise
+            where = error.filename or "the output"
+            raise click.ClickException(
+                printable(f"{where}: {error.strerror}. Change that, then run it again")
+            ) from error
+
+
+_SYSTEM_REFUSES = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENAMETOOLONG}
+"""What the user can do something about: rights, room, names."""
 
 
 @click.group(cls=FriendlyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -61,6 +75,7 @@ def main() -> None:
     msgs-slam models list               learned models for metric depth and named classes
     msgs-slam config                    every setting with its default and meaning
     """
+    prepare_streams()
 
 
 UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], help="Stop after this stage.")
@@ -103,7 +118,8 @@ def reconstruct(
     texts = source_settings(about_source)
     texts += [f"mapping.hold_out={hold_out}"] if hold_out is not None else []
     config = load_config(config_file, [*overrides, *texts], base=existing_config(run))
-    records = _interruptible(lambda: run_reconstruct(source, run, config, make_progress(quiet), until), run.root)
+    with stopping_softly(f"Go on with: msgs-slam resume {run.root}"):
+        records = run_reconstruct(source, run, config, make_progress(quiet), until)
     if not quiet:
         _print_summary(run.root, records)
 
@@ -126,7 +142,8 @@ def resume(
     run = RunFolder(run_path)
     require_run(run)
     config = load_config(config_file, overrides, base=existing_config(run))
-    records = _interruptible(lambda: run_resume(run, make_progress(quiet), config, until), run.root)
+    with stopping_softly(f"Go on with: msgs-slam resume {run.root}"):
+        records = run_resume(run, make_progress(quiet), config, until)
     if not quiet:
         _print_summary(run.root, records)
 
@@ -141,11 +158,11 @@ def status(run_path: Path, verbose: bool) -> None:
 
     run = open_run(run_path)
     found = run_status(run)
-    click.echo(f"{run.root}: made from {found.source}\n")
-    click.echo(status_table(found.stages, verbose))
+    say(f"{run.root}: made from {found.source}\n")
+    say(status_table(found.stages, verbose))
     records = {s.name: s.record for s in found.stages if s.record}
     for line in [*(f"warning: {w}" for w in found.warnings), *warning_lines(records)]:
-        click.echo(line)
+        say(line)
 
 
 @main.command()
@@ -179,7 +196,7 @@ def export(
     settings = load_config(config_file, overrides, base=made_with(run)).export
     for path in export_run(run, to or run.stage("export"), only, make_progress(quiet), settings):
         if not quiet:
-            click.echo(path)
+            say(path)
 
 
 @main.command()
@@ -204,14 +221,15 @@ def demo(out: Path, config_file: Path | None, overrides: tuple[str, ...], quiet:
     config = load_config(config_file, overrides)
 
     def reconstruct_clip(video: Path, run: RunFolder) -> None:
-        records = _interruptible(lambda: run_reconstruct(video, run, config, make_progress(quiet)), run.root)
+        with stopping_softly(f"Go on with: msgs-slam resume {run.root}"):
+            records = run_reconstruct(video, run, config, make_progress(quiet))
         if not quiet:
             _print_summary(run.root, records)
 
     result = run_demo(out, reconstruct_clip, make_progress(quiet))
-    click.echo("\nAgainst the known truth:")
+    say("\nAgainst the known truth:")
     for line in demo_summary(result):
-        click.echo(f"  {line}")
+        say(f"  {line}")
 
 
 @main.command("config")
@@ -223,23 +241,15 @@ def show_config(config_file: Path | None, overrides: tuple[str, ...]) -> None:
     click.echo(config_to_toml(load_config(config_file, overrides)), nl=False)
 
 
-def _interruptible(work: Callable[[], Any], root: Path) -> Any:
-    try:
-        return work()
-    except KeyboardInterrupt:
-        click.echo(f"\nStopped. Go on with: msgs-slam resume {root}", err=True)
-        sys.exit(130)
-
-
 def _print_summary(root: Path, records: dict[str, Any]) -> None:
     from msgs_cli.tables import status_table, warning_lines
     from pipelines.status import DONE, StageStatus
 
-    click.echo(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
+    say(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
     for line in warning_lines(records):
-        click.echo(line, err=True)
+        say(line, err=True)
     if "export" in records:
-        click.echo(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")
+        say(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")
 
 
 for command in (looking.evaluate, looking.report, looking.render, looking.view):

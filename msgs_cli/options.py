@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import logging
+import os
+import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+
+from msgs_cli.text import PrintableFormatter, say
 
 if TYPE_CHECKING:
     from pipelines.progress import Progress
@@ -93,7 +98,9 @@ def set_up_logging(quiet: bool, verbose: bool) -> None:
     if quiet and verbose:
         raise click.UsageError("-q and -v exclude each other")
     level = logging.ERROR if quiet else logging.INFO if verbose else logging.WARNING
-    logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr, force=True)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(PrintableFormatter("%(levelname)s: %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler], force=True)
 
 
 def make_progress(quiet: bool) -> Progress:
@@ -112,3 +119,21 @@ def open_run(path: Path) -> RunFolder:
     run = RunFolder(path)
     require_run(run)
     return run
+
+
+@contextmanager
+def stopping_softly(how_to_go_on: str) -> Iterator[None]:
+    """The first SIGINT, SIGTERM or SIGHUP ends the work in this block at its next snapshot, the second at once; then
+    the process ends with 128 plus the signal's number, as shells expect."""
+    from pipelines.stopping import soft_stop
+
+    def tell(number: int) -> None:
+        # Not through click: a signal may come while it prints.
+        os.write(2, b"\nStopping at the next snapshot. Once more: at once, which loses what was done since the last.\n")
+
+    try:
+        with soft_stop(tell):
+            yield
+    except KeyboardInterrupt as error:
+        say(f"\nStopped. {how_to_go_on}", err=True)
+        sys.exit(128 + getattr(error, "number", signal.SIGINT))

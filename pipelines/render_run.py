@@ -40,6 +40,8 @@ def render_run(
     """
     _require_choice("kind", kind, KINDS)
     _require_choice("path", path, PATHS)
+    if not 0.1 <= fps <= 240:
+        raise InputError(f"--fps is 0.1 to 240 frames a second; got {fps}")
     if target.suffix.lower() not in CODECS and target.is_file():
         raise InputError(f"{target} is a file. Name a folder for pictures, or a video ending in {', '.join(CODECS)}")
     outcome = load_outcome(run)

@@ -12,10 +12,16 @@ import pycolmap
 from numpy.typing import NDArray
 
 from formats.atomic import write_bytes
+from formats.errors import DiskFullError
 from formats.jsonfile import read_json, write_json
 from formats.tensors import load_arrays, save_arrays
 from pipelines.correspondence.features import Features
 from pipelines.correspondence.matching import VerifiedPair
+
+_DATABASE_SHARE = 3
+"""Bytes of the database and the models made from it, over those of the packed features and matches: a guess on the safe
+side, descriptors hardly pack."""
+_LEAST_ROOM = 30_000_000
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,7 @@ class Snapshots:
             shutil.rmtree(scratch, ignore_errors=True)
             (scratch / "work").mkdir(parents=True)
             (scratch / "model").mkdir()
+            self._require_room()
             model = compute(scratch / "work")
             if model is not None:
                 model.write_binary(scratch / "model")
@@ -65,6 +72,16 @@ class Snapshots:
             write_json(listed, [file.name for file in files])
             shutil.rmtree(scratch)
         return pycolmap.Reconstruction(path) if (path / "cameras.bin").exists() else None
+
+    def _require_room(self) -> None:
+        """COLMAP ends the whole process where its database meets a full disk, so there must be room for it before."""
+        needed = _DATABASE_SHARE * sum(p.stat().st_size for p in self.folder.glob("*/*.npz")) + _LEAST_ROOM
+        free = shutil.disk_usage(self.folder).free
+        if free < needed:
+            raise DiskFullError(
+                f"{self.folder}: structure from motion needs {needed / 1e6:.0f} MB of disk, {free / 1e6:.0f} MB are "
+                "free. Free some space, then run the same command again"
+            )
 
 
 def _pack(pairs: Sequence[VerifiedPair]) -> dict[str, NDArray]:

@@ -21,6 +21,7 @@ from pipelines.mapping.splitting import Blame, blame
 from pipelines.mapping.state import Exposures, OptimisedMap, OptimiserState, expose
 from pipelines.mapping.views import View, halved
 from pipelines.progress import Progress, SilentProgress
+from pipelines.stopping import is_asked
 
 MAP_RATES = {"means": 3e-4, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2, "class_logits": 6e-2}
 """Learning rates of Adam, of positions in units of the scene's median depth."""
@@ -56,7 +57,7 @@ def optimise_map(
     for iteration in (progress or SilentProgress()).track(remaining, label, len(remaining)):
         optimiser.visit(schedule.step(iteration))
         state.iteration = iteration + 1
-        if snapshot is not None and state.iteration % settings.snapshot_every == 0:
+        if snapshot is not None and (state.iteration % settings.snapshot_every == 0 or is_asked()):
             state.save(snapshot)
     optimiser.growth.prune()
     return state.result(views, schedule.total)

@@ -10,6 +10,7 @@ from formats.errors import InputError
 from pipelines.run_folder import save_depth_scales as write_depth_scales
 from pipelines.run_folder import save_figures, save_sparse, save_trajectory
 from pipelines.stages import Stage, StageContext
+from pipelines.stopping import is_asked
 from pipelines.tracking.adjust import Report, adjust_state, without_dependent_depth
 from pipelines.tracking.front_end import FrontEnd
 from pipelines.tracking.pictures import Pictures
@@ -63,7 +64,7 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
         if frame.id not in state.poses:
             front_end.track(frame.id)
         state.done += 1
-        if state.done % settings.snapshot_every == 0:
+        if state.done % settings.snapshot_every == 0 or is_asked():
             state.save(snapshot)
     # Frames before the first keyframe could not be followed from anywhere; now there are neighbours behind them.
     for frame_id in sorted(state.lost, reverse=True):

@@ -1,0 +1,48 @@
+"""What is printed: nothing that a terminal obeys, and nothing lost without a word."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from typing import Any
+
+import click
+
+
+def printable(text: str) -> str:
+    """The text with control characters and lone surrogates, as names of files may hold them, written out as \\x1b."""
+    return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
+
+
+def say(text: Any = "", err: bool = False) -> None:
+    """Print a line."""
+    click.echo(printable(str(text)), err=err)
+
+
+class PrintableFormatter(logging.Formatter):
+    """Logs without what a terminal would obey."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One line."""
+        return printable(super().format(record))
+
+
+def prepare_streams() -> None:
+    """Files and pipes get UTF-8 whatever the system's code page says; a terminal shows "?" for what it lacks."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            if stream.isatty():
+                stream.reconfigure(errors="replace")
+            else:
+                stream.reconfigure(encoding="utf-8", errors="backslashreplace")
+
+
+def flush_output() -> None:
+    """Raises OSError where what was printed could not be written (a full disk behind `>`)."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        # Python tries again when it ends, and would complain a second time.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise
