@@ -1,0 +1,492 @@
+"""Every reader of bytes from outside, with a good file for it and a judge of what it lets in.
+
+`make(folder)` writes the good files; `read(path)` reads them as the product does and raises `Nonsense` for what no
+reader should have accepted: a value that is not finite, a matrix that is no rotation, an index out of range, a file
+outside the folder. A reader may refuse anything with InputError.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import onnx
+import torch
+from damage_mutate import Mutator, in_json, in_ply, in_text, in_zip, with_json_head
+from layouts import LAYOUTS
+from onnx import TensorProto, helper
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from tiny_tflite import write_tflite
+
+from formats.colmap import read_colmap_model, write_colmap_model
+from formats.compact_gaussians import write_compact
+from formats.datasets import Camera, Sequence, open_sequence, recognise_source
+from formats.datasets.classes_json import read_classes_json
+from formats.datasets.intrinsics_json import read_intrinsics_json
+from formats.datasets.scannet_labels import read_nyu40_classes
+from formats.errors import InputError
+from formats.gaussian_files import read_gaussians
+from formats.gaussian_ply import write_gaussian_ply
+from formats.gaussians import GaussianCloud
+from formats.image_times import read_image_times
+from formats.images import (
+    exif_focal_px,
+    exif_time,
+    image_size,
+    list_images,
+    read_depth_png,
+    read_grey_png,
+    read_label_png,
+    read_rgb,
+    write_grey_png,
+    write_rgb,
+)  # fmt: skip
+from formats.jsonfile import read_toml, write_json
+from formats.mesh import MeshArrays, read_mesh_glb, read_mesh_ply, write_mesh_glb, write_mesh_ply
+from formats.spz import write_spz
+from formats.tensors import load_arrays, load_safetensors, load_tensors, save_arrays, save_tensors
+from formats.trajectory import read_matrices, read_tum, write_matrices, write_tum
+from formats.video import VideoReader, probe_video
+from formats.video_writer import write_video
+from pipelines.frames.source import open_source
+from pipelines.proxy.files.classes import read_class_table
+from pipelines.proxy.files.depth import _read as read_depth_file
+from pipelines.proxy.models.registry import ModelStore
+from pipelines.proxy.networks.card import read_card
+from pipelines.proxy.networks.head import load_linear_head
+from pipelines.proxy.networks.network_pass import ResultCache
+from pipelines.proxy.networks.session import Network
+from pipelines.structure.calibration import read_intrinsics
+from pipelines.viewer_scene import load_scene
+
+WIDTH, HEIGHT, FRAMES = 64, 48, 4
+
+
+class Nonsense(AssertionError):
+    """A reader accepted what makes no sense."""
+
+
+@dataclass(frozen=True)
+class Door:
+    """`entry` is the file that is given to `read`, "" for the folder; `damaged` the one that is damaged, "" for any;
+    `mutate` the way, None for one that fits the file's name; `weight` says how many cases it is worth."""
+
+    make: Callable[[Path], Any]
+    read: Callable[[Path], Any]
+    entry: str = ""
+    mutate: Mutator | None = None
+    damaged: str = ""
+    weight: float = 1.0
+
+
+def need(holds: Any, what: str) -> None:
+    if not holds:
+        raise Nonsense(what)
+
+
+def finite(values: Any, what: str) -> None:
+    need(np.isfinite(np.asarray(values, np.float64)).all(), f"{what}: not finite")
+
+
+# what is let in ---------------------------------------------------------------------------------------------------
+
+
+def judge_poses(poses: np.ndarray | None) -> None:
+    if poses is None:
+        return
+    known = np.isfinite(poses).all(axis=(1, 2))
+    need((known | np.isnan(poses).all(axis=(1, 2))).all(), "a pose known in part")
+    turns = poses[known, :3, :3]
+    need(np.abs(turns.transpose(0, 2, 1) @ turns - np.eye(3)).max(initial=0) < 1e-6, "no rotation")
+    need((np.linalg.det(turns) > 0).all(), "a mirrored rotation")
+
+
+def judge_camera(camera: Camera | None) -> None:
+    if camera is None:
+        return
+    finite([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion], "camera")
+    need(0 < camera.width < 1e5 and 0 < camera.height < 1e5, "size of the camera")
+    need(min(camera.fx, camera.fy) > 1e-3 and max(camera.fx, camera.fy) < 1e7, "focal length")
+
+
+def colmap_model(folder: Path) -> None:
+    model = read_colmap_model(folder)
+    judge_poses(model.cam_from_world)
+    for values in (model.cam_from_world, model.points, model.obs_xy, *(c[3] for c in model.cameras)):
+        finite(values, "model")
+    need(all(c[1] > 0 and c[2] > 0 for c in model.cameras), "a camera without a size")
+    need(len(set(model.names)) == len(model.names), "a name twice")
+    need((model.obs_point < len(model.points)).all(), "a point that is not there")
+
+
+def gaussians(path: Path) -> None:
+    cloud = read_gaussians(path)
+    for name in ("means", "log_scales", "quat_wxyz", "opacity_logits", "colors"):
+        finite(getattr(cloud, name), name)
+    need(np.abs(np.linalg.norm(cloud.quat_wxyz, axis=1) - 1).max(initial=0) < 1e-3, "no unit quaternion")
+    if cloud.class_probs is not None:
+        finite(cloud.class_probs, "class_probs")
+
+
+def viewer_scene(path: Path) -> None:
+    scene = load_scene(path)
+    finite(scene.centers, "centers")
+    finite(scene.covariances, "covariances")
+
+
+def mesh(read: Callable[[Path], MeshArrays]) -> Callable[[Path], None]:
+    return lambda path: finite(read(path).vertices, "vertices")
+
+
+def tum(path: Path) -> None:
+    times, poses = read_tum(path)
+    finite(times, "times")
+    finite(poses, "poses")
+    judge_poses(poses)
+
+
+def picture(path: Path) -> None:
+    read_any(path, read_rgb, image_size, exif_time, lambda p: exif_focal_px(p, WIDTH, HEIGHT))
+
+
+def maps(path: Path) -> None:
+    read_any(path, read_depth_png, read_label_png, read_grey_png)
+
+
+def read_any(path: Path, *readers: Callable[[Path], Any]) -> None:
+    """All of them, whatever the others say; refused when one refuses."""
+    refusals = []
+    for read in readers:
+        try:
+            read(path)
+        except InputError as error:
+            refusals.append(error)
+    if refusals:
+        raise refusals[0]
+
+
+def source(path: Path) -> None:
+    opened = open_source(path)
+    for frame in opened.read(warn=lambda text: None):
+        need(frame.rgb.shape == (opened.height, opened.width, 3), "a frame of another size")
+        opened.original(frame.source_index)
+        need("\n" not in opened.name(0, frame.source_index), "a line break in a name")
+    opened.exif_focal()
+
+
+def times(folder: Path) -> None:
+    found = read_image_times(list_images(folder))
+    if found is not None:
+        finite(found, "times")
+        need((np.diff(found) > 0).all(), "times go back")
+
+
+def intrinsics(path: Path) -> None:
+    camera, scale = read_intrinsics_json(path, integer_centres=False)
+    judge_camera(camera)
+    need(scale is None or (math.isfinite(scale) and scale > 0), "depth scale")
+
+
+def data_set(format: str) -> Callable[[Path], None]:
+    def read(path: Path) -> None:
+        path = next(path.glob("*.sens"), path)
+        recognise_source(path)
+        recording = open_sequence(path, format)
+        judge_camera(recording.camera)
+        judge_camera(recording.depth_camera)
+        judge_poses(recording.world_from_cam)
+        finite(recording.timestamps, "timestamps")
+        need(0 < recording.depth_per_metre < math.inf, "depth scale")
+        root = (path if path.is_dir() else path.parent).resolve()
+        for file in (*recording.image_paths, *recording.depth_paths, *recording.label_paths):
+            need(file is None or file.is_symlink() or file.resolve().is_relative_to(root), f"outside: {file}")
+        read_any(path, *(lambda _, i=i: judge_frame(recording, i) for i in range(min(len(recording), 2))))
+        source(path)
+
+    return read
+
+
+def judge_frame(recording: Sequence, index: int) -> None:
+    recording.rgb(index)
+    depth = recording.depth(index)
+    if depth is not None:
+        finite(depth, "depth")
+    recording.labels(index)
+
+
+def video(path: Path) -> None:
+    probe_video(path)
+    with VideoReader(path) as reader:
+        for _ in zip(range(60), reader, strict=False):
+            pass
+    finite(reader.timestamps, "timestamps")
+    need((np.diff(reader.timestamps) > 0).all(), "times go back")
+
+
+def network(folder: Path) -> None:
+    card = read_card(folder / "card.toml")
+    finite([card.white, *card.mean, *card.std, card.canonical_focal], "card")
+    opened = Network(card, 1, "cpu")
+    opened.run(np.zeros((24, 32, 3), np.uint8), opened.box(32, 24))
+
+
+def head(path: Path) -> None:
+    found = load_linear_head(path, 3)
+    finite(found.weight, "weight")
+    finite(found.bias, "bias")
+
+
+def store(folder: Path) -> None:
+    opened = ModelStore.open(folder)
+    opened.verify()
+    opened.first_here("depth")
+    for model in opened.models:
+        need(opened.path(model).resolve().is_relative_to(folder.resolve()), f"outside: {model.name}")
+
+
+def kept_result(folder: Path) -> None:
+    found = ResultCache(folder, 1).load("k")
+    need(found is None or (set(found) == {"depth"} and (found["depth"] == 1).all()), "another result")
+
+
+# good files -------------------------------------------------------------------------------------------------------
+
+
+@cache
+def _rng() -> np.random.Generator:
+    return np.random.default_rng(1)
+
+
+def _poses() -> np.ndarray:
+    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
+    poses[:, :3, :3] = Rotation.random(FRAMES, rng=np.random.default_rng(2)).as_matrix()
+    poses[:, :3, 3] = _rng().normal(size=(FRAMES, 3))
+    return poses
+
+
+def _cloud() -> GaussianCloud:
+    g = np.random.default_rng(3)
+    quat, probs = g.normal(size=(20, 4)), g.random((20, 3)).astype(np.float32)
+    return GaussianCloud(
+        g.normal(size=(20, 3)).astype(np.float32), (g.normal(size=(20, 3)) - 3).astype(np.float32),
+        (quat / np.linalg.norm(quat, axis=1, keepdims=True)).astype(np.float32), g.normal(size=20).astype(np.float32),
+        g.random((20, 3)).astype(np.float32), probs.argmax(1).astype(np.uint8), probs / probs.sum(1, keepdims=True),
+    )  # fmt: skip
+
+
+def _mesh() -> tuple[np.ndarray, ...]:
+    g = np.random.default_rng(4)
+    vertices, faces = g.normal(size=(8, 3)).astype(np.float32), g.integers(0, 8, (12, 3)).astype(np.int32)
+    return vertices, faces, g.integers(0, 255, (8, 3)).astype(np.uint8), np.arange(8).astype(np.uint8)
+
+
+def _rgb(seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 255, (height, width, 3)).astype(np.uint8)
+
+
+def make_colmap(suffix: str) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        names, points = [f"im{i}.png" for i in range(FRAMES)], 12
+        image, point = np.repeat(np.arange(FRAMES), points), np.tile(np.arange(points), FRAMES)
+        xyz, rgb = _rng().normal(size=(points, 3)), _rng().integers(0, 255, (points, 3)).astype(np.uint8)
+        xy = _rng().random((FRAMES * points, 2)) * 48
+        write_colmap_model(folder, WIDTH, HEIGHT, 50, 51, 32, 24, names, _poses(), xyz, rgb, image, point, xy)
+        for other in (p for p in folder.iterdir() if p.suffix != suffix):
+            other.unlink()
+
+    return make
+
+
+def make_splat(folder: Path) -> None:
+    rows = np.ones(10, dtype=[("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
+    (folder / "a.splat").write_bytes(rows.tobytes())
+
+
+def make_picture(name: str, **options: Any) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        ifd = exif.get_ifd(0x8769)
+        ifd[0xA405], ifd[0x9003], ifd[0x920A] = 28, "2024:01:02 03:04:05", (28, 10)
+        Image.fromarray(_rgb(width=32, height=24)).save(folder / name, exif=exif, **options)
+
+    return make
+
+
+def make_truth(folder: Path) -> None:
+    """A plain folder with everything that can lie in one."""
+    for i in range(FRAMES):
+        write_rgb(folder / "rgb" / f"{i:06d}.png", _rgb(i))
+        raw = np.random.default_rng(i).integers(0, 5000, (HEIGHT, WIDTH)).astype(np.uint16)
+        write_grey_png(folder / "depth" / f"{i:06d}.png", raw)
+        write_grey_png(folder / "labels" / f"{i:06d}.png", (raw % 3).astype(np.uint8))
+    write_json(folder / "classes.json", {"classes": [{"id": i, "name": f"c{i}"} for i in range(3)]})
+    make_intrinsics(folder)
+    write_matrices(folder / "traj.txt", _poses())
+    (folder / "timestamps.txt").write_text("".join(f"{i * 0.1}\n" for i in range(FRAMES)))
+
+
+def make_intrinsics(folder: Path) -> None:
+    camera = {"w": WIDTH, "h": HEIGHT, "fx": 50.5, "fy": 50.0, "cx": 31.5, "cy": 23.5, "k1": 0.1, "depth_scale": 1000.0}
+    write_json(folder / "intrinsics.json", {"camera": camera})
+
+
+def make_layout(name: str) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        truth = folder.with_name(folder.name + "_truth")
+        make_truth(truth)
+        made = folder.with_name(folder.name + "_made")
+        written = LAYOUTS[name][0](open_sequence(truth, "folder"), made)
+        shutil.rmtree(truth)
+        if written.is_file():
+            shutil.copy(written, folder / "room.sens")
+        else:
+            shutil.copytree(written, folder, dirs_exist_ok=True)
+        shutil.rmtree(made, ignore_errors=True)
+        written.unlink(missing_ok=True) if written.is_file() else None
+
+    return make
+
+
+def make_images(folder: Path) -> None:
+    for i in range(FRAMES):
+        write_rgb(folder / f"frame_{i}.{'jpg' if i else 'png'}", _rgb(i))
+    (folder / "timestamps.txt").write_text(
+        "".join(f"{i * 0.1} frame_{i}.{'jpg' if i else 'png'}\n" for i in range(FRAMES))
+    )
+
+
+def make_video(name: str, codec: str) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        if codec:
+            writer = cv2.VideoWriter(str(folder / name), cv2.VideoWriter.fourcc(*codec), 10, (WIDTH, HEIGHT))
+            for i in range(6):
+                writer.write(_rgb(i))
+            writer.release()
+        else:
+            write_video(folder / name, [_rgb(i) for i in range(6)], 10)
+
+    return make
+
+
+CARD = """task = "{task}"
+model = "{model}"
+input = "image"
+output = "scores"
+white = 1.0
+mean = [0.485, 0.456, 0.406]
+std = [0.229, 0.224, 0.225]
+size = [24, 32]
+{rest}
+"""
+
+
+def make_onnx(folder: Path) -> None:
+    weight = onnx.numpy_helper.from_array(np.full((1, 3, 1, 1), 0.3, np.float32), "w")
+    ports = [
+        helper.make_tensor_value_info(n, TensorProto.FLOAT, [1, c, 24, 32]) for n, c in (("image", 3), ("scores", 1))
+    ]
+    graph = helper.make_graph(
+        [helper.make_node("Conv", ["image", "w"], ["scores"])], "g", ports[:1], ports[1:], [weight]
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
+    model.ir_version = 8
+    onnx.save(model, folder / "net.onnx")
+    rest = "canonical_focal = 1000.0\nvalid = [0.1, 200.0]"
+    (folder / "card.toml").write_text(CARD.format(task="depth", model="net.onnx", rest=rest))
+
+
+def make_tflite(folder: Path) -> None:
+    write_tflite(folder / "net.tflite", [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]], [0.0, 0.1, 0.2])
+    rest = 'kind = "logits"\nclasses = ["a", "b", "c"]'
+    (folder / "card.toml").write_text(CARD.format(task="segmentation", model="net.tflite", rest=rest))
+
+
+def make_head(folder: Path) -> None:
+    shapes = {"bn.weight": (4,), "bn.bias": (4,), "bn.running_mean": (4,), "bn.running_var": (4,)}
+    shapes |= {"conv_seg.weight": (3, 4, 1, 1), "conv_seg.bias": (3,)}
+    torch.save({"state_dict": {f"decode_head.{k}": torch.ones(s) for k, s in shapes.items()}}, folder / "h.pth")
+
+
+def make_store(folder: Path) -> None:
+    row = {"name": "mine", "family": "moge", "bytes": 3, "sha256": "ab", "licence": "own", "commercial": False}
+    write_json(folder / "own.json", {"pinned": {"dinov2-vits14-ade20k": "00"}, "added": [row]})
+
+
+def text(name: str, content: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).write_text(content)
+
+
+ARRAYS = {"a": np.arange(20.0), "b": np.ones((3, 4), np.uint8), "s": np.array(["x", ""])}
+NYU = "id\traw_category\tnyu40id\tnyu40class\n1\twall\t1\twall\n2\tchair\t5\tchair\n22\tx\t0\tunannotated\n"
+JSON_HEAD = with_json_head(0)
+
+DOORS: dict[str, Door] = {
+    "COLMAP, binary": Door(make_colmap(".bin"), colmap_model, weight=2),
+    "COLMAP, text": Door(make_colmap(".txt"), colmap_model, weight=2),
+    "Gaussian PLY": Door(lambda f: write_gaussian_ply(f / "a.ply", _cloud(), ("a", "b")), gaussians, "a.ply", weight=2),
+    "viewer's scene": Door(lambda f: write_gaussian_ply(f / "a.ply", _cloud()), viewer_scene, "a.ply"),
+    "SPZ": Door(lambda f: write_spz(f / "a.spz", _cloud()), gaussians, "a.spz"),
+    ".splat": Door(make_splat, gaussians, "a.splat"),
+    "compact map": Door(lambda f: write_compact(f / "a.safetensors", _cloud()), gaussians, "a.safetensors", JSON_HEAD),
+    "mesh PLY": Door(lambda f: write_mesh_ply(f / "a.ply", *_mesh()), mesh(read_mesh_ply), "a.ply", in_ply),
+    "mesh GLB": Door(lambda f: write_mesh_glb(f / "a.glb", *_mesh()), mesh(read_mesh_glb), "a.glb", with_json_head(12)),
+    "npz": Door(lambda f: save_arrays(f / "a.npz", ARRAYS), load_arrays, "a.npz"),
+    "safetensors": Door(
+        lambda f: save_tensors(f / "a.safetensors", {"a": torch.zeros(3, 4)}),
+        lambda p: read_any(p, load_tensors, load_safetensors), "a.safetensors", JSON_HEAD,
+    ),
+    "TUM trajectory": Door(
+        lambda f: write_tum(f / "a.txt", np.arange(float(FRAMES)), _poses()), tum, "a.txt"
+    ),
+    "matrices": Door(
+        lambda f: write_matrices(f / "a.txt", _poses()), lambda p: judge_poses(read_matrices(p)), "a.txt"
+    ),
+    **{
+        f"picture {name.split('.')[1]}": Door(make_picture(name), picture, name)
+        for name in ("a.jpg", "a.png", "a.tif", "a.webp")
+    },
+    "bmp": Door(lambda f: Image.fromarray(_rgb()).save(f / "a.bmp"), picture, "a.bmp"),
+    "16 bit PNG": Door(lambda f: write_grey_png(f / "a.png", np.ones((24, 32), np.uint16)), maps, "a.png"),
+    "palette PNG": Door(lambda f: Image.fromarray(_rgb()).quantize(8).save(f / "a.png"), read_label_png, "a.png"),
+    "folder of images": Door(make_images, source),
+    "times of images": Door(make_images, times, damaged="timestamps.txt"),
+    "intrinsics": Door(make_intrinsics, intrinsics, "intrinsics.json", weight=2),
+    "--intrinsics JSON": Door(
+        make_intrinsics, lambda p: judge_camera(read_intrinsics(str(p), 640, 480)), "intrinsics.json"
+    ),
+    "--intrinsics text": Door(
+        text("cameras.txt", "# camera\n1 OPENCV 640 480 500 501 320 240 .1 .01 0 0\n"),
+        lambda p: judge_camera(read_intrinsics(str(p), 640, 480)), "cameras.txt", in_text,
+    ),
+    "classes": Door(make_truth, read_classes_json, "classes.json", in_json, "classes.json"),
+    "class table, JSON": Door(make_truth, read_class_table, "classes.json", in_json, "classes.json"),
+    "class table, text": Door(text("labels.txt", "0 wall x\n1 sofa\n2 floor\n"), read_class_table, "labels.txt"),
+    "ScanNet's label table": Door(text("t.tsv", NYU), read_nyu40_classes, "t.tsv"),
+    "data set folder": Door(make_truth, data_set("folder"), weight=2),
+    **{f"data set {name}": Door(make_layout(name), data_set(row[1]), weight=2) for name, row in LAYOUTS.items()},
+    "TOML": Door(text("a.toml", "[run]\nseed = 1\nname = 'x'\n[frames]\nrate = 2.5\n"), read_toml, "a.toml"),
+    "card": Door(make_onnx, network, damaged="card.toml", weight=2),
+    "ONNX": Door(make_onnx, network, damaged="net.onnx", weight=2),
+    "TFLite": Door(make_tflite, network, damaged="net.tflite", weight=2),
+    "head": Door(make_head, head, "h.pth"),
+    "model store": Door(make_store, store, damaged="own.json"),
+    "kept network result": Door(
+        lambda f: ResultCache(f, 1).save("k", {"depth": np.ones((6, 8))}), kept_result, mutate=in_zip
+    ),
+    "depth npy": Door(
+        lambda f: np.save(f / "a.npy", np.ones((6, 8), np.float32)), lambda p: read_depth_file(p, 0.001), "a.npy"
+    ),
+    "video mp4": Door(make_video("a.mp4", ""), video, "a.mp4"),
+    "video avi": Door(make_video("a.avi", "MJPG"), video, "a.avi"),
+    "video mkv": Door(make_video("a.mkv", ""), video, "a.mkv"),
+    "video as a source": Door(make_video("a.mp4", ""), source, "a.mp4"),
+}  # fmt: skip
