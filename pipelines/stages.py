@@ -33,6 +33,7 @@ from pipelines.records import (
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
 from pipelines.settings_file import save_settings
+from pipelines.stage_identity import stage_identity
 from pipelines.stopping import stop_if_asked
 
 FINGERPRINT = "fingerprint"
@@ -80,7 +81,7 @@ class StageContext:
 
 @dataclass(frozen=True)
 class Stage:
-    """`run` does the work and returns its key figures; raise `version` whenever its result changes.
+    """`run` does the work and returns its key figures; what code it is follows from its module (`stage_identity`).
 
     A stage that reads more than the stages before it says so by `inputs`: plain values that change with what it reads
     (files, models). `check` refuses what it could not use. Both see (source, config) before the first stage runs, so
@@ -88,11 +89,15 @@ class Stage:
     """
 
     name: str
-    version: int
     run: Callable[[StageContext], dict[str, Any]]
     summary: str
     inputs: Callable[[Path, Config], Any] | None = None
     check: Callable[[Path, Config], None] | None = None
+
+    @property
+    def file(self) -> Path:
+        """The module of `run`."""
+        return Path(self.run.__code__.co_filename)
 
 
 def run_stages(
@@ -106,7 +111,7 @@ def run_stages(
 ) -> dict[str, StageRecord]:
     """Bring every stage up to `until` up to date; returns their records.
 
-    A stage is up to date when its fingerprint (version, own settings, seed, own inputs, content of the stages before
+    A stage is up to date when its fingerprint (code, own settings, seed, own inputs, content of the stages before
     it) and its files are unchanged. Nothing of the run changes before everything that can be checked is; then the
     settings are written, and a stage that has to run again is taken out of the manifest, with those after it, before
     it starts. Raises InputError as the stages do.
@@ -235,10 +240,12 @@ def _flush_folder(folder: Path) -> None:
 
 
 def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) -> str:
-    """Digest of what a stage's result depends on: its version, its settings, the seed, its inputs, what is before."""
+    """Digest of what a stage's result depends on: its code, its settings, the seed, its inputs, what is before."""
     own = settings_of_stage(config, stage.name)
     beside = [] if inputs is None else [inputs]
-    text = json.dumps([stage.name, stage.version, own, config.run.seed, upstream, *beside], sort_keys=True)
+    text = json.dumps(
+        [stage.name, stage_identity(stage.name, stage.file), own, config.run.seed, upstream, *beside], sort_keys=True
+    )
     return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -110,4 +110,4 @@ def _kept_world(outcome: Outcome, settings: ExportConfig) -> World | None:
     return load_world(outcome.run) if settings.axes == outcome.config.export.axes else None
 
 
-STAGE = Stage("export", 2, run, "COLMAP model, Gaussian PLY, labelled mesh, trajectory")
+STAGE = Stage("export", run, "COLMAP model, Gaussian PLY, labelled mesh, trajectory")

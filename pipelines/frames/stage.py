@@ -316,6 +316,6 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
 
 
 STAGE = Stage(
-    "frames", 6, run, "pick frames, calibrate the camera, structure from motion over keyframes",
+    "frames", run, "pick frames, calibrate the camera, structure from motion over keyframes",
     inputs=mask_inputs, check=check,
 )  # fmt: skip

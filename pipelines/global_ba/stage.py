@@ -254,4 +254,4 @@ def save(
     return figures
 
 
-STAGE = Stage("global_ba", 1, run, "loops, global adjustment, the map moved and refined with it")
+STAGE = Stage("global_ba", run, "loops, global adjustment, the map moved and refined with it")

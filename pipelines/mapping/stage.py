@@ -96,4 +96,4 @@ def _measure_held_out(
     return [measure_view(result.gaussian_map, *args) for args in zip(held_out, poses, gains, offsets, strict=True)]
 
 
-STAGE = Stage("mapping", 5, run, "the semantic Gaussian map from the keyframes")
+STAGE = Stage("mapping", run, "the semantic Gaussian map from the keyframes")

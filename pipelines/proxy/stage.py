@@ -279,6 +279,4 @@ def _report(
     }
 
 
-STAGE = Stage(
-    "proxy", 7, run, "depth, reliability and classes of the keyframes", inputs=proxy_inputs, check=check_proxy
-)
+STAGE = Stage("proxy", run, "depth, reliability and classes of the keyframes", inputs=proxy_inputs, check=check_proxy)

@@ -146,4 +146,4 @@ def stretches(ids: list[int]) -> str:
     return ", ".join(f"{r[0]}-{r[-1]}" if len(r) > 1 else str(r[0]) for r in runs)
 
 
-STAGE = Stage("tracking", 4, run, "a pose for every frame, by correspondences and bundle adjustment")
+STAGE = Stage("tracking", run, "a pose for every frame, by correspondences and bundle adjustment")

@@ -1,0 +1,34 @@
+"""Before a release: give every stage whose sources have changed since the last one a new number.
+
+    python tests/release.py [--same mapping ...]
+
+Writes pipelines/stage_versions.toml for the version in pyproject.toml. A stage named with --same keeps its number: say
+so only where its results are known to be the same bytes, for users keep what an older release has made.
+"""
+
+import argparse
+import tomllib
+
+from formats.atomic import write_text
+from pipelines.run_folder_names import STAGES
+from pipelines.stage_identity import ROOT, TABLE, source_digest
+
+
+def main() -> None:
+    """See the top of this file."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--same", nargs="*", default=[], choices=STAGES)
+    same = parser.parse_args().same
+    text = TABLE.read_text(encoding="utf-8")
+    before = tomllib.loads(text)
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    lines = [text.splitlines()[0], f'release = "{version}"']
+    for name in STAGES:
+        sources = source_digest(ROOT / "pipelines" / name / "stage.py")
+        number = before[name]["number"] + (sources != before[name]["sources"] and name not in same)
+        lines += ["", f"[{name}]", f"number = {number}", f'sources = "{sources}"']
+    write_text(TABLE, "\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()
