@@ -21,17 +21,25 @@ from msgs_cli.text import say
     "--protocol", type=click.Choice(["msgs", "splatam"]), default="msgs",
     help="splatam adds that code's figures, for comparison with papers.",
 )  # fmt: skip
+@click.option(
+    "--class-map", metavar="FILE|NAME",
+    help="A TOML of the run's classes to the truth's. Default: one that comes with the program, where it fits.",
+)  # fmt: skip
 @verbosity_options
-def evaluate(run_path: Path, truth: Path, truth_format: str, protocol: str, quiet: bool, verbose: bool) -> None:
+def evaluate(
+    run_path: Path, truth: Path, truth_format: str, protocol: str, class_map: str | None, quiet: bool, verbose: bool
+) -> None:
     """Compare RUN with the truth: poses, images, depth, labels, mesh. Writes RUN/evaluation/."""
     set_up_logging(quiet, verbose)
     from formats.datasets import open_sequence
+    from pipelines.evaluation.class_map import open_class_map
     from pipelines.evaluation.table import evaluation_table
     from pipelines.evaluation.write import write_evaluation
 
+    joins = open_class_map(class_map) if class_map else None
     run = open_run(run_path)
     sequence = open_sequence(truth, truth_format)
-    figures = write_evaluation(run, sequence, make_progress(quiet), legacy=protocol == "splatam")
+    figures = write_evaluation(run, sequence, make_progress(quiet), legacy=protocol == "splatam", class_map=joins)
     say(evaluation_table(figures))
 
 

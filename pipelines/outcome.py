@@ -53,7 +53,8 @@ class Exposure:
 class Outcome:
     """config: the settings that each finished stage was made with. map_stage is "" and gaussian_map None before mapping
     is done; label_of_channel (C,) takes a class channel of the map to its label. `metric`: whether the world's unit is
-    the metre of the proxy depth. `move`: how all of it has been moved out of the run's own world."""
+    the metre of the proxy depth. vocabulary: the classes that the network which labelled it knows, () without one.
+    `move`: how all of it has been moved out of the run's own world."""
 
     run: RunFolder
     records: Mapping[str, StageRecord]
@@ -69,6 +70,7 @@ class Outcome:
     exposure: Exposure | None
     metric: bool
     semantics: str
+    vocabulary: tuple[str, ...]
     move: Similarity | None = None
 
     @property
@@ -142,6 +144,7 @@ def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:
         exposure=_load_exposure(run, map_stage, trajectory),
         metric=bool(report.get("metric", False)),
         semantics=str(report.get("semantics", "")),
+        vocabulary=tuple(map(str, report.get("vocabulary", ()))),
     )
 
 

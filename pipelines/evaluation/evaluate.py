@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from formats.datasets import Sequence
 from formats.errors import InputError
+from pipelines.evaluation.class_map import ClassMap, Matching, match_classes
 from pipelines.evaluation.legacy import legacy_cells
 from pipelines.evaluation.measure import Measured, measure_views
 from pipelines.evaluation.mesh_cells import mesh_cells
@@ -30,7 +31,8 @@ PROTOCOL = (
     "Depth of the map: the surface at which half the light is lost, against the true depth at the same pixel, over "
     "all views with true depth; pixels without either are left out of L1 and shown as the valid fraction.",
     "Labels: one confusion matrix over all views; pixels without a true class are left out, pixels to which the map "
-    "gives no class count as wrong; the mean is over the classes that occur in the truth.",
+    "gives no class count as wrong; the mean is over the classes that occur in the truth. Where a class map joins "
+    "names that differ, these are the classes that both sides know, and pixels of others are left out.",
     "Mesh: points spread evenly over it, after Sim(3) (SE(3) where the depth is metric), where a camera with true "
     "depth sees them; the truth is the points of the true depth.",
 )
@@ -53,6 +55,7 @@ def evaluate_outcome(
     progress: Progress | None = None,
     max_views: int = 100,
     legacy: bool = False,
+    class_map: ClassMap | None = None,
 ) -> tuple[dict[str, Any], Measured | None]:
     """As `evaluate_run`, with the measured views beside the figures."""
     matched = match_truth(outcome.frames, outcome.source_is_folder, truth)
@@ -61,10 +64,11 @@ def evaluate_outcome(
             f"{truth.root}: none of its {len(truth)} frames belongs to the {len(outcome.frames)} frames of "
             f"{outcome.run.root} by name or by time. Is it the truth of another recording?"
         )
+    matching = _matching(outcome, truth, class_map)
     trajectory, alignment = trajectory_cells(outcome, matched)
     measured = None
     if outcome.gaussian_map is not None:
-        measured = measure_views(outcome, matched, alignment, progress or SilentProgress(), max_views)
+        measured = measure_views(outcome, matched, alignment, matching, progress or SilentProgress(), max_views)
     result = {
         "run": outcome.run.root.name,
         "truth": f"{truth.root.name} ({truth.format})",
@@ -82,6 +86,12 @@ def evaluate_outcome(
         result["legacy"] = legacy_cells(outcome, matched, measured)
     # A round trip: what cannot be written as JSON (NaN, arrays) shows here and not at the user's.
     return json.loads(json.dumps(result, allow_nan=False)), measured
+
+
+def _matching(outcome: Outcome, truth: Sequence, class_map: ClassMap | None) -> Matching | None:
+    if class_map is not None:
+        class_map.require_known((*outcome.classes.names, *outcome.vocabulary), truth.class_names)
+    return match_classes(outcome.classes.names, outcome.vocabulary, truth.class_names, class_map)
 
 
 def _without_map(outcome: Outcome) -> dict[str, Any]:

@@ -5,21 +5,23 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.evaluation.class_map import Matching
 from pipelines.evaluation.label_score import Counts, LabelScore, matched_by_majority, matched_one_to_one, renamed, score
 
 
 def label_cells(
-    confusion: Counts, match: NDArray[np.int64] | None, semantics: str, true_names: tuple[str, ...]
+    confusion: Counts, matching: Matching | None, semantics: str, true_names: tuple[str, ...]
 ) -> dict[str, Any]:
-    """confusion as `count_labels` gives it; match (C,) the true class of every class of the run, None where their
-    names are not the truth's. A clustering's classes are named *by the truth*: its figures flatter and stand apart."""
+    """confusion as `count_labels` gives it; matching: what the classes of run and truth have in common, None where
+    their names are not the truth's. A clustering's classes are named *by the truth*: its figures flatter and stand
+    apart."""
     if confusion.size == 0 or confusion.sum() == 0:
         return {"missing": "no rendered view has true labels"}
     given = "labels from files" if semantics.startswith("files") else "predicted labels"
-    if match is not None:
-        return {"input": given, "matching": "by name", **_cells(score(renamed(confusion, match)), true_names)}
+    if matching is not None:
+        of = {"input": given, "matching": matching.how}
+        return {**of, **_cells(score(matching.joined(confusion)), matching.names)}
     return {
         "input": given,
         "matching": "none",
@@ -39,4 +41,5 @@ def _cells(found: LabelScore | None, names: tuple[str, ...]) -> dict[str, Any]:
         "pixel_accuracy": found.pixel_accuracy,
         "unlabelled": found.unlabelled,
         "class_iou": {n: float(v) for n, v in zip(names, found.class_iou, strict=True) if np.isfinite(v)},
+        "class_recall": {n: float(v) for n, v in zip(names, found.class_recall, strict=True) if np.isfinite(v)},
     }

@@ -28,11 +28,13 @@ def count_labels(labels: NDArray, truth: NDArray, classes: int, true_classes: in
 
 @dataclass(frozen=True)
 class LabelScore:
-    """mean_iou over the classes that occur in the truth; class_iou (C,) NaN where a class does not; pixel_accuracy;
+    """mean_iou over the classes that occur in the truth; class_iou, class_recall (C,) NaN where a class does not;
+    pixel_accuracy;
     unlabelled: share of the pixels with truth that were given no class."""
 
     mean_iou: float
     class_iou: NDArray[np.float64]
+    class_recall: NDArray[np.float64]
     pixel_accuracy: float
     unlabelled: float
 
@@ -49,8 +51,9 @@ def score(confusion: Counts) -> LabelScore | None:
     occurs = in_truth > 0
     union = in_truth + given - hit
     iou = np.where(occurs, hit / np.maximum(union, 1), np.nan)
+    recall = np.where(occurs, hit / np.maximum(in_truth, 1), np.nan)
     return LabelScore(
-        float(iou[occurs].mean()), iou, float(hit.sum() / total), float(confusion[:, classes].sum() / total)
+        float(iou[occurs].mean()), iou, recall, float(hit.sum() / total), float(confusion[:, classes].sum() / total)
     )
 
 

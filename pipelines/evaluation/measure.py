@@ -9,10 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pipelines.evaluation.class_map import Matching
 from pipelines.evaluation.depth_error import DepthErrorSum
 from pipelines.evaluation.image_quality import psnr, ssim
 from pipelines.evaluation.label_cells import label_cells
-from pipelines.evaluation.label_score import Counts, count_labels, indices_by_name, renamed
+from pipelines.evaluation.label_score import Counts, count_labels
 from pipelines.evaluation.perceptual import open_lpips
 from pipelines.evaluation.trajectory_error import AbsoluteError
 from pipelines.evaluation.truth import MatchedTruth
@@ -48,11 +49,11 @@ class MeasuredView:
 class Measured:
     """Sums over the views of a run."""
 
-    def __init__(self, names: tuple[str, ...], true_names: tuple[str, ...]) -> None:
+    def __init__(self, names: tuple[str, ...], true_names: tuple[str, ...], matching: Matching | None) -> None:
         self.views: list[MeasuredView] = []
         self.lpips = open_lpips()
         self.depth = DepthErrorSum()
-        self.match = indices_by_name(names, true_names)
+        self.matching = matching
         self.confusion: Counts = np.zeros((len(true_names), len(names) + 1), np.int64)
 
     def images(self) -> dict[str, Any]:
@@ -84,17 +85,22 @@ class Measured:
         return {
             "images": self.images(),
             "depth": depth_cells,
-            "labels": label_cells(self.confusion, self.match, outcome.semantics, matched.sequence.class_names),
+            "labels": label_cells(self.confusion, self.matching, outcome.semantics, matched.sequence.class_names),
             "views": [v.to_json() for v in self.views],
         }
 
 
 def measure_views(
-    outcome: Outcome, matched: MatchedTruth, alignment: AbsoluteError | None, progress: Progress, max_views: int
+    outcome: Outcome,
+    matched: MatchedTruth,
+    alignment: AbsoluteError | None,
+    matching: Matching | None,
+    progress: Progress,
+    max_views: int,
 ) -> Measured:
     """Keyframes, held-out frames and frames between at the run's own poses; held-out frames also at poses refined on
     the map, and frames not used for the map at the true ones."""
-    measured = Measured(outcome.classes.names, matched.sequence.class_names)
+    measured = Measured(outcome.classes.names, matched.sequence.class_names, matching)
     pixels = FramePixels(outcome.calibration)
     jobs = _jobs(outcome, matched, alignment, max_views)
     for frame_id, kind, cam_from_world in progress.track(jobs, "measuring", len(jobs)):
@@ -193,6 +199,7 @@ def _add_labels(measured: Measured, outcome: Outcome, view: MapView, truth: NDAr
     true_classes, classes = len(measured.confusion), measured.confusion.shape[1] - 1
     counts = count_labels(view.labels, truth, classes, true_classes)
     measured.confusion += counts
-    if measured.match is None or counts.sum() == 0:
+    joined = None if measured.matching is None else measured.matching.joined(counts)
+    if joined is None or joined.sum() == 0:
         return float("nan")
-    return float(np.trace(renamed(counts, measured.match)[:, :true_classes]) / counts.sum())
+    return float(np.trace(joined[:, :-1]) / joined.sum())

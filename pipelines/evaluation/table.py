@@ -97,11 +97,11 @@ def _label_rows(cells: dict[str, Any]) -> list[Row]:
         return rows
     if "missing" in cells:
         return _missing("mIoU, pixel accuracy", cells)
-    of = f"{cells['input']}; over the {len(cells['class_iou'])} classes of the truth"
+    of = f"{cells['input']}, {cells['matching']}; over {len(cells['class_iou'])} classes of the truth"
     classes = ", ".join(f"{n} {v:.1%}" for n, v in sorted(cells["class_iou"].items(), key=lambda item: -item[1]))
     return [
         ("mIoU, pixel accuracy", f"{cells['mean_iou']:.2%}, {cells['pixel_accuracy']:.2%}", of),
-        ("IoU of each class", classes, f"{cells['unlabelled']:.1%} of the pixels were given no class"),
+        ("IoU of each class", classes, f"{cells['unlabelled']:.1%} of the pixels were given none of them"),
     ]
 
 

@@ -10,6 +10,7 @@ from formats.atomic import write_text
 from formats.datasets import Sequence
 from formats.images import write_rgb
 from formats.jsonfile import write_json
+from pipelines.evaluation.class_map import ClassMap
 from pipelines.evaluation.evaluate import evaluate_outcome
 from pipelines.evaluation.measure import evenly, render_outcome
 from pipelines.evaluation.pictures import (
@@ -36,14 +37,19 @@ TITLES = ("frame", "map", "depth of the map", "true depth", "error, white = 10 %
 
 
 def write_evaluation(
-    run: RunFolder, truth: Sequence, progress: Progress | None = None, max_views: int = 100, legacy: bool = False
+    run: RunFolder,
+    truth: Sequence,
+    progress: Progress | None = None,
+    max_views: int = 100,
+    legacy: bool = False,
+    class_map: ClassMap | None = None,
 ) -> dict[str, Any]:
     """Evaluate and write RUN/evaluation/: evaluation.json, evaluation.md, two plots of the path, views.png.
 
     Returns the figures (see `evaluate_run`). Raises InputError as that does, before anything is written.
     """
     outcome = load_outcome(run)
-    result, _ = evaluate_outcome(outcome, truth, progress, max_views, legacy)
+    result, _ = evaluate_outcome(outcome, truth, progress, max_views, legacy, class_map)
     folder = run.evaluation_file.parent
     write_json(run.evaluation_file, result)
     write_text(folder / "evaluation.md", evaluation_table(result))

@@ -131,5 +131,5 @@ class OnnxLabels:
         return self._classes
 
     def figures(self) -> dict[str, Any]:
-        """How many classes the network knows."""
-        return {"network_classes": len(self._names)}
+        """The names that the network knows, whether or not they occur."""
+        return {"vocabulary": [n for i, n in enumerate(self._names) if i not in self._void]}
