@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from formats.compact_gaussians import read_compact
 from formats.errors import InputError
+from formats.gaussian_glb import read_gaussian_glb
 from formats.gaussian_ply import read_gaussian_ply
 from formats.gaussians import GaussianCloud, unit_quaternions
 from formats.reading import parsing, read_bytes
@@ -19,7 +20,7 @@ _SMALLEST_SCALE = 1e-9
 
 
 def read_gaussians(path: Path) -> GaussianCloud:
-    """The Gaussians of a .ply, .spz, .splat or compact .safetensors file, by its suffix.
+    """The Gaussians of a .ply, .spz, .splat, .glb or compact .safetensors file, by its suffix.
 
     Raises InputError for another suffix, a missing or damaged file, and values that are not finite.
     """
@@ -31,9 +32,11 @@ def read_gaussians(path: Path) -> GaussianCloud:
         return read_spz(path)
     if kind == ".splat":
         return read_splat(path)
+    if kind == ".glb":
+        return read_gaussian_glb(path)
     if kind == ".safetensors":
         return read_compact(path)[0]
-    raise InputError(f"{path} is no splat file by its name: expected .ply, .spz, .splat or .safetensors")
+    raise InputError(f"{path} is no splat file by its name: expected .ply, .spz, .splat, .glb or .safetensors")
 
 
 def read_splat(path: Path) -> GaussianCloud:

@@ -83,7 +83,7 @@ def render(run_path: Path, target: Path, kind: str, camera_path: str, fps: float
 @click.option("--port", default=8080, type=click.IntRange(1, 65535), show_default=True, help="Where to serve.")
 @click.option("--host", default="127.0.0.1", show_default=True, help="Which address to serve on.")
 def view(path: Path, port: int, host: str) -> None:
-    """Look at a run, or at any Gaussians (.ply, .spz, .splat), in the browser.
+    """Look at a run, or at any Gaussians (.ply, .spz, .glb, .splat), in the browser.
 
     Needs the extra: pip install 'msgs-slam[viewer]'.
     """

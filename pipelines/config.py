@@ -186,6 +186,7 @@ class ExportConfig:
     max_views: int = setting(200, "keyframes the mesh is fused from, evenly spread", within=(1, 100_000))
     mesh_side: int = setting(640, "pixels on the long side of their depth images", within=(16, 8192))
     spz: bool = setting(False, "write the map as point_cloud.spz too")
+    splat_glb: bool = setting(False, "write the map as point_cloud.glb too (glTF, KHR_gaussian_splatting)")
     sh_rest: bool = setting(False, "the splat PLYs hold f_rest_0 to 44 too, all zero, for readers that insist on them")
     least_piece: float = setting(
         0.01, "connected pieces smaller than this share of the largest one are removed", within=(0, 1)

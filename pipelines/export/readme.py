@@ -20,6 +20,8 @@ point_cloud.ply           the map: Gaussians in the layout of the original 3D Ga
 point_cloud_semantic.ply  the same, coloured by class, without the probabilities.
 point_cloud_compact.safetensors   the same in a fraction of the space.
 point_cloud.spz           only with --set export.spz=true: the colours of the map, small, for viewers on the web.
+point_cloud.glb           only with --set export.splat_glb=true: the map in glTF (KHR_gaussian_splatting), classes as
+                          attribute _LABEL; programs that do not know the extension show coloured points.
 mesh.ply, mesh.glb        the surface with a colour and a label (PLY: property label, GLB: attribute _LABEL) at each
                           vertex. MeshLab, Blender, trimesh.
 classes.json              number, name and colour of each class; 255 is "unknown".
@@ -29,9 +31,9 @@ world.json                what the axes are, what told which way is up, and how 
 
 _UPRIGHT = """\
 Axes: z is up, told by the {told_by}; {height}; x and y count from the middle of the
-camera's path, and y points where the first camera looked. The two formats that lay down which way is up follow their
-own rule: in mesh.glb and point_cloud.spz y is up. A splat viewer that takes y for up shows the PLY files on their
-back: turn them by -90 degrees about x.
+camera's path, and y points where the first camera looked. The formats that lay down which way is up follow their own
+rule: in mesh.glb, point_cloud.spz and point_cloud.glb y is up. A viewer that takes y for up shows the PLY files on
+their back: turn them by -90 degrees about x.
 """
 
 _FIRST = """\

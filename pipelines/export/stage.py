@@ -11,6 +11,7 @@ from pipelines.config import ExportConfig
 from pipelines.export.mesh import make_mesh, mesh_figures, write_mesh
 from pipelines.export.writers import (
     write_colmap,
+    write_glb_file,
     write_notes,
     write_ply,
     write_spz_file,
@@ -59,9 +60,10 @@ def find_world(outcome: Outcome, settings: ExportConfig) -> World:
 
 
 def write_all_but_mesh(outcome: Outcome, world: World, settings: ExportConfig, folder: Path) -> list[Path]:
-    """COLMAP model, PLYs, trajectory, notes; the SPZ where the settings want it. `outcome` stands in `world`."""
+    """COLMAP model, PLYs, trajectory, notes; SPZ and GLB where the settings want them. `outcome` stands in `world`."""
     paths = write_colmap(outcome, folder) + write_ply(outcome, settings.sh_rest, folder)
     paths += write_spz_file(outcome, world, folder) if settings.spz else []
+    paths += write_glb_file(outcome, world, folder) if settings.splat_glb else []
     return paths + write_trajectory(outcome, folder) + write_notes(outcome, world, folder)
 
 
@@ -97,6 +99,7 @@ def export_run(
         "colmap": lambda: write_colmap(outcome, folder),
         "ply": lambda: write_ply(outcome, settings.sh_rest, folder),
         "spz": lambda: write_spz_file(outcome, world, folder),
+        "glb": lambda: write_glb_file(outcome, world, folder),
         "mesh": mesh,
         "tum": lambda: write_trajectory(outcome, folder),
     }

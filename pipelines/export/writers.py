@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from formats.atomic import atomic_path, write_text
 from formats.colmap import write_colmap_model
 from formats.compact_gaussians import write_compact
+from formats.gaussian_glb import write_gaussian_glb
 from formats.gaussian_ply import write_gaussian_ply
 from formats.gaussians import GaussianCloud, isotropic_cloud
 from formats.nerfstudio import write_transforms
@@ -95,10 +96,22 @@ def write_spz_file(outcome: Outcome, world: World, folder: Path) -> list[Path]:
 
     SPZ says which way is up, so the scene stands upright in its viewers.
     """
-    cloud = map_cloud(outcome)
-    turned = replace(cloud, means=(cloud.means @ world.image_axes_from_exported.T).astype(np.float32))
-    write_spz(folder / "point_cloud.spz", turned)
+    write_spz(folder / "point_cloud.spz", _turned(map_cloud(outcome), world))
     return [folder / "point_cloud.spz"]
+
+
+def write_glb_file(outcome: Outcome, world: World, folder: Path) -> list[Path]:
+    """The map as glTF has Gaussians (KHR_gaussian_splatting), upright; nothing where there are none."""
+    cloud = map_cloud(outcome)
+    if len(cloud) == 0:
+        return []
+    write_gaussian_glb(folder / "point_cloud.glb", _turned(cloud, world), outcome.classes.names)
+    return [folder / "point_cloud.glb"]
+
+
+def _turned(cloud: GaussianCloud, world: World) -> GaussianCloud:
+    """The balls in the axes that splat formats take for theirs: x right, y down, z forward."""
+    return replace(cloud, means=(cloud.means @ world.image_axes_from_exported.T).astype(np.float32))
 
 
 def _by_class(cloud: GaussianCloud, outcome: Outcome) -> GaussianCloud:

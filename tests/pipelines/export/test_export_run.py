@@ -12,6 +12,7 @@ from evo.tools import file_interface
 
 from formats.datasets import open_sequence
 from formats.errors import InputError
+from formats.gaussian_glb import read_gaussian_glb
 from formats.spz import read_spz
 from pipelines.config import ExportConfig
 from pipelines.export.stage import export_run
@@ -31,7 +32,7 @@ def run(oracle_run: OracleRun) -> RunFolder:
 @pytest.fixture(scope="module")
 def folder(run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("exported")
-    paths = export_run(run, folder, settings=ExportConfig(spz=True, voxel=0.03))
+    paths = export_run(run, folder, settings=ExportConfig(spz=True, splat_glb=True, voxel=0.03))
     assert all(p.exists() for p in paths)
     return folder
 
@@ -77,6 +78,7 @@ def test_map_is_the_same_everywhere(folder: Path, exported: Outcome) -> None:
     # The reader gives x right, y down, z forward.
     np.testing.assert_allclose(small.means[:, [0, 2]], m.means[:, :2], atol=1e-3)
     np.testing.assert_allclose(small.means[:, 1], -m.means[:, 2], atol=1e-3)
+    np.testing.assert_allclose(read_gaussian_glb(folder / "point_cloud.glb").means, small.means, atol=1e-3)
     assert 0 < np.abs(small.log_scales[:, 0] - m.log_radii.numpy()).max() <= 1 / 32 + 1e-6
     assert (folder / "point_cloud.spz").stat().st_size < 0.2 * (folder / "point_cloud.ply").stat().st_size
 
@@ -101,6 +103,7 @@ def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
         "colmap": "transforms.json",
         "ply": "point_cloud.ply",
         "spz": "point_cloud.spz",
+        "glb": "point_cloud.glb",
         "tum": "trajectory.txt",
     }
     for only in set(EXPORTS) - {"mesh"}:

@@ -1,0 +1,158 @@
+"""Gaussians in a GLB by glTF's extension KHR_gaussian_splatting (Khronos, ratified).
+
+A primitive of points whose attributes are POSITION and, prefixed with the extension's name, ROTATION (x y z w), SCALE
+(standard deviations), OPACITY (0..1) and SH_DEGREE_0_COEF_0 (colour = 0.5 + 0.2821 * it). COLOR_0 is for programs that
+do not know the extension: they show a cloud of coloured points.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.atomic import write_bytes
+from formats.errors import InputError
+from formats.gaussian_ply import SH_C0
+from formats.gaussians import GaussianCloud, unit_quaternions
+from formats.reading import parsing, read_bytes
+
+EXTENSION = "KHR_gaussian_splatting"
+_JSON, _BINARY = 0x4E4F534A, 0x004E4942
+_BYTE, _FLOAT = 5121, 5126
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_LABEL = "_LABEL"
+# glTF's y is up and its z comes towards the viewer; splats have x right, y down, z forward.
+_FLIP = np.array([1, -1, -1], dtype=np.float32)
+_LEAST_OPACITY = 1e-4
+
+
+def write_gaussian_glb(path: Path, cloud: GaussianCloud, class_names: tuple[str, ...] = ()) -> None:
+    """Write a cloud, its class numbers as attribute _LABEL and their names in the mesh's extras.
+
+    The cloud has x right, y down, z forward, as from a splat PLY; the file's y is up. Nothing is rounded but the
+    fallback's colours. The same cloud gives the same bytes. Raises ValueError for an empty cloud, which glTF cannot
+    hold, InputError when the disk refuses.
+    """
+    if len(cloud) == 0:
+        raise ValueError("write_gaussian_glb: glTF has no way to store an empty cloud")
+    opacity = (1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))).astype(np.float32)
+    rgba = np.column_stack([np.clip(cloud.colors, 0, 1), opacity])
+    arrays: dict[str, NDArray[Any]] = {
+        "POSITION": cloud.means * _FLIP,
+        "COLOR_0": np.round(rgba * 255).astype(np.uint8),
+        f"{EXTENSION}:ROTATION": cloud.quat_wxyz[:, [1, 2, 3, 0]] * np.append(_FLIP, np.float32(1)),
+        f"{EXTENSION}:SCALE": np.exp(cloud.log_scales),
+        f"{EXTENSION}:OPACITY": opacity,
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": (cloud.colors - np.float32(0.5)) / np.float32(SH_C0),
+    }
+    if cloud.class_ids is not None:
+        arrays[_LABEL] = cloud.class_ids.astype(np.float32)
+    chunks = [np.ascontiguousarray(a, "<u1" if a.dtype == np.uint8 else "<f4").tobytes() for a in arrays.values()]
+    write_bytes(path, _container(_document(arrays, chunks, class_names), b"".join(chunks)))
+
+
+def _document(arrays: dict[str, NDArray[Any]], chunks: list[bytes], class_names: tuple[str, ...]) -> dict[str, Any]:
+    starts = np.cumsum([0, *(len(c) for c in chunks)]).tolist()
+    accessors: list[dict[str, Any]] = []
+    for i, (name, array) in enumerate(arrays.items()):
+        kind = next(k for k, w in _WIDTHS.items() if w == (1 if array.ndim == 1 else array.shape[1]))
+        accessor = {"bufferView": i, "componentType": _FLOAT, "count": len(array), "type": kind}
+        if array.dtype == np.uint8:
+            accessor |= {"componentType": _BYTE, "normalized": True}
+        if name == "POSITION":
+            accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
+        accessors.append(accessor)
+    properties = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {
+        "attributes": {name: i for i, name in enumerate(arrays)},
+        "mode": 0,
+        "extensions": {EXTENSION: properties},
+    }
+    return {
+        "asset": {"version": "2.0", "generator": "msgs-slam"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive], "extras": {"classes": list(class_names)}}],
+        "accessors": accessors,
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": s, "byteLength": len(c), "target": 34962}
+            for s, c in zip(starts, chunks, strict=False)
+        ],
+        "buffers": [{"byteLength": starts[-1]}],
+    }
+
+
+def _container(document: dict[str, Any], binary: bytes) -> bytes:
+    """The GLB of a document and its one buffer; both chunks padded to four bytes."""
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    binary += b"\0" * (-len(binary) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
+    return b"".join(
+        [head, struct.pack("<II", len(text), _JSON), text, struct.pack("<II", len(binary), _BINARY), binary]
+    )
+
+
+def read_gaussian_glb(path: Path) -> GaussianCloud:
+    """The first primitive of Gaussians in a GLB by this or another program; higher harmonics are dropped.
+
+    The transforms of nodes are not applied. Raises InputError when the file is missing or damaged, holds no Gaussians,
+    or packs them (other extensions, quantised attributes).
+    """
+    data = read_bytes(path)
+    with parsing(path, "GLB file with Gaussians", "export it again, uncompressed"):
+        document, binary = _chunks(data)
+        primitives = [p for m in document.get("meshes", []) for p in m["primitives"]]
+        found = next((p for p in primitives if EXTENSION in p.get("extensions", {})), None)
+        if found is None:
+            raise InputError(f"{path} holds no Gaussians ({EXTENSION}): it is a GLB of something else")
+        arrays = {name: _accessor(document, binary, i) for name, i in found["attributes"].items() if name != "COLOR_0"}
+        return _cloud(arrays)
+
+
+def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+    magic, version, _ = struct.unpack_from("<4sII", data)
+    if magic != b"glTF" or version != 2:
+        raise ValueError("it does not begin like a GLB of version 2")
+    length, kind = struct.unpack_from("<II", data, 12)
+    document = json.loads(data[20 : 20 + length])
+    after = 20 + length
+    binary_length, binary_kind = struct.unpack_from("<II", data, after)
+    if (kind, binary_kind) != (_JSON, _BINARY):
+        raise ValueError("its two parts are not the document and its bytes")
+    return document, data[after + 8 : after + 8 + binary_length]
+
+
+def _accessor(document: dict[str, Any], binary: bytes, index: int) -> NDArray[np.float32]:
+    accessor = document["accessors"][index]
+    if accessor["componentType"] != _FLOAT or "sparse" in accessor:
+        raise ValueError("an attribute is packed")
+    view = document["bufferViews"][accessor["bufferView"]]
+    width, count = _WIDTHS[accessor["type"]], int(accessor["count"])
+    if view.get("byteStride", 4 * width) != 4 * width:
+        raise ValueError("its attributes are interleaved")
+    start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
+    return np.frombuffer(binary, "<f4", count * width, start).reshape(count, width).astype(np.float32)
+
+
+def _cloud(arrays: dict[str, NDArray[np.float32]]) -> GaussianCloud:
+    opacity = arrays[f"{EXTENSION}:OPACITY"][:, 0].astype(np.float64).clip(_LEAST_OPACITY, 1 - _LEAST_OPACITY)
+    quat_xyzw = arrays[f"{EXTENSION}:ROTATION"] * np.append(_FLIP, np.float32(1))
+    smallest = np.finfo(np.float32).tiny
+    degrees = [int(n.split("_DEGREE_")[1].split("_")[0]) for n in arrays if "SH_DEGREE_" in n]
+    return GaussianCloud(
+        means=arrays["POSITION"] * _FLIP,
+        log_scales=np.log(np.maximum(arrays[f"{EXTENSION}:SCALE"], smallest)),
+        quat_wxyz=unit_quaternions(quat_xyzw[:, [3, 0, 1, 2]]),
+        opacity_logits=np.log(opacity / (1 - opacity)).astype(np.float32),
+        colors=arrays[f"{EXTENSION}:SH_DEGREE_0_COEF_0"] * np.float32(SH_C0) + np.float32(0.5),
+        class_ids=arrays[_LABEL][:, 0].astype(np.uint8) if _LABEL in arrays else None,
+        dropped_sh_degree=max(degrees, default=0),
+    )

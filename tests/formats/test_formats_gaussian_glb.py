@@ -1,0 +1,106 @@
+"""Gaussians in glTF: round trip in numbers, another program's reader, and files that are none."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pygltflib
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from formats.errors import InputError
+from formats.gaussian_files import read_gaussians
+from formats.gaussian_glb import EXTENSION, read_gaussian_glb, write_gaussian_glb
+from formats.gaussians import GaussianCloud
+
+
+def _cloud(m: int = 301) -> GaussianCloud:
+    rng = np.random.default_rng(3)
+    return GaussianCloud(
+        means=rng.uniform(-5, 5, (m, 3)).astype(np.float32),
+        log_scales=rng.uniform(-8, 1, (m, 3)).astype(np.float32),
+        quat_wxyz=Rotation.random(m, rng=rng).as_quat()[:, [3, 0, 1, 2]].astype(np.float32),
+        opacity_logits=rng.uniform(-6, 6, m).astype(np.float32),
+        colors=rng.uniform(-0.1, 1.1, (m, 3)).astype(np.float32),
+        class_ids=rng.integers(0, 4, m).astype(np.uint8),
+    )
+
+
+def test_round_trip_in_numbers(tmp_path: Path) -> None:
+    cloud = _cloud()
+    write_gaussian_glb(tmp_path / "a.glb", cloud, ("floor", "wall"))
+    write_gaussian_glb(tmp_path / "b.glb", cloud, ("floor", "wall"))
+    assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
+    read = read_gaussians(tmp_path / "a.glb")
+    np.testing.assert_array_equal(read.means, cloud.means)
+    np.testing.assert_allclose(read.log_scales, cloud.log_scales, atol=1e-6)
+    np.testing.assert_allclose(read.opacity_logits, cloud.opacity_logits, atol=1e-3)
+    np.testing.assert_allclose(read.colors, cloud.colors, atol=1e-6)
+    assert read.class_ids is not None
+    np.testing.assert_array_equal(read.class_ids, cloud.class_ids)
+    turns = [Rotation.from_quat(c.quat_wxyz[:, [1, 2, 3, 0]]) for c in (read, cloud)]
+    assert (turns[0].inv() * turns[1]).magnitude().max() < 1e-3
+
+
+def test_another_reader_finds_what_the_extension_says(tmp_path: Path) -> None:
+    cloud = _cloud()
+    write_gaussian_glb(tmp_path / "map.glb", cloud, ("floor",))
+    gltf = pygltflib.GLTF2().load(str(tmp_path / "map.glb"))
+    assert gltf.extensionsUsed == [EXTENSION]
+    primitive = gltf.meshes[0].primitives[0]
+    assert primitive.mode == pygltflib.POINTS
+    assert primitive.extensions[EXTENSION] == {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    attributes = vars(primitive.attributes)
+    blob = gltf.binary_blob()
+
+    def values(name: str, width: int) -> np.ndarray:
+        accessor = gltf.accessors[attributes[name]]
+        view = gltf.bufferViews[accessor.bufferView]
+        assert view.byteLength == 4 * width * len(cloud)
+        return np.frombuffer(blob, "<f4", width * len(cloud), view.byteOffset).reshape(-1, width)
+
+    # y is up in glTF: what was down is up, what was forward comes towards the viewer.
+    np.testing.assert_array_equal(values("POSITION", 3), cloud.means * (1, -1, -1))
+    np.testing.assert_allclose(values(f"{EXTENSION}:SCALE", 3), np.exp(cloud.log_scales), rtol=1e-6)
+    sigmoid = 1 / (1 + np.exp(-cloud.opacity_logits))
+    np.testing.assert_allclose(values(f"{EXTENSION}:OPACITY", 1)[:, 0], sigmoid, atol=1e-6)
+    # The covariance in the file's axes is the cloud's own, turned.
+    flip = np.diag([1.0, -1, -1])
+    axes = Rotation.from_quat(values(f"{EXTENSION}:ROTATION", 4)).as_matrix()
+    own = Rotation.from_quat(cloud.quat_wxyz[:, [1, 2, 3, 0]]).as_matrix()
+    squares = np.exp(2 * cloud.log_scales.astype(np.float64))
+    spread, expected = ((r * squares[:, None]) @ r.transpose(0, 2, 1) for r in (axes, flip @ own))
+    np.testing.assert_allclose(spread, expected, atol=1e-5)
+
+
+def test_who_does_not_know_the_extension_sees_points(tmp_path: Path) -> None:
+    cloud = _cloud()
+    write_gaussian_glb(tmp_path / "map.glb", cloud)
+    points = next(iter(trimesh.load_scene(tmp_path / "map.glb").geometry.values()))
+    np.testing.assert_allclose(points.vertices, cloud.means * (1, -1, -1), atol=1e-6)
+    np.testing.assert_allclose(points.colors[:, :3], np.clip(cloud.colors, 0, 1) * 255, atol=0.51)
+
+
+def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="empty"):
+        write_gaussian_glb(tmp_path / "none.glb", replace(_cloud(0), class_ids=None))
+    trimesh.creation.box().export(tmp_path / "box.glb")
+    with pytest.raises(InputError, match="no Gaussians"):
+        read_gaussian_glb(tmp_path / "box.glb")
+    write_gaussian_glb(tmp_path / "map.glb", _cloud())
+    data = (tmp_path / "map.glb").read_bytes()
+    (tmp_path / "cut.glb").write_bytes(data[: len(data) // 2])
+    length = struct.unpack_from("<I", data, 12)[0]
+    document = json.loads(data[20 : 20 + length])
+    document["accessors"][0]["count"] = 10**9
+    text = json.dumps(document).encode()
+    head = struct.pack("<4sIIII", b"glTF", 2, 0, len(text), 0x4E4F534A)
+    (tmp_path / "greedy.glb").write_bytes(head + text + data[20 + length :])
+    for name in ("cut.glb", "greedy.glb"):
+        with pytest.raises(InputError, match="damaged"):
+            read_gaussian_glb(tmp_path / name)
