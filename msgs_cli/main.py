@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,11 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 from formats.errors import InputError
 from msgs_cli import looking
 from msgs_cli.ablating import ablate
+from msgs_cli.json_lines import JsonError
 from msgs_cli.models import models
 from msgs_cli.options import (
     FOLDER,
+    LOG_FORMAT,
     RUN_ARGUMENT,
     make_progress,
     open_run,
@@ -42,7 +45,7 @@ class FriendlyGroup(click.Group):
             flush_output()
             return result
         except InputError as error:
-            raise click.ClickException(printable(str(error))) from error
+            raise _refused(ctx, str(error)) from error
         except OSError as error:
             if error.errno not in _SYSTEM_REFUSES:
                 raise
@@ -50,6 +53,10 @@ class FriendlyGroup(click.Group):
             raise click.ClickException(
                 printable(f"{where}: {error.strerror}. Change that, then run it again")
             ) from error
+
+
+def _refused(ctx: click.Context, text: str) -> click.ClickException:
+    return JsonError(text) if ctx.meta.get(LOG_FORMAT) == "json" else click.ClickException(printable(text))
 
 
 _SYSTEM_REFUSES = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENAMETOOLONG}
@@ -151,13 +158,17 @@ def resume(
 @main.command()
 @RUN_ARGUMENT
 @click.option("-v", "--verbose", is_flag=True, help="Every figure of every stage.")
-def status(run_path: Path, verbose: bool) -> None:
-    """Say which stages of RUN are done, what they found, and what was degraded."""
+@click.option("--json", "as_json", is_flag=True, help="The same for programs, with every figure.")
+def status(run_path: Path, verbose: bool, as_json: bool) -> None:
+    """Say which stages of RUN are done, what they found, what was degraded, and which files are damaged."""
     from msgs_cli.tables import status_table, warning_lines
     from pipelines.status import run_status
 
     run = open_run(run_path)
     found = run_status(run)
+    if as_json:
+        click.echo(json.dumps(found.to_json(), indent=1))
+        return
     say(f"{run.root}: made from {found.source}\n")
     say(status_table(found.stages, verbose))
     records = {s.name: s.record for s in found.stages if s.record}

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from msgs_cli.json_lines import JsonHandler, JsonProgress
 from msgs_cli.text import PrintableFormatter, say
 
 if TYPE_CHECKING:
@@ -23,8 +24,24 @@ FOLDER = click.Path(path_type=Path, file_okay=False)
 RUN_ARGUMENT = click.argument("run_path", metavar="RUN", type=FOLDER)
 
 
+LOG_FORMAT = "msgs_cli.log_format"
+
+
+def _keep_format(ctx: click.Context, parameter: click.Parameter, value: str) -> None:
+    ctx.meta[LOG_FORMAT] = value
+
+
+def _as_json() -> bool:
+    ctx = click.get_current_context(silent=True)
+    return ctx is not None and ctx.meta.get(LOG_FORMAT) == "json"
+
+
 def verbosity_options(command: Callable[..., None]) -> Callable[..., None]:
-    """-q and -v."""
+    """-q, -v and --log-format."""
+    command = click.option(
+        "--log-format", type=click.Choice(["text", "json"]), default="text", expose_value=False, callback=_keep_format,
+        help="json: progress, logs and errors on stderr as one JSON object a line.",
+    )(command)  # fmt: skip
     command = click.option("-v", "--verbose", is_flag=True, help="Log what is decided and why.")(command)
     return click.option("-q", "--quiet", is_flag=True, help="No bars and no table; only errors.")(command)
 
@@ -98,17 +115,20 @@ def set_up_logging(quiet: bool, verbose: bool) -> None:
     if quiet and verbose:
         raise click.UsageError("-q and -v exclude each other")
     level = logging.ERROR if quiet else logging.INFO if verbose else logging.WARNING
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(PrintableFormatter("%(levelname)s: %(message)s"))
+    handler: logging.Handler = JsonHandler() if _as_json() else logging.StreamHandler(sys.stderr)
+    if not _as_json():
+        handler.setFormatter(PrintableFormatter("%(levelname)s: %(message)s"))
     logging.basicConfig(level=level, handlers=[handler], force=True)
 
 
 def make_progress(quiet: bool) -> Progress:
-    """Bars on stderr, or nothing."""
+    """Bars on stderr, or JSON lines, or nothing."""
     from msgs_cli.progress import BarProgress
     from pipelines.progress import SilentProgress
 
-    return SilentProgress() if quiet else BarProgress()
+    if quiet:
+        return SilentProgress()
+    return JsonProgress() if _as_json() else BarProgress()
 
 
 def open_run(path: Path) -> RunFolder:

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
+
+from pipelines.wording import lost_text
 
 if TYPE_CHECKING:
     from pipelines.records import StageRecord
@@ -21,14 +26,23 @@ KEY_FIGURES = {
 """What a person wants to know first; `status -v` says all."""
 
 
-def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Left-aligned columns under a rule."""
+def format_table(header: Sequence[str], rows: Sequence[Sequence[str]], width: int = 0) -> str:
+    """Left-aligned columns under a rule; the last one is wrapped to a table of `width` characters, 0 = as it is."""
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
-    lines = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in [header, *rows]
-    ]
-    return "\n".join([lines[0], "  ".join("-" * width for width in widths), *lines[1:]])
+    before = sum(widths[:-1]) + 2 * (len(widths) - 1)
+    if width:
+        widths[-1] = min(widths[-1], max(width - before, 20))
+    lines = []
+    for row in [header, *rows]:
+        start = "".join(cell.ljust(w + 2) for cell, w in zip(row[:-1], widths[:-1], strict=True))
+        last = textwrap.wrap(row[-1], widths[-1]) if width else [row[-1]]
+        lines += [(start + (last[0] if last else "")).rstrip(), *(" " * before + more for more in last[1:])]
+    return "\n".join([lines[0], "  ".join("-" * w for w in widths), *lines[1:]])
+
+
+def terminal_width() -> int:
+    """Characters a line of the terminal, 0 where the output goes into a file or pipe."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
 
 
 def status_table(stages: Sequence[StageStatus], everything: bool = False) -> str:
@@ -39,13 +53,15 @@ def status_table(stages: Sequence[StageStatus], everything: bool = False) -> str
             rows.append([stage.name, stage.state, "", "", ""])
             continue
         wanted = record.figures if everything else [k for k in KEY_FIGURES[stage.name] if k in record.figures]
-        figures = ", ".join(f"{key} {format_figure(record.figures[key])}" for key in wanted)
+        figures = ", ".join(f"{key} {format_figure(record.figures[key], key)}" for key in wanted)
         rows.append([stage.name, stage.state, f"{record.seconds:.1f}", f"{record.peak_memory_mb:.0f}", figures])
-    return format_table(["stage", "state", "seconds", "peak MB", "figures"], rows)
+    return format_table(["stage", "state", "seconds", "peak MB", "figures"], rows, terminal_width())
 
 
-def format_figure(value: Any) -> str:
-    """Short text of a figure."""
+def format_figure(value: Any, key: str = "") -> str:
+    """Short text of a figure; lost frames together by their cause."""
+    if key == "lost" and isinstance(value, dict):
+        return lost_text(value)
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: "-"}[value]
     if isinstance(value, dict):

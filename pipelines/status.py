@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from pipelines.records import StageRecord, differing_settings, load_records, load_source
@@ -10,53 +10,81 @@ from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
 from pipelines.settings_file import load_settings
 
-DONE, INTERRUPTED, OUTDATED, NOT_YET = "done", "interrupted", "outdated", "not yet"
+DONE, DAMAGED, INTERRUPTED, OUTDATED, NOT_YET = "done", "damaged", "interrupted", "outdated", "not yet"
 
 
 @dataclass(frozen=True)
 class StageStatus:
-    """state: done; interrupted (begun and not ended); outdated (its files are there, but were made with other
-    settings or from other inputs than the stages before it have by now); not yet. record of a stage that is done;
-    changed: settings of run.toml, as `section.key=value`, with which `resume` would make it again."""
+    """state: done; damaged (done, but some of its files are gone or not as it left them); interrupted (begun and not
+    ended); outdated (its files are there, but were made with other settings or from other inputs than the stages before
+    it have by now); not yet. record: of a stage that is done; changed: settings of run.toml, as `section.key=value`,
+    with which `resume` would make it again; damaged: names of those files."""
 
     name: str
     state: str
     record: StageRecord | None
     changed: tuple[str, ...] = ()
+    damaged: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class RunStatus:
     """source: the path that the run was made from; stages: all of them, in order."""
 
+    run: RunFolder
     source: str
     stages: tuple[StageStatus, ...]
 
     @property
     def warnings(self) -> list[str]:
         """What is wrong with the run itself, and what to type."""
-        return [
-            f"{s.name} was made with other settings than run.toml asks for by now ({', '.join(s.changed)}): "
-            "`msgs-slam resume` makes it again"
+        again = f"`msgs-slam resume {self.run.root}` makes it and what follows again"
+        changed = [
+            f"{s.name} was made with other settings than run.toml asks for by now ({', '.join(s.changed)}): {again}"
             for s in self.stages
             if s.changed
         ]
+        damaged = [
+            f"{s.name}: {len(s.damaged)} of its {len(s.record.files)} files are damaged or gone ({_few(s.damaged)}): "
+            f"{again}"
+            for s in self.stages
+            if s.damaged and s.record
+        ]
+        return changed + damaged
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; the records without their lists of files."""
+        stages = []
+        for s in self.stages:
+            record = {k: v for k, v in asdict(s.record).items() if k != "files"} if s.record else None
+            stages.append(
+                {"name": s.name, "state": s.state, "changed": s.changed, "damaged": s.damaged, "record": record}
+            )
+        return {"run": str(self.run.root), "source": self.source, "stages": stages, "warnings": self.warnings}
 
 
 def run_status(run: RunFolder) -> RunStatus:
-    """Raises InputError where the manifest or the settings are damaged."""
+    """Reads every file of the run once, to tell which are damaged.
+
+    Raises InputError where the manifest or the settings are.
+    """
     records, config = load_records(run), load_settings(run)
     stages = []
     for name in STAGES:
         record = records.get(name)
         changed = tuple(differing_settings(record, config)) if record else ()
-        stages.append(StageStatus(name, _state(run, name, record), record, changed))
-    return RunStatus(load_source(run).path, tuple(stages))
+        damaged = tuple(run.damaged(name))
+        stages.append(StageStatus(name, _state(run, name, record, damaged), record, changed, damaged))
+    return RunStatus(run, load_source(run).path, tuple(stages))
 
 
-def _state(run: RunFolder, name: str, record: Any) -> str:
+def _state(run: RunFolder, name: str, record: StageRecord | None, damaged: tuple[str, ...]) -> str:
     if record is not None:
-        return DONE
+        return DAMAGED if damaged else DONE
     if run.partial(name).exists():
         return INTERRUPTED
     return OUTDATED if run.stage(name).exists() else NOT_YET
+
+
+def _few(names: tuple[str, ...], most: int = 5) -> str:
+    return ", ".join(names[:most]) + (", ..." if len(names) > most else "")

@@ -25,6 +25,7 @@ from pipelines.records import load_source
 from pipelines.run_folder import RunFolder
 from pipelines.types import LoopEdge, SparseModel
 from pipelines.upright.world import FIRST, load_world
+from pipelines.wording import lost_text
 
 MEASURED_VIEWS = 60
 SHOWN_VIEWS = 8
@@ -158,7 +159,7 @@ def _time_section(outcome: Outcome) -> str:
             name,
             f"{r.seconds:.1f}",
             f"{r.peak_memory_mb:.0f}",
-            ", ".join(f"{k} {_short(v)}" for k, v in r.figures.items()),
+            ", ".join(f"{k} {lost_text(v) if k == 'lost' else _short(v)}" for k, v in r.figures.items()),
         )
         for name, r in outcome.records.items()
     ]

@@ -19,6 +19,7 @@ from pipelines.tracking.result import normalise, to_sparse_model, to_trajectory
 from pipelines.tracking.segments import join_segments, split_segments
 from pipelines.tracking.state import FEATURE_SD, TrackState
 from pipelines.types import Frame
+from pipelines.wording import stretches
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -130,20 +131,9 @@ def describe(state: TrackState, frames: list[Frame], report: Report, metric: boo
 def warn_of_losses(context: StageContext, state: TrackState) -> None:
     """Name what is lost."""
     if state.lost:
-        context.warn(f"{len(state.lost)} frames have no pose: {stretches(sorted(state.lost))}")
+        context.warn(f"{len(state.lost)} frames have no pose: {stretches(state.lost)}")
     if len(set(state.segment.values())) > 1:
         context.warn("the trajectory has parts that could not be joined; only the largest is kept")
-
-
-def stretches(ids: list[int]) -> str:
-    """[1, 2, 3, 7] -> "1-3, 7"."""
-    runs: list[list[int]] = []
-    for i in ids:
-        if runs and i == runs[-1][-1] + 1:
-            runs[-1].append(i)
-        else:
-            runs.append([i])
-    return ", ".join(f"{r[0]}-{r[-1]}" if len(r) > 1 else str(r[0]) for r in runs)
 
 
 STAGE = Stage("tracking", run, "a pose for every frame, by correspondences and bundle adjustment")

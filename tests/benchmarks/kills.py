@@ -36,7 +36,8 @@ from pipelines.run_folder_names import STAGES
 from pipelines.world import ClipOptions, iter_clip, make_world
 
 SETTINGS = (
-    "run.threads=1", "run.device=cpu", "frames.max_features=800", "proxy.stereo_side=160", "mapping.passes=1",
+    "run.threads=1", "run.device=cpu", "frames.max_features=600", "proxy.stereo_side=96", "proxy.stereo_planes=24",
+    "mapping.passes=1",
     "mapping.min_iterations=20", "mapping.max_gaussians=6000", "mapping.snapshot_every=5", "export.voxel=0.08",
 )  # fmt: skip
 CHANGES = (

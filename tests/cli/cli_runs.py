@@ -9,10 +9,11 @@ from msgs_cli.main import main
 from pipelines.world import ClipOptions
 
 QUICK = (
-    "run.threads=1", "run.device=cpu", "frames.max_features=800", "proxy.stereo_side=160", "mapping.passes=1",
+    "run.threads=1", "run.device=cpu", "frames.max_features=600", "proxy.stereo_side=96", "proxy.stereo_planes=24",
+    "mapping.passes=1",
     "mapping.min_iterations=20", "mapping.max_gaussians=8000", "mapping.snapshot_every=5", "export.voxel=0.05",
 )  # fmt: skip
-OPTIONS = ClipOptions(frames=16, width=160, height=120, fps=10.0, laps=0.3)
+OPTIONS = ClipOptions(frames=14, width=160, height=120, fps=10.0, laps=0.26)
 
 
 def invoke(*arguments: object) -> Result:

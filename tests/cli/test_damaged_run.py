@@ -1,0 +1,102 @@
+"""Damage to a finished run: found, named, and never used. `tests/benchmarks/damage.py` tries all of it."""
+
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from cli_runs import invoke
+
+from msgs_cli.tables import format_figure, format_table
+from pipelines.records import load_records
+from pipelines.run_folder import RunFolder
+from pipelines.wording import lost_text, stretches
+
+USED_BY = {
+    "frames/frames.json": "ply",
+    "frames/000003.jpg": "colmap",
+    "frames/calibration.json": "tum",
+    "proxy/classes.json": "tum",
+    "global_ba/map.safetensors": "ply",
+    "global_ba/trajectory.npz": "tum",
+    "global_ba/sparse.npz": "colmap",
+}
+
+
+def spoil(path: Path, how: str) -> None:
+    if how == "deleted":
+        path.unlink()
+    elif how == "cut":
+        path.write_bytes(path.read_bytes()[:-7])
+    else:
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 1
+        path.write_bytes(data)
+
+
+@pytest.mark.parametrize("how", ["deleted", "cut", "flipped"])
+def test_damage_is_named_and_never_used(how: str, copied_run: Callable[[str], Path], tmp_path: Path) -> None:
+    run = copied_run("run.msgs")
+    for file, kind in USED_BY.items():
+        whole = (run / file).read_bytes()
+        spoil(run / file, how)
+        refused = invoke("export", run, "--only", kind, "--to", tmp_path / "out", "-q")
+        assert refused.exit_code == 1, file
+        assert str(run / file) in refused.stderr
+        assert f"msgs-slam resume {run}" in refused.stderr
+        stage, _, name = file.partition("/")
+        status = invoke("status", run).stdout
+        assert f"{stage}: 1 of its " in status
+        assert name in status
+        (run / file).write_bytes(whole)
+    assert invoke("export", run, "--only", "tum", "--to", tmp_path / "out", "-q").exit_code == 0
+
+
+def test_damaged_export_is_made_again(copied_run: Callable[[str], Path]) -> None:
+    run = copied_run("run.msgs")
+    before = load_records(RunFolder(run))["export"].content
+    spoil(run / "export" / "mesh.ply", "flipped")
+    spoil(run / "export" / "point_cloud.ply", "cut")
+    assert json.loads(invoke("status", run, "--json").stdout)["stages"][-1]["state"] == "damaged"
+    assert invoke("resume", run, "-q").exit_code == 0
+    assert load_records(RunFolder(run))["export"].content == before
+    found = json.loads(invoke("status", run, "--json").stdout)
+    assert [s["state"] for s in found["stages"]] == ["done"] * 6
+    assert found["warnings"] == []
+    assert found["stages"][0]["record"]["figures"]["frames"] == 14
+
+
+def test_settings_that_are_gone_are_made_again_from_the_records(copied_run: Callable[[str], Path]) -> None:
+    run = copied_run("run.msgs")
+    before = (run / "run.toml").read_bytes()
+    (run / "run.toml").unlink()
+    assert invoke("resume", run, "-q").exit_code == 0
+    assert (run / "run.toml").read_bytes() == before
+
+
+def test_progress_and_errors_as_json_lines(copied_run: Callable[[str], Path]) -> None:
+    run = copied_run("run.msgs")
+    (run / "export" / "mesh.glb").unlink()
+    done = invoke("resume", run, "--log-format", "json", "-v")
+    lines = [json.loads(line) for line in done.stderr.splitlines()]
+    assert {line["event"] for line in lines} == {"progress", "log"}
+    ended = [line for line in lines if line.get("ended")]
+    assert {line["label"] for line in ended} >= {"depth views"}
+    assert all(line["done"] == line["total"] for line in ended)
+    (run / "run.toml").write_text("")
+    refused = invoke("resume", run, "--log-format", "json")
+    assert refused.exit_code == 1
+    assert "not as the program left it" in json.loads(refused.stderr)["message"]
+    logging.getLogger().handlers.clear()
+
+
+def test_lost_frames_of_one_cause_are_told_together() -> None:
+    assert stretches([7, 1, 2, 3]) == "1-3, 7"
+    assert stretches(range(0, 100, 2), most=3) == "0, 2, 4 and 47 more stretches"
+    lost = {str(i): "blurred" if i == 8 else "too few matches" for i in range(5, 12)}
+    assert lost_text(lost) == "7 (too few matches 5-7, 9-11; blurred 8)"
+    assert format_figure({}, "lost") == "none"
+    assert len(format_figure({str(2 * i): "too few matches" for i in range(5000)}, "lost")) < 200
+    table = format_table(["stage", "figures"], [["tracking", "posed 3, lost none, " * 20]], width=60)
+    assert max(map(len, table.splitlines())) <= 60
