@@ -161,7 +161,6 @@ class GlobalBaConfig:
 
     use_loops: bool = setting(True, "look for places that are seen again")
     use_semantics: bool = setting(True, "propose loops by semantics too, eqs. (21) to (24)")
-    features: int = setting(2000, "SIFT features of a keyframe for finding loops", within=(10, 100_000))
     loop_gap: int = setting(8, "a loop joins keyframes at least this many apart", within=(1, 1_000_000))
     loop_candidates: int = setting(2, "candidates a keyframe", within=(1, 1000))
     loop_appearance: float = setting(0.02, "least appearance similarity of a candidate", within=(-1, 1))

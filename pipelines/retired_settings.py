@@ -28,9 +28,9 @@ _FIXED = {
     "depth_tolerance densify_every densify_until split_radius prune_opacity prune_weight prune_radius mean_rate "
     "radius_rate opacity_rate color_rate class_rate rate_decay pose_rate exposure_rate low_trust_step time_decay "
     "reliability_decay region_prior",
-    "global_ba": "words loop_shared_points richness loop_similarity miou_weight appearance_weight structure_weight "
-    "loop_error loop_share loop_sure_inliers loop_rotation loop_translation loop_drift loop_angle_drift "
-    "loop_scale_drift drift_px joint_px",
+    "global_ba": "features words loop_shared_points richness loop_similarity miou_weight appearance_weight "
+    "structure_weight loop_error loop_share loop_sure_inliers loop_rotation loop_translation loop_drift "
+    "loop_angle_drift loop_scale_drift drift_px joint_px",
     "export": "truncation least_weight",
 }
 FIXED = frozenset(f"{section}.{name}" for section, names in _FIXED.items() for name in names.split())

@@ -16,7 +16,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,18 +30,21 @@ from pipelines.types import (
     VOID,
     Calibration,
     ClassTable,
+    Features,
     Frame,
     LoopEdge,
     MirrorPairs,
     ProxyMaps,
     SparseModel,
     Trajectory,
+    Vocabulary,
 )
 
 if TYPE_CHECKING:
     from pipelines.gaussian_map import GaussianMap
 
 FRAMES, CALIBRATION, BACKBONE = "frames.json", "calibration.json", "backbone/model.npz"
+VOCABULARY, TRIED = "correspondence/vocabulary.npz", "correspondence/tried.npz"
 CLASSES, SYMMETRY, DESCRIPTORS = "classes.json", "symmetry.npz", "descriptors.npz"
 TRAJECTORY, SPARSE, DEPTH_SCALES = "trajectory.npz", "sparse.npz", "depth_scales.npz"
 MAP, EXPOSURE, LOOPS = "map.safetensors", "exposure.npz", "loops.json"
@@ -79,6 +81,21 @@ class RunFolder(FinishedFiles):
     def image_file(self, frame: Frame) -> Path:
         """The picture of a frame, undistorted."""
         return self.file("frames", frame.name)
+
+    def load_features(self, frame_id: int) -> Features | None:
+        """Features of a keyframe in undistorted pixels; None for any other frame."""
+        if not self.has("frames", features_name(frame_id)):
+            return None
+        return Features(**load_layout(self.file("frames", features_name(frame_id)), stored.FEATURES))
+
+    def load_vocabulary(self) -> Vocabulary:
+        """By which frames are described and compared."""
+        return Vocabulary(**load_layout(self.file("frames", VOCABULARY), stored.VOCABULARY))
+
+    def load_tried(self) -> dict[tuple[int, int], int]:
+        """Inverse of `save_tried`."""
+        rows = load_layout(self.file("frames", TRIED), stored.TRIED)["rows"].tolist()
+        return {(first, second): count for first, second, count in rows}
 
     def image(self, frame: Frame) -> NDArray[np.uint8]:
         """(H, W, 3) RGB, undistorted."""
@@ -230,6 +247,27 @@ def save_calibration(folder: Path, calibration: Calibration) -> None:
     write_json(folder / CALIBRATION, asdict(calibration))
 
 
+def save_features(folder: Path, frame_id: int, features: Features) -> None:
+    """One npz a keyframe."""
+    save_arrays(folder / features_name(frame_id), vars(features))
+
+
+def features_name(frame_id: int) -> str:
+    """Where a keyframe's features lie, inside the stage's folder."""
+    return f"correspondence/{frame_id:06d}.npz"
+
+
+def save_vocabulary(folder: Path, vocabulary: Vocabulary) -> None:
+    """One npz."""
+    save_arrays(folder / VOCABULARY, vars(vocabulary))
+
+
+def save_tried(folder: Path, tried: dict[tuple[int, int], int]) -> None:
+    """(first, second) frame ids of every pair of keyframes that was matched → matches that obey one geometry."""
+    rows = np.array([(*pair, count) for pair, count in tried.items()], np.int64).reshape(-1, 3)
+    save_arrays(folder / TRIED, {"rows": rows})
+
+
 def save_sparse_model(path: Path, model: SparseModel) -> None:
     """One npz."""
     save_arrays(path, dict(model.__dict__))
@@ -372,12 +410,3 @@ def save_loops(folder: Path, loops: list[LoopEdge]) -> None:
     """The verified loops."""
     rows = [{**vars(e), "frame2_from_frame1": e.frame2_from_frame1.tolist()} for e in loops]
     write_json(folder / LOOPS, rows)
-
-
-def resize_maps(maps: ProxyMaps, width: int, height: int) -> ProxyMaps:
-    """Proxy maps at another resolution. Nearest neighbour: depth must not be averaged across an edge."""
-
-    def nearest(array: NDArray) -> NDArray:
-        return cv2.resize(array, (width, height), interpolation=cv2.INTER_NEAREST)
-
-    return ProxyMaps(*(nearest(getattr(maps, n)) for n in ("depth", "confidence", "labels", "label_confidence")))

@@ -30,6 +30,9 @@ SPARSE_MODEL = {
     "frame_ids": "i N", "cam_from_world": "f N 4 4", "points_in_world": "f P 3", "colors": "i P 3",
     "obs_frame": "i O", "obs_point": "i O", "obs_xy": "f O 2",
 }  # fmt: skip
+FEATURES = {"keypoints": "f F 4", "descriptors": "i F 128"}
+VOCABULARY = {"words": "f W 128", "mean": "f D"}
+TRIED = {"rows": "i P 3"}
 PROXY_MAPS = {"inverse_depth": "f H W", "confidence": "i H W", "labels": "i H W", "label_confidence": "i H W"}
 EXPOSURE = {"frame_ids": "i N", "log_gains": "f N 3", "offsets": "f N 3"}
 DESCRIPTORS = {"frame_ids": "i N", "vectors": "f N F"}

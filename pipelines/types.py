@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,37 @@ def require_shape(name: str, array: NDArray, expected: Sequence[int | None]) -> 
     if len(shape) != len(expected) or any(e is not None and s != e for s, e in zip(shape, expected, strict=True)):
         want = tuple("any" if e is None else e for e in expected)
         raise ValueError(f"{name}: got shape {shape}, expected {want}")
+
+
+@dataclass(frozen=True)
+class Features:
+    """keypoints (F, 4) float32: x, y in pixels, diameter, orientation in radians; descriptors (F, 128) uint8 of length
+    NORM."""
+
+    keypoints: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    NORM: ClassVar[int] = 512
+
+    def __post_init__(self) -> None:
+        require_shape("keypoints", self.keypoints, (None, 4))
+        require_shape("descriptors", self.descriptors, (len(self.keypoints), 128))
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+    @property
+    def xy(self) -> NDArray[np.float64]:
+        """(F, 2) pixels."""
+        return self.keypoints[:, :2].astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """Words (W, 128) of descriptors, and the mean (W * 128,) of how frames look in them: what all frames of a place
+    share says nothing of which look at one spot."""
+
+    words: NDArray[np.float64]
+    mean: NDArray[np.float64]
 
 
 @dataclass(frozen=True)

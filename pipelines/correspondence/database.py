@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pycolmap
 
-from pipelines.correspondence.features import Features
 from pipelines.correspondence.matching import VerifiedPair
+from pipelines.types import Features
 
 
 def write_database(

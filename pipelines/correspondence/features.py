@@ -1,64 +1,49 @@
-"""SIFT features of a keyframe."""
+"""SIFT features of a picture: the only extractor there is."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
-from pipelines.types import require_shape
+from pipelines.types import Features, require_shape
 
-DESCRIPTOR_NORM = 512
-"""Length of a descriptor: COLMAP stores the root of L1-normalised SIFT times this, rounded to bytes."""
-
-
-@dataclass(frozen=True)
-class Features:
-    """keypoints (F, 4) float32: x, y in pixels, scale, orientation in radians; descriptors (F, 128) uint8."""
-
-    keypoints: NDArray[np.float32]
-    descriptors: NDArray[np.uint8]
-
-    def __post_init__(self) -> None:
-        require_shape("keypoints", self.keypoints, (None, 4))
-        require_shape("descriptors", self.descriptors, (len(self.keypoints), 128))
-
-    def __len__(self) -> int:
-        return len(self.keypoints)
-
-    def outside(self, left_out: NDArray[np.bool_] | None) -> Features:
-        """Those that do not lie in a mask (H, W)."""
-        if left_out is None or len(self) == 0:
-            return self
-        column, row = self.keypoints[:, :2].astype(np.int64).T
-        kept = ~left_out[row.clip(0, left_out.shape[0] - 1), column.clip(0, left_out.shape[1] - 1)]
-        return Features(self.keypoints[kept], self.descriptors[kept])
-
-    @property
-    def xy(self) -> NDArray[np.float64]:
-        """(F, 2) pixels."""
-        return self.keypoints[:, :2].astype(np.float64)
+_LAYERS = 3
+_EDGE_RATIO = 10.0
+_BLUR = 1.6
 
 
-class FeatureExtractor:
-    """SIFT on one thread: the same image gives the same bytes. Keep one for each thread."""
+def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB -> (H, W) grey."""
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
-    def __init__(self, max_features: int, peak_threshold: float) -> None:
-        options = pycolmap.FeatureExtractionOptions()
-        options.use_gpu = False
-        options.num_threads = 1
-        options.sift.max_num_features = max_features
-        options.sift.peak_threshold = peak_threshold
-        # A second orientation gives a second keypoint at the same place: it costs matching time and adds no geometry.
-        options.sift.max_num_orientations = 1
-        self._extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
 
-    def __call__(self, gray: NDArray[np.uint8]) -> Features:
-        """Features of an (H, W) uint8 image."""
-        require_shape("gray", gray, (None, None))
-        keypoints, descriptors = self._extractor.extract_from_uint8_array(np.ascontiguousarray(gray))
-        if len(keypoints) == 0:
-            return Features(np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8))
-        return Features(pycolmap.keypoints_to_matrix(keypoints), np.asarray(descriptors.data, dtype=np.uint8))
+def extract_features(
+    grey: NDArray[np.uint8], count: int, threshold: float, left_out: NDArray[np.bool_] | None = None
+) -> Features:
+    """The `count` SIFT features (Lowe 2004) of most contrast of an (H, W) picture, as RootSIFT (Arandjelović and
+    Zisserman, CVPR 2012), the strongest first.
+
+    `threshold` is the least contrast, as a share of the range of grey. None lies in the mask `left_out` (H, W).
+    """
+    require_shape("grey", grey, (None, None))
+    # OpenCV divides its threshold by the number of layers; its option puts keypoints a quarter pixel nearer the truth.
+    # It chooses the strongest before it looks at a mask, and what is left out would crowd the others out.
+    most = count if left_out is None else 0
+    sift = cv2.SIFT.create(most, _LAYERS, _LAYERS * threshold, _EDGE_RATIO, _BLUR, cv2.CV_32F, True)
+    found, descriptors = sift.detectAndCompute(grey, None if left_out is None else (~left_out).astype(np.uint8))
+    if not found:
+        return Features(np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8))
+    table = np.array([(*k.pt, k.size, np.radians(k.angle), -k.response) for k in found], np.float64)
+    # A second orientation gives a second keypoint at the same place: it costs matching time and adds no geometry.
+    by_place = np.lexsort(table[:, 3::-1].T)
+    _, first = np.unique(table[by_place, :3], axis=0, return_index=True)
+    order = by_place[first[np.argsort(table[by_place[first], 4], kind="stable")]][:count]
+    table[:, :2] += 0.5  # OpenCV puts the centre of the first pixel at (0, 0)
+    return Features(table[order, :4].astype(np.float32), _root(np.asarray(descriptors, np.float32)[order]))
+
+
+def _root(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """The root of the L1-normalised descriptors, in bytes."""
+    share = descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-12)
+    return np.clip(np.round(np.sqrt(share) * Features.NORM), 0, 255).astype(np.uint8)

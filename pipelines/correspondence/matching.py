@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipelines.correspondence.features import DESCRIPTOR_NORM, Features
+from pipelines.types import Features
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8], optio
         return np.zeros((0, 2), np.uint32)
     similarity = first.astype(np.float32) @ second.astype(np.float32).T
     best, score, runner_up, best_back = _two_nearest(similarity)
-    angle = np.arccos(np.clip(score / DESCRIPTOR_NORM**2, 0, 1))
-    next_angle = np.arccos(np.clip(runner_up / DESCRIPTOR_NORM**2, 0, 1))
+    angle = np.arccos(np.clip(score / Features.NORM**2, 0, 1))
+    next_angle = np.arccos(np.clip(runner_up / Features.NORM**2, 0, 1))
     index = np.arange(len(first))
     good = (best_back[best] == index) & (angle < options.max_angle) & (angle < options.max_ratio * next_angle)
     return np.stack([index[good], best[good]], axis=1).astype(np.uint32)

@@ -15,8 +15,8 @@ from formats.atomic import write_bytes
 from formats.errors import DiskFullError
 from formats.jsonfile import read_json, write_json
 from formats.tensors import load_arrays, save_arrays
-from pipelines.correspondence.features import Features
 from pipelines.correspondence.matching import VerifiedPair
+from pipelines.types import Features
 
 _DATABASE_SHARE = 3
 """Bytes of the database and the models made from it, over those of the packed features and matches: a guess on the safe

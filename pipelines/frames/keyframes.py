@@ -9,13 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.correspondence.flow import corners, follow
 from pipelines.frames.sharpness import reduce_image
 
 _TRACKED_SIDE = 480
 _MAX_CORNERS = 600
 _MIN_TRACKS = 30
-_BACKWARD_PX = 1.0
-_WINDOW = (21, 21)
+_APART_PX = 6.0
+_LEVELS = 4
 
 
 @dataclass(frozen=True)
@@ -70,19 +71,15 @@ class _Tracker:
 
     def __init__(self) -> None:
         self._previous: NDArray[np.uint8] | None = None
-        self._origin = np.zeros((0, 2), np.float32)
-        self._points = np.zeros((0, 2), np.float32)
+        self._origin = np.zeros((0, 2))
+        self._points = np.zeros((0, 2))
         self._started = 0
 
     def restart(self, gray: NDArray[np.uint8], left_out: NDArray[np.bool_] | None) -> None:
         """Take `gray`, the frame advanced to last, as the keyframe."""
-        scene = None
         if left_out is not None:
-            scene = cv2.resize((~left_out).astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        corners = cv2.goodFeaturesToTrack(gray, _MAX_CORNERS, 0.005, 6, mask=scene)
-        found = np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2)
-        self._origin = found.astype(np.float32)
-        self._points = self._origin
+            left_out = cv2.resize(left_out.astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+        self._origin = self._points = corners(gray, self._origin[:0], _MAX_CORNERS, _APART_PX, left_out)
         self._started = len(self._origin)
 
     def advance(self, gray: NDArray[np.uint8]) -> tuple[float, float]:
@@ -91,20 +88,10 @@ class _Tracker:
         if previous is None or self._started == 0:
             return 0.0, 1.0
         if len(self._points):
-            moved, found = _track(previous, gray, self._points)
+            moved, found = follow(previous, gray, self._points, self._points, _LEVELS)
             self._origin, self._points = self._origin[found], moved[found]
         survivors = len(self._points) / self._started
         if len(self._points) < min(_MIN_TRACKS, self._started):
             return np.inf, survivors
         distance = np.linalg.norm(self._points - self._origin, axis=1)
         return float(np.median(distance)) / gray.shape[1], survivors
-
-
-def _track(
-    first: NDArray[np.uint8], second: NDArray[np.uint8], points: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    guess = points.copy()  # OpenCV wants an array here, and without a flag does not read it
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(first, second, points, guess, winSize=_WINDOW, maxLevel=4)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, moved, guess.copy(), winSize=_WINDOW, maxLevel=4)
-    close = np.linalg.norm(back - points, axis=1) < _BACKWARD_PX
-    return np.asarray(moved, np.float32), (found.ravel() == 1) & (found_back.ravel() == 1) & close

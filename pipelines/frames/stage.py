@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from formats.images import read_rgb, write_rgb
 from formats.jsonfile import read_json, write_json
 from formats.video import VideoFrame
 from pipelines.config import Config, FramesConfig
+from pipelines.correspondence.features import to_grey
 from pipelines.correspondence.snapshots import Snapshots
 from pipelines.frames.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes
 from pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
@@ -27,7 +27,14 @@ from pipelines.frames.pick import sharpest_of_windows
 from pipelines.frames.recording import RecordingSource
 from pipelines.frames.sharpness import reduce_image, reduced_size
 from pipelines.frames.source import FolderSource, VideoSource, open_source
-from pipelines.run_folder import save_backbone, save_calibration, save_frames
+from pipelines.run_folder import (
+    save_backbone,
+    save_calibration,
+    save_features,
+    save_frames,
+    save_tried,
+    save_vocabulary,
+)
 from pipelines.stages import Stage, StageContext
 from pipelines.structure.backbone import to_sparse_model
 from pipelines.structure.calibration import read_intrinsics
@@ -61,6 +68,7 @@ def run(context: StageContext) -> dict[str, Any]:
     lens = make_lens(structure.model.cameras[1])
     calibration = _calibration(context, lens, origin, structure.focal_sd)
     _write_backbone(context, structure, keyframes, lens, frames)
+    _write_correspondences(context, structure, keyframes, lens)
     _write_frames(context, source, frames, lens)
     masked = masks.write(context.folder / "masks", frames, lens)
     save_calibration(context.folder, calibration)
@@ -190,7 +198,7 @@ def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks) -> Ke
 
 
 def _gray(context: StageContext, frame: Frame) -> NDArray[np.uint8]:
-    return np.asarray(cv2.cvtColor(read_rgb(_picked(context, frame.name)), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    return to_grey(read_rgb(_picked(context, frame.name)))
 
 
 def _structure(
@@ -274,6 +282,18 @@ def _write_backbone(
         structure.model, keyframes, lens, lambda frame_id: read_rgb(_picked(context, frames[frame_id].name))
     )
     save_backbone(context.folder, model)
+
+
+def _write_correspondences(context: StageContext, structure: Structure, keyframes: list[int], lens: Lens) -> None:
+    """What the stages after this one need of features and matches, in undistorted pixels."""
+    for frame_id, features in zip(keyframes, structure.features, strict=True):
+        keypoints = features.keypoints.copy()
+        # What a lens of much distortion cannot have seen lies nowhere in the picture.
+        keypoints[:, :2] = np.nan_to_num(lens.undistort_points(features.xy), nan=-1.0, posinf=-1.0, neginf=-1.0)
+        save_features(context.folder, frame_id, replace(features, keypoints=keypoints))
+    save_vocabulary(context.folder, structure.vocabulary)
+    found = {(p.first, p.second): len(p.matches) for p in structure.pairs}
+    save_tried(context.folder, {(keyframes[i], keyframes[j]): found.get((i, j), 0) for i, j in structure.tried})
 
 
 def _write_frames(context: StageContext, source: AnySource, frames: list[Frame], lens: Lens) -> None:

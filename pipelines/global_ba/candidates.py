@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.config import GlobalBaConfig
+from pipelines.correspondence.retrieval import far_apart, loop_pairs
 from pipelines.global_ba.semantics import LabelSummary, richness, similarity
 from pipelines.types import SparseModel
 
@@ -38,36 +39,33 @@ def shared_points(model: SparseModel) -> NDArray[np.int64]:
 
 
 def loop_candidates(
-    model: SparseModel, appearance: NDArray[np.float32], summaries: Sequence[LabelSummary], settings: GlobalBaConfig
+    model: SparseModel,
+    looks: NDArray[np.float64],
+    summaries: Sequence[LabelSummary],
+    refused: Collection[tuple[int, int]],
+    settings: GlobalBaConfig,
 ) -> list[tuple[int, int]]:
-    """Pairs (i, j), i < j, of keyframe indices, most promising first.
+    """Pairs (i, j), i < j, of keyframe indices, sorted.
 
-    Far apart in the sequence and hardly a point in common, and alike: by appearance, each keyframe's best; by semantics
-    (eq. 23, 24) those of the rich keyframes (eq. 21) that pass T_loop.
+    Far apart in the sequence and hardly a point in common, and alike: by appearance (N, N), each keyframe's best; by
+    semantics (eq. 23, 24) those of the rich keyframes (eq. 21) that pass T_loop. None of the pairs of frame ids that
+    structure from motion has refused.
     """
-    n = len(model.frame_ids)
-    index = np.arange(n)
-    apart = np.abs(index[:, None] - index[None]) >= settings.loop_gap
-    unrelated = apart & (shared_points(model) < SHARED_POINTS)
-    looks = np.where(unrelated, appearance @ appearance.T, -np.inf)
-    scored: dict[tuple[int, int], float] = {}
-    for i in range(n):
-        for j in np.argsort(-looks[i], kind="stable")[: settings.loop_candidates]:
-            if looks[i, j] > settings.loop_appearance:
-                scored[(min(i, int(j)), max(i, int(j)))] = float(looks[i, j])
-    if settings.use_semantics:
-        scored |= _semantic_candidates(unrelated, looks, summaries, settings)
-    return sorted(scored, key=lambda pair: (-scored[pair], pair))
+    ids = model.frame_ids.tolist()
+    unrelated = far_apart(len(ids), settings.loop_gap) & (shared_points(model) < SHARED_POINTS)
+    alike = loop_pairs(looks - settings.loop_appearance, unrelated, settings.loop_candidates)
+    by_labels = _semantic_candidates(unrelated, looks, summaries, settings) if settings.use_semantics else set()
+    return sorted(pair for pair in {*alike, *by_labels} if (ids[pair[0]], ids[pair[1]]) not in refused)
 
 
 def _semantic_candidates(
     unrelated: NDArray[np.bool_], looks: NDArray, summaries: Sequence[LabelSummary], settings: GlobalBaConfig
-) -> dict[tuple[int, int], float]:
-    out: dict[tuple[int, int], float] = {}
+) -> set[tuple[int, int]]:
+    out: set[tuple[int, int]] = set()
     for i in np.flatnonzero(richness(summaries) > RICH).tolist():
         others = np.flatnonzero(unrelated[i]).tolist()
         scores = [similarity(summaries[i], summaries[j], float(looks[i, j]), WEIGHTS) for j in others]
         for k in np.argsort(-np.array(scores), kind="stable")[: settings.loop_candidates]:
             if scores[k] > SIMILAR:
-                out[(min(i, others[k]), max(i, others[k]))] = float(scores[k])
+                out.add((min(i, others[k]), max(i, others[k])))
     return out

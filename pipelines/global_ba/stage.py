@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.correspondence.retrieval import likeness, unit
 from pipelines.gaussian_map import GaussianMap
 from pipelines.geometry import se3
-from pipelines.global_ba.appearance import describe_keyframes, join_appearances
 from pipelines.global_ba.candidates import loop_candidates
 from pipelines.global_ba.close import Closed, close_loops
 from pipelines.global_ba.joint import Refined, refine_together
@@ -34,16 +34,13 @@ from pipelines.stages import Stage, StageContext
 from pipelines.tracking.adjust import without_dependent_depth
 from pipelines.tracking.bundle import reprojection_errors
 from pipelines.tracking.depth_scales import sample_proxy
-from pipelines.tracking.features import extract_features
-from pipelines.tracking.klt import to_grey
+from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.result import to_sparse_model
 from pipelines.tracking.state import FEATURE_SD, TrackState
 from pipelines.types import VOID, Intrinsics, ProxyMaps, SparseModel, Trajectory
 
 Array = NDArray[np.float64]
 
-WORDS = 32
-"""Of the vocabulary for appearance."""
 DRIFT_PX = 6.0
 """A loop that is off by more pixels starts a pose graph."""
 JOINT_PX = 0.5
@@ -78,32 +75,31 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
     if snapshot.exists():
         return load_found(snapshot)
     run, settings, seed = context.run, context.config.global_ba, context.config.run.seed
-    views = load_keyframe_views(context, model)
+    pictures = Pictures(run, run.load_frames(), context.config.frames)
+    views = load_keyframe_views(context, model, pictures)
+    ids = model.frame_ids.tolist()
+    looks = likeness(np.stack([pictures.descriptor(i) for i in ids]))
     learned = run.load_descriptors()
-    appearance = join_appearances(
-        describe_keyframes([v.features.descriptors for v in views], WORDS, seed),
-        [learned.get(i) for i in model.frame_ids.tolist()],
-    )
-    pairs = loop_candidates(model, appearance, load_summaries(run, model), settings)
+    if all(i in learned for i in ids):  # the article's DINOSim counts half
+        seen = np.stack([learned[i] for i in ids])
+        looks = (looks + likeness(unit(seen - seen.mean(0)))) / 2
+    refused = {pair for pair, matches in run.load_tried().items() if matches == 0}
+    pairs = loop_candidates(model, looks, load_summaries(run, model), refused, settings)
     tracked = context.progress.track(pairs, "loops", len(pairs))
     found = find_loops(tracked, views, run.load_calibration().intrinsics, settings, seed)
     save_found(snapshot, found)
     return found
 
 
-def load_keyframe_views(context: StageContext, model: SparseModel) -> list[KeyframeView]:
+def load_keyframe_views(context: StageContext, model: SparseModel, pictures: Pictures) -> list[KeyframeView]:
     """Features of every keyframe, with what is known of their depth."""
     run = context.run
     intrinsics = run.load_calibration().intrinsics
-    frames = {f.id: f for f in run.load_frames()}
     scales = DepthScales.load(run)
     state = TrackState.from_backbone(model, 1.0)
     views = []
     for k, frame_id in enumerate(context.progress.track(model.frame_ids.tolist(), "features", len(model.frame_ids))):
-        frame = frames[frame_id]
-        features = extract_features(
-            to_grey(run.image(frame)), context.config.global_ba.features, run.left_out(frame)
-        )  # fmt: skip
+        features = pictures.features(frame_id)
         depth = np.zeros(len(features.xy))
         if run.has_proxy(frame_id) and (maps := scales.apply(frame_id, run.load_proxy(frame_id))) is not None:
             depth, _ = sample_proxy(maps, features.xy, intrinsics)

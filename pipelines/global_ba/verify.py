@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pipelines.config import GlobalBaConfig
+from pipelines.correspondence.matching import MatchOptions, match_descriptors
 from pipelines.geometry import se3
 from pipelines.geometry.camera import project, unproject
-from pipelines.tracking.features import Features, match_features
 from pipelines.tracking.pnp import FramePose, solve_pose
 from pipelines.tracking.relocalise import SNAP
 from pipelines.tracking.state import Sightings
-from pipelines.types import Intrinsics, LoopEdge
+from pipelines.types import Features, Intrinsics, LoopEdge
 
 Array = NDArray[np.float64]
 
@@ -72,7 +72,7 @@ def verify_loop(
     first: KeyframeView, second: KeyframeView, intrinsics: Intrinsics, settings: GlobalBaConfig, seed: int
 ) -> Loop | None:
     """The loop, if both directions find enough inliers, the same motion and a believable scale."""
-    pairs = match_features(first.features, second.features, ratio=0.8)
+    pairs = match_descriptors(first.features.descriptors, second.features.descriptors, MatchOptions())
     forward = _locate(first, pairs[:, 0], second, pairs[:, 1], intrinsics, settings, seed)
     backward = _locate(second, pairs[:, 1], first, pairs[:, 0], intrinsics, settings, seed)
     if forward is None or backward is None:
@@ -104,9 +104,9 @@ def _scaled(motion: Array, scale: float) -> Array:
 
 def _locate(
     source: KeyframeView,
-    source_index: NDArray[np.int64],
+    source_index: NDArray[np.integer],
     target: KeyframeView,
-    target_index: NDArray[np.int64],
+    target_index: NDArray[np.integer],
     intrinsics: Intrinsics,
     settings: GlobalBaConfig,
     seed: int,
@@ -127,7 +127,7 @@ def _locate(
     return FramePose(solved.cam_from_world, inliers)
 
 
-def _relative_scale(first: KeyframeView, second: KeyframeView, pairs: NDArray[np.int64], forward: FramePose) -> float:
+def _relative_scale(first: KeyframeView, second: KeyframeView, pairs: NDArray[np.integer], forward: FramePose) -> float:
     """Depth the second keyframe itself gives its features, over depth by the first one's points; 1 without drift."""
     used = pairs[forward.inliers]
     motion = forward.cam_from_world
@@ -138,7 +138,7 @@ def _relative_scale(first: KeyframeView, second: KeyframeView, pairs: NDArray[np
 
 
 def _sightings(
-    source: KeyframeView, source_index: NDArray[np.int64], target: KeyframeView, target_index: NDArray[np.int64]
+    source: KeyframeView, source_index: NDArray[np.integer], target: KeyframeView, target_index: NDArray[np.integer]
 ) -> Sightings:
     """Where the target sees points of the source."""
     point = source.point[source_index]

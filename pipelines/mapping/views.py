@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipelines.mapping.article.mirrors import Mirrors
-from pipelines.run_folder import resize_maps
 from pipelines.types import VOID, Intrinsics, ProxyMaps
 
 
@@ -158,3 +157,12 @@ def occurring_classes(all_labels: list[NDArray[np.uint8]], least_share: float = 
         counts += np.bincount(labels.reshape(-1), minlength=256)
     counts[VOID] = 0
     return tuple(int(i) for i in np.flatnonzero(counts > least_share * max(counts.sum(), 1)))
+
+
+def resize_maps(maps: ProxyMaps, width: int, height: int) -> ProxyMaps:
+    """Proxy maps at another resolution. Nearest neighbour: depth must not be averaged across an edge."""
+
+    def nearest(array: NDArray) -> NDArray:
+        return cv2.resize(array, (width, height), interpolation=cv2.INTER_NEAREST)
+
+    return ProxyMaps(*(nearest(getattr(maps, n)) for n in ("depth", "confidence", "labels", "label_confidence")))

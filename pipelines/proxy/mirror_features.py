@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from pipelines.correspondence.retrieval import unit
+from pipelines.types import Features
 
 _MOST_FEATURES = 1500
 _RATIO = 0.9
@@ -20,20 +22,16 @@ class MirroredMatches:
     size: NDArray[np.float64]
 
 
-def mirrored_matches(image: NDArray[np.uint8]) -> MirroredMatches:
-    """Features of an RGB image (h, w, 3) that look most like each other's mirror image, each match once."""
-    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
-    keypoints, descriptors = cv2.SIFT.create(nfeatures=_MOST_FEATURES, contrastThreshold=0.015).detectAndCompute(
-        grey, None
-    )
-    if len(keypoints) < 3:
+def mirrored_matches(features: Features) -> MirroredMatches:
+    """Features of a picture, the strongest of them, that look most like each other's mirror image, each match once."""
+    descriptors, size = features.descriptors[:_MOST_FEATURES], features.keypoints[:_MOST_FEATURES, 2].astype(np.float64)
+    xy = features.xy[:_MOST_FEATURES]
+    if len(xy) < 3:
         return MirroredMatches(np.zeros((0, 2, 2)), np.zeros((0, 2)))
-    root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-12)).astype(np.float32)
+    root = unit(descriptors.astype(np.float32))
     # Symmetric, because mirroring twice is nothing: the best partner's best partner is found in the same matrix.
     similarity = root @ mirror_descriptors(root).T
-    xy = np.array([k.pt for k in keypoints]) + 0.5
-    size = np.array([k.size for k in keypoints])
-    # A symmetric blob is its own mirror image, and a second orientation gives a second feature at the same place.
+    # A symmetric blob is its own mirror image.
     near = np.linalg.norm(xy[:, None] - xy[None], axis=-1) < 2 * np.maximum(size[:, None], size[None])
     similarity[near] = -1
     rows = np.arange(len(xy))

@@ -7,11 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
+from pipelines.correspondence.features import to_grey
+from pipelines.correspondence.flow import follow
 from pipelines.frames.source import Source, VideoSource
 from pipelines.geometry.camera import unproject
 from pipelines.proxy.providers import DepthEstimate
@@ -137,15 +138,11 @@ def _follow(first: NDArray[np.uint8], second: NDArray[np.uint8], points: Array) 
     The first is a picture of the source, the second a frame without lens distortion: also between equal instants
     points move a little.
     """
-    a, b = (np.asarray(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), np.uint8) for i in (first, second))
+    a, b = to_grey(first), to_grey(second)
     if np.array_equal(a, b):
         return points
-    start = (points - 0.5).astype(np.float32).reshape(-1, 1, 2)
-    there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, start, np.empty_like(start), winSize=(25, 25), maxLevel=4)
-    back, back_ok, _ = cv2.calcOpticalFlowPyrLK(b, a, there, np.empty_like(start), winSize=(25, 25), maxLevel=4)
-    if not (ok.all() and back_ok.all()) or np.linalg.norm(back - start, axis=-1).max() > 1:
-        return None
-    return there.reshape(2, 2).astype(np.float64) + 0.5
+    there, found = follow(a, b, points, points, levels=4)
+    return there if found.all() else None
 
 
 def _length(points: Array, estimate: DepthEstimate, camera: Intrinsics) -> float | None:

@@ -35,7 +35,7 @@ from pipelines.run_folder import (
     save_proxy_maps,
 )
 from pipelines.stages import Stage, StageContext
-from pipelines.types import VOID, Frame, ProxyMaps
+from pipelines.types import VOID, Features, Frame, ProxyMaps
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -223,10 +223,18 @@ def _symmetry_pass(
     context: StageContext, sequence: Sequence, frames: list[Frame], scale: DepthScale, metres: float
 ) -> dict[str, Any]:
     """Mirror planes of the scene, and the pixels they pair in every frame; says how many it found."""
+    enlarge = sequence.calibration.intrinsics.width / sequence.intrinsics.width
+
+    def features_of(frame: Frame) -> Features:
+        kept = context.run.load_features(frame.id)
+        assert kept is not None  # every frame with a pose is a keyframe
+        return replace(kept, keypoints=(kept.keypoints / [enlarge, enlarge, enlarge, 1]).astype(np.float32))
+
     planes = find_mirror_planes(
         sequence,
         frames,
         lambda frame: scale.in_backbone_unit(_load_depth(context.snapshot, frame)),
+        features_of,
         context.progress,
     )
     pairs_of = {}
@@ -236,8 +244,7 @@ def _symmetry_pass(
             # The planes are in the backbone's unit, the maps in the depth's.
             in_cam = [(p.in_cam(pose) * [1, 1, 1, scale.value * metres], p.confidence) for p in planes]
             pairs = mirror_pairs(sequence.image(frame), maps.depth, maps.confidence, sequence.intrinsics, in_cam)
-            enlarge = np.float32(sequence.calibration.intrinsics.width / sequence.intrinsics.width)
-            pairs_of[frame.id] = replace(pairs, pairs=pairs.pairs * enlarge)
+            pairs_of[frame.id] = replace(pairs, pairs=pairs.pairs * np.float32(enlarge))
     save_mirror_pairs(context.folder, pairs_of)
     return {"mirror_planes": len(planes), "mirror_pairs": sum(map(len, pairs_of.values()))}
 

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.camera import pixel_centers, project, unproject, unproject_depth
 from pipelines.progress import Progress
-from pipelines.proxy.mirror_features import mirrored_matches
+from pipelines.proxy.mirror_features import MirroredMatches, mirrored_matches
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.sequence import Sequence
-from pipelines.types import Frame, Intrinsics, MirrorPairs
+from pipelines.types import Features, Frame, Intrinsics, MirrorPairs
 
 Array = NDArray[np.float64]
 
@@ -61,15 +61,23 @@ class MirrorPlane:
 
 
 def find_mirror_planes(
-    sequence: Sequence, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate], progress: Progress
+    sequence: Sequence,
+    frames: list[Frame],
+    depth_of: Callable[[Frame], DepthEstimate],
+    features_of: Callable[[Frame], Features],
+    progress: Progress,
 ) -> list[MirrorPlane]:
     """The scene's mirror planes, the best supported first; [] where there is none.
 
-    `depth_of` gives depths in the backbone's unit; frames without a pose are passed over.
+    `depth_of` gives depths in the backbone's unit, `features_of` features at map size; frames without a pose are passed
+    over.
     """
     posed = [f for f in frames if f.id in sequence.cam_from_world]
     looked_at = posed[:: max(1, -(-len(posed) // _LOOKED_AT))]
-    found = [_pairs_in_world(sequence, f, depth_of(f)) for f in progress.track(looked_at, "symmetry", len(looked_at))]
+    found = [
+        _pairs_in_world(sequence, f, depth_of(f), mirrored_matches(features_of(f)))
+        for f in progress.track(looked_at, "symmetry", len(looked_at))
+    ]
     pairs = np.concatenate([np.zeros((0, 7)), *found])
     pairs = pairs[:: max(1, -(-len(pairs) // _MOST_PAIRS))]
     planes: list[MirrorPlane] = []
@@ -82,10 +90,9 @@ def find_mirror_planes(
     return planes
 
 
-def _pairs_in_world(sequence: Sequence, frame: Frame, estimate: DepthEstimate) -> Array:
+def _pairs_in_world(sequence: Sequence, frame: Frame, estimate: DepthEstimate, matches: MirroredMatches) -> Array:
     """(Q, 7): the two points of each mirrored match of a frame with reliable depths, and the farther depth."""
     camera = sequence.intrinsics
-    matches = mirrored_matches(sequence.image(frame))
     column, row = _pixels(matches.xy.reshape(-1, 2), camera).T
     depth = np.where(estimate.confidence >= _LEAST_CONFIDENCE, estimate.depth, 0)[row, column].astype(np.float64)
     points = unproject(matches.xy.reshape(-1, 2), depth, camera).reshape(-1, 2, 3)

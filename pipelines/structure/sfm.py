@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,9 +16,16 @@ from numpy.typing import NDArray
 from formats.errors import InputError
 from pipelines.config import FramesConfig
 from pipelines.correspondence.database import write_database
-from pipelines.correspondence.features import FeatureExtractor, Features
+from pipelines.correspondence.features import extract_features
 from pipelines.correspondence.matching import MatchOptions, VerifiedPair, match_pair
-from pipelines.correspondence.retrieval import frame_descriptors, loop_pairs, sequential_pairs
+from pipelines.correspondence.retrieval import (
+    describe,
+    far_apart,
+    learn_vocabulary,
+    likeness,
+    loop_pairs,
+    sequential_pairs,
+)
 from pipelines.correspondence.snapshots import Snapshots
 from pipelines.progress import Progress
 from pipelines.structure.adjust import adjust
@@ -27,6 +33,7 @@ from pipelines.structure.consistency import ModelReport, judge, without_misplace
 from pipelines.structure.mappers import calibrate_focal, map_globally, map_incrementally
 from pipelines.structure.parallax import HOW_TO_FILM, require_parallax
 from pipelines.structure.seams import cut
+from pipelines.types import Features, Vocabulary
 
 _PAIRS_PER_BLOCK = 64
 _MIN_KEYFRAMES = 3
@@ -39,13 +46,18 @@ R = TypeVar("R")
 class Structure:
     """An adjusted reconstruction (image i + 1 is keyframe i, camera 1 is the only one) and how good it is.
 
-    No point is seen from two of the report's parts: nothing tells how these lie to each other.
+    No point is seen from two of the report's parts: nothing tells how these lie to each other. `tried` are the pairs
+    of keyframes that were matched, `pairs` those of them that obey one geometry.
     """
 
     model: pycolmap.Reconstruction
     report: ModelReport
     mapper: str
     focal_sd: float
+    features: list[Features]
+    vocabulary: Vocabulary
+    tried: list[tuple[int, int]]
+    pairs: list[VerifiedPair]
 
 
 @dataclass(frozen=True)
@@ -67,7 +79,9 @@ class StructureFromMotion:
     def run(self, keyframe_ids: Sequence[int]) -> Structure:
         """Raises InputError when the keyframes have no parallax or too little in common."""
         features = self._features(keyframe_ids)
-        pairs = self._pairs(features)
+        vocabulary = learn_vocabulary(features, self.seed)
+        tried = self._proposed(features, vocabulary)
+        pairs = self._pairs(features, tried)
         xy = [f.xy for f in features]
         known_focal = self.camera.mean_focal_length() if self.camera.has_prior_focal_length else None
         require_parallax(pairs, xy, (self.camera.width, self.camera.height), known_focal)
@@ -75,15 +89,12 @@ class StructureFromMotion:
         focal_sd = adjust(model, refine_camera=not self.is_fixed)
         report = judge(model, pairs, xy, len(features), self.config.overlap)
         cut(model, report.parts)
-        return Structure(model, report, mapper, focal_sd)
+        return Structure(model, report, mapper, focal_sd, features, vocabulary, tried, pairs)
 
     def _features(self, keyframe_ids: Sequence[int]) -> list[Features]:
-        local = threading.local()
-
         def extract(frame_id: int) -> Features:
-            if not hasattr(local, "extractor"):
-                local.extractor = FeatureExtractor(self.config.max_features, self.config.peak_threshold)
-            return local.extractor(self.load_gray(frame_id)).outside(self.left_out(frame_id))
+            grey, left_out = self.load_gray(frame_id), self.left_out(frame_id)
+            return extract_features(grey, self.config.max_features, self.config.peak_threshold, left_out)
 
         def stored(frame_id: int) -> Features:
             return self.snapshots.features(frame_id, lambda: extract(frame_id))
@@ -91,9 +102,13 @@ class StructureFromMotion:
         found = parallel_map(stored, keyframe_ids, self.threads)
         return list(self.progress.track(found, "features", len(keyframe_ids)))
 
-    def _pairs(self, features: Sequence[Features]) -> list[VerifiedPair]:
+    def _proposed(self, features: Sequence[Features], vocabulary: Vocabulary) -> list[tuple[int, int]]:
+        alike = likeness(np.stack([describe(f, vocabulary) for f in features]))
+        loops = loop_pairs(alike, far_apart(len(features), self.config.overlap + 1), self.config.loop_candidates)
+        return sorted({*sequential_pairs(len(features), self.config.overlap), *loops})
+
+    def _pairs(self, features: Sequence[Features], proposed: Sequence[tuple[int, int]]) -> list[VerifiedPair]:
         options = MatchOptions()
-        proposed = sorted({*sequential_pairs(len(features), self.config.overlap), *self._loops(features)})
         blocks = [proposed[i : i + _PAIRS_PER_BLOCK] for i in range(0, len(proposed), _PAIRS_PER_BLOCK)]
 
         def match(pair: tuple[int, int]) -> VerifiedPair | None:
@@ -105,12 +120,6 @@ class StructureFromMotion:
         numbered = self.progress.track(enumerate(blocks), "matches", len(blocks))
         found = (self.snapshots.pairs(i, lambda b=block: match_block(b)) for i, block in numbered)  # type: ignore[misc]
         return list(itertools.chain.from_iterable(found))
-
-    def _loops(self, features: Sequence[Features]) -> list[tuple[int, int]]:
-        if self.config.loop_candidates == 0:
-            return []
-        descriptors = frame_descriptors(features, self.seed)
-        return loop_pairs(descriptors, self.config.loop_candidates, self.config.overlap + 1)
 
     def _map(
         self, features: Sequence[Features], pairs: Sequence[VerifiedPair]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.correspondence.flow import FLOW_SD, corners, follow
 from pipelines.geometry import se3
 from pipelines.geometry.camera import project, unproject
 from pipelines.tracking.depth_scales import keyframe_scale, sample_proxy
-from pipelines.tracking.klt import FLOW_SD, corners, follow
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.pnp import MIN_INLIERS, POSE_ERROR
 from pipelines.tracking.state import Sightings, TrackState

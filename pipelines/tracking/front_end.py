@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.config import TrackingConfig
+from pipelines.correspondence.flow import FLOW_SD, follow
 from pipelines.geometry.camera import project
 from pipelines.tracking.extend import promote, start_segment
-from pipelines.tracking.klt import FLOW_SD, follow
 from pipelines.tracking.motion import predict_pose
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.pnp import MIN_INLIERS, FramePose, solve_pose

@@ -9,10 +9,11 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.config import FramesConfig
+from pipelines.correspondence.features import extract_features, to_grey
+from pipelines.correspondence.retrieval import describe
 from pipelines.run_folder import RunFolder
-from pipelines.tracking.features import Features, extract_features, frame_descriptor
-from pipelines.tracking.klt import to_grey
-from pipelines.types import Frame, ProxyMaps
+from pipelines.types import Features, Frame, ProxyMaps
 
 T = TypeVar("T")
 
@@ -36,14 +37,15 @@ class _Recent(Generic[T]):
 class Pictures:
     """Everything tracking looks up by frame id; memory does not grow with the number of frames."""
 
-    def __init__(self, run: RunFolder, frames: Sequence[Frame], kept: int = 12) -> None:
-        self.run = run
+    def __init__(self, run: RunFolder, frames: Sequence[Frame], settings: FramesConfig, kept: int = 12) -> None:
+        self.run, self.settings = run, settings
+        self.vocabulary = run.load_vocabulary()
         self.frames = {f.id: f for f in frames}
         self._grey = _Recent(lambda i: to_grey(self.color(i)), kept)
         self._left_out = _Recent(lambda i: run.left_out(self.frames[i]), kept)
-        self._features = _Recent(lambda i: extract_features(self.grey(i), left_out=self.left_out(i)), 4 * kept)
-        # 32 x 24 x 3 numbers a frame: 9 MB for a thousand frames.
-        self._descriptor = _Recent(lambda i: frame_descriptor(self.color(i)), 20000)
+        self._features = _Recent(self._load_features, 4 * kept)
+        # 64 x 128 numbers a frame: 32 MB for a thousand.
+        self._descriptor = _Recent(lambda i: describe(self.features(i), self.vocabulary), 5000)
 
     def color(self, frame_id: int) -> NDArray[np.uint8]:
         """(H, W, 3) RGB."""
@@ -67,8 +69,15 @@ class Pictures:
         return ~(inside & left_out[np.where(inside, row, 0), np.where(inside, column, 0)])
 
     def features(self, frame_id: int) -> Features:
-        """SIFT features."""
+        """SIFT features: those that structure from motion had, of other frames new ones."""
         return self._features(frame_id)
+
+    def _load_features(self, frame_id: int) -> Features:
+        kept = self.run.load_features(frame_id)
+        if kept is not None:
+            return kept
+        count, threshold = self.settings.max_features, self.settings.peak_threshold
+        return extract_features(self.grey(frame_id), count, threshold, self.left_out(frame_id))
 
     def descriptor(self, frame_id: int) -> NDArray[np.float32]:
         """How the frame looks, for retrieval."""

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pipelines.correspondence.matching import MatchOptions, match_descriptors
 from pipelines.geometry import se3
-from pipelines.tracking.features import match_features
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.pnp import MIN_INLIERS, FramePose, solve_pose
 from pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
@@ -88,7 +88,7 @@ def match_keyframe(frame_id: int, keyframe: int, state: TrackState, pictures: Pi
     if len(known) == 0:
         return NO_SIGHTINGS
     theirs, ours = pictures.features(keyframe), pictures.features(frame_id)
-    pairs = match_features(theirs, ours)
+    pairs = match_descriptors(theirs.descriptors, ours.descriptors, MatchOptions())
     distance, nearest = cKDTree(known.xy).query(theirs.xy[pairs[:, 0]], distance_upper_bound=SNAP)
     keep = np.isfinite(distance)
     points, pairs = known.point[nearest[keep]], pairs[keep]

@@ -29,7 +29,7 @@ def run(context: StageContext) -> dict[str, Any]:
     proxy = context.run.load_proxy_report()
     settings = without_dependent_depth(context.config.tracking, proxy)
     metric = bool(proxy.get("metric", False))
-    pictures = Pictures(context.run, frames)
+    pictures = Pictures(context.run, frames, context.config.frames)
 
     state = track_frames(context, frames, pictures)
     if len(state.poses) < 2:

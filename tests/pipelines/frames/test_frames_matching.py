@@ -11,13 +11,21 @@ import pycolmap
 import pytest
 
 from pipelines.correspondence.database import write_database
-from pipelines.correspondence.features import FeatureExtractor, Features
+from pipelines.correspondence.features import extract_features
 from pipelines.correspondence.matching import MatchOptions, VerifiedPair, match_descriptors, verify_matches
-from pipelines.correspondence.retrieval import frame_descriptors, loop_pairs, sequential_pairs
+from pipelines.correspondence.retrieval import (
+    describe,
+    far_apart,
+    learn_vocabulary,
+    likeness,
+    loop_pairs,
+    sequential_pairs,
+)
 from pipelines.correspondence.snapshots import Snapshots
 from pipelines.frames.keyframes import KeyframeOptions, choose_keyframes
 from pipelines.structure.consistency import epipolar_error, judge, without_misplaced
 from pipelines.structure.parallax import rotation_residual
+from pipelines.types import Features
 from tests.pipelines.frames.conftest import FOCAL, HEIGHT, WIDTH, render, sideways, turn
 
 CAMERA = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, WIDTH, HEIGHT)
@@ -127,25 +135,41 @@ def test_sequential_pairs_reach_every_neighbour_and_no_pair_twice() -> None:
 
 
 def test_a_revisit_is_found_by_appearance() -> None:
-    extractor = FeatureExtractor(400, 0.004)
     poses = list(sideways(8))
     views = [render(*p) for p in [*poses, *poses[1:3]]]
-    features = [extractor(cv2.cvtColor(v, cv2.COLOR_RGB2GRAY)) for v in views]
-    descriptors = frame_descriptors(features, seed=0)
+    features = [extract_features(cv2.cvtColor(v, cv2.COLOR_RGB2GRAY), 400, 0.004) for v in views]
+    vocabulary = learn_vocabulary(features, seed=0)
+    descriptors = np.stack([describe(f, vocabulary) for f in features])
     np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, rtol=1e-5)
-    pairs = loop_pairs(descriptors, per_frame=1, min_gap=5)
+    pairs = loop_pairs(likeness(descriptors), far_apart(len(views), 5), per_frame=1)
     assert {(1, 8), (2, 9)} <= set(pairs)
     assert all(j - i >= 5 for i, j in pairs)
-    np.testing.assert_array_equal(frame_descriptors(features, seed=0), descriptors)
+    np.testing.assert_array_equal(learn_vocabulary(features, seed=0).words, vocabulary.words)
 
 
 def test_retrieval_stands_frames_without_features() -> None:
     empty = Features(np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8))
-    assert loop_pairs(frame_descriptors([empty, empty, empty], 0), 2, 1) == []
+    vocabulary = learn_vocabulary([empty, empty, empty], 0)
+    alike = likeness(np.stack([describe(empty, vocabulary)] * 3))
+    assert loop_pairs(alike, far_apart(3, 1), 2) == []
 
 
 def test_features_of_a_blank_image_are_none() -> None:
-    assert len(FeatureExtractor(400, 0.004)(np.full((100, 120), 128, np.uint8))) == 0
+    assert len(extract_features(np.full((100, 120), 128, np.uint8), 400, 0.004)) == 0
+
+
+def test_features_come_strongest_first_one_a_place_and_only_from_the_mask() -> None:
+    grey = cv2.cvtColor(render(*next(iter(sideways(2)))), cv2.COLOR_RGB2GRAY)
+    all_of_it = extract_features(grey, 400, 0.004)
+    places = np.unique(all_of_it.keypoints[:, :3], axis=0)
+    assert len(places) == len(all_of_it) > 100
+    fewer = extract_features(grey, 100, 0.004)
+    assert 50 < len(fewer) <= 100
+    np.testing.assert_array_equal(fewer.keypoints, all_of_it.keypoints[: len(fewer)])
+    right = np.arange(WIDTH)[None].repeat(HEIGHT, 0) >= WIDTH / 2
+    masked = extract_features(grey, 400, 0.004, right)
+    assert 100 < len(masked) <= 400
+    assert masked.xy[:, 0].max() < WIDTH / 2 + 1
 
 
 def _sliding(step: float, count: int) -> list[tuple[np.ndarray, None]]:

@@ -26,8 +26,10 @@ from pipelines.structure.seams import (
     worst_contradictions,
 )
 from pipelines.structure.sfm import Structure
+from pipelines.types import Vocabulary
 
 COUNT, REACH = 40, 4
+NO_WORDS = Vocabulary(np.zeros((1, 128)), np.zeros(128))
 
 
 def _checks(torn_at: int) -> list[PairCheck]:
@@ -162,7 +164,11 @@ def test_what_is_wrong_is_said(
 ) -> None:
     report = ModelReport(9, 9, 500, 0.3, 0.99, 0.99, tuple(seams), tuple(map(tuple, parts)))
     context = make_context(tmp_path)
-    warn_of_structure(context, Structure(pycolmap.Reconstruction(), report, "global", 0.0), list(range(0, 18, 2)))
+    warn_of_structure(
+        context,
+        Structure(pycolmap.Reconstruction(), report, "global", 0.0, [], NO_WORDS, [], []),
+        list(range(0, 18, 2)),
+    )
     assert len(context.warnings) == len(wanted)
     assert all(re.search(pattern, said) for pattern, said in zip(wanted, context.warnings, strict=True))
 
@@ -170,6 +176,8 @@ def test_what_is_wrong_is_said(
 def test_pairs_far_apart_that_contradict_are_no_fold(make_context: Callable[..., StageContext], tmp_path: Path) -> None:
     report = ModelReport(9, 9, 500, 0.3, 0.8, 0.69, (_seam(0),), (tuple(range(9)),))
     context = make_context(tmp_path)
-    warn_of_structure(context, Structure(pycolmap.Reconstruction(), report, "global", 0.0), list(range(9)))
+    warn_of_structure(
+        context, Structure(pycolmap.Reconstruction(), report, "global", 0.0, [], NO_WORDS, [], []), list(range(9))
+    )
     assert len(context.warnings) == 1
     assert re.search("far apart contradict .* 69% of the matched pairs", context.warnings[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,19 +11,18 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.config import GlobalBaConfig, TrackingConfig
+from pipelines.correspondence.retrieval import describe, learn_vocabulary, likeness
 from pipelines.geometry import se3
 from pipelines.geometry.alignment import align_points
 from pipelines.geometry.camera import project
 from pipelines.global_ba import loops
-from pipelines.global_ba.appearance import describe_keyframes
 from pipelines.global_ba.candidates import loop_candidates, shared_points
 from pipelines.global_ba.close import close_loops, reprojection_error
 from pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_found
 from pipelines.global_ba.semantics import summarise_labels
 from pipelines.global_ba.verify import KeyframeView, make_view, verify_loop
-from pipelines.tracking.features import Features
 from pipelines.tracking.state import TrackState
-from pipelines.types import Intrinsics, SparseModel
+from pipelines.types import Features, Intrinsics, SparseModel
 
 Array = NDArray[np.float64]
 CAMERA = Intrinsics(640, 480, 400, 400, 320, 240)
@@ -43,10 +43,11 @@ class Walk:
         points = self.model.points_in_world
         return [make_view(i, p, f, state.sightings[i], points, np.zeros(len(f.xy)), CAMERA) for i, p, f in rows]
 
-    def pairs(self, settings: GlobalBaConfig = SETTINGS) -> list[tuple[int, int]]:
+    def pairs(self, refused: Collection[tuple[int, int]] = ()) -> list[tuple[int, int]]:
         nothing = [summarise_labels(np.full((4, 4), 255, np.uint8), 3)] * len(self.features)
-        looks = describe_keyframes([f.descriptors for f in self.features], 16, 0)
-        return loop_candidates(self.model, looks, nothing, settings)
+        vocabulary = learn_vocabulary(self.features, 0)
+        looks = likeness(np.stack([describe(f, vocabulary) for f in self.features]))
+        return loop_candidates(self.model, looks, nothing, refused, SETTINGS)
 
     def find(self) -> FoundLoops:
         return find_loops(self.pairs(), self.views(), CAMERA, SETTINGS, 0)
@@ -77,14 +78,15 @@ def make_walk(drift: float = 0.0, scale_drift: float = 0.0, twins: bool = False)
         half = count // 2
         points[half:] = points[:half] * [-1, 1, -1]
         words[half:] = words[:half]
-    descriptors = np.sqrt(words / words.sum(1, keepdims=True)).astype(np.float32)
+    descriptors = np.round(512 * np.sqrt(words / words.sum(1, keepdims=True))).astype(np.uint8)
     truth = circle_poses(40, 1.12)
     features, frame, point, pixels = [], [], [], []
     for k, pose in enumerate(truth):
         xy, z = project(points @ pose[:3, :3].T + pose[:3, 3], CAMERA)
         seen = np.flatnonzero((z > 0.5) & (xy > 0).all(1) & (xy < [640, 480]).all(1))
         noisy = xy[seen] + rng.normal(size=(len(seen), 2)) * 0.4
-        features.append(Features(noisy, descriptors[seen]))
+        keypoints = np.concatenate([noisy, np.ones_like(noisy)], 1).astype(np.float32)
+        features.append(Features(keypoints, descriptors[seen]))
         # In its second lap the walk does not know the points of the first again.
         point.append(seen + (count if k >= 34 else 0))
         frame.append(np.full(len(seen), k))
@@ -130,6 +132,7 @@ def test_candidates_are_revisits() -> None:
     shared = shared_points(walk.model)
     assert all(shared[a, b] == 0 for a, b in pairs)
     assert shared[3, 4] > 100
+    assert walk.pairs(refused=pairs[:2]) == pairs[2:]
 
 
 def test_verified_loop_has_the_true_motion() -> None:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipelines.global_ba.appearance import describe_keyframes, join_appearances, learn_vocabulary
+from pipelines.correspondence.retrieval import describe, learn_vocabulary
 from pipelines.global_ba.semantics import mean_iou, richness, similarity, structure_similarity, summarise_labels
-from pipelines.types import VOID
+from pipelines.types import VOID, Features
 
 
 def stripes(count: int) -> np.ndarray:
@@ -46,35 +46,18 @@ def test_structure_knows_neighbours() -> None:
     assert similarity(a, shuffled, 0.0, (0.4, 0.3, 0.3)) < 0.6
 
 
-def test_vlad_brings_the_same_place_together() -> None:
+def test_the_same_place_looks_alike_and_others_by_chance() -> None:
     rng = np.random.default_rng(0)
 
-    def seen(place: np.ndarray) -> np.ndarray:
+    def seen(place: np.ndarray) -> Features:
         words = np.abs(place + rng.normal(size=place.shape) * 0.1)
-        return (words / np.linalg.norm(words, axis=1, keepdims=True)).astype(np.float32)
+        root = 512 * words / np.linalg.norm(words, axis=1, keepdims=True)
+        return Features(np.zeros((len(root), 4), np.float32), np.round(root).clip(0, 255).astype(np.uint8))
 
-    places = [np.abs(rng.normal(size=(200, 32))) for _ in range(6)]
-    vectors = describe_keyframes([seen(places[i]) for i in (0, 1, 2, 3, 4, 5, 0)], 8, 0)
+    places = [np.abs(rng.normal(size=(200, 128))) for _ in range(6)]
+    frames = [seen(places[i]) for i in (0, 1, 2, 3, 4, 5, 0)]
+    vocabulary = learn_vocabulary(frames, 0)
+    vectors = np.stack([describe(f, vocabulary) for f in frames])
     scores = vectors @ vectors[0]
-    assert scores[1:6].max() < 0.5 < scores[6]
+    assert scores[1:6].max() < 0 < 0.5 < scores[6]
     assert np.allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-5)
-
-
-def test_vocabulary_is_repeatable_and_bounded() -> None:
-    data = np.random.default_rng(0).normal(size=(50, 8)).astype(np.float32)
-    assert learn_vocabulary(data, 4, 3).tobytes() == learn_vocabulary(data, 4, 3).tobytes()
-    assert len(learn_vocabulary(data[:3], 8, 0)) == 3
-    assert describe_keyframes([np.zeros((0, 8), np.float32)] * 2, 4, 0).shape[0] == 2
-
-
-def test_a_networks_descriptors_count_half_and_only_when_all_keyframes_have_them() -> None:
-    rng = np.random.default_rng(0)
-    own = rng.normal(size=(4, 6)).astype(np.float32)
-    own /= np.linalg.norm(own, axis=1, keepdims=True)
-    learned = rng.normal(size=(4, 3)).astype(np.float32) + 5
-    assert join_appearances(own, [None, *learned[1:]]) is own
-    joined = join_appearances(own, list(learned))
-    assert np.linalg.norm(joined, axis=1) == pytest.approx(1, rel=1e-5)
-    centred = learned - learned.mean(0)
-    centred /= np.linalg.norm(centred, axis=1, keepdims=True)
-    np.testing.assert_allclose(joined @ joined.T, (own @ own.T + centred @ centred.T) / 2, atol=1e-5)

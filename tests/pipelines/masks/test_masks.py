@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from formats.errors import InputError
 from formats.images import read_rgb, write_grey_png, write_rgb
 from pipelines.config import ArticleConfig, MappingConfig, load_config
-from pipelines.correspondence.features import FeatureExtractor
+from pipelines.correspondence.features import extract_features
+from pipelines.correspondence.flow import corners
 from pipelines.frames.keyframes import KeyframeOptions, choose_keyframes
 from pipelines.frames.masks import check_masks, mask_inputs
 from pipelines.frames.source import open_source
@@ -24,8 +25,6 @@ from pipelines.mapping.views import View, make_view
 from pipelines.masks.files import open_masks
 from pipelines.masks.people import PeopleFinder, join_people, people_cards
 from pipelines.proxy.models.registry import ModelStore
-from pipelines.tracking.features import extract_features
-from pipelines.tracking.klt import corners
 from pipelines.types import Intrinsics
 from tests.pipelines.proxy.tiny_tflite import write_tflite
 
@@ -100,11 +99,9 @@ def test_changed_masks_are_seen(pictures: Path, tmp_path: Path) -> None:
 
 def test_features_corners_and_keyframes_keep_clear() -> None:
     grey = np.asarray(cv2.cvtColor(noise(), cv2.COLOR_RGB2GRAY), np.uint8)
-    found = FeatureExtractor(500, 0.004)(grey)
-    kept = found.outside(left_half())
+    found, kept = (extract_features(grey, 500, 0.004, mask) for mask in (None, left_half()))
     assert 5 < len(kept) < len(found)
-    assert (kept.xy[:, 0] >= WIDTH // 2).all()
-    assert (extract_features(grey, 200, left_half()).xy[:, 0] >= WIDTH // 2 - 1).all()
+    assert (kept.xy[:, 0] >= WIDTH // 2 - 1).all()
     assert (corners(grey, np.zeros((0, 2)), 50, left_out=left_half())[:, 0] > WIDTH // 2 - 4).all()
     # Only what is masked moves: by it alone every frame would be a keyframe.
     shown = [np.where(left_half(), np.roll(grey, 9 * i, 1), grey) for i in range(4)]

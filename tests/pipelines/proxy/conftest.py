@@ -13,6 +13,7 @@ from pipelines.run_folder import RunFolder, save_calibration, save_frames, save_
 from pipelines.stages import StageContext
 from pipelines.types import Calibration, Frame
 from pipelines.world import ClipOptions, make_world, render_frame
+from tests.pipelines.kept import keep_correspondences
 
 
 @pytest.fixture(scope="session")
@@ -37,6 +38,7 @@ def make_context(room: Room, tmp_path: Path) -> Callable[..., StageContext]:
         save_calibration(folder, room.calibration)
         if backbone:
             save_sparse_model(folder / "backbone" / "model.npz", room.backbone)
+            keep_correspondences(folder, {i: room.views[i].rgb for i in room.backbone.frame_ids.tolist()})
         for frame in room.frames:
             write_rgb(folder / frame.name, room.views[frame.id].rgb)
         run.stage("proxy").mkdir(exist_ok=True)

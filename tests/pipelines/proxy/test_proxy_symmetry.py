@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from proxy_room import Room, perfect_backbone
 
+from pipelines.correspondence.features import extract_features, to_grey
 from pipelines.geometry.camera import project, unproject, unproject_depth
 from pipelines.progress import SilentProgress
 from pipelines.proxy import symmetry
@@ -16,10 +17,10 @@ from pipelines.proxy.mirror_features import mirror_descriptors, mirrored_matches
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.sequence import Sequence
 from pipelines.proxy.stage import run
-from pipelines.proxy.symmetry import find_mirror_planes, mirror_pairs
+from pipelines.proxy.symmetry import MirrorPlane, find_mirror_planes, mirror_pairs
 from pipelines.run_folder import RunFolder, save_mirror_pairs
 from pipelines.stages import StageContext
-from pipelines.types import Calibration, Frame, Intrinsics, MirrorPairs, SparseModel
+from pipelines.types import Calibration, Features, Frame, Intrinsics, MirrorPairs, SparseModel
 from pipelines.world import WorldFrame
 
 CAMERA = Intrinsics(320, 240, 260, 260, 160, 120)
@@ -69,6 +70,16 @@ def walk(symmetric: bool, count: int = 8) -> tuple[Sequence, list[DepthEstimate]
     return Sequence(frames, calibration, CAMERA, model, lambda f: shots[f.id][0]), estimates
 
 
+def features(sequence: Sequence, frame: Frame) -> Features:
+    return extract_features(to_grey(sequence.image(frame)), 1500, 0.005)
+
+
+def search(sequence: Sequence, estimates: list[DepthEstimate]) -> list[MirrorPlane]:
+    return find_mirror_planes(
+        sequence, sequence.frames, lambda f: estimates[f.id], lambda f: features(sequence, f), SilentProgress()
+    )
+
+
 def test_mirrored_descriptors_are_those_of_the_mirrored_picture() -> None:
     image, _ = picture(np.eye(4), symmetric=False)
     sift = cv2.SIFT.create(nfeatures=200)
@@ -89,7 +100,7 @@ def test_mirrored_descriptors_are_those_of_the_mirrored_picture() -> None:
 
 def test_a_symmetric_room_has_its_plane_and_pairs() -> None:
     sequence, estimates = walk(symmetric=True)
-    planes = find_mirror_planes(sequence, sequence.frames, lambda f: estimates[f.id], SilentProgress())
+    planes = search(sequence, estimates)
     assert len(planes) >= 1
     plane = planes[0]
     assert abs(plane.normal[0]) > np.cos(np.radians(1))
@@ -125,8 +136,8 @@ def test_a_symmetric_room_has_its_plane_and_pairs() -> None:
 
 def test_a_room_without_symmetry_is_silent() -> None:
     sequence, estimates = walk(symmetric=False)
-    assert len(mirrored_matches(sequence.image(sequence.frames[0])).xy) > 5
-    assert find_mirror_planes(sequence, sequence.frames, lambda f: estimates[f.id], SilentProgress()) == []
+    assert len(mirrored_matches(features(sequence, sequence.frames[0])).xy) > 5
+    assert search(sequence, estimates) == []
     image, first = sequence.image(sequence.frames[0]), estimates[0]
     assert len(mirror_pairs(image, first.depth, first.confidence, CAMERA, [])) == 0
 
@@ -149,9 +160,9 @@ def test_too_little_to_see_is_silent() -> None:
     blank = Sequence(
         sequence.frames, sequence.calibration, CAMERA, sequence.backbone, lambda _: np.full((240, 320, 3), 90, np.uint8)
     )
-    assert find_mirror_planes(blank, blank.frames, lambda f: estimates[f.id], SilentProgress()) == []
+    assert search(blank, estimates) == []
     lost = Sequence(sequence.frames, sequence.calibration, CAMERA, None, sequence.read_image)
-    assert find_mirror_planes(lost, lost.frames, lambda f: estimates[f.id], SilentProgress()) == []
+    assert search(lost, estimates) == []
 
 
 @pytest.mark.parametrize("symmetric", [True, False])

@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from formats.images import write_rgb
 from pipelines.config import Config
+from pipelines.correspondence.features import to_grey
+from pipelines.correspondence.flow import corners
 from pipelines.geometry.camera import project, unproject
 from pipelines.progress import SilentProgress
 from pipelines.run_folder import (
@@ -27,9 +29,9 @@ from pipelines.run_folder import (
 )  # fmt: skip
 from pipelines.stages import StageContext
 from pipelines.tracking.bundle import Bundle
-from pipelines.tracking.klt import corners, to_grey
 from pipelines.types import Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, SparseModel
 from pipelines.world.clip import ClipOptions, WorldFrame, make_world, render_frame
+from tests.pipelines.kept import keep_correspondences
 
 Array = NDArray[np.float64]
 
@@ -119,6 +121,7 @@ def make_run(room_frames: tuple[Intrinsics, list[WorldFrame]]) -> Callable[..., 
         save_calibration(folder / "frames", Calibration(intrinsics, "given", 0.0, (0, 0, 0, 0)))
         save_classes(folder / "proxy", ClassTable(tuple(f"c{i}" for i in range(32)), ((0, 0, 0),) * 32))
         write_json(folder / "proxy" / "proxy.json", {"depth": "files", "semantics": "files", "metric": metric})
+        keep_correspondences(folder / "frames", {i: frames[i].rgb for i in keyframes or (0, 12)})
         if keyframes:
             model = _backbone(frames, truth, intrinsics, keyframes, backbone_scale)
             save_sparse_model(folder / "frames" / "backbone" / "model.npz", model)

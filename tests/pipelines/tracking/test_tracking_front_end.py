@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from pipelines.correspondence.features import extract_features
+from pipelines.correspondence.flow import corners, follow
+from pipelines.correspondence.matching import MatchOptions, match_descriptors
 from pipelines.geometry import se3
 from pipelines.geometry.camera import project
 from pipelines.tracking.extend import triangulate
-from pipelines.tracking.features import extract_features, frame_descriptor, match_features
-from pipelines.tracking.klt import corners, follow
 from pipelines.tracking.motion import interpolate_pose, predict_pose
 from pipelines.tracking.pnp import solve_pose
 from pipelines.tracking.state import Sightings, TrackState
@@ -111,22 +112,14 @@ def test_no_pose_from_nonsense() -> None:
 def test_features_match_a_turned_picture_and_not_another() -> None:
     first = texture(3, (300, 300))
     turned = np.ascontiguousarray(np.rot90(first))
-    a, b, other = (extract_features(x, 400) for x in (first, turned, texture(4, (300, 300))))
-    pairs = match_features(a, b)
+    a, b, other = (extract_features(x, 400, 0.005) for x in (first, turned, texture(4, (300, 300))))
+    pairs = match_descriptors(a.descriptors, b.descriptors, MatchOptions())
     # (x, y) goes to (y, 300 - x) in a picture turned to the left.
     wanted = np.stack([a.xy[pairs[:, 0], 1], 300 - a.xy[pairs[:, 0], 0]], 1)
     close = np.linalg.norm(wanted - b.xy[pairs[:, 1]], axis=1) < 1.5
     assert len(pairs) > 100
     assert close.mean() > 0.95
-    assert len(match_features(a, other)) < 0.1 * len(pairs)
-    assert len(match_features(a, extract_features(np.zeros((50, 50), np.uint8)))) == 0
-
-
-def test_descriptor_prefers_the_same_place() -> None:
-    first, other = (np.repeat(texture(s)[..., None], 3, 2) for s in (5, 6))
-    brighter = np.clip(first.astype(int) + 20, 0, 255).astype(np.uint8)
-    near, far = (float(frame_descriptor(first) @ frame_descriptor(x)) for x in (brighter, other))
-    assert near > 0.95 > 0.6 > far
+    assert len(match_descriptors(a.descriptors, other.descriptors, MatchOptions())) < 0.1 * len(pairs)
 
 
 def test_state_comes_back_from_disk(tmp_path: Path) -> None:

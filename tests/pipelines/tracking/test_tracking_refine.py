@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipelines.config import FramesConfig
 from pipelines.geometry import se3
 from pipelines.tracking.front_end import RENDER_LOSS
 from pipelines.tracking.pictures import Pictures
@@ -21,7 +22,7 @@ def test_comparison_brings_a_pose_nearer(tmp_path: Path, make_run: Callable[...,
     state = TrackState.from_backbone(backbone, 0.5)
     for k in (9, 12):
         state.poses[k] = made.cam_from_world[k]
-    pictures = Pictures(made.run, made.run.load_frames())
+    pictures = Pictures(made.run, made.run.load_frames(), FramesConfig())
     camera, weights = made.run.load_calibration().intrinsics, RenderWeights()
     truth = made.cam_from_world[10]
     start = se3.exp(np.array([0.025, -0.02, 0.025, 0.008, -0.01, 0.005])) @ truth
@@ -49,7 +50,10 @@ def test_depth_and_labels_of_the_frame_bring_its_pose_nearer_without_its_colours
     state = TrackState.from_backbone(backbone, 0.5)
     for k in (9, 12):
         state.poses[k] = made.cam_from_world[k]
-    pictures, camera = Pictures(made.run, made.run.load_frames()), made.run.load_calibration().intrinsics
+    pictures, camera = (
+        Pictures(made.run, made.run.load_frames(), FramesConfig()),
+        made.run.load_calibration().intrinsics,
+    )
     truth = made.cam_from_world[10]
     # Mostly along the view: there depth tells most. Its blending is some millimetres in front of the surface.
     start = se3.exp(np.array([0.01, -0.01, 0.06, 0.003, -0.004, 0.002])) @ truth

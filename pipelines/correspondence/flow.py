@@ -15,13 +15,8 @@ FLOW_SD = 0.4
 """Pixels: within which a followed point must come back, and how exactly it is then known."""
 
 
-def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB -> (H, W) grey."""
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
-
-
 def follow(
-    grey_from: NDArray[np.uint8], grey_to: NDArray[np.uint8], xy: Array, guess: Array
+    grey_from: NDArray[np.uint8], grey_to: NDArray[np.uint8], xy: Array, guess: Array, levels: int = LEVELS
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Where the points (Q, 2) of one picture lie in the other, searched from `guess` (Q, 2), and which were found (Q,).
 
@@ -37,8 +32,8 @@ def follow(
         return out, found
     # OpenCV puts the centre of the first pixel at (0, 0).
     start = (xy[found] - 0.5).astype(np.float32)
-    there, ok = _flow(grey_from, grey_to, start, (guess[found] - 0.5).astype(np.float32))
-    back, ok_back = _flow(grey_to, grey_from, there, start)
+    there, ok = _flow(grey_from, grey_to, start, (guess[found] - 0.5).astype(np.float32), levels)
+    back, ok_back = _flow(grey_to, grey_from, there, start, levels)
     inside = ((there >= 0) & (there <= [width - 1, height - 1])).all(1)
     good = ok & ok_back & inside & (np.linalg.norm(back - start, axis=1) < RETURN_ERROR)
     out[found] = there.astype(np.float64) + 0.5
@@ -47,11 +42,11 @@ def follow(
 
 
 def _flow(
-    grey_from: NDArray[np.uint8], grey_to: NDArray[np.uint8], xy: NDArray, guess: NDArray
+    grey_from: NDArray[np.uint8], grey_to: NDArray[np.uint8], xy: NDArray, guess: NDArray, levels: int
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003)
     there, status, _ = cv2.calcOpticalFlowPyrLK(
-        grey_from, grey_to, xy[:, None], guess[:, None].copy(), winSize=(WINDOW, WINDOW), maxLevel=LEVELS,
+        grey_from, grey_to, xy[:, None], guess[:, None].copy(), winSize=(WINDOW, WINDOW), maxLevel=levels,
         criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
     )  # fmt: skip
     return there.reshape(-1, 2).astype(np.float32), status.reshape(-1).astype(bool)

@@ -1,0 +1,21 @@
+"""What `frames` keeps of correspondences, for runs whose frames are made up."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.correspondence.features import extract_features, to_grey
+from pipelines.correspondence.retrieval import learn_vocabulary
+from pipelines.run_folder import save_features, save_tried, save_vocabulary
+
+
+def keep_correspondences(folder: Path, pictures: Mapping[int, np.ndarray]) -> None:
+    """Features of these keyframes (RGB), their vocabulary, and that no pair of them was tried."""
+    features = {i: extract_features(to_grey(rgb), 1500, 0.005) for i, rgb in pictures.items()}
+    for frame_id, found in features.items():
+        save_features(folder, frame_id, found)
+    save_vocabulary(folder, learn_vocabulary(list(features.values()), 0))
+    save_tried(folder, {})
