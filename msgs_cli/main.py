@@ -16,6 +16,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 from formats.errors import InputError
 from msgs_cli import looking
 from msgs_cli.ablating import ablate
+from msgs_cli.doctor import doctor
 from msgs_cli.json_lines import JsonError
 from msgs_cli.models import models
 from msgs_cli.options import (
@@ -80,6 +81,7 @@ def main() -> None:
     msgs-slam evaluate video.msgs --truth DATASET    errors against a known truth
     msgs-slam ablate SOURCE --truth DATASET          what each term of the method earns
     msgs-slam models list               learned models for metric depth and named classes
+    msgs-slam doctor                    what this machine has for the program, and what to mend
     msgs-slam config                    every setting with its default and meaning
     """
     prepare_streams()
@@ -267,6 +269,7 @@ for command in (looking.evaluate, looking.report, looking.render, looking.view):
     main.add_command(command)
 main.add_command(models)
 main.add_command(ablate)
+main.add_command(doctor)
 
 if __name__ == "__main__":
     main()

@@ -1,0 +1,190 @@
+"""What this machine has for the program: a line each, and what to do where something is missing."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import shutil
+import tempfile
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+GOOD, NOTE, BAD = "ok", "note", "BAD"
+DISTRIBUTION = "msgs-slam"
+_MODULES = (
+    "torch", "cv2", "pycolmap", "numba", "onnxruntime", "scipy", "skimage", "PIL", "trimesh", "plyfile", "safetensors"
+)  # fmt: skip
+_LEAST_MEMORY, _LEAST_DISK = 4.0, 3.0
+"""Gigabytes: the largest run of the benchmarks peaks at 1.8 and fills 0.5."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the examination; `fix` says what to type or change, "" where nothing needs to be."""
+
+    name: str
+    state: str
+    text: str
+    fix: str = ""
+
+
+def examine(folder: Path) -> list[Finding]:
+    """Every check in order; `folder` is where runs would be written. Never raises: what fails is a finding."""
+    checks: tuple[tuple[str, Callable[[], Finding]], ...] = (
+        ("program", _program), ("requirements", _requirements), ("libraries", _libraries), ("video", _video),
+        ("viewer", _viewer), ("threads", _threads), ("memory", _memory), ("gpu", _gpu), ("models", _models),
+        ("compiled kernels", _kernels), ("disk", lambda: _disk(folder)),
+    )  # fmt: skip
+    return [_guarded(name, check) for name, check in checks]
+
+
+def _guarded(name: str, check: Callable[[], Finding]) -> Finding:
+    try:
+        return check()
+    except Exception as error:  # the whole point is to go on and say it
+        return Finding(name, BAD, f"the check itself failed: {type(error).__name__}: {error}")
+
+
+def _program() -> Finding:
+    python = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
+    try:
+        return Finding("program", GOOD, f"{DISTRIBUTION} {importlib.metadata.version(DISTRIBUTION)}, {python}")
+    except importlib.metadata.PackageNotFoundError:
+        return Finding("program", NOTE, f"run from its sources, {python}", "pip install . in the folder of the sources")
+
+
+def _requirements() -> Finding:
+    """Versions against those that the installed package asks for."""
+    from packaging.requirements import Requirement
+
+    try:
+        wanted = [Requirement(text) for text in importlib.metadata.requires(DISTRIBUTION) or ()]
+    except importlib.metadata.PackageNotFoundError:
+        return Finding("requirements", NOTE, "unknown: the program is not installed", "pip install .")
+    wrong = []
+    for r in wanted:
+        if r.marker is not None and not r.marker.evaluate({"extra": ""}):
+            continue
+        try:
+            version = importlib.metadata.version(r.name)
+        except importlib.metadata.PackageNotFoundError:
+            wrong.append(f"{r.name} is missing")
+            continue
+        if not r.specifier.contains(version, prereleases=True):
+            wrong.append(f"{r.name} is {version}, wanted {r.specifier}")
+    if wrong:
+        return Finding("requirements", BAD, "; ".join(wrong), f"pip install --upgrade {DISTRIBUTION}")
+    return Finding("requirements", GOOD, "every package is there in a version that fits")
+
+
+def _libraries() -> Finding:
+    """That each one loads: a wheel for another processor or a missing system library shows here."""
+    broken = []
+    for name in _MODULES:
+        try:
+            importlib.import_module(name)
+        except Exception as error:  # a broken wheel raises anything
+            broken.append(f"{name} ({str(error).splitlines()[0] if str(error) else type(error).__name__})")
+    if broken:
+        return Finding("libraries", BAD, "do not load: " + ", ".join(broken), "pip install --force-reinstall those")
+    import torch
+
+    return Finding("libraries", GOOD, f"all load; torch {torch.__version__}")
+
+
+def _video() -> Finding:
+    """A few frames through the encoder and back."""
+    from formats.video import iter_video
+    from formats.video_writer import write_video
+
+    frames = [np.full((48, 64, 3), 40 * i, np.uint8) for i in range(5)]
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_video(Path(folder) / "check.mp4", frames, 10.0)
+        read = sum(1 for _ in iter_video(path))
+    if read != len(frames):
+        fix = "pip install --force-reinstall opencv-python-headless"
+        return Finding("video", BAD, f"{read} of {len(frames)} frames came back from an MP4", fix)
+    return Finding("video", GOOD, "MP4 is written and read")
+
+
+def _viewer() -> Finding:
+    if importlib.util.find_spec("viser") is None:
+        return Finding("viewer", NOTE, "`msgs-slam view` is not installed", f"pip install '{DISTRIBUTION}[viewer]'")
+    return Finding("viewer", GOOD, f"viser {importlib.metadata.version('viser')}")
+
+
+def _threads() -> Finding:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    limit = os.environ.get("OMP_NUM_THREADS", "")
+    if limit.isdecimal() and 0 < int(limit) < cores:
+        return Finding(
+            "threads", NOTE, f"{cores} cores, but OMP_NUM_THREADS={limit} holds some libraries back",
+            "unset OMP_NUM_THREADS; --set run.threads=N says how many the program takes",
+        )  # fmt: skip
+    return Finding("threads", GOOD, f"{cores} cores to use")
+
+
+def _memory() -> Finding:
+    if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
+        return Finding("memory", NOTE, "cannot be asked on this system")
+    size = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9
+    if size < _LEAST_MEMORY:
+        fix = "--set frames.max_side=480 needs less, or take a machine with more"
+        return Finding("memory", NOTE, f"{size:.1f} GB; under {_LEAST_MEMORY:g} long videos may not fit", fix)
+    return Finding("memory", GOOD, f"{size:.1f} GB")
+
+
+def _gpu() -> Finding:
+    import torch
+
+    if torch.cuda.is_available():
+        properties = torch.cuda.get_device_properties(0)
+        return Finding(
+            "gpu", GOOD, f"{properties.name}, {properties.total_memory / 1e9:.0f} GB; --device auto takes it"
+        )
+    if shutil.which("nvidia-smi") or Path("/dev/nvidia0").exists():
+        built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "a CPU build"
+        fix = "install a CUDA build of torch that fits the driver (pytorch.org, Get started)"
+        return Finding("gpu", BAD, f"there is an NVIDIA driver, but torch ({built}) finds no device", fix)
+    return Finding("gpu", GOOD, "none; everything runs on the CPU")
+
+
+def _models() -> Finding:
+    from pipelines.proxy.models.registry import ModelStore
+
+    store = ModelStore.open()
+    here = [model.name for model in store.models if store.is_here(model)]
+    if here:
+        return Finding("models", GOOD, f"{', '.join(here)} in {store.cache}")
+    text = f"none in {store.cache}: depth and regions come without networks, so no metres and few class names"
+    return Finding("models", NOTE, text, "msgs-slam models pull")
+
+
+def _kernels() -> Finding:
+    from pipelines.gaussians.render.jit import cache_directory
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        folder = cache_directory()
+    if folder is None:
+        fix = "set NUMBA_CACHE_DIR to a folder of yours that can be written"
+        return Finding("compiled kernels", NOTE, "cannot be kept: every start compiles for about a minute", fix)
+    kept = sum(1 for _ in folder.rglob("*.nbi"))
+    return Finding("compiled kernels", GOOD, f"{kept} kept in {folder}" if kept else f"will be kept in {folder}")
+
+
+def _disk(folder: Path) -> Finding:
+    free = shutil.disk_usage(folder).free / 1e9
+    if not os.access(folder, os.W_OK):
+        return Finding("disk", BAD, f"{folder.resolve()} cannot be written", "work in another folder, or give --out")
+    if free < _LEAST_DISK:
+        fix = "make room, or write to another disk with --out"
+        return Finding("disk", BAD, f"{free:.1f} GB free in {folder.resolve()}; a run takes up to {_LEAST_DISK:g}", fix)
+    return Finding("disk", GOOD, f"{free:.0f} GB free in {folder.resolve()}")

@@ -1,0 +1,54 @@
+"""The examination of a machine: what is well, and what it says of what is not."""
+
+import shutil
+from collections import namedtuple
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from msgs_cli.main import main
+from pipelines import doctor
+from pipelines.doctor import BAD, GOOD, NOTE, Finding, examine
+
+
+def found(name: str, folder: Path) -> Finding:
+    return next(f for f in examine(folder) if f.name == name)
+
+
+def test_this_machine_can_run_the_program() -> None:
+    result = CliRunner().invoke(main, ["doctor"])
+    assert result.exit_code == 0, result.output
+    lines = result.output.splitlines()
+    for name in ("program", "requirements", "libraries", "video", "threads", "memory", "gpu", "models", "disk"):
+        assert any(line[6:].startswith(name) for line in lines), name
+    # Every note says what to do.
+    for line, after in zip(lines, [*lines[1:], ""], strict=True):
+        assert not line.startswith(NOTE) or "fix: " in after, line
+
+
+def test_what_is_missing_is_said_with_its_fix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MSGS_SLAM_CACHE", str(tmp_path / "none"))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.setattr(doctor, "_MODULES", ("math", "no_such_module_at_all"))
+    monkeypatch.setattr(doctor.os, "sched_getaffinity", lambda _: {0, 1, 2}, raising=False)
+    usage = namedtuple("usage", "free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10**8))
+    findings = {f.name: f for f in examine(tmp_path)}
+    assert findings["libraries"].state == BAD
+    assert "no_such_module_at_all" in findings["libraries"].text
+    assert findings["models"].fix == "msgs-slam models pull"
+    assert findings["threads"].state == NOTE
+    assert findings["disk"].state == BAD
+    assert "0.1 GB" in findings["disk"].text
+
+
+def test_a_check_that_breaks_is_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken() -> Finding:
+        raise RuntimeError("no such bus")
+
+    monkeypatch.setattr(doctor, "_video", broken)
+    finding = found("video", tmp_path)
+    assert finding.state == BAD
+    assert "no such bus" in finding.text
+    assert found("viewer", tmp_path).state in (GOOD, NOTE)
