@@ -15,6 +15,7 @@ from __future__ import annotations
 import ast
 import functools
 import hashlib
+import os
 import tomllib
 from pathlib import Path
 
@@ -53,9 +54,10 @@ def stage_identity(name: str, file: Path) -> str:
 def source_digest(file: Path, root: Path = ROOT) -> str:
     """Over the names and contents of `stage_sources`; line ends do not count, as git may change them."""
     digest = hashlib.sha256()
-    for path in sorted(stage_sources(file, root), key=lambda p: p.relative_to(root).as_posix()):
+    named = {os.path.relpath(path, root).replace(os.sep, "/"): path for path in stage_sources(file, root)}
+    for name, path in sorted(named.items()):
         content = path.read_bytes().replace(b"\r\n", b"\n")
-        digest.update(f"{path.relative_to(root).as_posix()}\0{hashlib.sha256(content).hexdigest()}\n".encode())
+        digest.update(f"{name}\0{hashlib.sha256(content).hexdigest()}\n".encode())
     return digest.hexdigest()[:16]
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from pipelines.jit import kernel
 from pipelines.types import Features
 
 
@@ -56,7 +56,7 @@ def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8], optio
     return np.stack([index[good], best[good]], axis=1).astype(np.uint32)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _two_nearest(similarity):  # type: ignore[no-untyped-def]
     """Best column, its value and the second value of every row, and the best row of every column, in one pass."""
     rows, columns = similarity.shape

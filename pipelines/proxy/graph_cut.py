@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pipelines.jit import kernel
 
 
 def cut_graph(
@@ -34,7 +35,7 @@ def cut_image(image: NDArray[np.uint8], scale: float) -> NDArray[np.int64]:
     return cut_graph(a, b, np.concatenate(costs), np.ones(height * width), scale).reshape(height, width)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _root(parent: NDArray[np.int64], i: int) -> int:
     while parent[i] != i:
         parent[i] = parent[parent[i]]
@@ -42,7 +43,7 @@ def _root(parent: NDArray[np.int64], i: int) -> int:
     return i
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join(
     a: NDArray[np.int64], b: NDArray[np.int64], cost: NDArray[np.float64], mass: NDArray[np.float64], scale: float
 ) -> NDArray[np.int64]:

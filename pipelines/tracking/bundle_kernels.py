@@ -8,13 +8,14 @@ Loops run in the order of the observations, in one thread: the same input gives 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from pipelines.jit import kernel
 
 MIN_DEPTH = 1e-6
 """Relative to nothing: a point behind the camera is treated as an outlier of zero weight."""
 
 
-@njit(cache=True)
+@kernel
 def _residual(motion, point, camera, xy, inverse_sd, log_depth, depth_weight, residual, jac_cam, jac_point):  # type: ignore[no-untyped-def]
     """Fill residual (3,), its derivatives by twist (3, 6) and point (3, 3); False if behind the camera."""
     x = motion[0, 0] * point[0] + motion[0, 1] * point[1] + motion[0, 2] * point[2] + motion[0, 3]
@@ -44,14 +45,14 @@ def _residual(motion, point, camera, xy, inverse_sd, log_depth, depth_weight, re
     return True
 
 
-@njit(cache=True)
+@kernel
 def _cauchy(squared, width):  # type: ignore[no-untyped-def]
     """Cost and weight of Cauchy's loss of a squared residual."""
     scaled = squared / (width * width)
     return width * width * np.log1p(scaled), 1.0 / (1.0 + scaled)
 
 
-@njit(cache=True)
+@kernel
 def total_cost(motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_depth, depth_weight, width):  # type: ignore[no-untyped-def]
     """Robust cost of all observations; one behind its camera costs what a residual of ten widths does."""
     residual, jac_cam, jac_point = np.empty(3), np.empty((3, 6)), np.empty((3, 3))
@@ -67,7 +68,7 @@ def total_cost(motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_
     return cost
 
 
-@njit(cache=True)
+@kernel
 def linearise(motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_depth, depth_weight, width):  # type: ignore[no-untyped-def]
     """Normal equations: camera blocks (N, 6, 6), (N, 6), point blocks (P, 3, 3), (P, 3), mixed (O, 6, 3)."""
     n, p, o_count = len(motions), len(points), len(obs_cam)
@@ -104,7 +105,7 @@ def linearise(motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_d
     return cam_block, cam_right, point_block, point_right, mixed
 
 
-@njit(cache=True)
+@kernel
 def invert_points(point_block, damping):  # type: ignore[no-untyped-def]
     """Inverses (P, 3, 3) of the damped point blocks."""
     out = np.empty_like(point_block)
@@ -117,7 +118,7 @@ def invert_points(point_block, damping):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True)
+@kernel
 def number_blocks(starts, obs_cam, count):  # type: ignore[no-untyped-def]
     """numbers (N, N) of the pairs a <= b of cameras that share a point, row by row, -1 for others; their count."""
     numbers = np.full((count, count), -1, np.int32)
@@ -136,7 +137,7 @@ def number_blocks(starts, obs_cam, count):  # type: ignore[no-untyped-def]
     return numbers, used
 
 
-@njit(cache=True)
+@kernel
 def eliminate_points(starts, obs_cam, mixed, inverse_block, point_right, numbers, blocks, right):  # type: ignore[no-untyped-def]
     """Subtract the points' share from the blocks (B, 6, 6) of the reduced camera system and its right side (6N,).
 
@@ -165,7 +166,7 @@ def eliminate_points(starts, obs_cam, mixed, inverse_block, point_right, numbers
                         )
 
 
-@njit(cache=True)
+@kernel
 def point_steps(obs_cam, obs_point, mixed, inverse_block, point_right, cam_step):  # type: ignore[no-untyped-def]
     """Back substitution: steps (P, 3) of the points for the cameras' steps (N, 6)."""
     rest = point_right.copy()

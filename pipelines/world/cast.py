@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from pipelines.jit import kernel
 from pipelines.world.shapes import BOX, CYLINDER, FACE_COUNT, ROOM, SPHERE, Solid
 
 TILE = 8
@@ -52,12 +53,12 @@ def pack_solids(solids: list[Solid]) -> SolidArrays:
     )
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _to_local(x, y, z, turn):  # type: ignore[no-untyped-def]
     return turn[0] * x + turn[1] * y, -turn[1] * x + turn[0] * y, z
 
 
-@njit(cache=True)
+@kernel
 def hit_slabs(ox, oy, oz, dx, dy, dz, half, inside):  # type: ignore[no-untyped-def]
     """(t, face) where a ray enters a box, or leaves it when `inside`; local coordinates; NOTHING if it misses."""
     near, far = -NOTHING, NOTHING
@@ -85,7 +86,7 @@ def hit_slabs(ox, oy, oz, dx, dy, dz, half, inside):  # type: ignore[no-untyped-
     return near, near_face
 
 
-@njit(cache=True)
+@kernel
 def hit_round(ox, oy, oz, dx, dy, dz, half, is_sphere):  # type: ignore[no-untyped-def]
     """(t, face) where a ray enters a sphere or a standing cylinder (side 0, top 1, bottom 2)."""
     r = half[0]
@@ -106,7 +107,7 @@ def hit_round(ox, oy, oz, dx, dy, dz, half, is_sphere):  # type: ignore[no-untyp
     return NOTHING, 0
 
 
-@njit(cache=True)
+@kernel
 def trace(ox, oy, oz, dx, dy, dz, chosen, count, shape, center, half, turn, bound):  # type: ignore[no-untyped-def]
     """(t, solid, face) of the nearest hit among the first `count` solids of `chosen`; solid -1 if none."""
     best, solid, side = NOTHING, -1, 0
@@ -129,7 +130,7 @@ def trace(ox, oy, oz, dx, dy, dz, chosen, count, shape, center, half, turn, boun
     return best, solid, side
 
 
-@njit(cache=True)
+@kernel
 def surface(px, py, pz, s, face, shape, center, half, turn):  # type: ignore[no-untyped-def]
     """(u, v, nx, ny, nz) of world point p on a face: texture coordinates and the normal to the visible side."""
     x, y, z = _to_local(px - center[s, 0], py - center[s, 1], pz - center[s, 2], turn[s])
@@ -159,7 +160,7 @@ def surface(px, py, pz, s, face, shape, center, half, turn):  # type: ignore[no-
     return u, v, c * nx - w * ny, w * nx + c * ny, nz
 
 
-@njit(cache=True)
+@kernel
 def point_on_face(u, v, s, face, shape, center, half, turn):  # type: ignore[no-untyped-def]
     """World point (x, y, z) of texture coordinates on a face: the inverse of `surface`."""
     qx, qy, qz = 0.0, 0.0, 1 - 2 * v
@@ -186,7 +187,7 @@ def point_on_face(u, v, s, face, shape, center, half, turn):  # type: ignore[no-
     return center[s, 0] + c * x - w * y, center[s, 1] + w * x + c * y, center[s, 2] + z
 
 
-@njit(cache=True)
+@kernel
 def solids_in_cone(ox, oy, oz, ax, ay, az, half_angle, shape, center, bound, chosen):  # type: ignore[no-untyped-def]
     """Fill `chosen` with the solids that a cone (unit axis, half angle) may touch; returns their number."""
     count = 0
@@ -202,7 +203,7 @@ def solids_in_cone(ox, oy, oz, ax, ay, az, half_angle, shape, center, bound, cho
     return count
 
 
-@njit(cache=True)
+@kernel
 def sample_texture(u, v, face, level, atlas, levels, out):  # type: ignore[no-untyped-def]
     """Bilinear sample of one mip level into `out` (3,), in linear light."""
     offset, h, w = levels[face, level, 0], levels[face, level, 1], levels[face, level, 2]
@@ -217,7 +218,7 @@ def sample_texture(u, v, face, level, atlas, levels, out):  # type: ignore[no-un
         out[c] = code * code
 
 
-@njit(cache=True)
+@kernel
 def shade(u, v, face, footprint, atlas, levels, level_count, texel, low, high, out):  # type: ignore[no-untyped-def]
     """Trilinear sample for a pixel that covers `footprint` metres of the face; `low`, `high` are scratch (3,)."""
     fine = max(0.0, min(np.log2(max(footprint / texel[face], 1e-6)), level_count[face] - 1.0))
@@ -232,7 +233,7 @@ def shade(u, v, face, footprint, atlas, levels, level_count, texel, low, high, o
         out[c] += low[c]
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def render_rays(  # type: ignore[no-untyped-def]
     world_from_cam, center_xy, sub_xy, pixel, shape, center, half, turn, bound, first_face,
     atlas, levels, level_count, texel, color, depth, solid_at,
@@ -279,7 +280,7 @@ def render_rays(  # type: ignore[no-untyped-def]
                     color[i, j, c] = total[c] / sub_xy.shape[2]
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _ray(r, x, y):  # type: ignore[no-untyped-def]
     return (
         r[0, 0] * x + r[0, 1] * y + r[0, 2],
@@ -288,7 +289,7 @@ def _ray(r, x, y):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True)
+@kernel
 def _tile_cone(r, xy, top, bottom, left, right, pixel):  # type: ignore[no-untyped-def]
     """Unit axis and half angle of a cone round all rays of a tile, a pixel to spare."""
     x, y = xy[(top + bottom) // 2, (left + right) // 2, 0], xy[(top + bottom) // 2, (left + right) // 2, 1]

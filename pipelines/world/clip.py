@@ -104,7 +104,7 @@ def render_view(
     centers, samples = _rays(options)
     pixel = 1 / (options.intrinsics.fx * options.supersampling)
     a, solids = world.atlas, world.solids
-    render_rays(  # type: ignore[call-arg]
+    render_rays(
         np.ascontiguousarray(world_from_cam), centers, samples, pixel, *solids.arguments, solids.first_face,
         a.codes, a.levels, a.level_count, a.texel, color, depth, solid_at,
     )  # fmt: skip

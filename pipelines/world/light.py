@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from pipelines.jit import kernel
 from pipelines.world.cast import SolidArrays, point_on_face, surface, trace
 from pipelines.world.shapes import FACE_COUNT, Solid
 
@@ -41,11 +42,11 @@ def bake_light(
     caster = np.array([i for i, s in enumerate(solids) if s.material.emission == 0], np.int32)
     scene = arrays.arguments
     direct = np.zeros((len(grid), 3))
-    _direct(grid, lamps, caster, *scene, direct)  # type: ignore[call-arg]
+    _direct(grid, lamps, caster, *scene, direct)
     total = direct.copy()
     directions = _cosine_directions(samples)
     faces = (arrays.first_face, offsets, sizes)
-    _bounce(grid, directions, caster, *faces, albedo, direct, *scene, total)  # type: ignore[call-arg]
+    _bounce(grid, directions, caster, *faces, albedo, direct, *scene, total)
     total += _AMBIENT
     return [_smoothed(total[offsets[i] : offsets[i + 1]].reshape(h, w, 3)) for i, (h, w) in enumerate(sizes.tolist())]
 
@@ -74,7 +75,7 @@ def _cosine_directions(count: int) -> NDArray[np.float64]:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], axis=1)
 
 
-@njit(cache=True)
+@kernel
 def _texel_point(row, shape, center, half, turn):  # type: ignore[no-untyped-def]
     """Position just above a light texel, and its normal."""
     s, face = int(row[0]), int(row[1])
@@ -83,7 +84,7 @@ def _texel_point(row, shape, center, half, turn):  # type: ignore[no-untyped-def
     return x + 1e-3 * nx, y + 1e-3 * ny, z + 1e-3 * nz, nx, ny, nz
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def _direct(grid, lamps, caster, shape, center, half, turn, bound, out):  # type: ignore[no-untyped-def]
     side = 3
     for i in prange(grid.shape[0]):
@@ -110,7 +111,7 @@ def _direct(grid, lamps, caster, shape, center, half, turn, bound, out):  # type
                     out[i, c] += lamp[12 + c] * area * towards * leaving / (d2 * d2)
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def _bounce(  # type: ignore[no-untyped-def]
     grid, directions, caster, first_face, offsets, sizes, albedo, direct, shape, center, half, turn, bound, out
 ):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pipelines.jit import kernel
 
 
 def spread_votes(
@@ -23,7 +24,7 @@ def spread_votes(
     return out
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _pass_rows(votes: NDArray[np.float32], image: NDArray[np.uint8], fade: float, stretch: float) -> None:
     height, width, classes = votes.shape
     feedback = np.empty(width, np.float32)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pipelines.jit import kernel
 from pipelines.proxy.stereo.bands import Bands
 
 
@@ -34,7 +34,7 @@ def fuse_depths(
     return fused, support, conflict
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _sample(depth: NDArray[np.float32], px: float, py: float, tolerance: float) -> float:
     """Inverse-depth interpolation where the four neighbours lie on one surface, else the nearest pixel's depth."""
     height, width = depth.shape
@@ -54,7 +54,7 @@ def _sample(depth: NDArray[np.float32], px: float, py: float, tolerance: float) 
     return 1 / inverse
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _fuse_band(
     depth: NDArray[np.float32],
     others: NDArray[np.float32],

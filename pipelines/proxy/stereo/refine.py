@@ -7,9 +7,9 @@ far, so slanted surfaces correlate as well as frontal ones and the depth gets fi
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pipelines.jit import kernel
 from pipelines.proxy.stereo.bands import BAND_ROWS, Bands
 from pipelines.proxy.stereo.window import RADIUS, best_mean, correlate_row, weigh_windows
 
@@ -55,7 +55,7 @@ def refine_inverse_depth(
     return refined, score
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _warp_surface_row(
     other: NDArray[np.float32],
     warp: NDArray[np.float64],
@@ -94,7 +94,7 @@ def _warp_surface_row(
         row[width + RADIUS + i] = row[width + RADIUS - 1]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _refine_band(
     image: NDArray[np.float32],
     others: NDArray[np.float32],

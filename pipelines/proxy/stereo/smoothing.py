@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pipelines.jit import kernel
 from pipelines.proxy.stereo.bands import Bands
 
 _DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
@@ -39,7 +39,7 @@ def _path_starts(height: int, width: int, dy: int, dx: int) -> NDArray[np.int64]
     return np.argwhere(first)
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@kernel
 def _scan_paths(
     cost: NDArray[np.float32],
     image: NDArray[np.float32],
@@ -83,7 +83,7 @@ def _scan_paths(
             x += dx
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@kernel
 def pick_planes(total: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(H, W) best plane as a fractional index (a parabola through the lowest sum and its two neighbours), and
     (H, W) margin: by how much the second best, non-adjacent plane is worse, relative to the best."""

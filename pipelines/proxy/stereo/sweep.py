@@ -7,9 +7,9 @@ neighbours, so that an occlusion in the others does not count (Kang, Szeliski, C
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pipelines.jit import kernel
 from pipelines.proxy.stereo.bands import BAND_ROWS, Bands
 from pipelines.proxy.stereo.window import RADIUS, best_mean, correlate_row, weigh_windows
 
@@ -55,7 +55,7 @@ def sweep_cost(
     return cost
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _warp_row(
     other: NDArray[np.float32],
     warp: NDArray[np.float64],
@@ -98,7 +98,7 @@ def _warp_row(
         row[width + RADIUS + i] = row[width + RADIUS - 1]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _sweep_band(
     image: NDArray[np.float32],
     others: NDArray[np.float32],

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pipelines.jit import kernel
 from pipelines.proxy.providers import DepthEstimate
 
 _COLOR_SD = 10.0
@@ -36,7 +36,7 @@ def _coarse_colors(image: NDArray[np.uint8], height: int, width: int) -> NDArray
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _upsample(
     depth: NDArray[np.float32],
     confidence: NDArray[np.float32],

@@ -12,8 +12,9 @@ were seen to round differently with it, and a run has to end with the same bytes
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pipelines.jit import kernel
 
 RADIUS = 3
 STEP = 2
@@ -25,7 +26,7 @@ OUTSIDE = -2.0
 """Marks the score of a view that does not see the pixel."""
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def weigh_windows(
     image: NDArray[np.float32], first: int, last: int, likeness: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
@@ -67,7 +68,7 @@ def weigh_windows(
     return weights, weighted, moments
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def correlate_row(
     warped: NDArray[np.float32],
     weights: NDArray[np.float32],
@@ -99,7 +100,7 @@ def correlate_row(
         score[x] = value if seen[x] and value == value else np.float32(OUTSIDE)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def best_mean(scores: NDArray[np.float32], x: int, best: int) -> np.floating:
     """Mean of the `best` largest scores of column x among the views that see it; 0 when none does. Alters `scores`."""
     total = np.float32(0)

@@ -1,6 +1,7 @@
 """Where compiled kernels are kept: a writable place of our own, or nowhere, and the user is told."""
 
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -8,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.gaussians.render import jit
+from pipelines import jit
 
-ROOT = Path(__file__).resolve().parents[4]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(autouse=True)
@@ -19,9 +20,9 @@ def _fresh(monkeypatch, tmp_path):
         monkeypatch.delenv(name, raising=False)
     (tmp_path / "tmp").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
-    jit.cache_directory.cache_clear()
+    jit.cache_root.cache_clear()
     yield
-    jit.cache_directory.cache_clear()
+    jit.cache_root.cache_clear()
 
 
 def unwritable(monkeypatch, tmp_path, name: str) -> None:
@@ -33,13 +34,13 @@ def unwritable(monkeypatch, tmp_path, name: str) -> None:
 def test_the_place_the_user_names_comes_first(monkeypatch, tmp_path, recwarn):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "mine"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert jit.cache_directory().parent == tmp_path / "mine"
+    assert jit.cache_root().parent == tmp_path / "mine"
     assert not recwarn.list
 
 
 def test_else_the_users_cache_folder(monkeypatch, tmp_path, recwarn):
     monkeypatch.setenv("HOME", str(tmp_path))
-    directory = jit.cache_directory()
+    directory = jit.cache_root()
     assert directory.parent == tmp_path / ".cache" / "msgs-slam"
     assert directory.stat().st_mode & 0o777 == 0o700
     assert not recwarn.list
@@ -48,7 +49,7 @@ def test_else_the_users_cache_folder(monkeypatch, tmp_path, recwarn):
 def test_a_home_that_cannot_be_written_is_said_once(monkeypatch, tmp_path):
     unwritable(monkeypatch, tmp_path, "HOME")
     with pytest.warns(UserWarning, match="compiled kernels are kept in") as warned:
-        found = [jit.cache_directory() for _ in range(3)]
+        found = [jit.cache_root() for _ in range(3)]
     assert len(warned) == 1
     assert found[0] == found[1] == found[2]
     assert found[0].parent == tmp_path / "tmp"
@@ -59,25 +60,51 @@ def test_no_place_at_all_is_said(monkeypatch, tmp_path):
     unwritable(monkeypatch, tmp_path, "HOME")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "file" / "tmp"))
     with pytest.warns(UserWarning, match="compiled at every start"):
-        assert jit.cache_directory() is None
+        assert jit.cache_root() is None
 
 
 def test_a_folder_others_may_write_to_is_not_trusted(monkeypatch, tmp_path):
     """The cache is machine code: who can write it can run anything as us."""
     unwritable(monkeypatch, tmp_path, "HOME")
-    planted = tmp_path / "tmp" / f"msgs-slam-{os.getuid()}-renderer-{jit._source_hash()}"
+    planted = tmp_path / "tmp" / f"msgs-slam-{os.getuid()}-kernels"
     planted.mkdir()
     planted.chmod(0o777)
     with pytest.warns(UserWarning, match="compiled at every start"):
-        assert jit.cache_directory() is None
+        assert jit.cache_root() is None
 
 
-def test_the_name_follows_the_sources(monkeypatch, tmp_path):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    first = jit.cache_directory()
-    monkeypatch.setattr(jit, "_source_hash", lambda: "other")
-    jit.cache_directory.cache_clear()
-    assert jit.cache_directory() != first
+def test_a_kernel_follows_what_other_files_put_into_it(tmp_path):
+    """numba itself would go on using the machine code into which the older function is inlined."""
+    room = tmp_path / "pipelines"
+    room.mkdir()
+    for name in ("jit.py", "stage_identity.py"):
+        shutil.copyfile(ROOT / "pipelines" / name, room / name)
+    (room / "__init__.py").write_text("")
+    (room / "kernel.py").write_text(
+        "from pipelines.inlined import value\nfrom pipelines.jit import kernel\n\n"
+        "@kernel\ndef twice(x):\n    return 2 * value(x)\n\n"
+        "print(twice(1.0), sum(twice.stats.cache_hits.values()))\n"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
+    said = []
+    for factor in (3, 3, 5):
+        (room / "inlined.py").write_text(
+            f"from pipelines.jit import kernel\n\n@kernel\ndef value(x):\n    return {factor} * x\n"
+        )
+        command = [sys.executable, "-m", "pipelines.kernel"]
+        done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        said.append(done.stdout.strip())
+    assert said == ["6.0 0", "6.0 1", "10.0 0"]
+
+
+def test_no_other_way_to_numba_and_no_fastmath():
+    """Equal bytes over thread counts need floats that are taken literally; the renderer says what it allows."""
+    for path in (ROOT / "pipelines").rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        if path.name != "jit.py":
+            assert "njit" not in text, path
+            assert "fastmath=" not in text, path
 
 
 def test_kernels_run_and_are_cached_without_a_home(tmp_path):
