@@ -24,6 +24,7 @@ from formats.images import read_grey_png, read_rgb, write_grey_png
 from formats.jsonfile import read_json, read_json_object, write_json
 from formats.tensors import load_tensors, save_arrays, save_tensors
 from pipelines import stored
+from pipelines.depth.fields import FINE, DepthFields
 from pipelines.finished_files import FinishedFiles
 from pipelines.stored import dataclass_from_json, load_layout, reading
 from pipelines.types import (
@@ -46,7 +47,7 @@ if TYPE_CHECKING:
 FRAMES, CALIBRATION, BACKBONE = "frames.json", "calibration.json", "backbone/model.npz"
 VOCABULARY, TRIED = "correspondence/vocabulary.npz", "correspondence/tried.npz"
 CLASSES, SYMMETRY, DESCRIPTORS = "classes.json", "symmetry.npz", "descriptors.npz"
-TRAJECTORY, SPARSE, DEPTH_SCALES = "trajectory.npz", "sparse.npz", "depth_scales.npz"
+TRAJECTORY, SPARSE, DEPTH_FIELDS = "trajectory.npz", "sparse.npz", "depth_fields.npz"
 MAP, EXPOSURE, LOOPS = "map.safetensors", "exposure.npz", "loops.json"
 MESH, WORLD = "mesh.ply", "world.json"
 
@@ -135,6 +136,10 @@ class RunFolder(FinishedFiles):
         """Proxy maps of one frame; InputError when it has none."""
         return load_proxy_maps(self.file("proxy", proxy_name(frame_id)))
 
+    def find_proxy(self, frame_id: int) -> ProxyMaps | None:
+        """Proxy maps of one frame, None when it has none."""
+        return self.load_proxy(frame_id) if self.has_proxy(frame_id) else None
+
     def load_symmetry(self) -> dict[int, MirrorPairs]:
         """Frame id → pairs of pixels that show each other's mirror image; {} where no symmetry was found."""
         return load_mirror_pairs(self.file("proxy", SYMMETRY)) if self.has("proxy", SYMMETRY) else {}
@@ -166,11 +171,13 @@ class RunFolder(FinishedFiles):
         """Keyframe poses and points as `stage` left them."""
         return load_sparse_model(self.file(stage, SPARSE))
 
-    def load_depth_scales(self) -> dict[str, NDArray] | None:
-        """frame_ids, scales, grids: depth in the world over proxy depth; None where tracking left none."""
-        if not self.has("tracking", DEPTH_SCALES):
-            return None
-        return load_layout(self.file("tracking", DEPTH_SCALES), stored.DEPTH_SCALES)
+    def load_depth_fields(self, stage: str) -> DepthFields:
+        """What brings proxy depths into the world of `stage`, tracking or global_ba."""
+        path = self.file(stage, DEPTH_FIELDS)
+        arrays = load_layout(path, stored.DEPTH_FIELDS)
+        with reading(path, "file of depth fields"):
+            stored.require_increasing("frame_ids", arrays["frame_ids"])
+        return DepthFields(dict(zip(arrays["frame_ids"].tolist(), arrays["log_scales"], strict=True)))
 
     def has_exposure(self, stage: str) -> bool:
         """Whether `stage` has left exposures."""
@@ -294,11 +301,6 @@ def save_sparse(folder: Path, model: SparseModel) -> None:
     save_sparse_model(folder / SPARSE, model)
 
 
-def save_depth_scales(folder: Path, arrays: dict[str, NDArray]) -> None:
-    """frame_ids, scales, grids: see `RunFolder.load_depth_scales`."""
-    save_arrays(folder / DEPTH_SCALES, arrays)
-
-
 def save_figures(folder: Path, stage: str, figures: dict[str, Any]) -> None:
     """What the stage says of its result, for other programs."""
     write_json(folder / f"{stage}.json", figures)
@@ -397,6 +399,12 @@ def save_trajectory(folder: Path, trajectory: Trajectory) -> None:
 def save_map(folder: Path, gaussian_map: GaussianMap) -> None:
     """One safetensors file."""
     save_tensors(folder / MAP, {k: v.detach().cpu().contiguous() for k, v in vars(gaussian_map).items()})
+
+
+def save_depth_fields(folder: Path, fields: DepthFields) -> None:
+    """depth_fields.npz: frame_ids (N,), log_scales (N, rows, columns)."""
+    logs = np.array(list(fields.of_frame.values())).reshape(-1, FINE.rows, FINE.columns)
+    save_arrays(folder / DEPTH_FIELDS, {"frame_ids": np.array(list(fields.of_frame), np.int64), "log_scales": logs})
 
 
 def save_exposure(

@@ -16,6 +16,7 @@ from typing import Any
 from formats.atomic import is_disk_full, watched_by, write_text
 from formats.errors import DiskFullError, InputError
 from pipelines.config import Config, settings_of_stage
+from pipelines.device import settle_device
 from pipelines.journal import JOURNAL, Journal, empty
 from pipelines.progress import Progress, log
 from pipelines.records import (
@@ -70,8 +71,8 @@ class StageContext:
 
     @property
     def device(self) -> str:
-        """ "cpu" or "cuda", as settled before the first stage."""
-        return self.config.run.device
+        """ "cpu" or "cuda"."""
+        return settle_device(self.config.run.device)
 
     def warn(self, message: str) -> None:
         """A degraded result: logged now, counted and kept for the report."""

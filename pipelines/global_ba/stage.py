@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.correspondence.retrieval import likeness, unit
+from pipelines.depth.fields import DepthFields
+from pipelines.depth.scales import sample_proxy
 from pipelines.gaussian_map import GaussianMap
 from pipelines.geometry import se3
 from pipelines.global_ba.candidates import loop_candidates
@@ -18,11 +20,11 @@ from pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_f
 from pipelines.global_ba.move_map import follow_keyframes, move_map
 from pipelines.global_ba.semantics import LabelSummary, summarise_labels
 from pipelines.global_ba.verify import KeyframeView, Loop, make_view
-from pipelines.mapping.depth_fields import agree_on_depth
-from pipelines.mapping.load import DepthScales, load_views
+from pipelines.mapping.load import load_views
 from pipelines.mapping.poses import move_trajectory
 from pipelines.run_folder import (
     RunFolder,
+    save_depth_fields,
     save_exposure,
     save_figures,
     save_loops,
@@ -31,13 +33,12 @@ from pipelines.run_folder import (
     save_trajectory,
 )
 from pipelines.stages import Stage, StageContext
-from pipelines.tracking.adjust import without_dependent_depth
+from pipelines.tracking.adjust import align_depths, without_dependent_depth
 from pipelines.tracking.bundle import reprojection_errors
-from pipelines.tracking.depth_scales import sample_proxy
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.result import to_sparse_model
 from pipelines.tracking.state import FEATURE_SD, TrackState
-from pipelines.types import VOID, Intrinsics, ProxyMaps, SparseModel, Trajectory
+from pipelines.types import VOID, Intrinsics, SparseModel, Trajectory
 
 Array = NDArray[np.float64]
 
@@ -52,6 +53,7 @@ def run(context: StageContext) -> dict[str, Any]:
     model = context.run.load_sparse("tracking")
     trajectory = context.run.load_trajectory("mapping")
     gaussian_map = context.run.load_map("mapping", context.device)
+    fields = context.run.load_depth_fields("tracking")
     settings = context.config.global_ba
 
     found = search(context, model) if settings.use_loops else FoundLoops([], 0, 0, 0, 0)
@@ -65,7 +67,9 @@ def run(context: StageContext) -> dict[str, Any]:
         after = poses_of(trajectory, model.frame_ids)
         gaussian_map = move_map(gaussian_map, model.frame_ids, before, after, ratio)
         model = to_sparse_model(closed.state)
-    refined = refine(context, gaussian_map, trajectory, moved_px)
+        fields = align_depths(model, closed.report, context.run.load_calibration().intrinsics, context.run.find_proxy)
+    save_depth_fields(context.folder, fields)
+    refined = refine(context, gaussian_map, trajectory, fields, moved_px)
     return save(context, model, trajectory, gaussian_map, found, closed, refined, moved_px)
 
 
@@ -95,14 +99,14 @@ def load_keyframe_views(context: StageContext, model: SparseModel, pictures: Pic
     """Features of every keyframe, with what is known of their depth."""
     run = context.run
     intrinsics = run.load_calibration().intrinsics
-    scales = DepthScales.load(run)
+    fields = run.load_depth_fields("tracking")
     state = TrackState.from_backbone(model, 1.0)
     views = []
     for k, frame_id in enumerate(context.progress.track(model.frame_ids.tolist(), "features", len(model.frame_ids))):
         features = pictures.features(frame_id)
         depth = np.zeros(len(features.xy))
-        if run.has_proxy(frame_id) and (maps := scales.apply(frame_id, run.load_proxy(frame_id))) is not None:
-            depth, _ = sample_proxy(maps, features.xy, intrinsics)
+        if run.has_proxy(frame_id):
+            depth, _ = sample_proxy(fields.in_world(frame_id, run.load_proxy(frame_id)), features.xy, intrinsics)
         pose, seen = model.cam_from_world[k], state.sightings[frame_id]
         views.append(make_view(frame_id, pose, features, seen, model.points_in_world, depth, intrinsics))
     return views
@@ -125,14 +129,11 @@ def adjust(context: StageContext, model: SparseModel, found: FoundLoops) -> Clos
     state = TrackState.from_backbone(model, FEATURE_SD)
     drift = max(loop_drift_px(loop, state, intrinsics) for loop in found.loops)
 
-    def load_proxy(frame_id: int) -> ProxyMaps | None:
-        return run.load_proxy(frame_id) if run.has_proxy(frame_id) else None
-
     report = run.load_proxy_report()
     metric = bool(report.get("metric", False))
     tracking = without_dependent_depth(config.tracking, report)
     drifted = drift > DRIFT_PX
-    closed = close_loops(state, found.loops, drifted, intrinsics, load_proxy, metric, tracking, config.global_ba)
+    closed = close_loops(state, found.loops, drifted, intrinsics, run.find_proxy, metric, tracking, config.global_ba)
     if closed.error_after > 1.5 * closed.error_before + 0.05:
         context.warn(
             f"{len(found.loops)} loops were refused: with them the reprojection error of what was known before rises "
@@ -197,14 +198,16 @@ def largest_motion(context: StageContext, state: TrackState, model: SparseModel)
     return float((focal * (se3.rotation_angle(apart) + shift / depth)).max())
 
 
-def refine(context: StageContext, gaussian_map: GaussianMap, trajectory: Trajectory, moved_px: float) -> Refined | None:
+def refine(
+    context: StageContext, gaussian_map: GaussianMap, trajectory: Trajectory, fields: DepthFields, moved_px: float
+) -> Refined | None:
     """Map and poses together where the adjustment has moved them, or always, or never, as the settings say."""
     settings = context.config.global_ba
     if settings.joint == "never" or (settings.joint == "moved" and moved_px < JOINT_PX):
         return None
     mapping = context.config.mapping
-    given = load_views(context.run, trajectory, mapping, context.config.article, context.device)
-    views = agree_on_depth(given.views, given.anchors)
+    given = load_views(context.run, trajectory, mapping, context.config.article, context.device, fields)
+    views = given.views
     exposure = context.run.load_exposure()
     gains = {int(i): g for i, g in zip(exposure["frame_ids"], exposure["log_gains"], strict=True)}
     offsets = {int(i): o for i, o in zip(exposure["frame_ids"], exposure["offsets"], strict=True)}

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from pipelines.config import ArticleConfig, MappingConfig
+from pipelines.depth.fields import DepthFields
+from pipelines.depth.see_through import contradicted
 from pipelines.mapping.article.mirrors import Mirrors
-from pipelines.mapping.depth_fields import Anchors
 from pipelines.mapping.views import View, make_view, occurring_classes, working_size
 from pipelines.run_folder import RunFolder
 from pipelines.types import Frame, Intrinsics, ProxyMaps, Trajectory
@@ -25,7 +25,6 @@ class MappingInput:
     views: list[View]
     held_out: list[View]
     class_ids: tuple[int, ...]
-    anchors: Mapping[int, Anchors]
 
 
 def load_views(
@@ -34,12 +33,18 @@ def load_views(
     settings: MappingConfig,
     article: ArticleConfig | None = None,
     device: torch.device | str = "cpu",
+    fields: DepthFields | None = None,
 ) -> MappingInput:
-    """The keyframes of `trajectory` with images and proxies, in order; proxies scaled to the world of tracking."""
+    """The keyframes of `trajectory` with images and proxies, in order.
+
+    Depths are in the unit of the world by `fields`, those of tracking unless others are given; what other views see
+    through is unknown.
+    """
     frames = {f.id: f for f in run.load_frames()}
     full = run.load_calibration().intrinsics
     intrinsics = working_size(full, settings.max_side)
-    scales, symmetry = DepthScales.load(run), run.load_symmetry() if article and article.symmetry_weight > 0 else {}
+    fields = fields or run.load_depth_fields("tracking")
+    symmetry = run.load_symmetry() if article and article.symmetry_weight > 0 else {}
     kept, measured = split_frames(trajectory, settings.hold_out)
     maps = {i: run.load_proxy(i) for i in kept + measured if run.has_proxy(i)}
     class_ids = occurring_classes([maps[i].labels for i in kept if i in maps])
@@ -47,14 +52,21 @@ def load_views(
 
     def load(frame_id: int) -> View:
         frame = frames[frame_id]
-        scaled = scales.apply(frame_id, maps.get(frame_id))
+        scaled = fields.in_world(frame_id, maps[frame_id]) if frame_id in maps else None
         view = load_view(run, frame, intrinsics, poses[frame_id], scaled, class_ids, device)
         if frame_id not in symmetry:
             return view
-        field = torch.from_numpy(scales.field(frame_id, tuple(view.depth.shape))).to(device)
+        field = torch.from_numpy(fields.scales(frame_id, *view.depth.shape)).to(device)
         return replace(view, mirrors=Mirrors.of(symmetry[frame_id], full, intrinsics, device).scaled(field))
 
-    return MappingInput([load(i) for i in kept], [load(i) for i in measured], class_ids, load_anchors(run, intrinsics))
+    views = without_contradicted_depth([load(i) for i in kept])
+    return MappingInput(views, [load(i) for i in measured], class_ids)
+
+
+def without_contradicted_depth(views: Sequence[View]) -> list[View]:
+    """The views, their depth unknown where others see through it."""
+    wrong = contradicted([v.posed_depth() for v in views])
+    return [v.without_depth_at(torch.from_numpy(w)) for v, w in zip(views, wrong, strict=True)]
 
 
 def load_view(
@@ -71,20 +83,6 @@ def load_view(
     return make_view(frame.id, intrinsics, cam_from_world, image, maps, 1.0, class_ids, device, left_out)
 
 
-def load_anchors(run: RunFolder, intrinsics: Intrinsics) -> dict[int, Anchors]:
-    """The triangulated points of tracking in the pixels of every frame that sees them, by frame id."""
-    model = run.load_sparse("tracking")
-    full = run.load_calibration().intrinsics
-    scale = np.array([intrinsics.width / full.width, intrinsics.height / full.height])
-    out = {}
-    for n, frame_id in enumerate(model.frame_ids.tolist()):
-        mine = model.obs_frame == n
-        points = model.points_in_world[model.obs_point[mine]]
-        depth = points @ model.cam_from_world[n, 2, :3] + model.cam_from_world[n, 2, 3]
-        out[frame_id] = Anchors(model.obs_xy[mine] * scale, depth)
-    return out
-
-
 def split_frames(trajectory: Trajectory, hold_out: int) -> tuple[list[int], list[int]]:
     """(ids of keyframes to use, ids of posed frames held out: every `hold_out`-th, from half of that on)."""
     posed = trajectory.frame_ids[trajectory.is_posed].tolist()
@@ -93,44 +91,3 @@ def split_frames(trajectory: Trajectory, hold_out: int) -> tuple[list[int], list
         return keyframes, []
     held = [i for i in posed if i % hold_out == hold_out // 2]
     return [i for i in keyframes if i not in set(held)], held
-
-
-@dataclass(frozen=True)
-class DepthScales:
-    """What tracking found: depth in the world = scale field x proxy depth. grids: frame id → (rows, columns) scales."""
-
-    grids: Mapping[int, NDArray[np.float64]]
-
-    @staticmethod
-    def load(run: RunFolder) -> DepthScales:
-        """From tracking/depth_scales.npz; without that file every proxy is in the unit of the world."""
-        arrays = run.load_depth_scales()
-        if arrays is None:
-            return DepthScales({})
-        grids = arrays["grids"] if "grids" in arrays else arrays["scales"][:, None, None]
-        return DepthScales(dict(zip(arrays["frame_ids"].tolist(), grids, strict=True)))
-
-    def field(self, frame_id: int, shape: tuple[int, ...]) -> NDArray[np.float32]:
-        """(H, W) the scale of every pixel, 1 for a frame of which tracking said nothing."""
-        if frame_id not in self.grids:
-            return np.ones(shape, np.float32)
-        return scale_field(self.grids[frame_id], (shape[0], shape[1]))
-
-    def apply(self, frame_id: int, maps: ProxyMaps | None) -> ProxyMaps | None:
-        """The same maps with the depth in the unit of the world."""
-        if maps is None or frame_id not in self.grids:
-            return maps
-        depth = maps.depth * self.field(frame_id, maps.depth.shape)
-        return ProxyMaps(depth, maps.confidence, maps.labels, maps.label_confidence)
-
-
-def scale_field(grid: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float32]:
-    """(H, W) scales of every pixel: the log is bilinear between nodes that span the picture from corner to corner."""
-    rows, columns = grid.shape
-    height, width = shape
-    x = (np.arange(width) + 0.5) / width * (columns - 1)
-    y = (np.arange(height) + 0.5) / height * (rows - 1)
-    map_x, map_y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
-    # remap interpolates between the pixels at integer places: the nodes.
-    log_grid = np.log(grid).astype(np.float32)
-    return np.exp(cv2.remap(log_grid, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))

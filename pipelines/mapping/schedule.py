@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.config import MappingConfig
-from pipelines.mapping.covisibility import keyframe_weights, overlaps
+from pipelines.depth.posed import overlaps
+from pipelines.mapping.covisibility import keyframe_weights
 from pipelines.mapping.views import View
 
 WINDOW_STEPS = 2
@@ -75,7 +76,7 @@ class Schedule:
             visits = max(visits, settings.min_iterations)
         steps = (WINDOW_STEPS + 1) * len(views) if seeding else 0
         reliability = np.array([float(v.trust.mean()) for v in views])
-        return Schedule(seed, len(views), steps, visits, overlaps(views), reliability)
+        return Schedule(seed, len(views), steps, visits, overlaps([v.posed_depth() for v in views]), reliability)
 
     @property
     def total(self) -> int:

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 
 from formats.errors import InputError
-from pipelines.mapping.consistency import without_contradicted_depth
-from pipelines.mapping.depth_fields import agree_on_depth
 from pipelines.mapping.load import MappingInput, load_views
 from pipelines.mapping.measure import ViewFigures, mean_figures, measure_view
 from pipelines.mapping.optimise import OptimisedMap, optimise_map
@@ -26,7 +24,7 @@ def run(context: StageContext) -> dict[str, Any]:
     given = load_views(context.run, trajectory, settings, context.config.article, context.device)
     _require_views(given, context)
 
-    views = prepare_depth(given)
+    views = given.views
     result = optimise_map(
         views, len(given.class_ids), settings, seed,
         progress=context.progress, snapshot=context.snapshot / "state.safetensors", article=context.config.article,
@@ -37,14 +35,9 @@ def run(context: StageContext) -> dict[str, Any]:
     save_map(context.folder, result.gaussian_map)
     save_trajectory(context.folder, moved)
     save_exposure(context.folder, keyframe_ids, result.log_gains, result.offsets)
-    figures = _figures(context, given, views, result, moved)
+    figures = _figures(context, given, result, moved)
     save_figures(context.folder, "mapping", {**figures, "class_ids": list(given.class_ids)})
     return figures
-
-
-def prepare_depth(given: MappingInput) -> list[View]:
-    """The views with proxy depths that agree with each other; those that others see through are taken out."""
-    return without_contradicted_depth(agree_on_depth(given.views, given.anchors))
 
 
 def _require_views(given: MappingInput, context: StageContext) -> None:
@@ -63,10 +56,9 @@ def _require_views(given: MappingInput, context: StageContext) -> None:
         context.warn(f"{without} of {len(given.views)} keyframes have no proxy depth; they count by their colours only")
 
 
-def _figures(
-    context: StageContext, given: MappingInput, views: list[View], result: OptimisedMap, moved: Trajectory
-) -> dict[str, Any]:
+def _figures(context: StageContext, given: MappingInput, result: OptimisedMap, moved: Trajectory) -> dict[str, Any]:
     """Key figures over keyframes and held-out frames."""
+    views = given.views
     rows = zip(views, result.cam_from_world, result.log_gains, result.offsets, strict=True)
     keyframes = [
         measure_view(result.gaussian_map, *row) for row in context.progress.track(rows, "measuring", len(views))

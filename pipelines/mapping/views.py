@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pipelines.depth.posed import PosedDepth
 from pipelines.mapping.article.mirrors import Mirrors
 from pipelines.types import VOID, Intrinsics, ProxyMaps
 
@@ -57,14 +58,14 @@ class View:
         scene = self.scene if values.ndim == 2 else self.scene[..., None]
         return torch.where(scene, values, elsewhere)
 
-    def with_scaled_depth(self, scale: Tensor) -> View:
-        """The same view with its depth multiplied by an (H, W) field."""
-        mirrors = None if self.mirrors is None else self.mirrors.scaled(scale)
-        return replace(self, depth=self.depth * scale, mirrors=mirrors)
+    def posed_depth(self) -> PosedDepth:
+        """What other views are compared with, as arrays."""
+        pose = self.cam_from_world.cpu().numpy()
+        return PosedDepth(self.intrinsics, pose, self.depth.cpu().numpy(), self.trust.cpu().numpy())
 
-    def with_depth(self, depth: Tensor, reliability: Tensor) -> View:
-        """The same view with another depth and reliability."""
-        return replace(self, depth=depth, reliability=reliability)
+    def without_depth_at(self, wrong: Tensor) -> View:
+        """The same view, its depth unknown at the marked (H, W) pixels."""
+        return replace(self, depth=torch.where(wrong.to(self.depth.device), 0.0, self.depth))
 
 
 def make_view(

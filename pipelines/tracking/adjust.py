@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.config import TrackingConfig
-from pipelines.tracking import depth_scales
+from pipelines.depth import scales
+from pipelines.depth.align import align_keyframes
+from pipelines.depth.fields import DepthFields
+from pipelines.depth.scales import COARSE, WorldScale
 from pipelines.tracking.bundle import Bundle, adjust_bundle, adjust_pose
-from pipelines.tracking.depth_scales import WorldScale
 from pipelines.tracking.state import TrackState
-from pipelines.types import Intrinsics, ProxyMaps
+from pipelines.types import Intrinsics, ProxyMaps, SparseModel
 
 Array = NDArray[np.float64]
 
@@ -27,7 +29,8 @@ ITERATIONS = 20
 
 @dataclass
 class DepthTies:
-    """Proxy depths at the observations of a bundle, and the log scale fields (N, rows, columns) of its cameras.
+    """Proxy depths at the observations of a bundle, and the log scale fields (N, nodes of COARSE) of its
+    cameras.
 
     depth (O,) as the provider gave it, 0 = none; reliability (O,); has_depth (N,) bool; `factor` is what the world has
     been scaled by so far.
@@ -95,6 +98,13 @@ def adjust_state(
     return Report(figures, frame_ids, ties)
 
 
+def align_depths(model: SparseModel, report: Report, intrinsics: Intrinsics, load_proxy: LoadProxy) -> DepthFields:
+    """The fields of all keyframes in the world of `model`, which the reported adjustment has made."""
+    ties = report.ties
+    known = {i: scales.as_fine(ties.fields[c]) for c, i in enumerate(report.frame_ids) if ties.has_depth[c]}
+    return align_keyframes(model, intrinsics, load_proxy, known)
+
+
 def make_bundle(state: TrackState, frame_ids: list[int]) -> Bundle:
     """All sightings of the given frames, in their order; points seen only once are left out."""
     rows = [state.sightings[i] for i in frame_ids]
@@ -130,9 +140,9 @@ def sample_depths(
         if maps is None:
             continue
         mine = np.flatnonzero(bundle.obs_cam == c)
-        depth[mine], reliability[mine] = depth_scales.sample_proxy(maps, bundle.obs_xy[mine], intrinsics)
+        depth[mine], reliability[mine] = scales.sample_proxy(maps, bundle.obs_xy[mine], intrinsics)
         has_depth[c] = bool((depth[mine] > 0).sum() >= 5)
-    fields = np.zeros((len(frame_ids), depth_scales.ROWS, depth_scales.COLUMNS))
+    fields = np.zeros((len(frame_ids), COARSE.size))
     return DepthTies(depth, reliability, has_depth, fields, metric)
 
 
@@ -141,16 +151,16 @@ def set_scale(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics) -> Bundle
     z = bundle.points_in_cam()[:, 2]
     usable = (ties.depth > 0) & (z > 0)
     log_ratio = np.where(usable, np.log(np.where(usable, z, 1) / np.where(usable, ties.depth, 1)), 0.0)
-    basis = depth_scales.bilinear_basis(bundle.obs_xy, intrinsics)
     middles = np.zeros(len(ties.fields))
     for c in np.flatnonzero(ties.has_depth):
-        mine = np.flatnonzero(usable & (bundle.obs_cam == c))
-        values, weights = log_ratio[mine], ties.reliability[mine]
-        middles[c] = depth_scales.keyframe_scale(values, weights)
-        ties.fields[c] = depth_scales.fit_field(basis[mine], values, weights)
+        mine = usable & (bundle.obs_cam == c)
+        middles[c] = scales.keyframe_scale(log_ratio[mine], ties.reliability[mine])
+    used = usable & ties.has_depth[bundle.obs_cam]
+    basis = COARSE.at(bundle.obs_xy[used], intrinsics.width, intrinsics.height)
+    ties.fields = scales.fit_to_points(bundle.obs_cam[used], basis, log_ratio[used], ties.reliability[used], middles)
     if not (ties.metric and ties.has_depth.any()):
         return bundle
-    ties.world = depth_scales.world_scale(middles[ties.has_depth])
+    ties.world = scales.world_scale(middles[ties.has_depth])
     factor = ties.world.factor
     ties.factor *= factor
     ties.fields[ties.has_depth] += np.log(factor)
@@ -167,10 +177,9 @@ def with_depths(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics, setting
     """
     if not (settings.use_depth and ties.metric):
         return bundle
-    basis = depth_scales.bilinear_basis(bundle.obs_xy, intrinsics)
-    log_scale = np.einsum("og,og->o", basis, ties.fields.reshape(len(ties.fields), -1)[bundle.obs_cam])
+    log_scale = COARSE.at(bundle.obs_xy, intrinsics.width, intrinsics.height).of(ties.fields[bundle.obs_cam])
     trusted = (ties.depth > 0) & ties.has_depth[bundle.obs_cam]
-    sd = depth_scales.DEPTH_SD / np.sqrt(np.maximum(ties.reliability, depth_scales.MIN_RELIABILITY))
+    sd = scales.DEPTH_SD / np.sqrt(np.maximum(ties.reliability, scales.MIN_RELIABILITY))
     return replace(bundle, obs_depth=np.where(trusted, ties.depth * np.exp(log_scale), 0.0), obs_depth_sd=sd)
 
 

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.correspondence.flow import FLOW_SD, corners, follow
+from pipelines.depth.scales import sample_proxy, scale_at_points
 from pipelines.geometry import se3
 from pipelines.geometry.camera import project, unproject
-from pipelines.tracking.depth_scales import keyframe_scale, sample_proxy
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.pnp import MIN_INLIERS, POSE_ERROR
 from pipelines.tracking.state import Sightings, TrackState
@@ -64,12 +64,9 @@ def _from_proxy(frame_id: int, state: TrackState, pictures: Pictures, intrinsics
     count = max(NEW_POINTS - len(seen), 0)
     xy = corners(pictures.grey(frame_id), seen.xy, count, left_out=pictures.left_out(frame_id))
     depth, _ = sample_proxy(maps, xy, intrinsics)
-    known, trust = sample_proxy(maps, seen.xy, intrinsics)
     motion = state.poses[frame_id]
     z = state.points[seen.point] @ motion[2, :3] + motion[2, 3]
-    both = (known > 0) & (z > 0)
-    enough = int(both.sum()) >= MIN_INLIERS
-    scale = np.exp(keyframe_scale(np.log(z[both] / known[both]), trust[both])) if enough else 1.0
+    scale = scale_at_points(maps, seen.xy, z, intrinsics, MIN_INLIERS) or 1.0
     good = depth > 0
     in_cam = unproject(xy[good], depth[good] * scale, intrinsics)
     points = se3.transform(se3.inverse(motion), in_cam)

@@ -85,4 +85,4 @@ class Pictures:
 
     def proxy(self, frame_id: int) -> ProxyMaps | None:
         """Proxy maps where the frame has any."""
-        return self.run.load_proxy(frame_id) if self.run.has_proxy(frame_id) else None
+        return self.run.find_proxy(frame_id)

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 
 from formats.errors import InputError
-from pipelines.run_folder import save_depth_scales as write_depth_scales
-from pipelines.run_folder import save_figures, save_sparse, save_trajectory
+from pipelines.run_folder import save_depth_fields, save_figures, save_sparse, save_trajectory
 from pipelines.stages import Stage, StageContext
 from pipelines.stopping import is_asked
-from pipelines.tracking.adjust import Report, adjust_state, without_dependent_depth
+from pipelines.tracking.adjust import Report, adjust_state, align_depths, without_dependent_depth
 from pipelines.tracking.front_end import FrontEnd
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.refine import RenderWeights, compare_frame
@@ -43,8 +42,9 @@ def run(context: StageContext) -> dict[str, Any]:
 
     trajectory = to_trajectory(state, frames)
     save_trajectory(context.folder, trajectory)
-    save_sparse(context.folder, to_sparse_model(state))
-    save_depth_scales(context, state, report)
+    model = to_sparse_model(state)
+    save_sparse(context.folder, model)
+    save_depth_fields(context.folder, align_depths(model, report, intrinsics, pictures.proxy))
     figures = {**describe(state, frames, report, metric), **compared}
     if "reference_relative_sd" in proxy:  # what the user's reference leaves open; depths agree far better
         figures["scale_relative_sd"] = proxy["reference_relative_sd"]
@@ -98,18 +98,6 @@ def compare_all(context: StageContext, state: TrackState, pictures: Pictures) ->
             better.append(found.loss_after / found.loss_before)
     share = float(np.mean(better)) if better else 1.0
     return {"compared": len(others), "compared_better": len(better), "compared_loss_ratio": round(share, 4)}
-
-
-def save_depth_scales(context: StageContext, state: TrackState, report: Report) -> None:
-    """depth in the world = scales * proxy depth of the keyframe; grids (N, rows, columns) is the same, field by field.
-
-    A grid's nodes span the picture from corner to corner; between them the *log* scale is bilinear.
-    """
-    keep = [c for c, i in enumerate(report.frame_ids) if report.ties.has_depth[c]]
-    grids = np.exp(report.ties.fields[keep])
-    scales = np.exp(np.median(report.ties.fields[keep].reshape(len(keep), -1), axis=1)) if keep else np.zeros(0)
-    frame_ids = np.array([report.frame_ids[c] for c in keep], np.int64)
-    write_depth_scales(context.folder, {"frame_ids": frame_ids, "scales": scales, "grids": grids})
 
 
 def describe(state: TrackState, frames: list[Frame], report: Report, metric: bool) -> dict[str, Any]:

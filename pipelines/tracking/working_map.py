@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pipelines.depth.scales import scale_at_points
 from pipelines.gaussians.seeding import seed_gaussians, seed_grid
 from pipelines.proxy.palette import class_colors
-from pipelines.tracking.depth_scales import keyframe_scale, sample_proxy
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.state import TrackState
 from pipelines.types import VOID, Intrinsics, ProxyMaps
@@ -115,12 +115,8 @@ def proxy_scale(
     if frame_id not in state.sightings:
         return None
     seen = state.sightings[frame_id]
-    known, trust = sample_proxy(maps, seen.xy, intrinsics)
     z = state.points[seen.point] @ cam_from_world[2, :3] + cam_from_world[2, 3]
-    both = (known > 0) & (z > 0)
-    if both.sum() < MIN_POINTS:
-        return None
-    return float(np.exp(keyframe_scale(np.log(z[both] / known[both]), trust[both])))
+    return scale_at_points(maps, seen.xy, z, intrinsics, MIN_POINTS)
 
 
 def _class_picture(labels: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -24,18 +24,20 @@ sys.path.insert(0, str(ROOT))
 
 import cv2
 import numpy as np
+import torch
 from mapping import ABLATIONS, noisy_depth, noisy_labels
 from numpy.typing import NDArray
 
 from formats.datasets import Sequence, open_sequence
 from pipelines.config import Config, load_config
+from pipelines.depth.align import fit_fields
+from pipelines.depth.fields import FINE, field_scales
 from pipelines.evaluation.depth_error import DepthErrorSum
 from pipelines.evaluation.image_quality import psnr, ssim
 from pipelines.evaluation.label_score import count_labels, score
 from pipelines.evaluation.views import view_map
-from pipelines.mapping.load import MappingInput
+from pipelines.mapping.load import without_contradicted_depth
 from pipelines.mapping.optimise import optimise_map
-from pipelines.mapping.stage import prepare_depth
 from pipelines.mapping.views import View, make_view, occurring_classes
 from pipelines.types import VOID, Intrinsics, ProxyMaps
 
@@ -96,13 +98,21 @@ def _picture(folder: Path, index: int, size: tuple[int, int]) -> NDArray:
     return cv2.resize(picture, size, interpolation=cv2.INTER_NEAREST)
 
 
+def agreeing(views: list[View]) -> list[View]:
+    """The views with depths that agree, as tracking's fields and mapping would make them; no points."""
+    fields = fit_fields([v.posed_depth() for v in views], {}).reshape(-1, FINE.rows, FINE.columns)
+    scales = [field_scales(f, *v.depth.shape) for f, v in zip(fields, views, strict=True)]
+    scaled = [replace(v, depth=v.depth * torch.from_numpy(s)) for v, s in zip(views, scales, strict=True)]
+    return without_contradicted_depth(scaled)
+
+
 def measure(sequence: Sequence, shots: list[Shot], camera: Intrinsics, config: Config) -> dict[str, float]:
     """Map the stretch and compare it with the truth; depth in centimetres."""
     held_out = [s for n, s in enumerate(shots) if n % 8 == 4]
     used = [s for n, s in enumerate(shots) if n % 8 != 4]
     classes = occurring_classes([s.maps.labels for s in used])
     started = time.process_time()
-    views = prepare_depth(MappingInput([s.view(sequence, camera, classes) for s in used], [], classes, {}))
+    views = agreeing([s.view(sequence, camera, classes) for s in used])
     result = optimise_map(views, len(classes), config.mapping, 0, article=config.article)
     row: dict[str, float] = {"cpu seconds": time.process_time() - started, "gaussians": len(result.gaussian_map)}
     label_of = np.array([*classes, *[VOID] * (256 - len(classes))], np.uint8)

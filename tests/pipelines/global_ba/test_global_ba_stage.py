@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from pipelines.config import Config, load_config
+from pipelines.depth.fields import DepthFields
 from pipelines.gaussian_map import GaussianMap
 from pipelines.geometry import se3
 from pipelines.geometry.alignment import align_points
@@ -21,6 +22,7 @@ from pipelines.global_ba.stage import STAGE
 from pipelines.mapping.views import occurring_classes
 from pipelines.run_folder import (
     RunFolder,
+    save_depth_fields,
     save_exposure,
     save_map,
     save_sparse_model,
@@ -59,6 +61,7 @@ def finish_mapping(made: MadeRun, frames: list[WorldFrame]) -> None:
     # As after an adjustment: keyframes where they belong, but for the slip.
     model = doubled(replace(backbone, cam_from_world=made.cam_from_world[backbone.frame_ids]), slip)
     save_sparse_model(tracking / "sparse.npz", model)
+    save_depth_fields(tracking, DepthFields({}))
     poses = made.cam_from_world.copy()
     poses[FIRST_AGAIN:] = poses[FIRST_AGAIN:] @ se3.inverse(slip)
     ids = np.arange(len(frames))

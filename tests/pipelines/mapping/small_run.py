@@ -9,11 +9,13 @@ from finished import note_finished
 from numpy.typing import NDArray
 
 from formats.images import read_rgb
+from pipelines.depth.fields import DepthFields
 from pipelines.run_folder import (
     RunFolder,
     proxy_path,
     save_calibration,
     save_classes,
+    save_depth_fields,
     save_frames,
     save_proxy_maps,
     save_sparse_model,
@@ -57,6 +59,7 @@ def make_run(root: Path, sequence: Path, every: int = 2) -> RunFolder:
     n = len(frames)
     trajectory = Trajectory(np.arange(n), times, cam_from_world, np.ones(n, bool), ("",) * n)
     save_trajectory(root / "tracking", trajectory)
+    save_depth_fields(root / "tracking", DepthFields({}))
     save_sparse_model(root / "tracking" / "sparse.npz", points_seen_twice(k, cam_from_world, depths))
     note_finished(run, ("frames", "proxy", "tracking"), source=str(root))
     return run

@@ -1,4 +1,4 @@
-"""How proxy depths relate to triangulated structure: one scale for the world, one smooth field for each keyframe.
+"""How proxy depths relate to triangulated points: a scale or a coarse field for each keyframe, one scale for the world.
 
 A shift is no part of a field: depth that is known only up to one is given it before (`pipelines.proxy.aligned`).
 """
@@ -10,19 +10,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.depth.fields import FINE, Basis, Grid
+from pipelines.depth.solve import Equations, Prior, solve_fields
 from pipelines.types import Intrinsics, ProxyMaps
 
 Array = NDArray[np.float64]
 
-ROWS, COLUMNS = 3, 4
-"""Nodes of a field."""
+COARSE = Grid(3, 4)
+"""Of the fields that points alone can tell."""
+PRIOR = Prior(COARSE, node_sd=0.06, step_sd=0.05)
+"""Around the keyframe's scale."""
 DEPTH_SD = 0.05
 """Relative standard deviation of a reliable proxy depth after its scale is known."""
 MIN_RELIABILITY = 0.1
-NODE_SD = 0.06
-"""How far, relatively, a node of a field strays from its keyframe's scale."""
-STEP_SD = 0.05
-"""How much neighbouring nodes differ."""
+_ROUNDS = 5
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,16 @@ def keyframe_scale(log_ratio: Array, weights: Array) -> float:
     return weighted_median(log_ratio, weights) if len(log_ratio) and weights.sum() > 0 else 0.0
 
 
+def scale_at_points(maps: ProxyMaps, xy: Array, z: Array, intrinsics: Intrinsics, least: int) -> float | None:
+    """World over proxy depth: the median over points at pixels (Q, 2) and depths (Q,) of the world; None for fewer than
+    `least`."""
+    known, trust = sample_proxy(maps, xy, intrinsics)
+    both = (known > 0) & (z > 0)
+    if both.sum() < least:
+        return None
+    return float(np.exp(keyframe_scale(np.log(z[both] / known[both]), trust[both])))
+
+
 def world_scale(log_scales: Array) -> WorldScale:
     """The factor on the world that makes the keyframes' proxies right on average, from their log scales (N,).
 
@@ -72,40 +83,21 @@ def world_scale(log_scales: Array) -> WorldScale:
     return WorldScale(float(np.exp(-mean)), float(used.std() / np.sqrt(max(independent, 1.0))), n)
 
 
-def bilinear_basis(xy: Array, intrinsics: Intrinsics, rows: int = ROWS, columns: int = COLUMNS) -> Array:
-    """(Q, rows * columns) weights of a grid's nodes, which span the picture corner to corner, at pixels (Q, 2)."""
-    gx = np.clip(xy[:, 0] / intrinsics.width, 0, 1) * (columns - 1)
-    gy = np.clip(xy[:, 1] / intrinsics.height, 0, 1) * (rows - 1)
-    wx = np.clip(1 - np.abs(gx[:, None] - np.arange(columns)), 0, 1)
-    wy = np.clip(1 - np.abs(gy[:, None] - np.arange(rows)), 0, 1)
-    return (wy[:, :, None] * wx[:, None, :]).reshape(len(xy), rows * columns)
+def fit_to_points(field: NDArray[np.int64], basis: Basis, log_ratio: Array, weights: Array, middles: Array) -> Array:
+    """(N, nodes of COARSE) log scales: robust, smooth, near the keyframes' `middles` (N,) where there are few points.
 
-
-def fit_field(basis: Array, log_ratio: Array, weights: Array) -> Array:
-    """(ROWS, COLUMNS) log scales of one keyframe: robust, smooth, near its median where there are few points.
-
-    basis (Q, ROWS * COLUMNS), log_ratio (Q,) and weights (Q,) as for `keyframe_scale`.
+    field (Q,): whose point it is; basis: where, in COARSE; log_ratio (Q,) and weights (Q,) as for `keyframe_scale`.
     """
-    middle = keyframe_scale(log_ratio, weights)
-    prior = np.eye(ROWS * COLUMNS) / NODE_SD**2 + _steps(ROWS, COLUMNS) / STEP_SD**2
-    nodes: Array = np.zeros(ROWS * COLUMNS)
-    for _ in range(5):
-        residual = (log_ratio - middle - basis @ nodes) / DEPTH_SD
-        weighted = basis * (weights / (1 + residual**2))[:, None] / DEPTH_SD**2
-        nodes = np.asarray(np.linalg.solve(prior + weighted.T @ basis, weighted.T @ (log_ratio - middle)))
-    return middle + nodes.reshape(ROWS, COLUMNS)
+    expected = np.repeat(middles[:, None], COARSE.size, axis=1)
+    fields = expected
+    sd = DEPTH_SD / np.sqrt(np.maximum(weights, 1e-6))
+    for _ in range(_ROUNDS if len(fields) else 0):
+        residual = basis.of(fields[field]) - log_ratio
+        points = Equations.of_places(field, basis, COARSE.size, residual, sd, 1.0)
+        fields = solve_fields([points], fields, expected, PRIOR)
+    return fields
 
 
-def _steps(rows: int, columns: int) -> Array:
-    """Sum of outer products of neighbour differences."""
-    index = np.arange(rows * columns).reshape(rows, columns)
-    pairs = np.concatenate(
-        [
-            np.stack([index[:, :-1].ravel(), index[:, 1:].ravel()], 1),
-            np.stack([index[:-1].ravel(), index[1:].ravel()], 1),
-        ]
-    )
-    difference = np.zeros((len(pairs), rows * columns))
-    difference[np.arange(len(pairs)), pairs[:, 0]] = 1
-    difference[np.arange(len(pairs)), pairs[:, 1]] = -1
-    return difference.T @ difference
+def as_fine(field: Array) -> Array:
+    """(nodes of FINE,) a field of COARSE."""
+    return COARSE.finer(field, FINE)

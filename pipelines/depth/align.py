@@ -1,0 +1,154 @@
+"""The depths of all keyframes brought into one world: a field each, chosen so that views and triangulated points agree.
+
+The error of a depth is smooth over a picture and changes from picture to picture; where many pictures see the same
+surface its true place is near the middle of what they say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.depth.fields import FINE, Basis, DepthFields
+from pipelines.depth.posed import PosedDepth, neighbours
+from pipelines.depth.solve import Equations, Prior, solve_fields
+from pipelines.types import Intrinsics, ProxyMaps, SparseModel
+
+Array = NDArray[np.float64]
+
+PRIOR = Prior(FINE, node_sd=0.05, step_sd=0.08)
+"""Around what the keyframe's own points say."""
+SAMPLES_ACROSS = 40
+SIDE = 320
+"""Pixels on the long side of the depths that are compared."""
+PAIR_SD, POINT_SD = 0.03, 0.01
+"""Expected disagreement of two views about a surface, and of a view with a triangulated point."""
+GROSS = 0.15
+"""A larger disagreement is another surface."""
+SHARE = 0.25
+"""Neighbouring samples err alike: a picture's worth of them counts as a few per node."""
+ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Triangulated points of one view: xy (P, 2) in its pixels, depth (P,)."""
+
+    xy: Array
+    depth: Array
+
+
+def align_keyframes(
+    model: SparseModel,
+    intrinsics: Intrinsics,
+    load_maps: Callable[[int], ProxyMaps | None],
+    expected: Mapping[int, Array],
+) -> DepthFields:
+    """The fields of the model's keyframes that have maps.
+
+    `expected`: by frame id, log scales at FINE's nodes (108,) as the keyframe's own points alone give them; a keyframe
+    without takes the middle of the others.
+    """
+    views: list[PosedDepth] = []
+    ids: list[int] = []
+    anchors: dict[int, Anchors] = {}
+    for k, frame_id in enumerate(model.frame_ids.tolist()):
+        maps = load_maps(frame_id)
+        if maps is None or not (maps.depth > 0).any():
+            continue
+        view = _posed(maps, intrinsics, model.cam_from_world[k])
+        anchors[len(views)] = _anchors(model, k, intrinsics, view.intrinsics)
+        views.append(view)
+        ids.append(frame_id)
+    middle = float(np.median([np.median(e) for e in expected.values()])) if expected else 0.0
+    start = np.array([expected.get(i, np.full(FINE.size, middle)) for i in ids]).reshape(len(ids), FINE.size)
+    fields = fit_fields(views, anchors, start)
+    return DepthFields({i: f.reshape(FINE.rows, FINE.columns) for i, f in zip(ids, fields, strict=True)})
+
+
+def _posed(maps: ProxyMaps, intrinsics: Intrinsics, cam_from_world: Array) -> PosedDepth:
+    stride = max(round(max(maps.depth.shape) / SIDE), 1)
+    picked = (slice(stride // 2, None, stride),) * 2
+    depth, trust = maps.depth[picked].copy(), maps.confidence[picked].copy()
+    height, width = depth.shape
+    return PosedDepth(intrinsics.resized(width, height), cam_from_world, depth, trust * (depth > 0))
+
+
+def _anchors(model: SparseModel, k: int, full: Intrinsics, small: Intrinsics) -> Anchors:
+    """The model's points in the pixels of the k-th keyframe that sees them."""
+    mine = model.obs_frame == k
+    points = model.points_in_world[model.obs_point[mine]]
+    depth = points @ model.cam_from_world[k, 2, :3] + model.cam_from_world[k, 2, 3]
+    return Anchors(model.obs_xy[mine] * [small.width / full.width, small.height / full.height], depth)
+
+
+def fit_fields(views: Sequence[PosedDepth], anchors: Mapping[int, Anchors], expected: Array | None = None) -> Array:
+    """(N, nodes) log scales by robust least squares, re-linearised at every round; `anchors` by index of the view."""
+    start = np.zeros((len(views), FINE.size)) if expected is None else expected
+    fields = start
+    samples = [_Samples.of(v) for v in views]
+    near = neighbours(views)
+    for _ in range(ROUNDS if views else 0):
+        parts = [_point_equations(n, views[n], found, fields) for n, found in sorted(anchors.items())]
+        parts += [_pair_equations(i, j, samples[i], views[j], fields) for i, j in near]
+        fields = solve_fields(parts, fields, start, PRIOR)
+    return fields
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """A grid of pixels with depth: depth, trust (S,), rays (S, 3) in the world, center (3,)."""
+
+    depth: Array
+    trust: Array
+    rays: Array
+    center: Array
+    basis: Basis
+
+    @staticmethod
+    def of(view: PosedDepth) -> _Samples:
+        xy, depth, trust = view.grid(SAMPLES_ACROSS)
+        use = trust > 0.1
+        center: Array = np.asarray(np.linalg.inv(view.cam_from_world)[:3, 3], np.float64)
+        rays = view.in_world(xy[use], np.ones(int(use.sum()))) - center
+        basis = FINE.at(xy[use], view.intrinsics.width, view.intrinsics.height)
+        return _Samples(depth[use], trust[use], rays, center, basis)
+
+
+def _pair_equations(i: int, j: int, samples: _Samples, other: PosedDepth, fields: Array) -> Equations:
+    """Samples of view i carried into view j: their depth there against what view j says."""
+    depth = samples.depth * np.exp(samples.basis.of(fields[i]))
+    along = samples.rays @ other.cam_from_world[2, :3] * depth
+    xy, z, inside = other.seen(samples.center + samples.rays * depth[:, None])
+    place = np.where(inside[:, None], xy, 0).astype(int)
+    seen = other.depth[place[:, 1], place[:, 0]].astype(np.float64)
+    trust = other.trust[place[:, 1], place[:, 0]].astype(np.float64) * samples.trust
+    use = inside & (seen > 0) & (z > 0) & (trust > 0.05)
+    there = FINE.at(place[use] + 0.5, other.intrinsics.width, other.intrinsics.height)
+    residual = np.log(z[use]) - np.log(seen[use]) - there.of(fields[j])
+    near = np.abs(residual) < GROSS
+    # A point moves along its ray: how much of that is depth in the other view.
+    slope = (along[use] / z[use])[near]
+    here, there = samples.basis[use][near], there[near]
+    weights = np.concatenate([here.weights * slope[:, None], -there.weights], axis=1)
+    columns = np.concatenate([here.nodes + i * FINE.size, there.nodes + j * FINE.size], axis=1)
+    return Equations(columns, weights, residual[near], PAIR_SD / np.sqrt(trust[use][near]), SHARE)
+
+
+def _point_equations(n: int, view: PosedDepth, anchors: Anchors, fields: Array) -> Equations:
+    """The view's depth at triangulated points."""
+    width, height = view.intrinsics.width, view.intrinsics.height
+    inside = ((anchors.xy >= 0) & (anchors.xy < (width, height))).all(1)
+    xy, truth = anchors.xy[inside], anchors.depth[inside]
+    place = xy.astype(int)
+    seen = view.depth[place[:, 1], place[:, 0]].astype(np.float64)
+    trust = view.trust[place[:, 1], place[:, 0]].astype(np.float64)
+    use = (seen > 0) & (truth > 0) & (trust > 0.05)
+    basis = FINE.at(xy[use], width, height)
+    residual = np.log(seen[use]) + basis.of(fields[n]) - np.log(truth[use])
+    near = np.abs(residual) < 2 * GROSS
+    sd = POINT_SD / np.sqrt(trust[use][near])
+    return Equations.of_places(n, basis[near], FINE.size, residual[near], sd, SHARE)

@@ -1,0 +1,126 @@
+"""Fields that bring depths into one world: nearer the truth than what they were given, and not dragged off it."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.depth.align import align_keyframes
+from pipelines.depth.fields import FINE, DepthFields, field_scales
+from pipelines.depth.posed import overlaps
+from pipelines.depth.see_through import contradicted
+from pipelines.mapping.load import MappingInput
+from pipelines.run_folder import RunFolder, save_depth_fields
+from pipelines.types import ProxyMaps, SparseModel
+
+Maps = dict[int, ProxyMaps]
+
+
+@pytest.fixture(scope="module")
+def truth(small_run: RunFolder) -> Maps:
+    return {i: small_run.load_proxy(i) for i in small_run.load_sparse("tracking").frame_ids.tolist()}
+
+
+@pytest.fixture(scope="module")
+def align(small_run: RunFolder) -> Callable[..., DepthFields]:
+    model, intrinsics = small_run.load_sparse("tracking"), small_run.load_calibration().intrinsics
+
+    def run(maps: Maps, points: bool = True, expected: Mapping[int, NDArray] | None = None) -> DepthFields:
+        return align_keyframes(model if points else without_points(model), intrinsics, maps.get, expected or {})
+
+    return run
+
+
+def without_points(model: SparseModel) -> SparseModel:
+    return replace(model, obs_frame=model.obs_frame[:0], obs_point=model.obs_point[:0], obs_xy=model.obs_xy[:0])
+
+
+def with_scaled_depth(maps: Maps, scale: Callable[[tuple[int, ...]], NDArray]) -> Maps:
+    return {i: replace(m, depth=(m.depth * scale(m.depth.shape)).astype(np.float32)) for i, m in maps.items()}
+
+
+def relative_error(maps: Maps, truth: Maps, fields: DepthFields | None = None) -> float:
+    found = {i: (fields or DepthFields({})).in_world(i, m).depth for i, m in maps.items()}
+    known = {i: t.depth > 0 for i, t in truth.items()}
+    return float(np.mean(np.concatenate([np.abs(found[i] / truth[i].depth - 1)[known[i]] for i in maps])))
+
+
+def smooth_noise() -> Callable[[tuple[int, ...]], NDArray]:
+    rng = np.random.default_rng(0)
+    return lambda shape: field_scales(rng.normal(0, 0.05, (5, 6)) + 0.03 * rng.normal(), shape[0], shape[1])
+
+
+def test_a_field_spans_the_picture() -> None:
+    field = field_scales(np.array([[0.0, 0.2], [0.0, 0.2]]), 30, 40)
+    assert field.shape == (30, 40)
+    x = (np.arange(40) + 0.5) / 40
+    assert np.abs(np.log(field[7]) - 0.2 * x).max() < 2e-3
+
+
+def test_views_agree_on_a_depth_nearer_the_truth(truth: Maps, align: Callable[..., DepthFields]) -> None:
+    noisy = with_scaled_depth(truth, smooth_noise())
+    before = relative_error(noisy, truth)
+    by_views = relative_error(noisy, truth, align(noisy, points=False))
+    with_points = relative_error(noisy, truth, align(noisy))
+    assert 0 < with_points < by_views < 0.75 * before
+    assert with_points < 0.4 * before
+
+
+def test_depth_of_another_unit_comes_into_the_world(truth: Maps, align: Callable[..., DepthFields]) -> None:
+    """A keyframe whose own points say nothing takes the scale of the others, and then agrees with them."""
+    tripled = with_scaled_depth(truth, lambda shape: np.full(shape, 3.0))
+    known = {i: np.full(FINE.size, -np.log(3.0)) for i in list(truth)[:-2]}
+    assert 0 < relative_error(tripled, truth, align(tripled, expected=known)) < 0.006
+
+
+def test_true_depth_is_left_alone(truth: Maps, align: Callable[..., DepthFields]) -> None:
+    assert relative_error(truth, truth, align(truth)) < 0.006
+    one = dict(list(truth.items())[:1])
+    assert relative_error(one, truth, align(one)) < 0.006
+
+
+def test_wild_points_do_not_drag_the_depth(truth: Maps, small_run: RunFolder) -> None:
+    rng = np.random.default_rng(1)
+    model = small_run.load_sparse("tracking")
+    center = model.points_in_world.mean(0)
+    wild = rng.random(len(model.points_in_world)) < 0.2
+    points = np.where(wild[:, None], center + 3 * (model.points_in_world - center), model.points_in_world)
+    camera = small_run.load_calibration().intrinsics
+    fields = align_keyframes(replace(model, points_in_world=points), camera, truth.get, {})
+    assert relative_error(truth, truth, fields) < 0.01
+
+
+def test_fields_come_back_from_disk(tmp_path, truth: Maps, align: Callable[..., DepthFields]) -> None:  # type: ignore[no-untyped-def]
+    run, fields = RunFolder(tmp_path), align(with_scaled_depth(truth, smooth_noise()))
+    for some in (fields, DepthFields({})):
+        save_depth_fields(run.stage("tracking"), some)
+        back = run.load_depth_fields("tracking")
+        assert list(back.of_frame) == list(some.of_frame)
+        assert all(np.array_equal(back.of_frame[i], f) for i, f in some.of_frame.items())
+    maps = truth[0]
+    assert np.array_equal(DepthFields({}).in_world(0, maps).depth, maps.depth)
+    assert fields.in_world(99, maps).depth.max() == 0
+
+
+def test_overlap_is_one_with_oneself_and_less_elsewhere(room: MappingInput) -> None:
+    overlap = overlaps([v.posed_depth() for v in room.views])
+    assert np.allclose(np.diag(overlap), 1)
+    assert (overlap >= 0).all()
+    assert (overlap <= 1).all()
+    neighbours, far = np.diag(overlap, 1).mean(), np.diag(overlap, len(overlap) - 2).mean()
+    assert far < neighbours < 1
+
+
+def test_depth_that_others_see_through_is_found(room: MappingInput) -> None:
+    """A patch in the air before one view; the rest of the depth stays."""
+    posed = [v.posed_depth() for v in room.views]
+    assert all(
+        (wrong & (v.depth > 0)).sum() < 0.03 * (v.depth > 0).sum()
+        for wrong, v in zip(contradicted(posed), posed, strict=True)
+    )
+    patched = posed[5].depth.copy()
+    patched[20:40, 30:50] *= 0.5
+    posed[5] = replace(posed[5], depth=patched)
+    assert contradicted(posed)[5][22:38, 32:48].mean() > 0.8
