@@ -88,6 +88,11 @@ _SOURCE_OPTIONS = {
         "proxy.scale_ref", "REF",
         "Metres without metric depth: PICTURE:X1,Y1,X2,Y2=METRES, two pixels of one picture, or height=METRES.",
     ),
+    "gps": (
+        "export.gps", "FILE",
+        "Where it was taken, for files with x east, y north in metres: a GPX track, or a CSV with the columns time, "
+        "lat, lon, alt (a video counts from its start). Default: auto, the pictures' EXIF; off for neither.",
+    ),
 }  # fmt: skip
 """Option → the setting it stands for, what is given, help."""
 

@@ -6,8 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from formats.digest import file_sha256
+from formats.gps import read_track
 from formats.mesh import read_mesh_ply
-from pipelines.config import ExportConfig
+from pipelines.config import Config, ExportConfig
 from pipelines.export.mesh import make_mesh, mesh_figures, write_mesh
 from pipelines.export.writers import (
     write_colmap,
@@ -24,6 +26,7 @@ from pipelines.run_folder import RunFolder
 from pipelines.stages import Stage, StageContext
 from pipelines.types import SemanticMesh
 from pipelines.upright.find import find_upright
+from pipelines.upright.places import AUTO, OFF, world_on_earth
 from pipelines.upright.world import FIRST, World, load_world, upright_world, world_figures
 
 
@@ -31,12 +34,9 @@ def run(context: StageContext) -> dict[str, Any]:
     """All files; a mesh that an interrupted attempt has finished is kept."""
     found, settings = load_outcome(context.run, context.device), context.config.export
     found.require_map()
-    world = find_world(found, settings)
-    if settings.axes == "up" and world.axes != "up":
-        context.warn(
-            "neither a floor nor upright lines tell which way is up: the files keep the axes of the run, about "
-            "those of the first posed camera"
-        )
+    world, reasons = find_world(found, settings)
+    for reason in reasons:
+        context.warn(reason)
     outcome = found.moved(world.exported_from_run)
     write_all_but_mesh(outcome, world, settings, context.folder)
     mesh = _finished_mesh(context.folder)
@@ -54,9 +54,28 @@ def run(context: StageContext) -> dict[str, Any]:
     }
 
 
-def find_world(outcome: Outcome, settings: ExportConfig) -> World:
-    """The world for the files of a run whose map is done."""
-    return upright_world(outcome, find_upright(outcome)) if settings.axes == "up" else FIRST
+def find_world(outcome: Outcome, settings: ExportConfig) -> tuple[World, list[str]]:
+    """The world for the files of a run whose map is done, and what could not be found that was asked for."""
+    world = upright_world(outcome, find_upright(outcome)) if settings.axes == "up" else FIRST
+    reasons = []
+    if settings.axes == "up" and world.axes != "up":
+        reasons.append(
+            "neither a floor nor upright lines tell which way is up: the files keep the axes of the run, about "
+            "those of the first posed camera"
+        )
+    world, reason = world_on_earth(outcome, world, settings.gps)
+    return world, [*reasons, reason] if reason else reasons
+
+
+def _check(source: Path, config: Config) -> None:
+    """The track that the user gives can be read."""
+    if config.export.gps not in (AUTO, OFF):
+        read_track(Path(config.export.gps))
+
+
+def _inputs(source: Path, config: Config) -> Any:
+    """The track's content: other fixes under the same name make other files."""
+    return None if config.export.gps in (AUTO, OFF) else file_sha256(Path(config.export.gps))
 
 
 def write_all_but_mesh(outcome: Outcome, world: World, settings: ExportConfig, folder: Path) -> list[Path]:
@@ -88,7 +107,7 @@ def export_run(
     found = load_outcome(run)
     found.require_map()
     settings = settings or found.config.export
-    world = _kept_world(found, settings) or find_world(found, settings)
+    world = _kept_world(found, settings) or find_world(found, settings)[0]
     outcome = found.moved(world.exported_from_run)
 
     def mesh() -> list[Path]:
@@ -110,7 +129,8 @@ def export_run(
 
 def _kept_world(outcome: Outcome, settings: ExportConfig) -> World | None:
     """That of the run's own export, so that what is written later or elsewhere fits; None for other axes."""
-    return load_world(outcome.run) if settings.axes == outcome.config.export.axes else None
+    own = outcome.config.export
+    return load_world(outcome.run) if (settings.axes, settings.gps) == (own.axes, own.gps) else None
 
 
-STAGE = Stage("export", run, "COLMAP model, Gaussian PLY, labelled mesh, trajectory")
+STAGE = Stage("export", run, "COLMAP model, Gaussian PLY, labelled mesh, trajectory", inputs=_inputs, check=_check)

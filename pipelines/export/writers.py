@@ -130,11 +130,11 @@ def write_trajectory(outcome: Outcome, folder: Path) -> list[Path]:
 
 def write_world(outcome: Outcome, world: World, folder: Path) -> Path:
     """world.json: what the coordinates of the other files mean."""
-    return save_world(folder, world, "metre" if outcome.metric else "free")
+    return save_world(folder, world, "metre" if outcome.metric or world.earth else "free")
 
 
 def write_notes(outcome: Outcome, world: World, folder: Path) -> list[Path]:
     """The class table, the world, and what each file is for."""
     save_classes(folder, outcome.classes)
-    write_text(folder / "README.txt", readme(world, outcome.metric))
+    write_text(folder / "README.txt", readme(world, outcome.metric or world.earth is not None))
     return [folder / "classes.json", write_world(outcome, world, folder), folder / "README.txt"]
