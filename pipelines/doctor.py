@@ -168,11 +168,11 @@ def _models() -> Finding:
 
 
 def _kernels() -> Finding:
-    from pipelines.gaussians.render.jit import cache_directory
+    from pipelines.jit import cache_root
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        folder = cache_directory()
+        folder = cache_root()
     if folder is None:
         fix = "set NUMBA_CACHE_DIR to a folder of yours that can be written"
         return Finding("compiled kernels", NOTE, "cannot be kept: every start compiles for about a minute", fix)
