@@ -38,8 +38,8 @@ def nearest_rotation(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     return u @ vt
 
 
-def write_tum(path: Path, timestamps: NDArray[np.float64], world_from_cam: NDArray[np.float64]) -> None:
-    """Write `timestamp tx ty tz qx qy qz qw` lines: camera centres and orientations in the world.
+def write_tum(path: Path, timestamps: NDArray[np.float64], world_from_cam: NDArray[np.float64], note: str = "") -> None:
+    """Write `timestamp tx ty tz qx qy qz qw` lines: camera centres and orientations in the world; `note` as comments.
 
     timestamps (N,) seconds, world_from_cam (N, 4, 4). Raises ValueError for other shapes, InputError when the disk
     refuses. The sign of a quaternion is chosen so that qw >= 0.
@@ -47,7 +47,7 @@ def write_tum(path: Path, timestamps: NDArray[np.float64], world_from_cam: NDArr
     n = len(timestamps)
     if world_from_cam.shape != (n, 4, 4):
         raise ValueError(f"write_tum: got {n} timestamps and poses of shape {world_from_cam.shape}")
-    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    lines = [f"# {line}" for line in (*note.splitlines(), "timestamp tx ty tz qx qy qz qw")]
     if n:
         quat_xyzw = Rotation.from_matrix(world_from_cam[:, :3, :3]).as_quat(canonical=True)
         for time, t, q in zip(timestamps, world_from_cam[:, :3, 3], quat_xyzw, strict=True):

@@ -163,7 +163,7 @@ def resume(
 @click.option("--json", "as_json", is_flag=True, help="The same for programs, with every figure.")
 def status(run_path: Path, verbose: bool, as_json: bool) -> None:
     """Say which stages of RUN are done, what they found, what was degraded, and which files are damaged."""
-    from msgs_cli.tables import status_table, warning_lines
+    from msgs_cli.tables import scale_lines, status_table, warning_lines
     from pipelines.status import run_status
 
     run = open_run(run_path)
@@ -174,6 +174,8 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
     say(f"{run.root}: made from {found.source}\n")
     say(status_table(found.stages, verbose))
     records = {s.name: s.record for s in found.stages if s.record}
+    for line in scale_lines(run.root, records):
+        say(line)
     for line in [*(f"warning: {w}" for w in found.warnings), *warning_lines(records)]:
         say(line)
 
@@ -255,12 +257,14 @@ def show_config(config_file: Path | None, overrides: tuple[str, ...]) -> None:
 
 
 def _print_summary(root: Path, records: dict[str, Any]) -> None:
-    from msgs_cli.tables import status_table, warning_lines
+    from msgs_cli.tables import scale_lines, status_table, warning_lines
     from pipelines.status import DONE, StageStatus
 
     say(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
     for line in warning_lines(records):
         say(line, err=True)
+    for line in scale_lines(root, records):
+        say(line)
     if "export" in records:
         say(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")
 

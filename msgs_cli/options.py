@@ -88,10 +88,10 @@ _SOURCE_OPTIONS = {
         "proxy.scale_ref", "REF",
         "Metres without metric depth: PICTURE:X1,Y1,X2,Y2=METRES, two pixels of one picture, or height=METRES.",
     ),
-    "gps": (
-        "export.gps", "FILE",
-        "Where it was taken, for files with x east, y north in metres: a GPX track, or a CSV with the columns time, "
-        "lat, lon, alt (a video counts from its start). Default: auto, the pictures' EXIF; off for neither.",
+    "scale": (
+        "export.scale", "auto|free",
+        "Without metric depth or --scale-ref, auto says how many metres a unit is about; free does not guess. Neither "
+        "changes any length. Default: auto.",
     ),
 }  # fmt: skip
 """Option → the setting it stands for, what is given, help."""

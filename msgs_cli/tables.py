@@ -6,6 +6,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.wording import lost_text
@@ -18,10 +19,10 @@ if TYPE_CHECKING:
 KEY_FIGURES = {
     "frames": ("frames", "keyframes_placed", "calibration", "focal_px", "focal_sd_px"),
     "proxy": ("depth", "semantics", "metric", "classes"),
-    "tracking": ("posed", "keyframes", "lost", "scale", "scale_relative_sd"),
+    "tracking": ("posed", "keyframes", "lost", "scale"),
     "mapping": ("gaussians", "keyframe_psnr"),
     "global_ba": ("loops",),
-    "export": ("images", "vertices", "faces", "up", "floor", "gps"),
+    "export": ("images", "vertices", "faces", "up", "floor"),
 }
 """What a person wants to know first; `status -v` says all."""
 
@@ -67,6 +68,15 @@ def format_figure(value: Any, key: str = "") -> str:
     if isinstance(value, dict):
         return " ".join(f"{key} {format_figure(v)}" for key, v in value.items()) or "none"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def scale_lines(root: Path, records: dict[str, StageRecord]) -> list[str]:
+    """How long the unit is, once the export has found it."""
+    from pipelines.metres.files import load_metres
+    from pipelines.run_folder import RunFolder
+
+    metres = load_metres(RunFolder(root)) if "export" in records else None
+    return [] if metres is None else [f"\nScale: {metres.text}"]
 
 
 def warning_lines(records: dict[str, StageRecord]) -> list[str]:

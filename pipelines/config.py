@@ -178,16 +178,17 @@ class ExportConfig:
         "up: z up where up can be told, the floor at 0 where one is found; first: those of the first posed camera",
         ("up", "first"),
     )
-    gps: str = setting(
-        "auto",
-        "x east, y north, metres: auto by GPS in the pictures' EXIF, off, or a track (GPX, or CSV of time, lat, lon)",
-    )
     voxel: float = setting(0.008, "voxel of the mesh, in units of the scene's median depth", within=(0.0005, 1))
     max_blocks: int = setting(
         80000, "blocks of 8 x 8 x 8 voxels; voxels grow where more would be needed", within=(10, 10_000_000)
     )
     max_views: int = setting(200, "keyframes the mesh is fused from, evenly spread", within=(1, 100_000))
     mesh_side: int = setting(640, "pixels on the long side of their depth images", within=(16, 8192))
+    scale: str = setting(
+        "auto",
+        "where nothing tells metres, auto says how long a unit is about, by a network and usual sizes; free does not",
+        ("auto", "free"),
+    )
     spz: bool = setting(False, "write the map as point_cloud.spz too")
     splat_glb: bool = setting(False, "write the map as point_cloud.glb too (glTF, KHR_gaussian_splatting)")
     sh_rest: bool = setting(False, "the splat PLYs hold f_rest_0 to 44 too, all zero, for readers that insist on them")

@@ -14,10 +14,11 @@ from pipelines.config import Config
 from pipelines.device import settle_device
 from pipelines.gaussian_map import GaussianMap
 from pipelines.geometry.alignment import Similarity
+from pipelines.metres.files import load_metres
 from pipelines.records import StageRecord, load_records, load_source, recorded_config
 from pipelines.run_folder import RunFolder
 from pipelines.settings_file import load_settings
-from pipelines.types import VOID, Calibration, ClassTable, Frame, SparseModel, Trajectory
+from pipelines.types import VOID, Calibration, ClassTable, Frame, Metres, SparseModel, Trajectory
 
 _MAP_STAGES = ("global_ba", "mapping")
 _POSE_STAGES = ("global_ba", "mapping", "tracking")
@@ -54,7 +55,8 @@ class Outcome:
     """config: the settings that each finished stage was made with. map_stage is "" and gaussian_map None before mapping
     is done; label_of_channel (C,) takes a class channel of the map to its label. `metric`: whether the world's unit is
     the metre of the proxy depth. vocabulary: the classes that the network which labelled it knows, () without one.
-    `move`: how all of it has been moved out of the run's own world."""
+    `move`: how all of it has been moved out of the run's own world. `metres`: how long the unit is, as far as the
+    export could tell."""
 
     run: RunFolder
     records: Mapping[str, StageRecord]
@@ -72,6 +74,7 @@ class Outcome:
     semantics: str
     vocabulary: tuple[str, ...]
     move: Similarity | None = None
+    metres: Metres | None = None
 
     @property
     def source_is_folder(self) -> bool:
@@ -145,6 +148,7 @@ def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:
         metric=bool(report.get("metric", False)),
         semantics=str(report.get("semantics", "")),
         vocabulary=tuple(map(str, report.get("vocabulary", ()))),
+        metres=load_metres(run) if "export" in records else None,
     )
 
 

@@ -49,7 +49,7 @@ VOCABULARY, TRIED = "correspondence/vocabulary.npz", "correspondence/tried.npz"
 CLASSES, SYMMETRY, DESCRIPTORS = "classes.json", "symmetry.npz", "descriptors.npz"
 TRAJECTORY, SPARSE, DEPTH_FIELDS = "trajectory.npz", "sparse.npz", "depth_fields.npz"
 MAP, EXPOSURE, LOOPS = "map.safetensors", "exposure.npz", "loops.json"
-MESH, WORLD = "mesh.ply", "world.json"
+MESH, WORLD, SCALE = "mesh.ply", "world.json", "scale.json"
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ def require_shape(name: str, array: NDArray, expected: Sequence[int | None]) -> 
 
 @dataclass(frozen=True)
 class Features:
-    """keypoints (F, 4) float32: x, y in pixels, scale, orientation in radians; descriptors (F, 128) uint8 of length
+    """keypoints (F, 4) float32: x, y in pixels, diameter, orientation in radians; descriptors (F, 128) uint8 of length
     NORM."""
 
     keypoints: NDArray[np.float32]
@@ -266,3 +266,43 @@ class SemanticMesh:
         require_shape("faces", self.faces, (None, 3))
         require_shape("colors", self.colors, (v, 3))
         require_shape("labels", self.labels, (v,))
+
+
+@dataclass(frozen=True)
+class MetresSource:
+    """What one source says alone: metres per unit and their relative standard deviation."""
+
+    source: str
+    per_unit: float
+    relative_sd: float
+
+
+@dataclass(frozen=True)
+class Metres:
+    """How long the unit of a world is, which is never rescaled by it: metres per unit and their relative standard
+    deviation (that of the logarithm).
+
+    is_guess: whether only what is usual in the world tells it; sources: what it rests on, most telling first; alone:
+    what each says; disagreement: the Birge ratio of the sources, over 1 where they scatter more than they should.
+    """
+
+    per_unit: float
+    relative_sd: float
+    is_guess: bool
+    sources: tuple[str, ...]
+    alone: tuple[MetresSource, ...] = ()
+    disagreement: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (self.per_unit > 0 and self.relative_sd > 0):
+            raise ValueError(f"metres per unit and their deviation must be positive, got {self}")
+
+    @property
+    def text(self) -> str:
+        """1 unit = about 0.83 m ± 18 % (a guess, from floor height and 2 doors)."""
+        *first, last = self.sources or ("nothing in particular",)
+        told = f"{', '.join(first)} and {last}" if first else last
+        about, guess = ("about ", "a guess, ") if self.is_guess else ("", "")
+        percent = 100 * self.relative_sd
+        spread = f"{percent:.0f}" if percent >= 2 else f"{percent:.1f}"
+        return f"1 unit = {about}{self.per_unit:.{2 if self.is_guess else 3}g} m ± {spread} % ({guess}from {told})"

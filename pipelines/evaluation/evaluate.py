@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from formats.datasets import Sequence
@@ -77,6 +78,7 @@ def evaluate_outcome(
         "frames": frame_cells(outcome, matched),
         "camera": camera_cells(outcome, truth),
         "trajectory": trajectory,
+        "scale": scale_cells(outcome, trajectory),
         "frame errors": frame_errors(outcome, matched, alignment),
         **(measured.cells(outcome, matched) if measured else _without_map(outcome)),
         "mesh": mesh_cells(outcome, matched, alignment),
@@ -144,6 +146,19 @@ def trajectory_cells(outcome: Outcome, matched: MatchedTruth) -> tuple[dict[str,
     cells["rpe"] = _rpe(estimate[usable], truth[usable], sim3.alignment.scale)
     best = absolute_error(estimate[usable, :3, 3], truth[usable, :3, 3], False) if outcome.metric else sim3
     return cells, best
+
+
+def scale_cells(outcome: Outcome, trajectory: dict[str, Any]) -> dict[str, Any]:
+    """The metres per unit that the run states, with their relative sd, beside the true ones by Sim(3)."""
+    found = trajectory.get("sim3 all", trajectory)
+    if "missing" in found:
+        return {"missing": found["missing"]}
+    true = found["scale"]
+    if outcome.metres is None:
+        return {"missing": "the run states no scale", "true": true}
+    m = outcome.metres
+    sigmas = abs(np.log(m.per_unit / true)) / m.relative_sd
+    return {"stated": m.per_unit, "relative sd": m.relative_sd, "guess": m.is_guess, "true": true, "sigmas": sigmas}
 
 
 def frame_errors(outcome: Outcome, matched: MatchedTruth, alignment: AbsoluteError | None) -> list[list[float]]:

@@ -167,8 +167,9 @@ def _about_camera(outcome: Outcome) -> list[str]:
             "know it, or film with more movement to the side."
         )
     if not outcome.metric:
+        known = "Lengths have no unit" if outcome.metres is None else "How long a metre is, is a guess"
         found.append(
-            "Lengths have no unit: nothing in a single moving camera tells metres. Give a known distance (--scale-ref) "
-            "or metric depth (--depth files or a metric network) to get them."
+            f"{known}: nothing in a single moving camera tells metres. Give a known distance (--scale-ref) or metric "
+            "depth (--depth files or a metric network) to get them."
         )
     return found

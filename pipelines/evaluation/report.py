@@ -18,7 +18,7 @@ from pipelines.evaluation.plots import RED, Line, plot
 from pipelines.evaluation.report_views import RenderedViews, class_section, quality_section, render_views
 from pipelines.evaluation.table import evaluation_table
 from pipelines.evaluation.write import PATH_FROM_ABOVE, trajectory_plots
-from pipelines.export.readme import readme
+from pipelines.export.readme import lengths, readme
 from pipelines.outcome import Outcome, load_outcome
 from pipelines.progress import Progress, SilentProgress
 from pipelines.records import load_source
@@ -124,11 +124,10 @@ def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[Loo
 
 
 def _scale_text(outcome: Outcome) -> str:
-    if not outcome.metric:
-        return "free: the unit of length is the run's own"
-    record = outcome.records.get("tracking")
-    spread = None if record is None else record.figures.get("scale_relative_sd")
-    return "metres, from the proxy depth" + (f", ± {spread:.2%}" if isinstance(spread, float) else "")
+    if outcome.metres is not None or outcome.metric:
+        return lengths(outcome.metres, outcome.metric)
+    exported = "export" in outcome.records
+    return lengths(None, False) if exported else "free so far: the export says how many metres a unit is about"
 
 
 def _path_section(outcome: Outcome) -> str:
@@ -179,7 +178,7 @@ def _export_section(outcome: Outcome) -> str:
         for p in sorted(folder.rglob("*"))
         if p.is_file() and p.parent.name != "frames"
     ]
-    notes = readme(load_world(outcome.run) or FIRST, outcome.metric)
+    notes = readme(load_world(outcome.run) or FIRST, outcome.metres, outcome.metric)
     return section("Files for other programs", f"<pre>{escape(notes)}</pre>", table(("in export/", "size"), sizes))
 
 

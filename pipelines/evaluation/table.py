@@ -25,6 +25,7 @@ def _rows(result: dict[str, Any]) -> list[Row]:
     of = f"{frames['picked']} picked, {frames['keyframes']} keyframes, {frames['with true pose']} with a true pose"
     rows = [("frames posed", str(frames["posed"]), of), _camera_row(result["camera"])]
     rows += _trajectory_rows(result["trajectory"], stage["poses"])
+    rows += _scale_rows(result["scale"])
     rows += _image_rows(result["images"], stage["map"])
     rows += _depth_rows(result["depth"]) + _label_rows(result["labels"]) + _mesh_rows(result["mesh"])
     return rows + _cost_rows(result["cost"])
@@ -56,6 +57,13 @@ def _trajectory_rows(cells: dict[str, Any], stage: str) -> list[Row]:
     rpe = cells["rpe"]
     text = f"{100 * rpe['translation rmse']:.2f} cm, {rpe['rotation rmse degrees']:.3f}°"
     return [*rows, ("RPE rmse", text, f"{rpe['pairs']} pairs, poses of {stage}")]
+
+
+def _scale_rows(cells: dict[str, Any]) -> list[Row]:
+    if "missing" in cells:
+        return _missing("metres per unit", cells)
+    text = f"{cells['stated']:.4g} ± {cells['relative sd']:.1%}{', a guess' if cells['guess'] else ''}"
+    return [("metres per unit", text, f"true {cells['true']:.4g}, {cells['sigmas']:.1f} sigmas off")]
 
 
 def _image_rows(cells: dict[str, Any], stage: str) -> list[Row]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pipelines.types import Metres
 from pipelines.upright.world import World
 
 _FILES = """\
@@ -25,34 +26,42 @@ point_cloud.glb           only with --set export.splat_glb=true: the map in glTF
 mesh.ply, mesh.glb        the surface with a colour and a label (PLY: property label, GLB: attribute _LABEL) at each
                           vertex. MeshLab, Blender, trimesh.
 classes.json              number, name and colour of each class; 255 is "unknown".
+scale.json                how many metres a unit of length is, its relative standard deviation, and who says so.
 world.json                what the axes are, what told which way is up, and how this world lies to the run's own.
 
 """
 
 _UPRIGHT = """\
-Axes: z is up, told by the {told_by}; {height}.
-{heading}. The formats that lay down which way is up follow their own
+Axes: z is up, told by the {told_by}; {height}; x and y count from the middle of the
+camera's path, and y points where the first camera looked. The formats that lay down which way is up follow their own
 rule: in mesh.glb, point_cloud.spz and point_cloud.glb y is up. A viewer that takes y for up shows the PLY files on
 their back: turn them by -90 degrees about x.
 """
-
-_OWN_HEADING = """\
-x and y count from the middle of the camera's path, and y points where the first camera looked"""
 
 _FIRST = """\
 Axes: the run's own, about those of the first posed camera: x right, y down, z forward{why}.
 """
 
-_METRES = "Lengths are metres.\n"
-_FREE = "The unit of lengths is free: one camera cannot tell metres. Metric depth or --scale-ref makes them metres.\n"
+_FREE = "The unit of lengths is free: one camera cannot tell metres. Metric depth or --scale-ref makes them metres."
 
 
-def readme(world: World, metric: bool) -> str:
+def lengths(metres: Metres | None, metric: bool) -> str:
+    """What one unit of length is, in a line or two of plain text."""
+    if metres is None:
+        return "Lengths are metres." if metric else _FREE
+    if metric:
+        return f"Lengths are metres: {metres.text}."
+    return (
+        f"{metres.text[0].upper()}{metres.text[1:]}.\n"
+        f"Nothing is rescaled by this: multiply lengths by {metres.per_unit:.3g} to have them in metres."
+    )
+
+
+def readme(world: World, metres: Metres | None, metric: bool) -> str:
     """The text of README.txt for files in that world."""
     if world.axes == "up":
         height = "the floor is at z = 0" if world.has_floor else "no floor was found, so z counts from that path too"
-        heading = "x is east and y north (GPS, see world.json)" if world.earth else _OWN_HEADING
-        axes = _UPRIGHT.format(told_by=world.told_by, height=height, heading=heading)
+        axes = _UPRIGHT.format(told_by=world.told_by, height=height)
     else:
         axes = _FIRST.format(why=", since nothing told which way is up or nobody asked (export.axes)")
-    return _FILES + axes + (_METRES if metric else _FREE)
+    return _FILES + axes + lengths(metres, metric) + "\n"

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from formats.digest import file_sha256
-from formats.gps import read_track
 from formats.mesh import read_mesh_ply
 from pipelines.config import Config, ExportConfig
 from pipelines.export.mesh import make_mesh, mesh_figures, write_mesh
@@ -20,13 +19,15 @@ from pipelines.export.writers import (
     write_trajectory,
     write_world,
 )
+from pipelines.metres.find import Machine, find_metres
 from pipelines.outcome import Outcome, load_outcome
 from pipelines.progress import Progress, SilentProgress
+from pipelines.proxy.networks.identity import card_identity
+from pipelines.proxy.selection import metric_card
 from pipelines.run_folder import RunFolder
 from pipelines.stages import Stage, StageContext
-from pipelines.types import SemanticMesh
+from pipelines.types import Metres, SemanticMesh
 from pipelines.upright.find import find_upright
-from pipelines.upright.places import AUTO, OFF, world_on_earth
 from pipelines.upright.world import FIRST, World, load_world, upright_world, world_figures
 
 
@@ -34,9 +35,13 @@ def run(context: StageContext) -> dict[str, Any]:
     """All files; a mesh that an interrupted attempt has finished is kept."""
     found, settings = load_outcome(context.run, context.device), context.config.export
     found.require_map()
-    world, reasons = find_world(found, settings)
-    for reason in reasons:
-        context.warn(reason)
+    world = find_world(found, settings)
+    if settings.axes == "up" and world.axes != "up":
+        context.warn(
+            "neither a floor nor upright lines tell which way is up: the files keep the axes of the run, about "
+            "those of the first posed camera"
+        )
+    found = replace(found, metres=guess_metres(context, found, settings))
     outcome = found.moved(world.exported_from_run)
     write_all_but_mesh(outcome, world, settings, context.folder)
     mesh = _finished_mesh(context.folder)
@@ -51,31 +56,41 @@ def run(context: StageContext) -> dict[str, Any]:
         "compact_map_mb": round((context.folder / "point_cloud_compact.safetensors").stat().st_size / 1e6, 2),
         **mesh_figures(mesh),
         **world_figures(world),
+        **metres_figures(outcome.metres),
     }
 
 
-def find_world(outcome: Outcome, settings: ExportConfig) -> tuple[World, list[str]]:
-    """The world for the files of a run whose map is done, and what could not be found that was asked for."""
-    world = upright_world(outcome, find_upright(outcome)) if settings.axes == "up" else FIRST
-    reasons = []
-    if settings.axes == "up" and world.axes != "up":
-        reasons.append(
-            "neither a floor nor upright lines tell which way is up: the files keep the axes of the run, about "
-            "those of the first posed camera"
-        )
-    world, reason = world_on_earth(outcome, world, settings.gps)
-    return world, [*reasons, reason] if reason else reasons
+def guess_metres(context: StageContext, outcome: Outcome, settings: ExportConfig) -> Metres | None:
+    """How long the unit of the run's world is; what speaks against it is warned of."""
+    machine, guess = Machine(context.threads, context.device), settings.scale == "auto"
+    found = find_metres(context.run, outcome.trajectory, metric_card() if guess else None, machine, guess)
+    if found.warning:
+        context.warn(found.warning)
+    return found.metres
 
 
-def _check(source: Path, config: Config) -> None:
-    """The track that the user gives can be read."""
-    if config.export.gps not in (AUTO, OFF):
-        read_track(Path(config.export.gps))
+def metres_figures(metres: Metres | None) -> dict[str, Any]:
+    """How long the unit is, and where that comes from."""
+    if metres is None:
+        return {"metres_per_unit": None}
+    return {
+        "metres_per_unit": round(metres.per_unit, 4),
+        "metres_relative_sd": round(metres.relative_sd, 4),
+        "metres_are": "a guess" if metres.is_guess else "given",
+        "metres_from": ", ".join(metres.sources),
+        "metres_disagreement": round(metres.disagreement, 2),
+    }
 
 
-def _inputs(source: Path, config: Config) -> Any:
-    """The track's content: other fixes under the same name make other files."""
-    return None if config.export.gps in (AUTO, OFF) else file_sha256(Path(config.export.gps))
+def export_inputs(source: Path, config: Config) -> str | None:
+    """The network that the guess is made with."""
+    card = metric_card() if config.export.scale == "auto" else None
+    return None if card is None else card_identity(card)
+
+
+def find_world(outcome: Outcome, settings: ExportConfig) -> World:
+    """The world for the files of a run whose map is done."""
+    return upright_world(outcome, find_upright(outcome)) if settings.axes == "up" else FIRST
 
 
 def write_all_but_mesh(outcome: Outcome, world: World, settings: ExportConfig, folder: Path) -> list[Path]:
@@ -107,8 +122,10 @@ def export_run(
     found = load_outcome(run)
     found.require_map()
     settings = settings or found.config.export
-    world = _kept_world(found, settings) or find_world(found, settings)[0]
+    world = _kept_world(found, settings) or find_world(found, settings)
     outcome = found.moved(world.exported_from_run)
+    if outcome.metres is not None and outcome.metres.is_guess and settings.scale == "free":
+        outcome = replace(outcome, metres=None)
 
     def mesh() -> list[Path]:
         made = make_mesh(outcome, settings, progress or SilentProgress())
@@ -129,8 +146,7 @@ def export_run(
 
 def _kept_world(outcome: Outcome, settings: ExportConfig) -> World | None:
     """That of the run's own export, so that what is written later or elsewhere fits; None for other axes."""
-    own = outcome.config.export
-    return load_world(outcome.run) if (settings.axes, settings.gps) == (own.axes, own.gps) else None
+    return load_world(outcome.run) if settings.axes == outcome.config.export.axes else None
 
 
-STAGE = Stage("export", run, "COLMAP model, Gaussian PLY, labelled mesh, trajectory", inputs=_inputs, check=_check)
+STAGE = Stage("export", run, "COLMAP model, Gaussian PLY, labelled mesh, trajectory, metres", inputs=export_inputs)

@@ -19,7 +19,8 @@ from formats.gaussians import GaussianCloud, isotropic_cloud
 from formats.nerfstudio import write_transforms
 from formats.spz import write_spz
 from formats.trajectory import write_tum
-from pipelines.export.readme import readme
+from pipelines.export.readme import lengths, readme
+from pipelines.metres.files import save_metres
 from pipelines.outcome import Outcome
 from pipelines.run_folder import save_classes
 from pipelines.types import SparseModel
@@ -123,18 +124,19 @@ def _by_class(cloud: GaussianCloud, outcome: Outcome) -> GaussianCloud:
 
 def write_trajectory(outcome: Outcome, folder: Path) -> list[Path]:
     """The poses of all posed frames."""
-    t = outcome.trajectory
-    write_tum(folder / "trajectory.txt", t.timestamps[t.is_posed], t.world_from_cam[t.is_posed])
+    t, note = outcome.trajectory, lengths(outcome.metres, outcome.metric)
+    write_tum(folder / "trajectory.txt", t.timestamps[t.is_posed], t.world_from_cam[t.is_posed], note)
     return [folder / "trajectory.txt"]
 
 
 def write_world(outcome: Outcome, world: World, folder: Path) -> Path:
     """world.json: what the coordinates of the other files mean."""
-    return save_world(folder, world, "metre" if outcome.metric or world.earth else "free")
+    return save_world(folder, world, "metre" if outcome.metric else "free")
 
 
 def write_notes(outcome: Outcome, world: World, folder: Path) -> list[Path]:
-    """The class table, the world, and what each file is for."""
+    """The class table, the world, how long its unit is, and what each file is for."""
     save_classes(folder, outcome.classes)
-    write_text(folder / "README.txt", readme(world, outcome.metric or world.earth is not None))
-    return [folder / "classes.json", write_world(outcome, world, folder), folder / "README.txt"]
+    write_text(folder / "README.txt", readme(world, outcome.metres, outcome.metric))
+    world_file, scale_file = write_world(outcome, world, folder), save_metres(folder, outcome.metres)
+    return [folder / "classes.json", world_file, scale_file, folder / "README.txt"]

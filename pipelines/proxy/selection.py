@@ -166,14 +166,10 @@ def _cached(task: str) -> Card | None:
     return None if model is None else store.card(model)
 
 
-def open_metric_network(around: Surroundings) -> OnnxDepth | None:
-    """The best network for metric depth in the cache, for the scale alone; None where there is none.
-
-    `prepare(frames)` runs it, `estimate(frame).depth` is what it says of a frame in metres as it comes, (h, w).
-    """
-    store = ModelStore.open()
-    model = store.first_here("depth", metres_only=True)
-    return None if model is None else OnnxDepth(store.card(model), _workplace(around, "network_metres"))
+def metric_card() -> Card | None:
+    """The card of the best network in the cache that tells metres, be it good for nothing else; None without one."""
+    model = ModelStore.open().first_metric()
+    return None if model is None else ModelStore.open().card(model)
 
 
 def missing_networks() -> str | None:

@@ -112,6 +112,15 @@ class ModelStore:
                 return model
         return None
 
+    def first_metric(self) -> Model | None:
+        """The best network for depth in the cache that tells metres: by itself, or as its training camera saw them."""
+        for model in self.models:
+            family = self.families[model.family]
+            tells = not family.get("relative") or "focal" in family
+            if family["task"] == "depth" and tells and self.is_here(model):
+                return model
+        return None
+
     def take(self, folder: Path, models: Sequence[Model]) -> list[Model]:
         """Copy the files of `models` that lie in `folder` into the cache; they are known by their content, whatever
         they are called. Returns those that were found. Raises InputError when there is no such folder."""

@@ -10,6 +10,8 @@ multiple = 28                     # sides are multiples of this, near `pixels` i
 pixels = 263424
 output = "predicted_depth"        # .tflite: any tensor of the network, also one before its last step
 canonical_focal = 1000.0          # depth · focal / canonical_focal is metres; 0: depth is metres as it comes
+focal = [0, 0]                    # of the camera it was trained with, in pixels of its input (`size`), for a
+                                  # network without a canonical focal length that is to tell metres
 relative = ""                     # else "scale", "depth" or "inverse": depth up to scale; depth, or inverse depth, up
                                   # to scale and shift; each frame is then aligned to the triangulated points
 valid = [0.1, 200.0]              # values at or beyond these stops are unknown
@@ -62,6 +64,7 @@ class Card:
     pixels: int = 448 * 588
     align_corners: bool = False
     canonical_focal: float = 0.0
+    focal: tuple[float, ...] = (0.0, 0.0)
     relative: str = ""
     valid: tuple[float, ...] = (0.0, float("inf"))
     confidence: str = ""
@@ -175,6 +178,8 @@ def _check(card: Card, path: Path) -> None:
         "valid is [lowest, highest]": len(card.valid) == 2 and 0 <= card.valid[0] < card.valid[1],
         "relative is scale, depth or inverse": card.relative in ("", "scale", "depth", "inverse"),
         "canonical_focal is 0 or positive": card.canonical_focal >= 0,
+        "focal is [fx, fy], positive, and goes with size": card.focal == (0, 0)
+        or (len(card.focal) == 2 and min(card.focal) > 0 and all(card.size)),
         "groups has one name for each class": len(card.groups) in (0, len(card.classes)),
         "segmentation needs classes": card.is_clustered
         or card.task != "segmentation"

@@ -65,11 +65,11 @@ def name_structure(voxels: Voxels, gravity: Gravity, cameras: NDArray[np.float64
     eye = float(np.median(cameras @ gravity.up))
     thick = 2.5 * voxels.size
     share = voxels.weight / voxels.weight.sum()
-    for level in _levels(height, share * (upward > _HORIZONTAL), voxels.size):
+    for level in levels(height, share * (upward > _HORIZONTAL), voxels.size):
         members = (upward > _HORIZONTAL) & (np.abs(height - level) < thick)
         is_lowest = share[height < level - 2 * thick].sum() < _BEYOND_SHARE
         kind[members & (kind == OTHER)] = FLOOR if is_lowest and level < eye else SURFACE
-    for level in _levels(height, share * (upward < -_HORIZONTAL), voxels.size):
+    for level in levels(height, share * (upward < -_HORIZONTAL), voxels.size):
         members = (upward < -_HORIZONTAL) & (np.abs(height - level) < thick)
         if share[height > level + 2 * thick].sum() < _BEYOND_SHARE and level > eye:
             kind[members] = CEILING
@@ -79,18 +79,20 @@ def name_structure(voxels: Voxels, gravity: Gravity, cameras: NDArray[np.float64
 
 @dataclass(frozen=True)
 class FloorPlane:
-    """`normal` (3,) unit vector upwards, and a `point` (3,) of the floor, in the world."""
+    """`normal` (3,) unit vector upwards, and a `point` (3,) of the floor or the ceiling, in the world."""
 
     normal: NDArray[np.float64]
     point: NDArray[np.float64]
 
 
-def floor_plane(voxels: Voxels, kinds: NDArray[np.int64], up: NDArray[np.float64]) -> FloorPlane | None:
-    """The plane of the voxels that `name_structure` called floor, robustly; None without a floor.
+def floor_plane(
+    voxels: Voxels, kinds: NDArray[np.int64], up: NDArray[np.float64], kind: int = FLOOR
+) -> FloorPlane | None:
+    """The plane of the voxels that `name_structure` called floor (or CEILING, for `kind`), robustly; None without any.
 
     Up by normals is good to a degree or two, which is centimetres at the feet: the floor's own plane is exact.
     """
-    floor, share = voxels.position[kinds == FLOOR], voxels.weight[kinds == FLOOR]
+    floor, share = voxels.position[kinds == kind], voxels.weight[kinds == kind]
     if len(floor) < 3:
         return None
     weight = share
@@ -103,22 +105,24 @@ def floor_plane(voxels: Voxels, kinds: NDArray[np.int64], up: NDArray[np.float64
     return FloorPlane(normal, middle)
 
 
-def _levels(value: NDArray[np.float64], share: NDArray[np.float64], size: float) -> list[float]:
-    """Peaks of a weighted histogram of `value`, largest first, each with a share worth naming."""
-    if share.sum() < _LEAST_SHARE:
+def levels(
+    value: NDArray[np.float64], share: NDArray[np.float64], size: float, least: float = _LEAST_SHARE
+) -> list[float]:
+    """Peaks of a histogram of `value` weighted by `share`, largest first, each with at least the share `least`."""
+    if share.sum() < least:
         return []
     low = value.min() - 4 * size
     bins = np.bincount(((value - low) / size).astype(np.int64), weights=share)
     smooth = np.convolve(bins, np.ones(5), mode="same")
-    levels = []
-    while smooth.max() >= _LEAST_SHARE:
+    found = []
+    while smooth.max() >= least:
         peak = int(smooth.argmax())
         span = slice(max(peak - 2, 0), peak + 3)
         center = (np.arange(len(bins))[span] * bins[span]).sum() / bins[span].sum()
-        levels.append(float(low + (center + 0.5) * size))
+        found.append(float(low + (center + 0.5) * size))
         bins[max(peak - 4, 0) : peak + 5] = 0
         smooth = np.convolve(bins, np.ones(5), mode="same")
-    return levels
+    return found
 
 
 def _name_walls(
@@ -146,7 +150,7 @@ def _name_walls(
         normal -= up * (normal @ up)
         normal /= np.linalg.norm(normal)
         offset = voxels.position @ normal
-        for level in _levels(offset, share * facing, voxels.size):
+        for level in levels(offset, share * facing, voxels.size):
             plane = facing & (np.abs(offset - level) < 2.5 * voxels.size)
             if share[offset < level - 5 * voxels.size].sum() < _BEYOND_SHARE:
                 kind[plane] = WALL

@@ -1,0 +1,47 @@
+"""What this room reads of a run beside its maps, and the file it leaves in the export."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+from formats.jsonfile import read_json, read_json_object, write_json
+from pipelines.run_folder import SCALE, RunFolder
+from pipelines.stored import dataclass_from_json, reading
+from pipelines.types import Metres, MetresSource
+
+_FRAME_SCALES, _TRACKED = "frame_scales.json", "tracking.json"
+
+
+def load_scale_spreads(run: RunFolder) -> tuple[list[float], float]:
+    """How far each frame's proxy depth strays from its triangulated points, relatively, and how exactly tracking could
+    make the world agree with metric depth; ([], 0) where nothing of that is known."""
+    sd, spreads = None, []
+    if run.has("tracking", _TRACKED):
+        sd = read_json_object(run.file("tracking", _TRACKED)).get("scale_relative_sd")
+    if run.has("proxy", _FRAME_SCALES):
+        path = run.file("proxy", _FRAME_SCALES)
+        rows = read_json(path)
+        with reading(path, "table of scales"):
+            spreads = [float(r["spread"]) for r in rows]
+    return spreads, float(sd or 0.0)
+
+
+def load_metres(run: RunFolder) -> Metres | None:
+    """How long the world's unit is, as the export found it; None where it did not, or has not run."""
+    if not (run.stage("export") / SCALE).exists():  # exports are the user's: files may be gone
+        return None
+    if (row := read_json(run.file("export", SCALE))) is None:
+        return None
+    with reading(run.file("export", SCALE), "scale"):
+        alone = tuple(dataclass_from_json(MetresSource, s) for s in row["alone"])
+        numbers = {k: float(row[k]) for k in ("per_unit", "relative_sd", "disagreement")}
+        sources = tuple(str(s) for s in row["sources"])
+        return Metres(**numbers, is_guess=bool(row["is_guess"]), sources=sources, alone=alone)
+
+
+def save_metres(folder: Path, metres: Metres | None) -> Path:
+    """scale.json: the value, its sentence, and what each source says; null where nothing tells metres."""
+    path = folder / SCALE
+    write_json(path, None if metres is None else {"text": metres.text, **asdict(metres)})
+    return path

@@ -1,0 +1,156 @@
+"""Metres per unit of a run from everything that is known of it, with an honest standard deviation."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.depth.fields import DepthFields
+from pipelines.metres.evidence import Combined, Evidence, combine, independence
+from pipelines.metres.files import load_scale_spreads
+from pipelines.metres.heights import camera_height, ceiling_height, usual_distance
+from pipelines.metres.known import MEASURED, known_scale
+from pipelines.metres.network import network_scale
+from pipelines.metres.scene import Scene, SeenFrame, build_scene
+from pipelines.metres.sizes import THINGS
+from pipelines.metres.things import sizes_of_things
+from pipelines.proxy.networks.card import Card
+from pipelines.run_folder import DEPTH_FIELDS, RunFolder
+from pipelines.types import Intrinsics, Metres, MetresSource, Trajectory
+
+_MOST_FRAMES = 40
+_MOST_NETWORK_FRAMES = 24
+_CONTRADICTION = 3.0
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Where a network runs."""
+
+    threads: int = 1
+    device: str = "cpu"
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Keyframes of a run, their camera, and the names of their classes; `is_named`: whether something that knows things
+    gave the names."""
+
+    frames: list[SeenFrame]
+    frame_ids: list[int]
+    camera: Intrinsics
+    names: tuple[str, ...]
+    is_named: bool
+
+
+@dataclass(frozen=True)
+class Found:
+    """metres: None where nothing tells them, or only a guess could and may not; warning: what speaks against them."""
+
+    metres: Metres | None
+    warning: str | None = None
+
+
+def find_metres(run: RunFolder, trajectory: Trajectory, card: Card | None, machine: Machine, guess: bool) -> Found:
+    """How long the unit of the world of `trajectory` is.
+
+    card: a network for metric depth, where there is one; guess: whether what is usual in the world counts. Raises
+    InputError for a network that is not what its card says.
+    """
+    given = known_evidence(run)
+    usual = usual_evidence(load_seen(run, trajectory), card, machine) if guess else []
+    # What was measured needs no guesses beside it: they can only doubt it.
+    pieces = given if any(p.kind == MEASURED for p in given) else [*given, *usual]
+    return Found(describe(pieces) if pieces else None, contradiction(given, usual))
+
+
+def usual_evidence(seen: Seen, card: Card | None, machine: Machine) -> list[Evidence]:
+    """What a network, the room and the things in it say; nothing where no frame has reliable depth."""
+    scene = build_scene(seen.frames, seen.camera, seen.names, seen.is_named) if seen.frames else None
+    if scene is None:
+        return []
+    pieces = scene_evidence(scene)
+    if card is not None:
+        some = seen.frames[:: -(-len(seen.frames) // _MOST_NETWORK_FRAMES)]
+        found = network_scale(card, some, seen.camera, machine.threads, machine.device)
+        pieces += [found] if found else []
+    return pieces
+
+
+def scene_evidence(scene: Scene) -> list[Evidence]:
+    """What the room itself says."""
+    return [*camera_height(scene), *ceiling_height(scene), *sizes_of_things(scene), usual_distance(scene)]
+
+
+def load_seen(run: RunFolder, trajectory: Trajectory) -> Seen:
+    """Keyframes with maps, evenly spread."""
+    stage = next((s for s in ("global_ba", "tracking") if run.has(s, DEPTH_FIELDS)), None)
+    fields = run.load_depth_fields(stage) if stage else DepthFields({})
+    frame_of = {f.id: f for f in run.load_frames()}
+    keys = np.flatnonzero(trajectory.is_keyframe)
+    rows = [int(k) for k in keys if run.has_proxy(int(trajectory.frame_ids[k]))]
+    frames, frame_ids = [], []
+    for row in rows[:: max(1, -(-len(rows) // _MOST_FRAMES))]:
+        frame_id = int(trajectory.frame_ids[row])
+        maps = fields.in_world(frame_id, run.load_proxy(frame_id))
+        frames.append(SeenFrame(run.image(frame_of[frame_id]), maps, trajectory.world_from_cam[row]))
+        frame_ids.append(frame_id)
+    is_named = run.load_proxy_report().get("semantics") != "segments"
+    return Seen(frames, frame_ids, run.load_calibration().intrinsics, run.load_classes().names, is_named)
+
+
+def known_evidence(run: RunFolder) -> list[Evidence]:
+    """What made the world metric; nothing where nothing did."""
+    spreads, statistical = load_scale_spreads(run)
+    return known_scale(run.load_proxy_report(), spreads, statistical)
+
+
+def describe(pieces: Sequence[Evidence]) -> Metres:
+    """The combination of the pieces, with the sources by name and what each says alone."""
+    combined = combine(pieces)
+    alone = tuple(MetresSource(p.source, float(np.exp(p.log_scale)), p.sd) for p in pieces)
+    return Metres(
+        per_unit=combined.factor,
+        relative_sd=combined.sd,
+        is_guess=all(p.is_guess for p in pieces),
+        sources=_names(pieces, combined),
+        alone=alone,
+        disagreement=combined.disagreement,
+    )
+
+
+def _names(pieces: Sequence[Evidence], combined: Combined) -> tuple[str, ...]:
+    """The sources that the result rests on, most telling first; alike ones counted; what is refuted left out."""
+    weight: dict[str, float] = defaultdict(float)
+    count: Counter[str] = Counter()
+    for piece, power in zip(pieces, independence(pieces), strict=True):
+        if float(piece.distance(np.array([combined.log_scale]))[0]) < _CONTRADICTION:
+            weight[piece.source] += power / min(m.sd for m in piece.modes) ** 2
+            count[piece.source] += 1
+    if len(weight) > 1:
+        weight.pop("usual distances", None)
+    return tuple(_counted(count[name], name) for name in sorted(weight, key=lambda n: -weight[n]))
+
+
+def _counted(count: int, source: str) -> str:
+    """ "door" → "1 door", "2 doors"; what is no thing stays as it is."""
+    if source not in THINGS:
+        return source
+    return f"{count} {source}{'' if count == 1 else 'es' if source.endswith('ch') else 's'}"
+
+
+def contradiction(given: Sequence[Evidence], usual: Sequence[Evidence]) -> str | None:
+    """What to warn of where the given metres are far from everything that is usual; None where they are not."""
+    if not given or not usual:
+        return None
+    known, guessed = combine(given), combine(usual)
+    if abs(known.log_scale - guessed.log_scale) < _CONTRADICTION * np.hypot(known.sd, guessed.sd):
+        return None
+    times = float(np.exp(guessed.log_scale - known.log_scale))
+    return (
+        f"{given[0].source} makes the scene implausible in size: {', '.join(_names(usual, guessed))} say that lengths "
+        f"are {times:.2g} times as large, give or take {guessed.sd:.0%}. Check its unit"
+    )

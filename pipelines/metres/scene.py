@@ -1,0 +1,130 @@
+"""What the scale is read from: the surface that the keyframes saw, its classes, which way is up, and the cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.camera import unproject_depth
+from pipelines.proxy.regions.structure import (
+    CEILING,
+    FLOOR,
+    FloorPlane,
+    Gravity,
+    find_gravity,
+    floor_plane,
+    name_structure,
+)
+from pipelines.proxy.regions.voxels import Voxels, find, gather_frame, merge, select, voxel_keys
+from pipelines.proxy.sequence import resample_nearest, resize_area
+from pipelines.types import VOID, Intrinsics, ProxyMaps
+
+Array = NDArray[np.float64]
+
+VOXELS_PER_DEPTH = 60
+"""A voxel is this fraction of the median depth: 4 cm at 2.4 m."""
+LEAST_CONFIDENCE = 0.3
+_SIDE = 200
+_LEAST_WEIGHT = 1.5
+_LEAST_PLANE = 30
+"""Voxels without which a floor or a ceiling is none."""
+
+
+@dataclass(frozen=True)
+class SeenFrame:
+    """One keyframe: its picture (H, W, 3), its maps with depth in the unit of the world, world_from_cam (4, 4)."""
+
+    image: NDArray[np.uint8]
+    maps: ProxyMaps
+    world_from_cam: Array
+
+
+@dataclass(frozen=True)
+class Scene:
+    """kind (V,): floor, ceiling, … of `regions.structure`; label (V,) class of each voxel or VOID; names of the
+    classes; centres (N, 3) of the cameras; median_depth of what they see. `is_named`: whether
+    something that knows things gave the names, and not the geometry."""
+
+    voxels: Voxels
+    gravity: Gravity
+    kind: NDArray[np.int64]
+    label: NDArray[np.uint8]
+    names: tuple[str, ...]
+    centres: Array
+    median_depth: float
+    is_named: bool = True
+
+    def named(self, names: Sequence[str]) -> NDArray[np.bool_]:
+        """(V,) voxels whose class has one of these names."""
+        wanted = [i for i, name in enumerate(self.names) if name.lower() in names]
+        return np.isin(self.label, wanted)
+
+    def plane(self, kind: int) -> FloorPlane | None:
+        """Of the floor or the ceiling; None where there is hardly any."""
+        if (self.kind == kind).sum() < _LEAST_PLANE:
+            return None
+        return floor_plane(self.voxels, self.kind, self.gravity.up, kind)
+
+    @property
+    def floor(self) -> FloorPlane | None:
+        return self.plane(FLOOR)
+
+    @property
+    def ceiling(self) -> FloorPlane | None:
+        return self.plane(CEILING)
+
+
+def build_scene(
+    frames: Sequence[SeenFrame], intrinsics: Intrinsics, names: tuple[str, ...], is_named: bool
+) -> Scene | None:
+    """The scene of some keyframes; None where none of them has reliable depth."""
+    known = [f.maps.depth[(f.maps.depth > 0) & (f.maps.confidence >= LEAST_CONFIDENCE)][::7] for f in frames]
+    if not sum(map(len, known)):
+        return None
+    median_depth = float(np.median(np.concatenate(known)))
+    size = median_depth / VOXELS_PER_DEPTH
+    scale = min(1.0, _SIDE / max(intrinsics.width, intrinsics.height))
+    camera = intrinsics.resized(max(1, round(intrinsics.width * scale)), max(1, round(intrinsics.height * scale)))
+    rows = [_gather(f, camera, size) for f in frames]
+    voxels = merge(size, [(keys, values) for keys, values, _ in rows])
+    voxels = select(voxels, voxels.weight > _LEAST_WEIGHT)
+    cameras = np.array([f.world_from_cam for f in frames])
+    gravity = find_gravity(voxels, -cameras[:, :3, 1].mean(0))
+    kind = name_structure(voxels, gravity, cameras[:, :3, 3])
+    label = _vote(voxels, [votes for _, _, votes in rows])
+    return Scene(voxels, gravity, kind, label, names, cameras[:, :3, 3], median_depth, is_named)
+
+
+def _gather(
+    frame: SeenFrame, camera: Intrinsics, size: float
+) -> tuple[NDArray[np.int64], Array, tuple[NDArray[np.int64], NDArray[np.uint8]]]:
+    """The frame's voxels as `gather_frame` gives them, and (Q,) key and label of each of its reliable pixels."""
+    rows, columns = camera.height, camera.width
+    depth = resample_nearest(frame.maps.depth, rows, columns)
+    confidence = resample_nearest(frame.maps.confidence, rows, columns)
+    labels = resample_nearest(frame.maps.labels, rows, columns)
+    sure = confidence >= LEAST_CONFIDENCE
+    weight = np.where(sure, confidence, 0).astype(np.float32)
+    image = resize_area(frame.image, columns, rows)
+    keys, values = gather_frame(depth, weight, image, camera, frame.world_from_cam, size)
+    motion = frame.world_from_cam
+    points = unproject_depth(depth, camera) @ motion[:3, :3].T + motion[:3, 3]
+    use = sure & (depth > 0) & (labels != VOID)
+    return keys, values, (voxel_keys(points[use], size), labels[use])
+
+
+def _vote(voxels: Voxels, votes: Sequence[tuple[NDArray[np.int64], NDArray[np.uint8]]]) -> NDArray[np.uint8]:
+    """(V,) the label that most pixels of each voxel have; VOID for a voxel without any."""
+    label = np.full(len(voxels), VOID, np.uint8)
+    if not len(voxels) or not votes:
+        return label
+    at = find(voxels.keys, np.concatenate([keys for keys, _ in votes]))
+    given = np.concatenate([labels for _, labels in votes])
+    counts = np.zeros((len(voxels), 256), np.int32)
+    np.add.at(counts, (at[at >= 0], given[at >= 0]), 1)
+    found = counts.any(1)
+    label[found] = counts[found].argmax(1)
+    return label

@@ -1,0 +1,190 @@
+"""Metres of a room: from the camera's height and from things, whatever its unit; a guess changes no geometry."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from finished import note_finished
+from numpy.typing import NDArray
+
+from formats.jsonfile import read_json, write_json
+from pipelines.config import Config, ExportConfig
+from pipelines.depth.fields import DepthFields
+from pipelines.export.stage import run as export
+from pipelines.geometry.alignment import Similarity
+from pipelines.metres.find import Found, Machine, contradiction, find_metres, known_evidence, load_seen, usual_evidence
+from pipelines.metres.heights import camera_height, floor_trust
+from pipelines.metres.scene import Scene
+from pipelines.metres.things import sizes_of_things
+from pipelines.progress import SilentProgress
+from pipelines.proxy.regions.structure import FLOOR, OTHER, Gravity
+from pipelines.proxy.regions.voxels import Voxels
+from pipelines.run_folder import RunFolder, save_depth_fields
+from pipelines.stages import StageContext
+
+STAGES_DONE = ("frames", "proxy", "tracking", "mapping")
+OracleRun = Callable[..., RunFolder]
+ROTATION = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+
+
+def moved(scale: float) -> Similarity:
+    return Similarity(scale, ROTATION, np.array([3.0, -2, 1]))
+
+
+@pytest.fixture(scope="module")
+def run(oracle_run: OracleRun) -> RunFolder:
+    """Its unit is 0.4 m; classes have their names, and come from files."""
+    return oracle_run(moved(2.5), metric=False, pixel_stride=6)
+
+
+def rescale_depth(run: RunFolder, factor: float) -> None:
+    """What tracking says of proxy depth in a world of another unit."""
+    t = run.load_trajectory("tracking")
+    ids = t.frame_ids[t.is_keyframe]
+    save_depth_fields(run.stage("tracking"), DepthFields({int(i): np.full((9, 12), np.log(factor)) for i in ids}))
+    note_finished(run, STAGES_DONE)
+
+
+def found_in(run: RunFolder, guess: bool = True) -> Found:
+    return find_metres(run, run.load_trajectory("mapping"), None, Machine(), guess)
+
+
+def test_the_scale_is_found_within_its_sigmas_and_says_from_what(run: RunFolder) -> None:
+    rescale_depth(run, 2.5)
+    metres = found_in(run).metres
+    assert metres is not None
+    assert metres.is_guess
+    assert abs(np.log(metres.per_unit / 0.4)) < 2 * metres.relative_sd
+    assert 0.05 < metres.relative_sd <= 0.3
+    assert metres.text.startswith("1 unit = about 0.")
+    assert "a guess, from " in metres.text
+    assert "floor height" in metres.sources
+
+
+def test_it_follows_the_unit_of_the_world(run: RunFolder, oracle_run: OracleRun) -> None:
+    rescale_depth(run, 2.5)
+    other = oracle_run(moved(40.0), metric=False, pixel_stride=6)
+    rescale_depth(other, 40.0)
+    first, second = found_in(run).metres, found_in(other).metres
+    assert first is not None
+    assert second is not None
+    assert first.per_unit / second.per_unit == pytest.approx(16.0, rel=0.03)
+
+
+def test_free_units_stay_free_and_metric_ones_are_known(run: RunFolder, oracle_run: OracleRun) -> None:
+    assert found_in(run, guess=False).metres is None
+    metric = found_in(oracle_run(pixel_stride=6), guess=False).metres
+    assert metric is not None
+    assert not metric.is_guess
+    assert metric.per_unit == pytest.approx(1.0, abs=0.01)
+    assert 0.01 < metric.relative_sd < 0.1
+
+
+def test_depth_in_a_wrong_unit_is_doubted(oracle_run: OracleRun) -> None:
+    run = oracle_run(moved(12.0), pixel_stride=6)
+    rescale_depth(run, 12.0)
+    found = found_in(run)
+    assert found.warning is not None
+    assert "Check its unit" in found.warning
+    seen = load_seen(run, run.load_trajectory("mapping"))
+    assert contradiction(known_evidence(run), usual_evidence(seen, None, Machine())) == found.warning
+    assert found_in(oracle_run(pixel_stride=6)).warning is None
+
+
+def test_a_reference_wins_over_what_is_usual(run: RunFolder) -> None:
+    report = run.load_proxy_report()
+    given = {"metric": True, "scale_from": "reference", "reference_relative_sd": 0.01}
+    try:
+        write_json(run.stage("proxy") / "proxy.json", report | given)
+        rescale_depth(run, 2.5)
+        metres = found_in(run).metres
+    finally:
+        write_json(run.stage("proxy") / "proxy.json", report)
+        note_finished(run, STAGES_DONE)
+    assert metres is not None
+    assert metres.per_unit == pytest.approx(1.0, abs=0.03)
+    assert metres.sources == ("the given reference",)
+
+
+def test_an_export_with_a_guess_differs_in_words_only(run: RunFolder, tmp_path: Path) -> None:
+    rescale_depth(run, 2.5)
+    for scale in ("auto", "free"):
+        (tmp_path / scale).mkdir()
+        config = Config(export=ExportConfig(voxel=0.2, scale=scale))
+        export(StageContext(run, run.root, config, tmp_path / scale, SilentProgress()))
+    guessed, free = tmp_path / "auto", tmp_path / "free"
+    names = {str(p.relative_to(free)) for p in free.rglob("*") if p.is_file()}
+    differ = {n for n in names if (free / n).read_bytes() != (guessed / n).read_bytes()}
+    assert differ == {"README.txt", "trajectory.txt", "scale.json"}
+    rows = [[r for r in (f / "trajectory.txt").read_text().splitlines() if r[0] != "#"] for f in (guessed, free)]
+    assert rows[0] == rows[1]
+    for text in ((guessed / "trajectory.txt").read_text(), (guessed / "README.txt").read_text()):
+        assert "about 0." in text
+        assert "a guess" in text
+    assert "free" in (free / "trajectory.txt").read_text()
+    assert read_json(free / "scale.json") is None
+    assert read_json(guessed / "scale.json")["is_guess"]
+
+
+# scenes of voxels ------------------------------------------------------------------------------------------------
+
+
+def plane(x: tuple[float, float], z: tuple[float, float], height: float, step: float = 0.05) -> NDArray[np.float64]:
+    """(V, 3) level points; y is up."""
+    grid = np.stack(np.meshgrid(np.arange(*x, step), [height], np.arange(*z, step)), -1)
+    return grid.reshape(-1, 3)
+
+
+def scene(parts: list[tuple[NDArray[np.float64], int, str]], centres: NDArray[np.float64]) -> Scene:
+    """Level surfaces with a kind and a class each, seen by cameras."""
+    points = np.concatenate([p for p, _, _ in parts])
+    names = tuple(dict.fromkeys(name for _, _, name in parts))
+    kind = np.concatenate([np.full(len(p), k) for p, k, _ in parts])
+    label = np.concatenate([np.full(len(p), names.index(n), np.uint8) for p, _, n in parts])
+    up = np.array([0.0, 1, 0])
+    normals = np.tile(up, (len(points), 1))
+    voxels = Voxels(
+        0.05, np.arange(len(points)), np.full(len(points), 3.0), points, normals, np.zeros((len(points), 3))
+    )
+    return Scene(voxels, Gravity(up, True), kind, label, names, centres, 2.4)
+
+
+CENTRES = np.stack([np.linspace(0, 4, 20), np.full(20, 1.5), np.full(20, 1.0)], 1)
+FLOOR_PART = (plane((0, 5), (0, 4), 0.0), FLOOR, "floor")
+
+
+def test_tables_and_seats_are_measured_each_by_itself() -> None:
+    tables = [(plane((x, x + 1), (3, 3.6), 0.74), OTHER, "table") for x in (0.0, 3.0)]
+    seat = (plane((1.8, 2.3), (3, 3.5), 0.45), OTHER, "chair")
+    pieces = sizes_of_things(scene([FLOOR_PART, *tables, seat], CENTRES))
+    assert sorted(p.source for p in pieces) == ["chair", "table", "table"]
+    for piece in pieces:
+        assert min(abs(m.log_scale) for m in piece.modes) < 0.08  # a voxel is 7 % of a table's height
+
+
+def test_a_table_top_that_is_lowest_is_no_floor() -> None:
+    only_table = scene([(FLOOR_PART[0], FLOOR, "table")], CENTRES)
+    assert floor_trust(only_table) is None
+    assert camera_height(only_table) == []
+    assert sizes_of_things(only_table) == []
+    unnamed = replace(scene([(FLOOR_PART[0], FLOOR, "object 3")], CENTRES), is_named=False)
+    named = scene([FLOOR_PART], CENTRES)
+    trusts = [floor_trust(unnamed), floor_trust(named)]
+    assert None not in trusts
+    assert trusts[0] > trusts[1]  # type: ignore[operator]
+
+
+def test_on_stairs_the_camera_is_measured_over_its_own_step() -> None:
+    """Four metres up in twenty steps: over the lowest floor the camera hangs at 3.5 m on average."""
+    steps = [(plane((0.25 * k, 0.25 * k + 0.25), (0, 1.2), 0.2 * k), OTHER, "stairs") for k in range(21)]
+    ground = (plane((-2, 0), (0, 1.2), 0.0), FLOOR, "floor")
+    along = np.linspace(-0.5, 5, 40)
+    centres = np.stack([along, 1.5 + 0.8 * np.clip(along, 0, None), np.full(40, 0.6)], 1)
+    pieces = camera_height(scene([ground, *steps], centres))
+    assert len(pieces) == 1
+    main = pieces[0].modes[0]
+    assert abs(main.log_scale) < 0.2  # 1.45 m are meant, and a step or two are looked at from the side
+    assert main.sd > 0.15
+    assert sizes_of_things(scene([ground, *steps], centres)) == []
