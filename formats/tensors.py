@@ -58,7 +58,10 @@ def load_arrays(path: Path) -> dict[str, NDArray]:
         if total > MAX_UNPACKED_BYTES:
             raise InputError(f"{path} would unpack to {total / 1e9:.0f} GB: it is not a file of this program")
         with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
+            arrays = {name: file[name] for name in file.files}
+        if not all(isinstance(array, np.ndarray) for array in arrays.values()):
+            raise ValueError("a member of it is no array")
+        return arrays
 
 
 def save_tensors(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:

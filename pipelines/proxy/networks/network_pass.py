@@ -21,10 +21,18 @@ from pipelines.proxy.sequence import Sequence
 from pipelines.types import Frame
 
 Arrays = dict[str, NDArray]
-_KEY = "key"
-"""Each kept result says what it is of, so that a file moved in its place is seen."""
+_STAMP = "stamp"
 _MEASURED = 3
 _LONG = 120.0
+
+
+def _stamp(key: str, arrays: Arrays) -> str:
+    """What a result is of and what it holds, kept with it: another one in its place, or another content, is seen."""
+    digest = hashlib.sha256(key.encode())
+    for name, array in sorted(arrays.items()):
+        digest.update(f"\0{name} {array.dtype.str} {array.shape}\0".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True)
@@ -41,7 +49,7 @@ class ResultCache:
             if self.megabytes <= 0 or not path.exists():
                 return None
             found = load_arrays(path)
-            if found.pop(_KEY, np.array("")).tolist() != key:
+            if found.pop(_STAMP, np.array("")).tolist() != _stamp(key, found):
                 return None
             os.utime(path)
         except (InputError, OSError) as error:
@@ -56,7 +64,7 @@ class ResultCache:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             with atomic_path(self._path(key)) as temporary, temporary.open("wb") as stream:
-                np.savez_compressed(stream, allow_pickle=False, **arrays, **{_KEY: np.array(key)})
+                np.savez_compressed(stream, allow_pickle=False, **arrays, **{_STAMP: np.array(_stamp(key, arrays))})
         except (InputError, OSError) as error:
             log.info("%s: the result is not kept (%s)", self.folder, error)
 
