@@ -32,7 +32,7 @@ def locked(run: RunFolder) -> Iterator[None]:
             yield
         except InputError as error:
             if made and not isinstance(error, DiskFullError) and not load_records(run):
-                shutil.rmtree(run.root)
+                shutil.rmtree(run.root, ignore_errors=True)  # Windows keeps the open lock
             raise
 
 

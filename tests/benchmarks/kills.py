@@ -114,7 +114,7 @@ def unbroken(clip: Path, work: Path) -> list[dict[str, str]]:
     shutil.rmtree(run.root, ignore_errors=True)
     for change in CHANGES:
         child = in_child(lambda c=change: reconstruct(clip, run, settings(c), SilentProgress()), None)  # type: ignore[misc]
-        assert os.waitpid(child, 0)[1] == 0
+        assert os.waitpid(child, 0)[1] == 0, "the unbroken run failed"
         digests_after.append(digests(run))
     write_json(kept, {"code": code, "digests": digests_after})
     return digests_after
@@ -162,7 +162,9 @@ def main() -> None:
     options = parser.parse_args()
     rng, counts = random.Random(options.seed), collections.Counter[str]()
     options.work.mkdir(parents=True, exist_ok=True)
-    clip = make_clip(options.work / "clip.avi")
+    clip = options.work / "clip.avi"
+    # In a child too: a process whose libraries have begun threads of their own cannot be forked any more.
+    os.waitpid(in_child(lambda: make_clip(clip), None), 0)
 
     whole = unbroken(clip, options.work)
     run = RunFolder(options.work / "killed.msgs")
