@@ -16,6 +16,7 @@ from formats.datasets.scannet import scaled_camera
 from formats.datasets.sequence import Sequence
 from formats.errors import InputError
 from formats.images import MAX_IMAGE_PIXELS, decode_rgb
+from formats.reading import opened, require_file
 from formats.trajectory import clean_poses
 
 _VERSION = 4
@@ -74,7 +75,7 @@ class SensFrames:
         return np.frombuffer(data, dtype="<u2").reshape(height, width).astype(np.uint16)
 
     def _read(self, start: int, length: int) -> bytes:
-        with self.path.open("rb") as file:
+        with opened(self.path) as file:
             file.seek(start)
             return file.read(length)
 
@@ -84,8 +85,8 @@ def open_sens(path: Path) -> Sequence:
 
     Raises InputError for another version or compression, and for a file that ends before its frames do.
     """
-    size = path.stat().st_size
-    with path.open("rb") as file:
+    size = require_file(path)
+    with opened(path) as file:
         header = _read_header(file, path)
         index, poses, times = _read_index(file, path, header.frame_count, size)
     frames = SensFrames(path, header.depth_kind, header.depth_size, *index)

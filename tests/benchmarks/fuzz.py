@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import collections
+import contextlib
 import os
 import resource
 import select
@@ -83,7 +84,8 @@ def campaign(
             longest, largest = max(longest, seconds), max(largest, megabytes)
             if kind not in FINE and keep is not None and found[kind] == 1:
                 kept = keep / f"{name} {number}".replace("/", "_")
-                shutil.copytree(case, kept, symlinks=True, dirs_exist_ok=True)
+                with contextlib.suppress(shutil.Error):  # a pipe cannot be kept
+                    shutil.copytree(case, kept, symlinks=True, dirs_exist_ok=True)
                 (keep / f"{kept.name}.txt").write_text(f"{kind}\n{how}\n")
             shutil.rmtree(case)
     return found, longest, largest
