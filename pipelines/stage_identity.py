@@ -16,12 +16,15 @@ import ast
 import functools
 import hashlib
 import os
+import re
 import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE = Path(__file__).with_name("stage_versions.toml")
 ROOMS = ("pipelines", "formats")
+PACKAGE = "msgs_slam"
+"""What the rooms lie in where the program is installed: imports begin with it there, and say the same."""
 PLUMBING = frozenset(
     [
         "pipelines.config",
@@ -41,6 +44,7 @@ PLUMBING = frozenset(
         "formats.reading",
     ]
 )
+_INSTALLED = re.compile(rb"^(\s*(?:from|import) )msgs_slam\.", re.MULTILINE)
 
 
 @functools.cache
@@ -57,6 +61,7 @@ def source_digest(file: Path, root: Path = ROOT) -> str:
     named = {os.path.relpath(path, root).replace(os.sep, "/"): path for path in stage_sources(file, root)}
     for name, path in sorted(named.items()):
         content = path.read_bytes().replace(b"\r\n", b"\n")
+        content = _INSTALLED.sub(rb"\1", content)
         digest.update(f"{name}\0{hashlib.sha256(content).hexdigest()}\n".encode())
     return digest.hexdigest()[:16]
 
@@ -82,6 +87,7 @@ def _imported_files(path: Path, root: Path) -> tuple[Path, ...]:
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
             names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    names = {n.removeprefix(f"{PACKAGE}.") for n in names}
     inside = {n for n in names if n.split(".")[0] in ROOMS}
     inside |= {n.rsplit(".", k)[0] for n in inside for k in range(1, n.count(".") + 1)}
     files = (file for name in sorted(inside - PLUMBING) for file in _files_of(name, root))

@@ -1,0 +1,118 @@
+"""What a notebook needs: reconstruct a video, open a finished run, look at it from anywhere.
+
+    import msgs_slam
+
+    run = msgs_slam.reconstruct("video.mp4", settings=["mapping.passes=6"])
+    run.world_from_cam            # (N, 4, 4) poses of the posed frames, in the world of the exported files
+    view = run.draw(run.world_from_cam[0])
+    view.color, view.depth, view.labels
+
+Everything else of the program lies beside it under this name: `msgs_slam.formats`, `msgs_slam.pipelines`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from pipelines.evaluation.views import MapView
+    from pipelines.outcome import Outcome
+    from pipelines.types import Intrinsics
+
+__all__ = ["Run", "main", "open_run", "reconstruct"]
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run whose map is done, in the world of its exported files (z up and metres where `world.json` says so)."""
+
+    path: Path
+
+    @cached_property
+    def outcome(self) -> Outcome:
+        """All that the run has found; raises InputError where the folder is no run or its map is not done."""
+        from pipelines.outcome import load_outcome
+        from pipelines.run_folder import RunFolder
+        from pipelines.upright.world import load_world
+
+        found = load_outcome(RunFolder(self.path))
+        found.require_map()
+        world = load_world(found.run)
+        return found if world is None else found.moved(world.exported_from_run)
+
+    @property
+    def names(self) -> list[str]:
+        """File names of the posed frames, in the order of `world_from_cam`."""
+        posed = self.outcome.trajectory.is_posed
+        return [frame.name for frame, has_pose in zip(self.outcome.frames, posed, strict=True) if has_pose]
+
+    @property
+    def world_from_cam(self) -> NDArray[np.float64]:
+        """(N, 4, 4) poses of the posed frames; camera axes x right, y down, z forward."""
+        trajectory = self.outcome.trajectory
+        return trajectory.world_from_cam[trajectory.is_posed]
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """The camera of the undistorted frames, in pixels; the first pixel's centre is (0.5, 0.5)."""
+        return self.outcome.calibration.intrinsics
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the labels."""
+        return self.outcome.classes.names
+
+    def draw(self, world_from_cam: NDArray[np.float64]) -> MapView:
+        """The map as a camera at that pose (4, 4) sees it.
+
+        color (H, W, 3) float32 0..1, depth (H, W) in the unit of the world, labels (H, W) uint8 (255 = none), coverage
+        (H, W). Raises ValueError for another shape.
+        """
+        import numpy as np
+
+        from pipelines.evaluation.measure import render_outcome
+
+        pose = np.asarray(world_from_cam, np.float64)
+        if pose.shape != (4, 4):
+            raise ValueError(f"draw: got a pose of shape {pose.shape}, expected (4, 4)")
+        return render_outcome(self.outcome, np.asarray(np.linalg.inv(pose), np.float64))
+
+
+def open_run(path: Path | str) -> Run:
+    """A finished run folder. Raises InputError where it is none, or its map is not done."""
+    run = Run(Path(path))
+    _ = run.outcome
+    return run
+
+
+def reconstruct(source: Path | str, out: Path | str | None = None, settings: Iterable[str] = ()) -> Run:
+    """Reconstruct a video, a folder of images or a data set, or go on where an interrupted run was; silent.
+
+    out: the run folder, by default the source's name with .msgs in the working folder; settings: as after `--set` on
+    the command line, e.g. "mapping.passes=6". Raises InputError for a source or setting that cannot be used.
+    """
+    from pipelines.config import load_config
+    from pipelines.progress import SilentProgress
+    from pipelines.reconstruct import default_run_folder, existing_config
+    from pipelines.reconstruct import reconstruct as run_reconstruct
+    from pipelines.run_folder import RunFolder
+
+    source = Path(source)
+    run = RunFolder(Path(out)) if out is not None else default_run_folder(source)
+    config = load_config(None, settings, base=existing_config(run))
+    run_reconstruct(source, run, config, SilentProgress())
+    return Run(run.root)
+
+
+def main() -> None:
+    """The command `msgs-slam`."""
+    from msgs_cli.main import main as command
+
+    command()
