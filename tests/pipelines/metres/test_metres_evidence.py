@@ -1,9 +1,16 @@
 """What pieces of evidence say together: exact for Gaussians, robust where one is wrong, and as sure as it should be."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from formats.errors import InputError
+from msgs_cli.tables import scale_lines
 from pipelines.metres.evidence import Evidence, Mode, combine, measured
+from pipelines.metres.files import load_metres, save_metres
+from pipelines.metres.find import describe
+from pipelines.run_folder import RunFolder
 
 
 def gaussian(kind: str, at: float, sd: float, wrong: float = 1e-9, is_guess: bool = False) -> Evidence:
@@ -67,3 +74,24 @@ def test_stated_sigmas_hold_for_worlds_drawn_from_the_priors() -> None:
         found = combine(pieces)
         inside.append(abs(found.log_scale) < 2 * found.sd)
     assert 0.9 < np.mean(inside) < 1.0
+
+
+def test_what_is_stated_survives_the_disk_and_stands_in_status(tmp_path: Path) -> None:
+    """A guess says that it is one; a run whose export is not done says nothing."""
+    metres = describe([
+        measured("door", "door", 2.4, ((2.02, 0.05, 1.0),)),
+        measured("door", "door", 2.5, ((2.02, 0.05, 1.0),)),
+        measured("floor height", "camera height", 1.8, ((1.45, 0.2, 1.0),)),
+    ])  # fmt: skip
+    run = RunFolder(tmp_path)
+    save_metres(run.stage("export"), metres)
+    assert load_metres(run) == metres
+    (line,) = scale_lines(tmp_path, {"export": None})  # type: ignore[dict-item]
+    assert "1 unit = about 0.8" in line
+    assert line.endswith("(a guess, from 2 doors and floor height)")
+    assert scale_lines(tmp_path, {}) == []
+    save_metres(run.stage("export"), None)
+    assert load_metres(run) is None
+    (run.stage("export") / "scale.json").write_text('{"per_unit": "long"}')
+    with pytest.raises(InputError, match=r"scale.json"):
+        load_metres(run)
