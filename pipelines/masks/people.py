@@ -24,10 +24,12 @@ _SURE = 0.75
 """Both networks' mean over a candidate. Chosen on 70 pictures of 7 recordings: people had 0.82 and more, other things
 0.67 and less, but for one rucksack."""
 _LEAST_SHARE = 0.001
-_REACH = 0.02
+_REACH = 0.06
 """Of the picture's long side: what the person network sees so near a candidate belongs to it (feet, hair, hands)."""
-_MARGIN = 0.008
-"""Of the long side: the rim that is left out around people, whose borders are soft in both networks."""
+_MARGIN = 0.012
+"""Of the long side: the rim that is left out around people, whose borders are soft in both networks. With both numbers
+99.3 % of a woman pasted into 12 pictures of a room were found and 3.1 % of the picture beside her; with a third of
+the reach and two thirds of the rim 96.2 and 1.4 %."""
 
 
 @dataclass(frozen=True)

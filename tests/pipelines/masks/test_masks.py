@@ -25,7 +25,10 @@ from pipelines.mapping.views import View, make_view
 from pipelines.masks.files import open_masks
 from pipelines.masks.people import PeopleFinder, join_people, people_cards
 from pipelines.proxy.models.registry import ModelStore
-from pipelines.types import Intrinsics
+from pipelines.proxy.providers import DepthEstimate, LabelEstimate
+from pipelines.proxy.stereo.bands import Bands
+from pipelines.proxy.stereo.sweep import sweep_cost
+from pipelines.types import VOID, Intrinsics
 from tests.pipelines.proxy.tiny_tflite import write_tflite
 
 HEIGHT, WIDTH = 96, 128
@@ -108,6 +111,32 @@ def test_features_corners_and_keyframes_keep_clear() -> None:
     still = choose_keyframes([(g, left_half()) for g in shown], KeyframeOptions())
     assert still.largest_displacement < 0.01
     assert choose_keyframes([(g, ~left_half()) for g in shown], KeyframeOptions()).largest_displacement > 0.05
+
+
+def test_proxies_of_what_is_left_out_are_unknown() -> None:
+    depth = np.ones((HEIGHT, WIDTH), np.float32)
+    normals = np.full((HEIGHT, WIDTH, 3), 70, np.int8)
+    masked = DepthEstimate(depth, depth, 0, normals).without(left_half())
+    for values in (masked.depth, masked.confidence, masked.normals):
+        assert values is not None
+        np.testing.assert_array_equal(np.flatnonzero(values.reshape(HEIGHT, WIDTH, -1)[0].any(-1)), range(64, WIDTH))
+    labels = LabelEstimate(np.zeros((HEIGHT, WIDTH), np.uint8), depth).without(left_half())
+    assert (labels.labels[:, :64] == VOID).all()
+    assert (labels.labels[:, 64:] == 0).all()
+    assert (labels.confidence[:, :64] == 0).all()
+
+
+def test_stereo_compares_no_window_that_touches_what_another_view_leaves_out() -> None:
+    grey = cv2.cvtColor(noise(), cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
+    blanked = np.where(left_half(), np.float32(np.nan), np.roll(grey, -8, 1))
+    shift = np.array([[[1.0, 0, 0, -8], [0, 1, 0, 0], [0, 0, 1, 0]]])  # 8 pixels at the inverse depth 1
+    planes, bands = np.array([0.25, 1.0]), Bands(1)
+    cost = sweep_cost(grey, blanked[None], shift, planes, 1, bands)
+    assert (cost[:, : 64 - 8, 0] == 1).all()  # no view sees it: as good as any other depth
+    assert np.median(cost[10:-10, 84:110, 1]) < 0.05 < 0.4 < np.median(cost[10:-10, 84:110, 0])
+    assert np.isfinite(cost).all()
+    whole = sweep_cost(grey, np.stack([blanked, np.roll(grey, -8, 1)]), shift.repeat(2, 0), planes, 1, bands)
+    assert np.median(whole[10:-10, 30:110, 1]) < 0.05  # another view does
 
 
 # people -----------------------------------------------------------------------------------------------------------
