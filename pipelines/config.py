@@ -77,6 +77,10 @@ class FramesConfig:
         "auto", "auto leaves people out where networks for them are in the cache; keep takes them for scene",
         ("auto", "keep"),
     )  # fmt: skip
+    least_piece: int = setting(
+        8, "keyframes that cannot be placed among the others but among each other make a piece, from so many on",
+        within=(3, 1_000_000),
+    )  # fmt: skip
     mapper: str = setting("auto", "structure from motion at once or view by view", ("auto", "global", "incremental"))
 
 

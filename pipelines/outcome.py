@@ -56,7 +56,7 @@ class Outcome:
     is done; label_of_channel (C,) takes a class channel of the map to its label. `metric`: whether the world's unit is
     the metre of the proxy depth. vocabulary: the classes that the network which labelled it knows, () without one.
     `move`: how all of it has been moved out of the run's own world. `metres`: how long the unit is, as far as the
-    export could tell."""
+    export could tell. piece: "" for the largest one, which has all there is; of another, trajectory and points."""
 
     run: RunFolder
     records: Mapping[str, StageRecord]
@@ -75,6 +75,7 @@ class Outcome:
     vocabulary: tuple[str, ...]
     move: Similarity | None = None
     metres: Metres | None = None
+    piece: str = ""
 
     @property
     def source_is_folder(self) -> bool:
@@ -90,6 +91,8 @@ class Outcome:
 
     def load_sparse(self) -> SparseModel | None:
         """Points and their observations as the last stage that has any left them."""
+        if self.piece:
+            return self.run.load_sparse("tracking", self.piece)
         for stage in (self.pose_stage, "tracking"):
             if self.run.has_sparse(stage):
                 return self._in_this_world(self.run.load_sparse(stage))
@@ -114,6 +117,14 @@ class Outcome:
             gaussian_map=None if self.gaussian_map is None else self.gaussian_map.moved(other_from_run),
             move=other_from_run,
         )
+
+    def pieces(self) -> list[Outcome]:
+        """What nothing joins to the rest, each in a world of its own without metres, largest first."""
+        names = self.run.pieces("tracking")
+        return [
+            replace(self, piece=n, trajectory=self.run.load_trajectory("tracking", n), metric=False, metres=None)
+            for n in names
+        ]
 
     def frame_row(self, frame_id: int) -> int:
         """Row of a frame in the trajectory."""

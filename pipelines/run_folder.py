@@ -13,6 +13,7 @@ is given the folder of the running stage.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from itertools import count, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,18 +86,17 @@ class RunFolder(FinishedFiles):
 
     def load_features(self, frame_id: int) -> Features | None:
         """Features of a keyframe in undistorted pixels; None for any other frame."""
-        if not self.has("frames", features_name(frame_id)):
-            return None
-        return Features(**load_layout(self.file("frames", features_name(frame_id)), stored.FEATURES))
+        name = features_name(frame_id)
+        return Features(**load_layout(self.file("frames", name), stored.FEATURES)) if self.has("frames", name) else None
 
     def load_vocabulary(self) -> Vocabulary:
         """By which frames are described and compared."""
         return Vocabulary(**load_layout(self.file("frames", VOCABULARY), stored.VOCABULARY))
 
     def load_tried(self) -> dict[tuple[int, int], int]:
-        """Inverse of `save_tried`."""
-        rows = load_layout(self.file("frames", TRIED), stored.TRIED)["rows"].tolist()
-        return {(first, second): count for first, second, count in rows}
+        """Pairs that were matched: see `save_matching`."""
+        rows = load_layout(self.file("frames", TRIED), stored.TRIED)["rows"]
+        return {(first, second): matches for first, second, matches in rows.tolist()}
 
     def image(self, frame: Frame) -> NDArray[np.uint8]:
         """(H, W, 3) RGB, undistorted."""
@@ -153,9 +153,13 @@ class RunFolder(FinishedFiles):
 
     # tracking, mapping, global_ba -------------------------------------------------------------------------------
 
-    def load_trajectory(self, stage: str) -> Trajectory:
+    def pieces(self, stage: str) -> list[str]:
+        """Folders inside `stage` ("frames", "tracking") of the pieces that nothing joins to the rest, largest first."""
+        return list(takewhile(lambda piece: self.has(stage, piece + SPARSE), (f"piece_{n}/" for n in count(2))))
+
+    def load_trajectory(self, stage: str, piece: str = "") -> Trajectory:
         """The poses as `stage` ("tracking", "mapping" or "global_ba") left them."""
-        path = self.file(stage, TRAJECTORY)
+        path = self.file(stage, piece + TRAJECTORY)
         arrays = load_layout(path, stored.TRAJECTORY)
         with reading(path, "trajectory"):
             stored.require_increasing("frame_ids", arrays["frame_ids"])
@@ -167,9 +171,9 @@ class RunFolder(FinishedFiles):
         """Whether `stage` has left points."""
         return self.has(stage, SPARSE)
 
-    def load_sparse(self, stage: str) -> SparseModel:
+    def load_sparse(self, stage: str, piece: str = "") -> SparseModel:
         """Keyframe poses and points as `stage` left them."""
-        return load_sparse_model(self.file(stage, SPARSE))
+        return load_sparse_model(self.file(stage, piece + SPARSE))
 
     def load_depth_fields(self, stage: str) -> DepthFields:
         """What brings proxy depths into the world of `stage`, tracking or global_ba."""
@@ -264,13 +268,9 @@ def features_name(frame_id: int) -> str:
     return f"correspondence/{frame_id:06d}.npz"
 
 
-def save_vocabulary(folder: Path, vocabulary: Vocabulary) -> None:
-    """One npz."""
+def save_matching(folder: Path, vocabulary: Vocabulary, tried: dict[tuple[int, int], int]) -> None:
+    """tried: (first, second) frame ids of every pair of keyframes that was matched → matches that obey one geometry."""
     save_arrays(folder / VOCABULARY, vars(vocabulary))
-
-
-def save_tried(folder: Path, tried: dict[tuple[int, int], int]) -> None:
-    """(first, second) frame ids of every pair of keyframes that was matched → matches that obey one geometry."""
     rows = np.array([(*pair, count) for pair, count in tried.items()], np.int64).reshape(-1, 3)
     save_arrays(folder / TRIED, {"rows": rows})
 

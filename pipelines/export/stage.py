@@ -43,6 +43,7 @@ def run(context: StageContext) -> dict[str, Any]:
         )
     found = replace(found, metres=guess_metres(context, found, settings))
     outcome = found.moved(world.exported_from_run)
+    write_pieces(found, context.folder)
     write_all_but_mesh(outcome, world, settings, context.folder)
     mesh = _finished_mesh(context.folder)
     if mesh is None:
@@ -86,6 +87,12 @@ def export_inputs(source: Path, config: Config) -> str | None:
     """The network that the guess is made with."""
     card = metric_card() if config.export.scale == "auto" else None
     return None if card is None else card_identity(card)
+
+
+def write_pieces(found: Outcome, folder: Path) -> list[Path]:
+    """piece_2 and so on: the COLMAP model and the trajectory of what nothing joins to the rest."""
+    places = [(piece, folder / piece.piece) for piece in found.pieces()]
+    return [path for piece, place in places for path in write_colmap(piece, place) + write_trajectory(piece, place)]
 
 
 def find_world(outcome: Outcome, settings: ExportConfig) -> World:

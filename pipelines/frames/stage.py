@@ -32,8 +32,8 @@ from pipelines.run_folder import (
     save_calibration,
     save_features,
     save_frames,
-    save_tried,
-    save_vocabulary,
+    save_matching,
+    save_sparse,
 )
 from pipelines.stages import Stage, StageContext
 from pipelines.structure.backbone import to_sparse_model
@@ -231,6 +231,12 @@ def warn_of_structure(context: StageContext, structure: Structure, ids: list[int
         context.warn(
             f"structure from motion could not place {report.total - report.registered} of {report.total} keyframes"
         )
+    for piece in structure.pieces:
+        inside = sorted(ids[i - 1] for i in piece.reg_image_ids())
+        context.warn(
+            f"{len(inside)} of them, frames {inside[0]}-{inside[-1]}, fit among each other: what tracking does not "
+            "find elsewhere becomes a piece of its own"
+        )
     parts = [p for p in report.parts if len(p) >= _LEAST_PART]
     if len(parts) > 1:
         named = ", ".join(f"{ids[p[0]]}-{ids[p[-1]]}" for p in parts)
@@ -278,10 +284,13 @@ def _calibration(context: StageContext, lens: Lens, origin: str, focal_sd: float
 def _write_backbone(
     context: StageContext, structure: Structure, keyframes: list[int], lens: Lens, frames: list[Frame]
 ) -> None:
-    model = to_sparse_model(
-        structure.model, keyframes, lens, lambda frame_id: read_rgb(_picked(context, frames[frame_id].name))
-    )
+    def load_rgb(frame_id: int) -> NDArray[np.uint8]:
+        return read_rgb(_picked(context, frames[frame_id].name))
+
+    model = to_sparse_model(structure.model, keyframes, lens, load_rgb)
     save_backbone(context.folder, model)
+    for number, piece in enumerate(structure.pieces, 2):
+        save_sparse(context.folder / f"piece_{number}", to_sparse_model(piece, keyframes, lens, load_rgb))
 
 
 def _write_correspondences(context: StageContext, structure: Structure, keyframes: list[int], lens: Lens) -> None:
@@ -291,9 +300,9 @@ def _write_correspondences(context: StageContext, structure: Structure, keyframe
         # What a lens of much distortion cannot have seen lies nowhere in the picture.
         keypoints[:, :2] = np.nan_to_num(lens.undistort_points(features.xy), nan=-1.0, posinf=-1.0, neginf=-1.0)
         save_features(context.folder, frame_id, replace(features, keypoints=keypoints))
-    save_vocabulary(context.folder, structure.vocabulary)
     found = {(p.first, p.second): len(p.matches) for p in structure.pairs}
-    save_tried(context.folder, {(keyframes[i], keyframes[j]): found.get((i, j), 0) for i, j in structure.tried})
+    tried = {(keyframes[i], keyframes[j]): found.get((i, j), 0) for i, j in structure.tried}
+    save_matching(context.folder, structure.vocabulary, tried)
 
 
 def _write_frames(context: StageContext, source: AnySource, frames: list[Frame], lens: Lens) -> None:

@@ -61,8 +61,12 @@ class ModelReport:
     @property
     def is_sound(self) -> bool:
         """Whether the other mapper need not be asked."""
-        whole = len(self.parts[0]) >= 0.95 * self.total
-        return whole and self.pairs_agreeing >= 0.9 and not self.contradicted
+        return len(self.parts[0]) >= 0.95 * self.total and self.is_consistent
+
+    @property
+    def is_consistent(self) -> bool:
+        """Whether what is placed agrees with the pictures."""
+        return self.pairs_agreeing >= 0.9 and not self.contradicted
 
 
 def judge(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -32,7 +32,7 @@ from pipelines.structure.adjust import adjust
 from pipelines.structure.consistency import ModelReport, judge, without_misplaced
 from pipelines.structure.mappers import calibrate_focal, map_globally, map_incrementally
 from pipelines.structure.parallax import HOW_TO_FILM, require_parallax
-from pipelines.structure.seams import cut
+from pipelines.structure.seams import cut, take_out
 from pipelines.types import Features, Vocabulary
 
 _PAIRS_PER_BLOCK = 64
@@ -47,7 +47,8 @@ class Structure:
     """An adjusted reconstruction (image i + 1 is keyframe i, camera 1 is the only one) and how good it is.
 
     No point is seen from two of the report's parts: nothing tells how these lie to each other. `tried` are the pairs
-    of keyframes that were matched, `pairs` those of them that obey one geometry.
+    of keyframes that were matched, `pairs` those of them that obey one geometry. `pieces` are further models, in the
+    same camera, of keyframes that the ones before could not place, each with a world and a unit of its own.
     """
 
     model: pycolmap.Reconstruction
@@ -58,6 +59,7 @@ class Structure:
     vocabulary: Vocabulary
     tried: list[tuple[int, int]]
     pairs: list[VerifiedPair]
+    pieces: list[pycolmap.Reconstruction]
 
 
 @dataclass(frozen=True)
@@ -85,11 +87,45 @@ class StructureFromMotion:
         xy = [f.xy for f in features]
         known_focal = self.camera.mean_focal_length() if self.camera.has_prior_focal_length else None
         require_parallax(pairs, xy, (self.camera.width, self.camera.height), known_focal)
-        model, mapper, _ = self._map(features, pairs)
+        found = self._map(features, pairs)
+        if found is None:
+            raise InputError(
+                f"no structure could be found: {len(pairs)} pairs of {len(features)} views match. The views have too "
+                f"little texture, blur or overlap. {HOW_TO_FILM}, slowly and in good light"
+            )
+        model, mapper, _ = found
         focal_sd = adjust(model, refine_camera=not self.is_fixed)
         report = judge(model, pairs, xy, len(features), self.config.overlap)
         cut(model, report.parts)
-        return Structure(model, report, mapper, focal_sd, features, vocabulary, tried, pairs)
+        pieces = self._pieces(features, pairs, model)
+        return Structure(model, report, mapper, focal_sd, features, vocabulary, tried, pairs, pieces)
+
+    def _pieces(
+        self, features: Sequence[Features], pairs: Sequence[VerifiedPair], model: pycolmap.Reconstruction
+    ) -> list[pycolmap.Reconstruction]:
+        """Sound models of the keyframes that `model` leaves, in its camera, until there is none of the least size."""
+        camera, xy = model.cameras[1], [f.xy for f in features]
+        camera.has_prior_focal_length = True
+        left = set(range(len(features))) - {i - 1 for i in model.reg_image_ids()}
+        pieces: list[pycolmap.Reconstruction] = []
+        number = 1
+        while True:
+            number += 1
+            rest = [p for p in pairs if p.first in left and p.second in left]
+            if len({k for p in rest for k in (p.first, p.second)}) < self.config.least_piece:
+                return pieces
+            snapshots = Snapshots(self.snapshots.folder / f"piece_{number}")
+            snapshots.folder.mkdir(exist_ok=True)
+            found = replace(self, camera=camera, is_fixed=True, snapshots=snapshots)._map(features, rest)
+            if found is None or found[2].registered < self.config.least_piece:
+                return pieces
+            piece = found[0]
+            adjust(piece, refine_camera=False)
+            report = judge(piece, rest, xy, len(features), self.config.overlap)
+            left -= {i - 1 for i in piece.reg_image_ids()}
+            if len(report.parts[0]) >= self.config.least_piece and report.is_consistent:
+                take_out(piece, [k for part in report.parts[1:] for k in part])
+                pieces.append(piece)
 
     def _features(self, keyframe_ids: Sequence[int]) -> list[Features]:
         def extract(frame_id: int) -> Features:
@@ -123,8 +159,9 @@ class StructureFromMotion:
 
     def _map(
         self, features: Sequence[Features], pairs: Sequence[VerifiedPair]
-    ) -> tuple[pycolmap.Reconstruction, str, ModelReport]:
-        """The better of the global and the incremental model; the second is only made when the first is doubtful."""
+    ) -> tuple[pycolmap.Reconstruction, str, ModelReport] | None:
+        """The better of the global and the incremental model, None where neither is any; the second is only made when
+        the first is doubtful."""
         xy = [f.xy for f in features]
         best: tuple[pycolmap.Reconstruction, str, ModelReport] | None = None
         wanted = ("global", "incremental") if self.config.mapper == "auto" else (self.config.mapper,)
@@ -139,10 +176,7 @@ class StructureFromMotion:
             if best is None or report.score > best[2].score:
                 best = model, name, report
         if best is None or best[2].registered < min(_MIN_KEYFRAMES, len(features)) or best[2].points < _MIN_POINTS:
-            raise InputError(
-                f"no structure could be found: {len(pairs)} pairs of {len(features)} views match. The views have too "
-                f"little texture, blur or overlap. {HOW_TO_FILM}, slowly and in good light"
-            )
+            return None
         return best
 
     def _run_mapper(

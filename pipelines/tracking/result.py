@@ -24,6 +24,21 @@ def keep_largest_segment(state: TrackState) -> None:
     state.keyframes = [k for k in state.keyframes if k in state.poses]
 
 
+def take_pieces(state: TrackState, least: int) -> list[TrackState]:
+    """The segments but the largest that have at least so many frames, largest first, each in a world of its own."""
+    counts = Counter(state.segment.values())
+    order = sorted(counts, key=lambda s: (-counts[s], s))[1:]
+    pieces = []
+    for segment in (s for s in order if counts[s] >= least):
+        inside = [i for i in sorted(state.poses) if state.segment[i] == segment]
+        poses, sightings = {i: state.poses[i] for i in inside}, {i: state.sightings[i] for i in inside}
+        keyframes = [k for k in state.keyframes if k in poses]
+        piece = TrackState(state.points, state.colors, poses, sightings, keyframes, segment=dict.fromkeys(inside, 0))
+        normalise(piece)
+        pieces.append(piece)
+    return pieces
+
+
 def normalise(state: TrackState) -> None:
     """Keep one world, the first posed camera its origin."""
     keep_largest_segment(state)

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 from formats.errors import InputError
-from pipelines.run_folder import save_depth_fields, save_figures, save_sparse, save_trajectory
+from pipelines.run_folder import RunFolder, save_depth_fields, save_figures, save_sparse, save_trajectory
 from pipelines.stages import Stage, StageContext
 from pipelines.stopping import is_asked
 from pipelines.tracking.adjust import Report, adjust_state, align_depths, without_dependent_depth
 from pipelines.tracking.front_end import FrontEnd
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.refine import RenderWeights, compare_frame
-from pipelines.tracking.result import normalise, to_sparse_model, to_trajectory
+from pipelines.tracking.result import normalise, take_pieces, to_sparse_model, to_trajectory
 from pipelines.tracking.segments import join_segments, split_segments
 from pipelines.tracking.state import FEATURE_SD, TrackState
 from pipelines.types import Frame
@@ -38,6 +38,8 @@ def run(context: StageContext) -> dict[str, Any]:
         )
     report = adjust_state(state, intrinsics, pictures.proxy, metric, settings)
     compared = compare_all(context, state, pictures) if settings.render == "all" else {}
+    pieces = take_pieces(state, context.config.frames.least_piece)
+    save_pieces(context, pieces, frames)
     normalise(state)
 
     trajectory = to_trajectory(state, frames)
@@ -45,7 +47,7 @@ def run(context: StageContext) -> dict[str, Any]:
     model = to_sparse_model(state)
     save_sparse(context.folder, model)
     save_depth_fields(context.folder, align_depths(model, report, intrinsics, pictures.proxy))
-    figures = {**describe(state, frames, report, metric), **compared}
+    figures = {**describe(state, frames, report, metric), **compared, "pieces": [len(p.poses) for p in pieces]}
     if "reference_relative_sd" in proxy:  # what the user's reference leaves open; depths agree far better
         figures["scale_relative_sd"] = proxy["reference_relative_sd"]
     save_figures(context.folder, "tracking", figures)
@@ -70,8 +72,21 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
     # Frames before the first keyframe could not be followed from anywhere; now there are neighbours behind them.
     for frame_id in sorted(state.lost, reverse=True):
         front_end.track(frame_id, may_start=False)
+    add_pieces(state, context.run, context.config.frames.least_piece)
+    for order in (sorted(state.lost), sorted(state.lost, reverse=True)):
+        for frame_id in order if context.run.pieces("frames") else ():
+            if frame_id in state.lost:
+                front_end.track(frame_id, may_start=False)
     join_segments(state, pictures, intrinsics, context.config.run.seed)
     return state
+
+
+def add_pieces(state: TrackState, run: RunFolder, least: int) -> None:
+    """What structure from motion could place only among itself, and nothing has placed since, as further segments."""
+    for piece in run.pieces("frames"):
+        model = TrackState.from_backbone(run.load_sparse("frames", piece), FEATURE_SD)
+        if sum(k not in state.poses for k in model.keyframes) >= least:
+            state.add_segment(model)
 
 
 def start_state(context: StageContext) -> TrackState:
@@ -98,6 +113,18 @@ def compare_all(context: StageContext, state: TrackState, pictures: Pictures) ->
             better.append(found.loss_after / found.loss_before)
     share = float(np.mean(better)) if better else 1.0
     return {"compared": len(others), "compared_better": len(better), "compared_loss_ratio": round(share, 4)}
+
+
+def save_pieces(context: StageContext, pieces: list[TrackState], frames: list[Frame]) -> None:
+    """What nothing joins to the rest, each in a world and a unit of its own."""
+    for number, piece in enumerate(pieces, 2):
+        folder = context.folder / f"piece_{number}"
+        save_trajectory(folder, to_trajectory(piece, frames))
+        save_sparse(folder, to_sparse_model(piece))
+        context.warn(
+            f"{len(piece.poses)} frames ({stretches(sorted(piece.poses))}) are posed among each other, but nothing "
+            f"tells how they lie to the rest: they are exported apart, as piece_{number}"
+        )
 
 
 def describe(state: TrackState, frames: list[Frame], report: Report, metric: bool) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -85,6 +85,14 @@ class TrackState:
         self.lost.pop(frame_id, None)
         if is_keyframe:
             self.keyframes = sorted({*self.keyframes, frame_id})
+
+    def add_segment(self, other: TrackState) -> None:
+        """The keyframes of another world that are not posed yet, with their points, as a segment of their own."""
+        first = self.add_points(other.points, other.colors)[:1]
+        segment = max(self.segment.values(), default=-1) + 1
+        for k in (k for k in other.keyframes if k not in self.poses):
+            seen = other.sightings[k]
+            self.add_frame(k, other.poses[k], replace(seen, point=seen.point + first), True, segment)
 
     def add_points(self, points: Array, colors: NDArray[np.uint8]) -> NDArray[np.int64]:
         """Their indices (Q,)."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipelines.correspondence.features import extract_features, to_grey
 from pipelines.correspondence.retrieval import learn_vocabulary
-from pipelines.run_folder import save_features, save_tried, save_vocabulary
+from pipelines.run_folder import save_features, save_matching
 
 
 def keep_correspondences(folder: Path, pictures: Mapping[int, np.ndarray]) -> None:
@@ -17,5 +17,4 @@ def keep_correspondences(folder: Path, pictures: Mapping[int, np.ndarray]) -> No
     features = {i: extract_features(to_grey(rgb), 1500, 0.005) for i, rgb in pictures.items()}
     for frame_id, found in features.items():
         save_features(folder, frame_id, found)
-    save_vocabulary(folder, learn_vocabulary(list(features.values()), 0))
-    save_tried(folder, {})
+    save_matching(folder, learn_vocabulary(list(features.values()), 0), {})

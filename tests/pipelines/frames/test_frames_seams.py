@@ -166,7 +166,7 @@ def test_what_is_wrong_is_said(
     context = make_context(tmp_path)
     warn_of_structure(
         context,
-        Structure(pycolmap.Reconstruction(), report, "global", 0.0, [], NO_WORDS, [], []),
+        Structure(pycolmap.Reconstruction(), report, "global", 0.0, [], NO_WORDS, [], [], []),
         list(range(0, 18, 2)),
     )
     assert len(context.warnings) == len(wanted)
@@ -177,7 +177,7 @@ def test_pairs_far_apart_that_contradict_are_no_fold(make_context: Callable[...,
     report = ModelReport(9, 9, 500, 0.3, 0.8, 0.69, (_seam(0),), (tuple(range(9)),))
     context = make_context(tmp_path)
     warn_of_structure(
-        context, Structure(pycolmap.Reconstruction(), report, "global", 0.0, [], NO_WORDS, [], []), list(range(9))
+        context, Structure(pycolmap.Reconstruction(), report, "global", 0.0, [], NO_WORDS, [], [], []), list(range(9))
     )
     assert len(context.warnings) == 1
     assert re.search("far apart contradict .* 69% of the matched pairs", context.warnings[0])

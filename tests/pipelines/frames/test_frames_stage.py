@@ -194,3 +194,28 @@ def test_an_unreadable_image_is_left_out_with_a_warning(
     assert figures["keyframes_placed"] == figures["keyframes"]
     assert any("view_004.png" in w for w in context.warnings)
     assert not (context.folder / "view_004.png").exists()
+
+
+def test_what_shows_another_place_is_a_piece_of_its_own(
+    tmp_path: Path, make_context: Callable[..., StageContext]
+) -> None:
+    """A walk, cut to the walk through the mirrored room, of which no picture fits the others."""
+    folder = tmp_path / "both"
+    walk = write_walk(folder, sideways(WALK_FRAMES))
+    for i, (center, rotation) in enumerate(sideways(8)):
+        write_rgb(folder / f"view_{WALK_FRAMES + i:03d}.png", np.ascontiguousarray(render(center, rotation)[:, ::-1]))
+    context = make_context(folder, "frames.least_piece=5")
+    run(context)
+    context.folder.rename(context.run.stage("frames"))
+    backbone, pieces = context.run.load_backbone(), context.run.pieces("frames")
+    assert backbone is not None
+    assert len(pieces) == 1
+    piece = context.run.load_sparse("frames", pieces[0])
+    assert backbone.frame_ids.max() < WALK_FRAMES <= piece.frame_ids.min()
+    assert len(backbone.frame_ids) >= 10
+    assert len(piece.frame_ids) >= 6
+    assert any("fit among each other" in w for w in context.warnings)
+    truth = np.array([center for center, _ in sideways(8)])[piece.frame_ids - WALK_FRAMES] * [-1, 1, 1]
+    found = np.linalg.inv(piece.cam_from_world)[:, :3, 3]
+    moved = align_points(found, truth, with_scale=True).apply(found)
+    assert 0 < np.linalg.norm(moved - truth, axis=1).max() < 0.03 < np.ptp(walk.centers[:, 0])
