@@ -158,3 +158,9 @@ def test_export_with_other_settings_must_say_where_to(tmp_path: Path) -> None:
     result = invoke("export", tmp_path, "--set", "export.voxel=0.02")
     assert result.exit_code == 2
     assert "--to" in result.stderr
+
+
+def test_a_class_map_that_is_none_is_refused_before_the_run_is_looked_at(tmp_path: Path) -> None:
+    result = invoke("evaluate", tmp_path / "no.msgs", "--truth", tmp_path, "--class-map", "mine.toml")
+    assert result.exit_code == 1
+    assert "mine.toml: there is no such file, nor a class map of that name; known: ade20k-replica" in result.stderr
