@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from formats.errors import InputError
 from formats.gaussian_files import read_gaussians
+from formats.reading import reaching
 from pipelines.evaluation.measure import evenly
 from pipelines.gaussian_map import decided_channels
 from pipelines.outcome import Outcome, labels_of_channels, load_outcome
@@ -70,9 +71,11 @@ class ViewerScene:
 
 def load_scene(path: Path) -> ViewerScene:
     """Of a run folder or a file of Gaussians. Raises InputError for anything else, or a run without a map."""
-    if path.is_file():
+    with reaching(path):
+        is_file, is_folder = path.is_file(), path.is_dir()
+    if is_file:
         return _from_file(path)
-    if not path.is_dir():
+    if not is_folder:
         raise InputError(f"{path}: there is no such run folder or splat file")
     return _from_run(load_outcome(RunFolder(path)))
 

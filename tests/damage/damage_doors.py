@@ -8,6 +8,7 @@ outside the folder. A reader may refuse anything with InputError.
 from __future__ import annotations
 
 import math
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ from formats.datasets.intrinsics_json import read_intrinsics_json
 from formats.datasets.scannet_labels import read_nyu40_classes
 from formats.errors import InputError
 from formats.gaussian_files import read_gaussians
+from formats.gaussian_glb import write_gaussian_glb
 from formats.gaussian_ply import write_gaussian_ply
 from formats.gaussians import GaussianCloud
 from formats.image_times import read_image_times
@@ -56,7 +58,9 @@ from formats.tensors import load_arrays, load_safetensors, load_tensors, save_ar
 from formats.trajectory import read_matrices, read_tum, write_matrices, write_tum
 from formats.video import VideoReader, probe_video
 from formats.video_writer import write_video
+from pipelines.evaluation.class_map import read_class_map
 from pipelines.frames.source import open_source
+from pipelines.masks.files import open_masks
 from pipelines.proxy.files.classes import read_class_table
 from pipelines.proxy.files.depth import _read as read_depth_file
 from pipelines.proxy.models.registry import ModelStore
@@ -207,7 +211,7 @@ def data_set(format: str) -> Callable[[Path], None]:
         need(0 < recording.depth_per_metre < math.inf, "depth scale")
         root = (path if path.is_dir() else path.parent).resolve()
         for file in (*recording.image_paths, *recording.depth_paths, *recording.label_paths):
-            need(file is None or file.is_symlink() or file.resolve().is_relative_to(root), f"outside: {file}")
+            need(file is None or os.path.islink(file) or file.resolve().is_relative_to(root), f"outside: {file}")
         read_any(path, *(lambda _, i=i: judge_frame(recording, i) for i in range(min(len(recording), 2))))
         source(path)
 
@@ -220,6 +224,12 @@ def judge_frame(recording: Sequence, index: int) -> None:
     if depth is not None:
         finite(depth, "depth")
     recording.labels(index)
+
+
+def masks(folder: Path) -> None:
+    opened = open_masks(folder / "masks", open_source(folder / "rgb"))
+    for index in range(2):
+        opened.left_out(index, WIDTH, HEIGHT)
 
 
 def video(path: Path) -> None:
@@ -364,6 +374,12 @@ def make_images(folder: Path) -> None:
     )
 
 
+def make_masks(folder: Path) -> None:
+    for i in range(2):
+        write_rgb(folder / "rgb" / f"{i}.jpg", _rgb(i))
+        write_grey_png(folder / "masks" / f"{i}.png", np.full((HEIGHT, WIDTH), 255 * i, np.uint8))
+
+
 def make_video(name: str, codec: str) -> Callable[[Path], None]:
     def make(folder: Path) -> None:
         if codec:
@@ -427,6 +443,7 @@ def text(name: str, content: str) -> Callable[[Path], None]:
 
 ARRAYS = {"a": np.arange(20.0), "b": np.ones((3, 4), np.uint8), "s": np.array(["x", ""])}
 NYU = "id\traw_category\tnyu40id\tnyu40class\n1\twall\t1\twall\n2\tchair\t5\tchair\n22\tx\t0\tunannotated\n"
+CLASS_MAP = 'truth = ["wall", "couch"]\n[classes]\nwall = "wall"\nsofa = ["couch", "wall"]\n'
 JSON_HEAD = with_json_head(0)
 
 DOORS: dict[str, Door] = {
@@ -437,6 +454,11 @@ DOORS: dict[str, Door] = {
     "SPZ": Door(lambda f: write_spz(f / "a.spz", _cloud()), gaussians, "a.spz"),
     ".splat": Door(make_splat, gaussians, "a.splat"),
     "compact map": Door(lambda f: write_compact(f / "a.safetensors", _cloud()), gaussians, "a.safetensors", JSON_HEAD),
+    "Gaussian GLB": Door(
+        lambda f: write_gaussian_glb(f / "a.glb", _cloud()), gaussians, "a.glb", with_json_head(12)
+    ),
+    "class map": Door(text("a.toml", CLASS_MAP), read_class_map, "a.toml"),
+    "masks": Door(make_masks, masks, damaged="0.png"),
     "mesh PLY": Door(lambda f: write_mesh_ply(f / "a.ply", *_mesh()), mesh(read_mesh_ply), "a.ply", in_ply),
     "mesh GLB": Door(lambda f: write_mesh_glb(f / "a.glb", *_mesh()), mesh(read_mesh_glb), "a.glb", with_json_head(12)),
     "npz": Door(lambda f: save_arrays(f / "a.npz", ARRAYS), load_arrays, "a.npz"),
