@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from pipelines.proxy.regions.voxels import Voxels, find, neighbour_keys
 
 _ALIKE = (
-    frozenset({"bed", "sofa", "armchair", "chair", "seat", "swivel chair", "bench", "ottoman", "stool"}),
+    frozenset({"bed", "seating", "sofa", "armchair", "chair", "seat", "swivel chair", "bench", "ottoman", "stool"}),
     frozenset({"cabinet", "shelf", "wardrobe", "bookcase", "chest of drawers", "buffet"}),
     frozenset({"table", "desk", "coffee table", "counter", "countertop", "kitchen island"}),
 )
