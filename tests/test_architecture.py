@@ -15,6 +15,13 @@ FORBIDDEN = {
 }
 
 
+FLOORS = (
+    {"geometry"}, {"world"}, {"correspondence"}, {"depth"}, {"gaussians"}, {"structure"}, {"frames", "masks", "proxy"},
+    {"tracking"}, {"mapping"}, {"global_ba"}, {"export", "upright"}, {"evaluation"},
+)  # fmt: skip
+"""The folders of pipelines/, each above those that it may import; on one floor, those that need each other."""
+
+
 def imported_packages(path: Path) -> set[str]:
     """Top-level packages that a file imports anywhere."""
     found: set[str] = set()
@@ -31,6 +38,30 @@ def test_imports_go_one_way(room: str) -> None:
     files = sorted((ROOT / room).rglob("*.py"))
     assert files
     wrong = {str(f.relative_to(ROOT)): imported_packages(f) & FORBIDDEN[room] for f in files}
+    assert not {name: bad for name, bad in wrong.items() if bad}
+
+
+def imported_folders(path: Path) -> set[str]:
+    """Folders of pipelines/ that a file imports from anywhere."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names = [a.name for a in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
+        if isinstance(node, ast.ImportFrom):
+            names = [f"{node.module}.{name}" for name in names]
+        found |= {n.split(".")[1] for n in names if n.startswith("pipelines.")}
+    return found
+
+
+def test_every_folder_stands_on_one_floor() -> None:
+    folders = {p.parent.name for p in (ROOT / "pipelines").glob("*/__init__.py")}
+    assert sorted(name for floor in FLOORS for name in floor) == sorted(folders)
+
+
+@pytest.mark.parametrize("height", range(len(FLOORS)), ids=lambda h: "+".join(sorted(FLOORS[h])))
+def test_no_folder_imports_one_above_it(height: int) -> None:
+    above = set().union(*FLOORS[height + 1 :])
+    files = [f for folder in FLOORS[height] for f in sorted((ROOT / "pipelines" / folder).rglob("*.py"))]
+    wrong = {str(f.relative_to(ROOT)): imported_folders(f) & above for f in files}
     assert not {name: bad for name, bad in wrong.items() if bad}
 
 
