@@ -83,6 +83,11 @@ class Intrinsics:
         """(3, 3) calibration matrix K."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
+    def at_most(self, side: int) -> Intrinsics:
+        """The camera of images whose long side is at most `side` pixels; 0 leaves it as it is."""
+        scale = min(1.0, side / max(self.width, self.height)) if side > 0 else 1.0
+        return self.resized(max(round(self.width * scale), 1), max(round(self.height * scale), 1))
+
     def resized(self, width: int, height: int) -> Intrinsics:
         """The same camera after its image is resized to width x height."""
         sx, sy = width / self.width, height / self.height

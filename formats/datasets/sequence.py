@@ -149,20 +149,6 @@ class Sequence:
             table[[label_class.id, *label_class.other_ids]] = index
         return table[read_label_png(path)]
 
-    def subset(self, indices: Iterable[int]) -> Sequence:
-        """The sequence of these frames only, in increasing order of time."""
-        keep = sorted(set(indices))
-        return replace(
-            self,
-            names=tuple(self.names[i] for i in keep),
-            timestamps=self.timestamps[keep],
-            image_paths=_pick(self.image_paths, keep),
-            depth_paths=_pick(self.depth_paths, keep),
-            label_paths=_pick(self.label_paths, keep),
-            world_from_cam=None if self.world_from_cam is None else self.world_from_cam[keep],
-            store=None if self.store is None else _PartOfStore(self.store, tuple(keep)),
-        )
-
     def with_used_classes(self) -> Sequence:
         """The same with only those classes that occur in the label images (reads all of them)."""
         used = used_label_ids([p for p in self.label_paths if p is not None])
@@ -175,25 +161,9 @@ class Sequence:
         return None if path is None else read_depth_png(path)
 
 
-@dataclass(frozen=True)
-class _PartOfStore:
-    store: FrameStore
-    indices: tuple[int, ...]
-
-    def rgb(self, index: int) -> NDArray[np.uint8]:
-        return self.store.rgb(self.indices[index])
-
-    def raw_depth(self, index: int) -> NDArray[np.uint16]:
-        return self.store.raw_depth(self.indices[index])
-
-
 def used_label_ids(paths: Iterable[Path]) -> set[int]:
     """All ids that occur in these label images."""
     seen = np.zeros(65536, dtype=bool)
     for path in paths:
         seen[read_label_png(path).ravel()] = True
     return {int(i) for i in np.flatnonzero(seen)}
-
-
-def _pick(paths: tuple, keep: list[int]) -> tuple:
-    return tuple(paths[i] for i in keep) if paths else ()

@@ -19,7 +19,6 @@ from pipelines.gaussian_map import GaussianMap, decided_channels
 from pipelines.gaussians.render import get_threads, render
 from pipelines.outcome import Outcome
 from pipelines.progress import Progress
-from pipelines.proxy.sequence import map_intrinsics
 from pipelines.types import VOID, SemanticMesh
 
 TRUNCATION = 4.0
@@ -32,7 +31,7 @@ def make_mesh(outcome: Outcome, settings: ExportConfig, progress: Progress) -> S
     """The surface of the map as the keyframes see it; without a vertex where nothing is seen twice."""
     trajectory, gaussian_map = outcome.trajectory, outcome.require_map()
     poses = spread(list(trajectory.cam_from_world[trajectory.is_keyframe]), settings.max_views)
-    camera = map_intrinsics(outcome.calibration.intrinsics, settings.mesh_side)
+    camera = outcome.calibration.intrinsics.at_most(settings.mesh_side)
     views = [depth_view(gaussian_map, p, camera) for p in progress.track(poses, "depth views", len(poses))]
     voxel = settings.voxel * _median_depth(views)
     volume = fuse(views, voxel, TRUNCATION, settings.max_blocks, get_threads())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, replace
@@ -217,7 +216,7 @@ def _structure(
         left_out=lambda frame_id: masks.left_out(frames[frame_id], camera.width, camera.height),
         snapshots=Snapshots(context.snapshot),
         progress=context.progress,
-        threads=_threads(context),
+        threads=context.threads,
         seed=context.config.run.seed,
     ).run(keyframes)
     warn_of_structure(context, structure, [frames[k].id for k in keyframes])
@@ -262,10 +261,6 @@ def warn_of_structure(context: StageContext, structure: Structure, ids: list[int
             f"pictures taken far apart contradict the camera's path: {agreeing}. Either things that repeat were taken "
             "for each other, which does no harm, or a loop is not closed"
         )
-
-
-def _threads(context: StageContext) -> int:
-    return context.config.run.threads or os.cpu_count() or 1
 
 
 def _calibration(context: StageContext, lens: Lens, origin: str, focal_sd: float) -> Calibration:
@@ -320,7 +315,7 @@ def _write_frames(context: StageContext, source: AnySource, frames: list[Frame],
 
     # Read again from the source: a picked JPEG would be compressed twice.
     pictures: Iterator[VideoFrame] = source.read(by_index)
-    done = parallel_map(write, pictures, _threads(context))
+    done = parallel_map(write, pictures, context.threads)
     for _ in context.progress.track(done, "undistorting", len(missing)):
         pass
 

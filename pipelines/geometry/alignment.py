@@ -72,23 +72,3 @@ def align_points(
     rotation = (u * signs) @ vt
     scale = float(d @ signs / (w @ (source_centred**2).sum(1))) if with_scale else 1.0
     return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
-
-
-def align_points_robust(
-    source: NDArray, target: NDArray, with_scale: bool = True, iterations: int = 20
-) -> tuple[Similarity, NDArray[np.bool_]]:
-    """As `align_points`, with Tukey weights from the median residual; also which points (N,) bool were used.
-
-    Stands up to about a third of gross outliers. Raises ValueError as `align_points`.
-    """
-    weights = np.ones(len(source))
-    for _ in range(iterations):
-        similarity = align_points(source, target, with_scale, weights)
-        residuals = np.linalg.norm(similarity.apply(source) - target, axis=1)
-        # 4.685 sigma keeps 95 % efficiency; sigma of a 3-D residual's norm from its median is /1.538.
-        cut = 4.685 * max(float(np.median(residuals)) / 1.538, 1e-12)
-        updated = np.clip(1 - (residuals / cut) ** 2, 0, None) ** 2
-        if (updated > 0).sum() < 4 or np.allclose(updated, weights, atol=1e-6):
-            break
-        weights = updated
-    return similarity, weights > 0

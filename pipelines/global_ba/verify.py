@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from pipelines.config import GlobalBaConfig
 from pipelines.correspondence.matching import MatchOptions, match_descriptors
 from pipelines.geometry import se3
-from pipelines.geometry.camera import project, unproject
+from pipelines.geometry.camera import unproject
 from pipelines.tracking.pnp import FramePose, solve_pose
 from pipelines.tracking.relocalise import SNAP
 from pipelines.tracking.state import Sightings
@@ -145,13 +145,3 @@ def _sightings(
     known = point >= 0
     xy = target.features.xy[target_index[known]]
     return Sightings(point[known], xy, np.full(int(known.sum()), 1.0))
-
-
-def disagreement_in_pixels(loop: Loop, first: KeyframeView, second: KeyframeView, intrinsics: Intrinsics) -> float:
-    """Median distance between where the current poses and where the loop put the first keyframe's points."""
-    known = np.isfinite(first.in_cam[:, 2])
-    now = second.cam_from_world @ se3.inverse(first.cam_from_world)
-    a, _ = project(se3.transform(now, first.in_cam[known]), intrinsics)
-    b, _ = project(se3.transform(loop.edge.frame2_from_frame1, first.in_cam[known]), intrinsics)
-    distance = np.linalg.norm(a - b, axis=1)
-    return float(np.nanmedian(distance)) if np.isfinite(distance).any() else float("inf")

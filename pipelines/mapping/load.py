@@ -13,7 +13,7 @@ from pipelines.config import ArticleConfig, MappingConfig
 from pipelines.depth.fields import DepthFields
 from pipelines.depth.see_through import contradicted
 from pipelines.mapping.article.mirrors import Mirrors
-from pipelines.mapping.views import View, make_view, occurring_classes, working_size
+from pipelines.mapping.views import View, make_view, occurring_classes
 from pipelines.run_folder import RunFolder
 from pipelines.types import Frame, Intrinsics, ProxyMaps, Trajectory
 
@@ -42,7 +42,7 @@ def load_views(
     """
     frames = {f.id: f for f in run.load_frames()}
     full = run.load_calibration().intrinsics
-    intrinsics = working_size(full, settings.max_side)
+    intrinsics = full.at_most(settings.max_side)
     fields = fields or run.load_depth_fields("tracking")
     symmetry = run.load_symmetry() if article and article.symmetry_weight > 0 else {}
     kept, measured = split_frames(trajectory, settings.hold_out)

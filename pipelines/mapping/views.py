@@ -141,16 +141,6 @@ def halved_scene(scene: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.from_numpy(shown).to(scene.device)
 
 
-def working_size(intrinsics: Intrinsics, max_side: int) -> Intrinsics:
-    """The camera of images whose long side is at most `max_side`; 0 leaves it as it is."""
-    side = max(intrinsics.width, intrinsics.height)
-    if max_side <= 0 or side <= max_side:
-        return intrinsics
-    return intrinsics.resized(
-        max(round(intrinsics.width * max_side / side), 1), max(round(intrinsics.height * max_side / side), 1)
-    )
-
-
 def occurring_classes(all_labels: list[NDArray[np.uint8]], least_share: float = 1e-5) -> tuple[int, ...]:
     """The classes that make up at least `least_share` of the labelled pixels, in order."""
     counts = np.zeros(256, np.int64)

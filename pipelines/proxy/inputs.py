@@ -24,7 +24,7 @@ from pipelines.proxy.selection import (
     open_learned_depth,
     open_learned_semantics,
 )
-from pipelines.proxy.sequence import Sequence, map_intrinsics
+from pipelines.proxy.sequence import Sequence
 from pipelines.types import Calibration, Frame, Intrinsics
 
 
@@ -77,7 +77,7 @@ def _before_frames(source: Path, config: Config) -> Surroundings:
     camera = Intrinsics(width, height, width, width, width / 2, height / 2)
     names = [Frame(i, pictures.name(i, i), 0.0, i, 0.0) for i in range(pictures.expected_frames)]
     calibration = Calibration(camera, "given", 0.0, (0.0, 0.0, 0.0, 0.0))
-    small = map_intrinsics(camera, config.proxy.max_side)
+    small = camera.at_most(config.proxy.max_side)
 
     def nothing(_: Any) -> Any:
         raise AssertionError("providers are only opened here")

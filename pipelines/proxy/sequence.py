@@ -52,12 +52,6 @@ def resize_area(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def map_intrinsics(frame_camera: Intrinsics, max_side: int) -> Intrinsics:
-    """The frames' camera with its long side reduced to at most `max_side` pixels."""
-    scale = min(1.0, max_side / max(frame_camera.width, frame_camera.height))
-    return frame_camera.resized(max(1, round(frame_camera.width * scale)), max(1, round(frame_camera.height * scale)))
-
-
 def resample_nearest(array: NDArray, height: int, width: int) -> NDArray:
     """(H, W, ...) → (height, width, ...): each pixel takes the value under its centre (depth must not be averaged)."""
     rows = ((np.arange(height) + 0.5) * array.shape[0] / height).astype(np.int64)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from pipelines.proxy.reliability import reliability, semantic_agreement, theta, 
 from pipelines.proxy.scale import DepthScale, measure_scale
 from pipelines.proxy.scratch import load_scratch, save_scratch
 from pipelines.proxy.selection import Surroundings, open_depth, open_semantics
-from pipelines.proxy.sequence import Sequence, map_intrinsics
+from pipelines.proxy.sequence import Sequence
 from pipelines.proxy.symmetry import find_mirror_planes, mirror_pairs
 from pipelines.run_folder import (
     load_proxy_maps,
@@ -47,7 +46,7 @@ def run(context: StageContext) -> dict[str, Any]:
         sequence,
         config,
         lambda name: context.snapshot / name,
-        _threads(context),
+        context.threads,
         context.config.run.device,
         context.progress,
         open_recording(context.source, context.config.run.format),
@@ -87,13 +86,9 @@ def run(context: StageContext) -> dict[str, Any]:
 
 def _load_sequence(context: StageContext) -> Sequence:
     calibration = context.run.load_calibration()
-    camera = map_intrinsics(calibration.intrinsics, context.config.proxy.max_side)
+    camera = calibration.intrinsics.at_most(context.config.proxy.max_side)
     run = context.run
     return Sequence(run.load_frames(), calibration, camera, run.load_backbone(), run.image, run.left_out)
-
-
-def _threads(context: StageContext) -> int:
-    return context.config.run.threads or os.cpu_count() or 1
 
 
 def _frames_to_do(context: StageContext, sequence: Sequence, config: ProxyConfig, depths: DepthProvider) -> list[Frame]:

@@ -17,7 +17,7 @@ from pipelines.config import ArticleConfig
 from pipelines.gaussians.render import render, track_gn
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.state import TrackState
-from pipelines.tracking.working_map import View, WorkingMap, seed_map, view_of, working_camera
+from pipelines.tracking.working_map import WORKING_SIDE, View, WorkingMap, seed_map, view_of
 from pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
@@ -84,7 +84,7 @@ def compare_frame(
     None where the keyframes have no depth, too little of the map is seen, or the search does not converge. The
     keyframes lie in one segment. The terms of depth and labels need proxies of the frame itself (`proxy.frames`).
     """
-    small = working_camera(intrinsics)
+    small = intrinsics.at_most(WORKING_SIDE)
     drawn = seed_map(keyframes, state, pictures, intrinsics)
     if drawn is None:
         return None

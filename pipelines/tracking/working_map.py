@@ -51,12 +51,6 @@ class View:
     labels: Tensor | None
 
 
-def working_camera(intrinsics: Intrinsics) -> Intrinsics:
-    """The camera at the working size."""
-    factor = min(WORKING_SIDE / max(intrinsics.width, intrinsics.height), 1.0)
-    return intrinsics.resized(round(intrinsics.width * factor), round(intrinsics.height * factor))
-
-
 def seed_map(keyframes: list[int], state: TrackState, pictures: Pictures, intrinsics: Intrinsics) -> WorkingMap | None:
     """Gaussians at the keyframes' proxy depths, each scaled to agree with the points it sees; None without depth."""
     parts = [p for k in keyframes if (p := _seed_keyframe(k, state, pictures, intrinsics)) is not None]
@@ -71,7 +65,7 @@ def _seed_keyframe(
     maps = pictures.proxy(keyframe)
     if maps is None:
         return None
-    small, motion = working_camera(intrinsics), state.poses[keyframe]
+    small, motion = intrinsics.at_most(WORKING_SIDE), state.poses[keyframe]
     depth = _resized(maps.depth, small) * np.float32(proxy_scale(keyframe, motion, maps, state, intrinsics) or 1.0)
     grid = torch.from_numpy(seed_grid(small.height, small.width, STRIDE))
     channels = torch.from_numpy(_resized(maps.labels, small))
@@ -90,7 +84,7 @@ def view_of(
     camera: Intrinsics,
 ) -> View:
     """The frame, its proxy depth scaled by the points it sees or, without enough of them, as the keyframes' is."""
-    small, maps = working_camera(camera), pictures.proxy(frame_id)
+    small, maps = camera.at_most(WORKING_SIDE), pictures.proxy(frame_id)
     image = _picture(pictures.color(frame_id), small)
     if maps is None:
         nothing = torch.zeros(small.height, small.width)

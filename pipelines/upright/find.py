@@ -12,7 +12,6 @@ from pipelines.export.depth_views import depth_view, spread
 from pipelines.outcome import Outcome
 from pipelines.proxy.regions.structure import Gravity, find_gravity, floor_plane, name_structure
 from pipelines.proxy.regions.voxels import Voxels, gather_frame, merge, select
-from pipelines.proxy.sequence import map_intrinsics
 from pipelines.upright.cameras import cameras_up
 from pipelines.upright.lines import up_of_lines
 
@@ -75,7 +74,7 @@ def _verdict(witnesses: dict[str, Array]) -> tuple[Array, str]:
 
 def surface_voxels(outcome: Outcome, cam_from_world: Sequence[Array]) -> Voxels:
     """The surface that the map shows from poses (N, 4, 4), as voxels a sixtieth of its usual depth wide."""
-    gaussian_map, camera = outcome.require_map(), map_intrinsics(outcome.calibration.intrinsics, _SIDE)
+    gaussian_map, camera = outcome.require_map(), outcome.calibration.intrinsics.at_most(_SIDE)
     views = [depth_view(gaussian_map, pose, camera) for pose in cam_from_world]
     seen = np.concatenate([np.zeros(0), *(v.depth[v.weight > 0] for v in views)])
     size = float(np.median(seen)) / _VOXELS_PER_DEPTH if len(seen) else 1.0

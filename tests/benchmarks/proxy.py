@@ -38,7 +38,7 @@ from tracking import write_noisy_depth
 from formats.images import natural_key, read_depth_png
 from pipelines.config import load_config
 from pipelines.geometry.camera import project, unproject_depth
-from pipelines.proxy.sequence import map_intrinsics, resample_nearest
+from pipelines.proxy.sequence import resample_nearest
 from pipelines.reconstruct import reconstruct
 from pipelines.run_folder import RunFolder
 from pipelines.types import VOID, Frame, ProxyMaps
@@ -223,7 +223,7 @@ def flicker(run: RunFolder, labels_of: dict[int, NDArray[np.uint8]] | None = Non
     changed = compared = 0
     for first, second in pairwise(frames):
         a, b = run.load_proxy(first.id), run.load_proxy(second.id)
-        camera = map_intrinsics(calibration.intrinsics, max(a.depth.shape))
+        camera = calibration.intrinsics.at_most(max(a.depth.shape))
         second_from_first = poses[second.id] @ np.linalg.inv(poses[first.id])
         points = unproject_depth(a.depth / unit, camera) @ second_from_first[:3, :3].T + second_from_first[:3, 3]
         xy, z = project(points, camera)

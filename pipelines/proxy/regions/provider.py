@@ -99,9 +99,7 @@ class SegmentLabels:
         return np.asarray((centres - floor.point) @ floor.normal)
 
     def _gather(self, frame: Frame, estimate: DepthEstimate) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        camera = self.sequence.intrinsics
-        scale = min(1.0, _GATHER_SIDE / max(camera.width, camera.height))
-        small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+        small = self.sequence.intrinsics.at_most(_GATHER_SIDE)
         confidence = resample_nearest(estimate.confidence, small.height, small.width)
         return gather_frame(
             resample_nearest(estimate.depth, small.height, small.width),

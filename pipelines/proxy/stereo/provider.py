@@ -21,7 +21,7 @@ from formats.errors import InputError
 from pipelines.progress import Progress
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.scratch import load_scratch, save_scratch
-from pipelines.proxy.sequence import Sequence, map_intrinsics, resize_area
+from pipelines.proxy.sequence import Sequence, resize_area
 from pipelines.proxy.stereo.bands import Bands
 from pipelines.proxy.stereo.consistency import fuse_depths
 from pipelines.proxy.stereo.fill import fill_unsure
@@ -72,7 +72,7 @@ class MultiviewDepth:
         self._index = {int(f): i for i, f in enumerate(self._model.frame_ids)}
         self._frame = {f.id: f for f in sequence.frames}
         self._bands = Bands(threads)
-        self._camera: Intrinsics = map_intrinsics(sequence.calibration.intrinsics, settings.side)
+        self._camera: Intrinsics = sequence.calibration.intrinsics.at_most(settings.side)
         self._grey = lru_cache(_CACHED_FRAMES)(self._read_grey)
         self._raw = lru_cache(_CACHED_FRAMES)(self._load_raw)
 

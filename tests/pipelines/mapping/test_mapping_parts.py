@@ -14,7 +14,7 @@ from pipelines.mapping.covisibility import keyframe_weights
 from pipelines.mapping.load import MappingInput, load_views, split_frames
 from pipelines.mapping.poses import interpolate_rows, move_trajectory
 from pipelines.mapping.schedule import RATE_DECAY, Schedule, Seeding
-from pipelines.mapping.views import channel_table, halved, occurring_classes, working_size
+from pipelines.mapping.views import channel_table, halved, occurring_classes
 from pipelines.run_folder import RunFolder
 from pipelines.types import VOID, Intrinsics, Trajectory
 
@@ -61,8 +61,8 @@ def test_half_a_view_sees_the_same(room: MappingInput) -> None:
 
 def test_working_size_never_enlarges() -> None:
     k = Intrinsics(300, 200, 250, 250, 150, 100)
-    assert working_size(k, 640) == k == working_size(k, 0)
-    assert (working_size(k, 150).width, working_size(k, 150).height) == (150, 100)
+    assert k.at_most(640) == k == k.at_most(0)
+    assert (k.at_most(150).width, k.at_most(150).height) == (150, 100)
 
 
 def test_classes_that_hardly_occur_get_no_channel() -> None:

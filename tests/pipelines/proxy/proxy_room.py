@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from formats.images import write_grey_png, write_rgb
 from pipelines.geometry.camera import project
-from pipelines.proxy.sequence import Sequence, map_intrinsics
+from pipelines.proxy.sequence import Sequence
 from pipelines.run_folder import write_json
 from pipelines.types import Calibration, Frame, Intrinsics, SparseModel
 from pipelines.world import WorldFrame
@@ -30,7 +30,7 @@ class Room:
         return Sequence(
             self.frames,
             self.calibration,
-            map_intrinsics(self.calibration.intrinsics, max_side),
+            self.calibration.intrinsics.at_most(max_side),
             self.backbone,
             lambda frame: self.views[frame.id].rgb,
         )
