@@ -1,0 +1,105 @@
+"""Who works with a map does so where it lies: on a device that is only pretended, but as strict as a GPU."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from finished import note_finished
+
+from formats.datasets import open_sequence
+from pipelines.config import Config, ExportConfig, GlobalBaConfig, MappingConfig
+from pipelines.evaluation.evaluate import evaluate_run
+from pipelines.export import stage as export_stage
+from pipelines.export.stage import export_run
+from pipelines.global_ba import stage as global_ba_stage
+from pipelines.global_ba.move_map import move_map
+from pipelines.mapping import growth
+from pipelines.mapping import stage as mapping_stage
+from pipelines.progress import SilentProgress
+from pipelines.render_run import render_run
+from pipelines.run_folder import RunFolder
+from pipelines.stages import Stage, StageContext
+from pipelines.viewer_scene import load_scene
+from tests.pipelines.mapping.small_run import make_run
+from tests.pretend_device import DEVICE, PretendTensor, WrongDeviceError, pretended
+
+CONFIG = Config(
+    mapping=MappingConfig(passes=2.0, min_iterations=0, max_side=40, hold_out=4),
+    global_ba=GlobalBaConfig(use_loops=False, joint="always", joint_passes=1.0),
+    export=ExportConfig(voxel=0.05, mesh_side=40),
+)
+_BEFORE = ("frames", "proxy", "tracking")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def device() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch, pretended(patch):
+        yield
+
+
+def finish(stage: Stage, run: RunFolder, done: tuple[str, ...], config: Config = CONFIG) -> dict:
+    folder = run.stage(stage.name)
+    folder.mkdir(exist_ok=True)
+    figures = stage.run(StageContext(run, run.root, config, folder, SilentProgress()))
+    note_finished(run, (*_BEFORE, *done, stage.name), config)
+    return figures
+
+
+@pytest.fixture(scope="module")
+def run(device: None, tmp_path_factory: pytest.TempPathFactory, world_sequence: Path) -> RunFolder:
+    """Mapped on the pretended device, refined and exported there."""
+    made = make_run(tmp_path_factory.mktemp("device") / "run", world_sequence, every=4)
+    mapped = finish(mapping_stage.STAGE, made, ())
+    refined = finish(global_ba_stage.STAGE, made, ("mapping",))
+    finish(export_stage.STAGE, made, ("mapping", "global_ba"))
+    assert mapped["keyframe_psnr"] > 15
+    assert mapped["held_out_psnr"] > 10
+    assert refined["joint"] in ("kept", "thrown away")
+    return made
+
+
+def test_a_map_can_be_moved_there(run: RunFolder) -> None:
+    gaussian_map = run.load_map("mapping", DEVICE)
+    assert isinstance(gaussian_map.means, PretendTensor)
+    trajectory = run.load_trajectory("mapping")
+    poses = trajectory.cam_from_world
+    moved = move_map(gaussian_map, trajectory.frame_ids, poses, poses, np.full(len(poses), 2.0))
+    assert isinstance(moved.means, PretendTensor)
+    assert torch.allclose(moved.log_radii.cpu(), gaussian_map.log_radii.cpu() + np.log(2.0), atol=1e-6)
+
+
+def test_what_was_made_there_can_be_exported_again(run: RunFolder, tmp_path: Path) -> None:
+    export_run(run, tmp_path, "ply")
+    export_run(run, tmp_path, "spz")
+    assert (tmp_path / "point_cloud.ply").stat().st_size > 10_000
+
+
+def test_it_is_measured_there(run: RunFolder, world_sequence: Path) -> None:
+    result = evaluate_run(run, open_sequence(world_sequence), max_views=2)
+    assert result["images"]["keyframes"]["psnr"] > 15
+    assert "held out at refined poses" in result["images"]
+
+
+def test_it_is_drawn_there(run: RunFolder, tmp_path: Path) -> None:
+    render_run(run, tmp_path / "pictures", path="own", frames=2)
+    assert len(list((tmp_path / "pictures").iterdir())) == 2
+
+
+def test_it_is_viewed_from_there(run: RunFolder) -> None:
+    assert len(load_scene(run.root).centers) > 100
+
+
+def test_a_misplaced_copy_to_the_cpu_is_found(
+    world_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The test of these tests."""
+    right = growth.Growth._spacing
+    monkeypatch.setattr(growth.Growth, "_spacing", lambda self, view: right(self, view).cpu())
+    made = make_run(tmp_path / "run", world_sequence, every=8)
+    with pytest.raises(WrongDeviceError, match="of the CPU meets"):
+        finish(mapping_stage.STAGE, made, (), replace(CONFIG, mapping=MappingConfig(max_side=40)))
