@@ -16,8 +16,9 @@ FORBIDDEN = {
 
 
 FLOORS = (
-    {"geometry"}, {"world"}, {"correspondence"}, {"depth"}, {"gaussians"}, {"structure"}, {"frames", "masks", "proxy"},
-    {"tracking"}, {"mapping"}, {"global_ba"}, {"export", "upright"}, {"evaluation"},
+    {"geometry"}, {"world"}, {"correspondence"}, {"depth"}, {"gaussians"}, {"structure"},
+    {"frames", "masks", "proxy"}, {"metres"}, {"tracking"}, {"mapping"}, {"global_ba"}, {"export", "upright"},
+    {"evaluation"},
 )  # fmt: skip
 """The folders of pipelines/, each above those that it may import; on one floor, those that need each other."""
 
