@@ -26,6 +26,10 @@ FORMAT = 2
 """Of manifest.json. 1, that of 0.1.0, had neither a checksum nor the settings of the records."""
 
 
+SETTINGS_MARK = "# Written by msgs-slam."
+"""How run.toml begins since format 2."""
+
+
 @dataclass(frozen=True)
 class Source:
     """What the run was made from: the path, and the identity of what was there (`source_digest`)."""
@@ -100,7 +104,10 @@ def read_manifest(path: Path) -> Manifest:
 def _manifest(path: Path, value: dict[str, Any]) -> Manifest:
     format, stages = value.get("format", 1), value["stages"]
     if format == 1:
-        stages = migrated_stages(value, read_toml(path.with_name("run.toml")))
+        settings = path.with_name("run.toml")
+        if settings.read_bytes().startswith(SETTINGS_MARK.encode()):
+            raise InputError(f"{path} is of version 0.1.0, but run.toml beside it is not: it is another run's")
+        stages = migrated_stages(value, read_toml(settings))
     elif format != FORMAT:
         raise InputError(f"{path}: its format is {str(format)[:20]}, this version of the program knows {FORMAT}")
     elif value.pop("check", None) != _check(value):

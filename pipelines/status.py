@@ -50,7 +50,9 @@ class RunStatus:
             for s in self.stages
             if s.damaged and s.record
         ]
-        return changed + damaged
+        file = self.run.settings_file
+        gone = [] if file.exists() else [f"{file} is gone: stages that are not done get default settings"]
+        return gone + changed + damaged
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; the records without their lists of files."""

@@ -86,7 +86,8 @@ def verdict(name: str, result: Result, file: str, same: bool) -> str:
         return "named" if Path(file).name in said else "WRONG: status does not name it"
     if result.exit_code == 0:
         return "unused" if same else "WRONG: used, and nothing said"
-    return "refused" if Path(file).name in said and "msgs-slam" in said else f"WRONG: says {said[-200:]}"
+    names = {Path(file).name, "run.toml"} if file == "manifest.json" else {Path(file).name}  # both tell of one source
+    return "refused" if any(name in said for name in names) and "msgs-slam" in said else f"WRONG: says {said[-200:]}"
 
 
 def chosen_files(run: Path, series: int) -> list[str]:
