@@ -210,6 +210,27 @@ def exif_time(path: Path) -> float | None:
     return seconds + (float(f"0.{fraction}") if fraction.isdecimal() else 0.0)
 
 
+def exif_gps(path: Path) -> tuple[float, float, float] | None:
+    """(latitude, longitude, altitude) in degrees and metres that EXIF tells; altitude NaN, all None where untold."""
+    with _opened(Path(path)) as image:
+        tags = dict(image.getexif().get_ifd(ExifTags.IFD.GPSInfo))
+    angles = []
+    for key, negative in ((ExifTags.GPS.GPSLatitude, "S"), (ExifTags.GPS.GPSLongitude, "W")):
+        try:
+            degrees, minutes, seconds = (float(v) for v in tags[key])
+        except (KeyError, TypeError, ValueError, ZeroDivisionError):
+            return None
+        sign = -1 if str(tags.get(key - 1, "")).strip("\0 ").upper() == negative else 1
+        angles.append(sign * (degrees + minutes / 60 + seconds / 3600))
+    latitude, longitude = angles
+    # Phones without a fix write zeros.
+    if not (abs(latitude) <= 90 and abs(longitude) <= 180) or (latitude == 0 and longitude == 0):
+        return None
+    height = _positive(tags.get(ExifTags.GPS.GPSAltitude))
+    below = tags.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01")
+    return latitude, longitude, math.nan if height is None else -height if below else height
+
+
 def _orientation(image: Image.Image) -> int:
     """1 to 8 as EXIF defines them; 1 for whatever else stands there: text, lists, other numbers."""
     value = image.getexif().get(ExifTags.Base.Orientation, 1)

@@ -93,6 +93,11 @@ _SOURCE_OPTIONS = {
         "Without metric depth or --scale-ref, auto says how many metres a unit is about; free does not guess. Neither "
         "changes any length. Default: auto.",
     ),
+    "gps": (
+        "export.gps", "FILE",
+        "Where it was taken, for files with x east, y north in metres: a GPX track, or a CSV with the columns time, "
+        "lat, lon, alt (a video counts from its start). Default: auto, the pictures' EXIF; off for neither.",
+    ),
 }  # fmt: skip
 """Option → the setting it stands for, what is given, help."""
 

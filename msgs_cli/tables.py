@@ -22,7 +22,7 @@ KEY_FIGURES = {
     "tracking": ("posed", "keyframes", "lost", "scale"),
     "mapping": ("gaussians", "keyframe_psnr"),
     "global_ba": ("loops",),
-    "export": ("images", "vertices", "faces", "up", "floor"),
+    "export": ("images", "vertices", "faces", "up", "floor", "gps"),
 }
 """What a person wants to know first; `status -v` says all."""
 

@@ -182,6 +182,10 @@ class ExportConfig:
         "up: z up where up can be told, the floor at 0 where one is found; first: those of the first posed camera",
         ("up", "first"),
     )
+    gps: str = setting(
+        "auto",
+        "x east, y north, metres: auto by GPS in the pictures' EXIF, off, or a track (GPX, or CSV of time, lat, lon)",
+    )
     voxel: float = setting(0.008, "voxel of the mesh, in units of the scene's median depth", within=(0.0005, 1))
     max_blocks: int = setting(
         80000, "blocks of 8 x 8 x 8 voxels; voxels grow where more would be needed", within=(10, 10_000_000)

@@ -26,17 +26,20 @@ point_cloud.glb           only with --set export.splat_glb=true: the map in glTF
 mesh.ply, mesh.glb        the surface with a colour and a label (PLY: property label, GLB: attribute _LABEL) at each
                           vertex. MeshLab, Blender, trimesh.
 classes.json              number, name and colour of each class; 255 is "unknown".
-scale.json                how many metres a unit of length is, its relative standard deviation, and who says so.
+scale.json                how many metres a unit of the run is, its relative standard deviation, and who says so.
 world.json                what the axes are, what told which way is up, and how this world lies to the run's own.
 
 """
 
 _UPRIGHT = """\
-Axes: z is up, told by the {told_by}; {height}; x and y count from the middle of the
-camera's path, and y points where the first camera looked. The formats that lay down which way is up follow their own
+Axes: z is up, told by the {told_by}; {height}.
+{heading}. The formats that lay down which way is up follow their own
 rule: in mesh.glb, point_cloud.spz and point_cloud.glb y is up. A viewer that takes y for up shows the PLY files on
 their back: turn them by -90 degrees about x.
 """
+
+_OWN_HEADING = """\
+x and y count from the middle of the camera's path, and y points where the first camera looked"""
 
 _FIRST = """\
 Axes: the run's own, about those of the first posed camera: x right, y down, z forward{why}.
@@ -61,7 +64,8 @@ def readme(world: World, metres: Metres | None, metric: bool) -> str:
     """The text of README.txt for files in that world."""
     if world.axes == "up":
         height = "the floor is at z = 0" if world.has_floor else "no floor was found, so z counts from that path too"
-        axes = _UPRIGHT.format(told_by=world.told_by, height=height)
+        heading = "x is east and y north (GPS, see world.json)" if world.earth else _OWN_HEADING
+        axes = _UPRIGHT.format(told_by=world.told_by, height=height, heading=heading)
     else:
         axes = _FIRST.format(why=", since nothing told which way is up or nobody asked (export.axes)")
     return _FILES + axes + lengths(metres, metric) + "\n"

@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from formats.digest import file_sha256
+from formats.gps import read_track
 from formats.mesh import read_mesh_ply
 from pipelines.config import Config, ExportConfig
 from pipelines.export.mesh import make_mesh, mesh_figures, write_mesh
@@ -19,6 +21,7 @@ from pipelines.export.writers import (
     write_trajectory,
     write_world,
 )
+from pipelines.metres.files import save_metres
 from pipelines.metres.find import Machine, find_metres
 from pipelines.outcome import Outcome, load_outcome
 from pipelines.progress import Progress, SilentProgress
@@ -28,6 +31,7 @@ from pipelines.run_folder import RunFolder
 from pipelines.stages import Stage, StageContext
 from pipelines.types import Metres, SemanticMesh
 from pipelines.upright.find import find_upright
+from pipelines.upright.places import AUTO, OFF, world_on_earth
 from pipelines.upright.world import FIRST, World, load_world, upright_world, world_figures
 
 
@@ -35,16 +39,15 @@ def run(context: StageContext) -> dict[str, Any]:
     """All files; a mesh that an interrupted attempt has finished is kept."""
     found, settings = load_outcome(context.run, context.device), context.config.export
     found.require_map()
-    world = find_world(found, settings)
-    if settings.axes == "up" and world.axes != "up":
-        context.warn(
-            "neither a floor nor upright lines tell which way is up: the files keep the axes of the run, about "
-            "those of the first posed camera"
-        )
-    found = replace(found, metres=guess_metres(context, found, settings))
-    outcome = found.moved(world.exported_from_run)
+    world, reasons = find_world(found, settings)
+    for reason in reasons:
+        context.warn(reason)
+    found = replace(found, metres=gps_metres(world) or guess_metres(context, found, settings))
+    outcome = on_earth(found.moved(world.exported_from_run), world)
     write_pieces(found, context.folder)
     write_all_but_mesh(outcome, world, settings, context.folder)
+    if world.earth is not None:
+        save_metres(context.folder, found.metres)
     mesh = _finished_mesh(context.folder)
     if mesh is None:
         mesh = make_mesh(outcome, settings, context.progress)
@@ -57,7 +60,7 @@ def run(context: StageContext) -> dict[str, Any]:
         "compact_map_mb": round((context.folder / "point_cloud_compact.safetensors").stat().st_size / 1e6, 2),
         **mesh_figures(mesh),
         **world_figures(world),
-        **metres_figures(outcome.metres),
+        **metres_figures(found.metres),
     }
 
 
@@ -83,10 +86,23 @@ def metres_figures(metres: Metres | None) -> dict[str, Any]:
     }
 
 
-def export_inputs(source: Path, config: Config) -> str | None:
-    """The network that the guess is made with."""
+def gps_metres(world: World) -> Metres | None:
+    """How long the unit of the run's own world is, by GPS."""
+    if world.earth is None:
+        return None
+    return Metres(world.exported_from_run.scale, max(world.earth.scale_sd, 1e-3), False, ("GPS",))
+
+
+def on_earth(outcome: Outcome, world: World) -> Outcome:
+    """Files that lie on the Earth are in metres: there is nothing to multiply."""
+    return outcome if world.earth is None else replace(outcome, metric=True, metres=None)
+
+
+def export_inputs(source: Path, config: Config) -> list[str]:
+    """The network that the guess is made with, and the track: other fixes under the same name make other files."""
     card = metric_card() if config.export.scale == "auto" else None
-    return None if card is None else card_identity(card)
+    track = [] if config.export.gps in (AUTO, OFF) else [file_sha256(Path(config.export.gps))]
+    return track if card is None else [card_identity(card), *track]
 
 
 def write_pieces(found: Outcome, folder: Path) -> list[Path]:
@@ -95,9 +111,23 @@ def write_pieces(found: Outcome, folder: Path) -> list[Path]:
     return [path for piece, place in places for path in write_colmap(piece, place) + write_trajectory(piece, place)]
 
 
-def find_world(outcome: Outcome, settings: ExportConfig) -> World:
-    """The world for the files of a run whose map is done."""
-    return upright_world(outcome, find_upright(outcome)) if settings.axes == "up" else FIRST
+def find_world(outcome: Outcome, settings: ExportConfig) -> tuple[World, list[str]]:
+    """The world for the files of a run whose map is done, and what could not be found that was asked for."""
+    world = upright_world(outcome, find_upright(outcome)) if settings.axes == "up" else FIRST
+    reasons = []
+    if settings.axes == "up" and world.axes != "up":
+        reasons.append(
+            "neither a floor nor upright lines tell which way is up: the files keep the axes of the run, about "
+            "those of the first posed camera"
+        )
+    world, reason = world_on_earth(outcome, world, settings.gps)
+    return world, [*reasons, reason] if reason else reasons
+
+
+def _check(source: Path, config: Config) -> None:
+    """The track that the user gives can be read."""
+    if config.export.gps not in (AUTO, OFF):
+        read_track(Path(config.export.gps))
 
 
 def write_all_but_mesh(outcome: Outcome, world: World, settings: ExportConfig, folder: Path) -> list[Path]:
@@ -129,8 +159,8 @@ def export_run(
     found = load_outcome(run)
     found.require_map()
     settings = settings or found.config.export
-    world = _kept_world(found, settings) or find_world(found, settings)
-    outcome = found.moved(world.exported_from_run)
+    world = _kept_world(found, settings) or find_world(found, settings)[0]
+    outcome = on_earth(found.moved(world.exported_from_run), world)
     if outcome.metres is not None and outcome.metres.is_guess and settings.scale == "free":
         outcome = replace(outcome, metres=None)
 
@@ -153,7 +183,10 @@ def export_run(
 
 def _kept_world(outcome: Outcome, settings: ExportConfig) -> World | None:
     """That of the run's own export, so that what is written later or elsewhere fits; None for other axes."""
-    return load_world(outcome.run) if settings.axes == outcome.config.export.axes else None
+    own = outcome.config.export
+    return load_world(outcome.run) if (settings.axes, settings.gps) == (own.axes, own.gps) else None
 
 
-STAGE = Stage("export", run, "COLMAP model, Gaussian PLY, labelled mesh, trajectory, metres", inputs=export_inputs)
+STAGE = Stage(
+    "export", run, "COLMAP model, Gaussian PLY, labelled mesh, trajectory, metres", inputs=export_inputs, check=_check
+)

@@ -131,7 +131,7 @@ def write_trajectory(outcome: Outcome, folder: Path) -> list[Path]:
 
 def write_world(outcome: Outcome, world: World, folder: Path) -> Path:
     """world.json: what the coordinates of the other files mean."""
-    return save_world(folder, world, "metre" if outcome.metric else "free")
+    return save_world(folder, world, "metre" if outcome.metric or world.earth else "free")
 
 
 def write_notes(outcome: Outcome, world: World, folder: Path) -> list[Path]:

@@ -145,6 +145,10 @@ class FolderSource:
         path = self._images[index]
         return path if reusable(path) else None
 
+    def file(self, index: int) -> Path:
+        """The image of that number, however it is turned."""
+        return self._images[index]
+
     def exif_focal(self) -> float | None:
         """That of the first readable image."""
         for path in self._images:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from pipelines.run_folder import WORLD, RunFolder
 from pipelines.stored import reading
 from pipelines.upright.cameras import cameras_up
 from pipelines.upright.find import Upright
+from pipelines.upright.georeference import Georeference
 
 Array = NDArray[np.float64]
 
@@ -28,13 +29,14 @@ _Y_DOWN_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 @dataclass(frozen=True)
 class World:
     """axes "up" (z up) or "first" (the run's own); what told up ("" where nothing did), whether z = 0 is a floor, and
-    by how many degrees each other witness of up differs."""
+    by how many degrees each other witness of up differs; `earth`: where it lies, if x is east and y is north."""
 
     axes: str
     told_by: str
     has_floor: bool
     exported_from_run: Similarity
     against: dict[str, float] = field(default_factory=dict)
+    earth: Georeference | None = None
 
     @property
     def gltf_from_exported(self) -> Array:
@@ -78,7 +80,11 @@ def _level_axes(up: Array, world_from_cam: Array) -> Array:
 
 def world_figures(world: World) -> dict[str, Any]:
     """For the table of the run."""
-    return {"up": world.told_by or "unknown", "floor": world.has_floor, "degrees_from_up": world.against}
+    figures = {"up": world.told_by or "unknown", "floor": world.has_floor, "degrees_from_up": world.against}
+    if world.earth is not None:
+        e = world.earth
+        figures["gps"] = {"used": e.used, "of": e.fixes, "residual_m": e.residual, "scale_relative_sd": e.scale_sd}
+    return figures
 
 
 def save_world(folder: Path, world: World, unit: str) -> Path:
@@ -94,6 +100,7 @@ def save_world(folder: Path, world: World, unit: str) -> Path:
             "floor_at_zero": world.has_floor,
             "unit": unit,
             "degrees_from_up": world.against,
+            **({} if world.earth is None else {"georeference": asdict(world.earth) | {"frame": "east north up"}}),
             "exported_from_run": {
                 "scale": move.scale, "rotation": move.rotation.tolist(), "translation": move.translation.tolist()
             },
@@ -111,7 +118,7 @@ def read_world(path: Path) -> World:
     """Inverse of `save_world`. Raises InputError for a file that is missing or damaged."""
     value = read_json_object(path)
     with reading(path, "world of the exported files"):
-        move = value["exported_from_run"]
+        move, earth = value["exported_from_run"], value.get("georeference")
         return World(
             axes=str(value["axes"]),
             told_by=str(value["up_told_by"]),
@@ -122,7 +129,15 @@ def read_world(path: Path) -> World:
                 np.array(move["translation"], dtype=np.float64),
             ),
             against={str(name): float(v) for name, v in value["degrees_from_up"].items()},
+            earth=None if earth is None else _earth(earth),
         )
+
+
+def _earth(value: dict[str, Any]) -> Georeference:
+    latitude, longitude, altitude = (float(v) for v in value["origin"])
+    used, fixes = int(value["used"]), int(value["fixes"])
+    origin = (latitude, longitude, altitude)
+    return Georeference(origin, float(value["residual"]), used, fixes, float(value["scale_sd"]))
 
 
 def up_in_run(outcome: Outcome) -> Array:

@@ -107,7 +107,7 @@ def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
         "tum": "trajectory.txt",
     }
     for only in set(EXPORTS) - {"mesh"}:
-        export_run(run, tmp_path / only, only)
+        export_run(run, tmp_path / only, only, settings=ExportConfig(axes="first"))
         assert (tmp_path / only / expected[only]).exists()
         assert not (tmp_path / only / "README.txt").exists()
 

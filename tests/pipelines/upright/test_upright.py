@@ -105,7 +105,9 @@ def shapeless(oracle_run: OracleRun) -> RunFolder:
 
 def test_a_scene_that_does_not_tell_stays_as_it_was(shapeless: RunFolder) -> None:
     outcome = load_outcome(shapeless)
-    assert find_world(outcome, ExportConfig()) == FIRST
+    world, reasons = find_world(outcome, ExportConfig())
+    assert world == FIRST
+    assert "which way is up" in reasons[0]
     paths = export_run(shapeless, shapeless.root / "out", "tum")
     assert shapeless.root / "out" / "world.json" in paths
     rows = np.loadtxt(shapeless.root / "out" / "trajectory.txt")
@@ -113,7 +115,7 @@ def test_a_scene_that_does_not_tell_stays_as_it_was(shapeless: RunFolder) -> Non
 
 
 def test_first_axes_on_request(run: RunFolder) -> None:
-    assert find_world(load_outcome(run), ExportConfig(axes="first")) is FIRST
+    assert find_world(load_outcome(run), ExportConfig(axes="first")) == (FIRST, [])
 
 
 def test_world_file_round_trip(run: RunFolder) -> None:

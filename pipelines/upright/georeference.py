@@ -1,0 +1,94 @@
+"""The exported world laid onto the Earth: z is up already, so a turn about it, a scale and a shift are left."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.gps import enu_from_geodetic
+from pipelines.geometry.alignment import Similarity
+
+Array = NDArray[np.float64]
+
+_LEAST_FIXES = 4
+_TRIALS = 500
+_LEAST_SPAN = 3.0
+"""The path must span so many times the residual's deviation: else noise decides scale and heading."""
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """origin (3,) latitude, longitude, altitude of (0, 0, 0); x is east, y north. `residual`: metres, root mean square
+    of a horizontal coordinate over the `used` of `fixes`; `scale_sd`: relative standard deviation of the scale."""
+
+    origin: tuple[float, float, float]
+    residual: float
+    used: int
+    fixes: int
+    scale_sd: float
+
+
+def georeference(centers: Array, places: Array, metric: bool) -> tuple[Similarity, Georeference] | str:
+    """(enu_from_world, how good it is) of camera centres (N, 3), z up, and their places (N, 3), NaN where unknown.
+
+    Heading, scale and shift come from the horizontal coordinates alone: altitudes by GPS are two or three times worse.
+    A metric world keeps its scale. Places that fit no common motion are left out (RANSAC over pairs, Fischler and
+    Bolles 1981, then least squares on what agrees). Returns in words why there is none where that is so.
+    """
+    known = np.isfinite(places[:, :2]).all(axis=1)
+    if known.sum() < _LEAST_FIXES:
+        return f"only {int(known.sum())} frames have a place, {_LEAST_FIXES} are needed"
+    rough = np.append(np.median(places[known, :2], axis=0), 0.0)
+    flat = np.column_stack([places[known, :2], np.zeros(int(known.sum()))])
+    target = enu_from_geodetic(flat, rough)[:, :2] @ (1, 1j)
+    source = centers[known][:, :2] @ (1, 1j)
+    inside = _agreeing(source, target, metric)
+    turn, shift = _fit(source[inside], target[inside], metric)
+    errors = target[inside] - (turn * source[inside] + shift)
+    residual = float(np.sqrt((np.abs(errors) ** 2).sum() / max(2 * inside.sum() - 4, 1)))
+    spread = float(np.sqrt((np.abs(target[inside] - target[inside].mean()) ** 2).sum()))
+    span = float(np.abs(target[inside] - target[inside].mean()).max())
+    if span < _LEAST_SPAN * residual:
+        return f"the path spans {2 * span:.1f} m, too little against places that are {residual:.1f} m off"
+    scale = abs(turn)
+    rotation = np.array([[turn.real, -turn.imag, 0], [turn.imag, turn.real, 0], [0, 0, scale]]) / scale
+    heights = places[known, 2][inside] - scale * centers[known, 2][inside]
+    altitude = float(np.nanmedian(heights)) if np.isfinite(heights).any() else 0.0
+    move = Similarity(scale, rotation, np.array([shift.real, shift.imag, 0.0]))
+    found = Georeference(
+        (float(rough[0]), float(rough[1]), altitude), residual, int(inside.sum()), int(known.sum()),
+        0.0 if metric else residual / spread,
+    )  # fmt: skip
+    return move, found
+
+
+def _agreeing(source: NDArray, target: NDArray, metric: bool) -> NDArray[np.bool_]:
+    """(N,) which places the best motion through any two of them explains, by the median of what it leaves."""
+    rng = np.random.default_rng(0)
+    best, kept = np.inf, np.ones(len(source), bool)
+    for _ in range(_TRIALS):
+        pair = rng.choice(len(source), 2, replace=False)
+        if abs(source[pair[0]] - source[pair[1]]) < 1e-9:
+            continue
+        turn, shift = _fit(source[pair], target[pair], metric)
+        off = np.abs(target - (turn * source + shift))
+        if (middle := float(np.median(off))) < best and abs(turn) > 1e-9:
+            best = middle
+            # The median of a plane's Rayleigh distances is 1.18 deviations; 3.5 deviations lose nothing that is true.
+            kept = off <= max(3.5 / 1.18 * middle, 1e-9)
+    for _ in range(5):
+        turn, shift = _fit(source[kept], target[kept], metric)
+        off = np.abs(target - (turn * source + shift))
+        kept = off <= max(3.5 / 1.18 * float(np.median(off)), 1e-9)
+    return kept
+
+
+def _fit(source: NDArray, target: NDArray, metric: bool) -> tuple[complex, complex]:
+    """target = turn * source + shift in the complex plane, least squares; |turn| = 1 for a metric world."""
+    a, b = source - source.mean(), target - target.mean()
+    turn = complex((a.conj() * b).sum() / max(float((np.abs(a) ** 2).sum()), 1e-18))
+    if metric:
+        turn = turn / abs(turn) if abs(turn) > 1e-12 else 1 + 0j
+    return turn, complex(target.mean() - turn * source.mean())
