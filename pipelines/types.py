@@ -32,7 +32,7 @@ def require_shape(name: str, array: NDArray, expected: Sequence[int | None]) -> 
 
 @dataclass(frozen=True)
 class Features:
-    """keypoints (F, 4) float32: x, y in pixels, diameter, orientation in radians; descriptors (F, 128) uint8 of length
+    """keypoints (F, 4) float32: x, y in pixels, scale, orientation in radians; descriptors (F, 128) uint8 of length
     NORM."""
 
     keypoints: NDArray[np.float32]

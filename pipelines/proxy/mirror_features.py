@@ -23,9 +23,10 @@ class MirroredMatches:
 
 
 def mirrored_matches(features: Features) -> MirroredMatches:
-    """Features of a picture, the strongest of them, that look most like each other's mirror image, each match once."""
-    descriptors, size = features.descriptors[:_MOST_FEATURES], features.keypoints[:_MOST_FEATURES, 2].astype(np.float64)
-    xy = features.xy[:_MOST_FEATURES]
+    """Features of a picture, the largest of them, that look most like each other's mirror image, each match once."""
+    largest = np.argsort(-features.keypoints[:, 2], kind="stable")[:_MOST_FEATURES]
+    descriptors, xy = features.descriptors[largest], features.xy[largest]
+    size = 2 * features.keypoints[largest, 2].astype(np.float64)
     if len(xy) < 3:
         return MirroredMatches(np.zeros((0, 2, 2)), np.zeros((0, 2)))
     root = unit(descriptors.astype(np.float32))

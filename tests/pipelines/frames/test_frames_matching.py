@@ -158,18 +158,14 @@ def test_features_of_a_blank_image_are_none() -> None:
     assert len(extract_features(np.full((100, 120), 128, np.uint8), 400, 0.004)) == 0
 
 
-def test_features_come_strongest_first_one_a_place_and_only_from_the_mask() -> None:
+def test_features_are_one_a_place_and_none_is_in_the_mask() -> None:
     grey = cv2.cvtColor(render(*next(iter(sideways(2)))), cv2.COLOR_RGB2GRAY)
     all_of_it = extract_features(grey, 400, 0.004)
-    places = np.unique(all_of_it.keypoints[:, :3], axis=0)
-    assert len(places) == len(all_of_it) > 100
-    fewer = extract_features(grey, 100, 0.004)
-    assert 50 < len(fewer) <= 100
-    np.testing.assert_array_equal(fewer.keypoints, all_of_it.keypoints[: len(fewer)])
-    right = np.arange(WIDTH)[None].repeat(HEIGHT, 0) >= WIDTH / 2
+    assert len(np.unique(all_of_it.keypoints[:, :3], axis=0)) == len(all_of_it) > 100
+    right = np.arange(WIDTH)[None].repeat(HEIGHT, 0) >= WIDTH // 2
     masked = extract_features(grey, 400, 0.004, right)
-    assert 100 < len(masked) <= 400
-    assert masked.xy[:, 0].max() < WIDTH / 2 + 1
+    assert 50 < len(masked) < len(all_of_it)
+    assert masked.xy[:, 0].max() < WIDTH // 2
 
 
 def _sliding(step: float, count: int) -> list[tuple[np.ndarray, None]]:
