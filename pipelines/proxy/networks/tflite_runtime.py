@@ -44,13 +44,16 @@ class TfliteRuntime:
 
     def run(self, outputs: Sequence[str], feed: dict[str, NDArray]) -> list[NDArray]:
         """As `Runtime.run`."""
+        try:
+            return self._run(outputs, feed)
+        except ValueError as error:  # of an input that does not fit, or a tensor that a damaged file leaves empty
+            raise RuntimeError(_first_line(error)) from error
+
+    def _run(self, outputs: Sequence[str], feed: dict[str, NDArray]) -> list[NDArray]:
         for name, values in feed.items():
             detail = self._in[name]
             rows_first = values.transpose(0, 2, 3, 1) if values.ndim == 4 else values
-            try:
-                self._interpreter.set_tensor(detail["index"], _quantised(rows_first, detail))
-            except ValueError as error:
-                raise RuntimeError(_first_line(error)) from error
+            self._interpreter.set_tensor(detail["index"], _quantised(rows_first, detail))
         self._interpreter.invoke()
         found = []
         for name in outputs:
