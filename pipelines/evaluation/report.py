@@ -170,13 +170,12 @@ def _short(value: Any) -> str:
 
 
 def _export_section(outcome: Outcome) -> str:
-    folder = outcome.run.stage("export")
     if "export" not in outcome.records:
         return section("Files for other programs", "<p>Not exported yet.</p>")
     sizes = [
-        (str(p.relative_to(folder)), f"{p.stat().st_size / 1e6:.2f} MB")
-        for p in sorted(folder.rglob("*"))
-        if p.is_file() and p.parent.name != "frames"
+        (name, f"{size / 1e6:.2f} MB")
+        for name, (size, _) in outcome.records["export"].files.items()
+        if not name.startswith("frames/")
     ]
     notes = readme(load_world(outcome.run) or FIRST, outcome.metres, outcome.metric)
     return section("Files for other programs", f"<pre>{escape(notes)}</pre>", table(("in export/", "size"), sizes))
