@@ -57,11 +57,11 @@ def guarding(served_host: str) -> Iterator[None]:
 
         return original(*args, process_request=answer, **kwargs)
 
-    ws.serve = serve  # type: ignore[misc, assignment]
+    ws.serve = serve  # type: ignore[misc, assignment, unused-ignore]
     try:
         yield
     finally:
-        ws.serve = original  # type: ignore[misc]
+        ws.serve = original  # type: ignore[misc, unused-ignore]
     if not used:
         raise InputError("this version of viser cannot be guarded against other pages: pip install 'viser==1.1.1'")
 

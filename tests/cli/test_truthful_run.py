@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from cli_runs import FinishedRun, invoke
+from cli_runs import OPTIONS, FinishedRun, invoke
 
 from formats.errors import InputError
 from pipelines.config import Config
@@ -70,7 +70,7 @@ def test_changed_setting_then_ctrl_c(finished_run: FinishedRun, copied_run: Call
     assert made_with(RunFolder(run)).mapping.hold_out == 4
     assert invoke("evaluate", run, "--truth", finished_run.truth).exit_code == 0
     held_out = json.loads((run / "evaluation" / "evaluation.json").read_text())["images"]["held out"]
-    assert held_out["views"] == 4
+    assert held_out["views"] == OPTIONS.frames // 4
 
 
 def test_settings_asked_for_are_not_those_it_was_made_with(copied_run: Callable[[str], Path]) -> None:
