@@ -1,6 +1,7 @@
 """A finished run of a tiny clip by the real stages, made once."""
 
 import shutil
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,14 @@ from cli_runs import OPTIONS, QUICK, FinishedRun, invoke
 
 from formats.video_writer import write_video
 from pipelines.world import iter_clip, make_world, write_sequence
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _signals_as_at_a_terminal() -> None:
+    """A suite in the background (nohup, `&`) starts with SIGINT and SIGHUP ignored; its children would inherit that."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="session")
