@@ -249,7 +249,10 @@ def test_sens_file(tmp_path: Path, known: Known) -> None:
 
 def test_damaged_sens_files_are_explained(tmp_path: Path, known: Known) -> None:
     data, path = _sens_bytes(known), tmp_path / "scene.sens"
-    for keep in (0, 10, 200, len(data) // 2):
+    path.write_bytes(b"")
+    with pytest.raises(InputError, match="is empty"):
+        open_sequence(path)
+    for keep in (10, 200, len(data) // 2):
         path.write_bytes(data[:keep])
         with pytest.raises(InputError, match="not copied completely"):
             open_sequence(path)

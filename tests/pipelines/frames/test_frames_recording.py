@@ -26,12 +26,13 @@ from pipelines.reconstruct import reconstruct
 from pipelines.run_folder import RunFolder
 from pipelines.structure.lens import distortion_of, make_lens, to_pycolmap
 from pipelines.types import VOID, Calibration, Frame, Intrinsics
+from tests.pipelines.part_of_sequence import part_of
 
 
 @pytest.fixture(scope="session")
 def short(truth: Sequence) -> Sequence:
     """Five frames of the room are enough to tell one layout from another."""
-    return truth.subset(range(0, 20, 4))
+    return part_of(truth, range(0, 20, 4))
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

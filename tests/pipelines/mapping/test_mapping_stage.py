@@ -42,7 +42,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory, world_sequence: Path) -> 
     run = make_run(tmp_path_factory.mktemp("finished") / "run", world_sequence)
     mapped = mapping_stage.run(context(run, "mapping"))
     note_finished(run, ("frames", "proxy", "tracking", "mapping"), CONFIG)
-    return run, mapped, export_stage.run(context(run, "export"))
+    exported = export_stage.run(context(run, "export"))
+    note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"), CONFIG)
+    return run, mapped, exported
 
 
 def test_mapping_says_how_good_it_is(finished: tuple[RunFolder, dict, dict]) -> None:
