@@ -48,11 +48,13 @@ from pipelines.geometry.camera import unproject_depth
 from pipelines.outcome import Outcome, load_outcome
 from pipelines.proxy.networks.labels import network_labels
 from pipelines.proxy.networks.session import Network
+from pipelines.proxy.palette import class_colors
 from pipelines.proxy.selection import choose_semantics
 from pipelines.proxy.sequence import resample_nearest
 from pipelines.reconstruct import reconstruct
 from pipelines.run_folder import RunFolder
 from pipelines.types import VOID, ClassTable
+from pipelines.upright.world import FIRST, load_world
 
 DATA = ROOT.parent / "shared" / "data"
 SOURCES = {
@@ -129,7 +131,9 @@ class Labelled:
         place = {n: i for i, n in enumerate(self.names)}
         self._of_network = np.array([*(place[n] for n in card.labels), VOID], np.uint8)
         mesh = read_mesh_ply(run.stage("export") / "mesh.ply")
-        self._mesh, self._mesh_labels = cKDTree(mesh.vertices), mesh.labels
+        world = load_world(run) or FIRST
+        vertices = world.exported_from_run.inverse().apply(mesh.vertices.astype(np.float64))
+        self._mesh, self._mesh_labels = cKDTree(vertices), mesh.labels
 
     def kinds(self, frame_id: int) -> dict[str, NDArray[np.uint8]]:
         """(H, W) labels at the size of the frame."""
@@ -194,7 +198,8 @@ def write_sheet(labelled: Labelled, truth: Sequence | None, target: Path) -> Non
         image = outcome.run.image(outcome.frames[outcome.frame_row(frame_id)])
         cells = [image, *(_named(v, labelled.names, colors) for v in labelled.kinds(frame_id).values())]
         if frame_id in true_of and truth is not None:
-            true_colors = [c.color or (128, 128, 128) for c in truth.classes]
+            spread = class_colors(len(truth.classes))
+            true_colors = [c.color or s for c, s in zip(truth.classes, spread, strict=True)]
             cells.append(_named(true_of[frame_id], truth.class_names, true_colors))
         rows.append(np.hstack([cv2.resize(c, (360, round(360 * c.shape[0] / c.shape[1]))) for c in cells]))
     write_rgb(target, np.vstack(rows).astype(np.uint8))
