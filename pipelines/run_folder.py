@@ -191,10 +191,6 @@ class RunFolder(FinishedFiles):
         """frame_ids (N,), log_gains (N, 3), offsets (N, 3) of the mapped keyframes."""
         return load_layout(self.file(stage, EXPOSURE), stored.EXPOSURE)
 
-    def has_map(self, stage: str) -> bool:
-        """Whether `stage` has left a map."""
-        return self.has(stage, MAP)
-
     def load_map(self, stage: str, device: str = "cpu") -> GaussianMap:
         """The Gaussian map as `stage` left it."""
         from pipelines.gaussian_map import GaussianMap  # torch takes seconds to import, and few who read a run need it
