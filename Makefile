@@ -10,7 +10,7 @@ demo: $(VENV)/.installed
 	$(BIN)/msgs-slam demo
 
 test: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
