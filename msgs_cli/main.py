@@ -226,7 +226,7 @@ def export(
 @settings_options
 @verbosity_options
 def demo(out: Path, config_file: Path | None, overrides: tuple[str, ...], quiet: bool, verbose: bool) -> None:
-    """Make a short synthetic room video with known truth, reconstruct it, print the errors and where to look."""
+    """Reconstruct a short video of a made-up room, compare with its known truth, print the errors and where to look."""
     set_up_logging(quiet, verbose)
     from pipelines.config import load_config
     from pipelines.demo import demo_summary, run_demo

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from formats.atomic import write_bytes
 from formats.datasets import open_sequence
 from formats.errors import InputError
-from formats.jsonfile import read_json, write_json
-from formats.video_writer import write_video
+from formats.images import write_rgb
+from formats.video import iter_video
 from pipelines.evaluation.table import evaluation_table
 from pipelines.evaluation.write import write_evaluation
 from pipelines.progress import Progress
 from pipelines.run_folder import RunFolder
-from pipelines.world import ClipOptions, iter_clip, make_world, write_sequence
 
-CLIP = ClipOptions(frames=36, width=320, height=240, fps=10.0, laps=0.32)
 VIDEO, TRUTH, RUN = "room.mp4", "room_truth", "room.msgs"
-_TEXEL = 0.006
+CLIP = Path(__file__).with_name("demo_clip")
+"""The video, and its truth without the pictures as a zip: 36 frames of a made-up room (tests/world/demo_clip.py)."""
 
 
 @dataclass(frozen=True)
@@ -33,33 +34,32 @@ class DemoResult:
     table: str
 
 
-def make_demo_clip(folder: Path, progress: Progress, options: ClipOptions = CLIP) -> tuple[Path, Path]:
-    """Write the video and, in a folder beside it, the truth; returns both paths. What is there already stays.
+def unpack_demo_clip(folder: Path, clip: Path = CLIP) -> tuple[Path, Path]:
+    """Put the video and, in a folder beside it, its truth into `folder`; returns both paths. What is there stays.
 
-    Raises InputError when the folder holds something else or cannot be written.
+    Raises InputError when the folder holds another video of that name or cannot be written.
     """
-    video, truth, done = folder / VIDEO, folder / TRUTH, folder / TRUTH / "clip.json"
-    stamp = {"clip": vars(options), "texel": _TEXEL}
-    if done.exists() and video.exists() and read_json(done) == stamp:
+    video, truth, content = folder / VIDEO, folder / TRUTH, (clip / VIDEO).read_bytes()
+    if video.exists():
+        if video.read_bytes() != content:
+            raise InputError(f"{video} is there already and is not the demo's. Choose another folder")
         return video, truth
-    if video.exists() and not done.exists():
-        raise InputError(f"{video} is there already and is not the demo's. Choose another folder")
-    world = make_world(texel=_TEXEL)
-    frames = list(iter_clip(world, options, progress))
-    write_sequence(truth, world, options, frames)
-    write_video(video, (f.rgb for f in frames), options.fps)
-    write_json(done, stamp)
+    for frame in iter_video(clip / VIDEO):
+        write_rgb(truth / "rgb" / f"{frame.source_index:06d}.png", frame.rgb)
+    with zipfile.ZipFile(clip / f"{TRUTH}.zip") as archive:
+        archive.extractall(truth)
+    write_bytes(video, content)  # last: where it is, the truth is whole
     return video, truth
 
 
 def run_demo(
-    folder: Path, reconstruct: Callable[[Path, RunFolder], Any], progress: Progress, options: ClipOptions = CLIP
+    folder: Path, reconstruct: Callable[[Path, RunFolder], Any], progress: Progress, clip: Path = CLIP
 ) -> DemoResult:
-    """Make the clip, have it reconstructed from the video alone (`reconstruct(video, run)`), evaluate the run.
+    """Unpack the clip, have it reconstructed from the video alone (`reconstruct(video, run)`), evaluate the run.
 
     The truth is opened only after the reconstruction has ended. Raises InputError as the steps do.
     """
-    video, truth = make_demo_clip(folder, progress, options)
+    video, truth = unpack_demo_clip(folder, clip)
     run = RunFolder(folder / RUN)
     reconstruct(video, run)
     figures = write_evaluation(run, open_sequence(truth), progress, max_views=10)

@@ -22,7 +22,6 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE = Path(__file__).with_name("stage_versions.toml")
-ROOMS = ("pipelines", "formats")
 PACKAGE = "msgs_slam"
 """What the rooms lie in where the program is installed: imports begin with it there, and say the same."""
 PLUMBING = frozenset(
@@ -88,7 +87,7 @@ def _imported_files(path: Path, root: Path) -> tuple[Path, ...]:
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
             names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
     names = {n.removeprefix(f"{PACKAGE}.") for n in names}
-    inside = {n for n in names if n.split(".")[0] in ROOMS}
+    inside = {n for n in names if (root / n.split(".")[0]).is_dir()}
     inside |= {n.rsplit(".", k)[0] for n in inside for k in range(1, n.count(".") + 1)}
     files = (file for name in sorted(inside - PLUMBING) for file in _files_of(name, root))
     return tuple(file for file in files if file.is_file())

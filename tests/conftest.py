@@ -35,7 +35,7 @@ def world_sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     rgb/, depth/, labels/, traj.txt, intrinsics.json, classes.json, timestamps.txt.
     """
-    from pipelines.world import ClipOptions, make_world, write_sequence
+    from tests.world import ClipOptions, make_world, write_sequence
 
     options = ClipOptions(frames=32, width=240, height=180, laps=0.5)
     return write_sequence(tmp_path_factory.mktemp("world"), make_world(texel=0.01), options)

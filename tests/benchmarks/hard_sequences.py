@@ -33,7 +33,7 @@ def turn(folder: Path, data: Path) -> Array:
 
 def turn_within(folder: Path, data: Path) -> Array:
     """A walk, half a turn forth and back on the spot in its middle, and the walk goes on."""
-    from pipelines.world.paths import room_walk
+    from tests.world.paths import room_walk
 
     there = room_walk(np.linspace(0, 0.3, 40))
     away = np.radians(90) * np.sin(np.linspace(0, np.pi, 26)[1:-1])
@@ -64,7 +64,7 @@ def blackout(folder: Path, data: Path) -> Array:
 
 def fast_walk(folder: Path, count: int, seed: int, blank_walls: bool = False) -> Array:
     """Steps of 10 to 17 degrees round the table, each picture blurred over a tenth of a step."""
-    from pipelines.world.paths import room_walk
+    from tests.world.paths import room_walk
 
     steps = np.cumsum(np.random.default_rng(seed).uniform(10, 17, count)) / 360
     return draw(folder, room_walk(steps), blurred=room_walk, steps=steps, noise=3.0, blank_walls=blank_walls)
@@ -123,7 +123,7 @@ HARD: dict[str, Callable[[Path, Path], Array]] = {
 
 def standing(angles: Array, shake: float) -> Array:
     """(N, 4, 4) world_from_cam of someone who stands beside the table and turns; `shake` in metres."""
-    from pipelines.world.paths import look_at
+    from tests.world.paths import look_at
 
     rng = np.random.default_rng(0)
     center = np.array([1.6, 1.3, 1.45]) + shake * rng.standard_normal((len(angles), 3))
@@ -146,7 +146,7 @@ def draw(
 ) -> Array:
     """Pictures of the room from world_from_cam (N, 4, 4), which are returned; with motion blur over a tenth of a step
     where the walk and its steps are given."""
-    from pipelines.world.clip import ClipOptions, make_world, render_view
+    from tests.world.clip import ClipOptions, make_world, render_view
 
     world = make_world("room", texel=0.006, blank_walls=blank_walls)
     options = ClipOptions(width=SIZE[0], height=SIZE[1])

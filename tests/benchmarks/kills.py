@@ -35,7 +35,7 @@ from pipelines.reconstruct import all_stages, reconstruct, resume
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
 from pipelines.stage_identity import stage_identity
-from pipelines.world import ClipOptions, iter_clip, make_world
+from tests.world import ClipOptions, iter_clip, make_world
 
 SETTINGS = (
     "run.threads=1", "run.device=cpu", "frames.max_features=600", "proxy.stereo_side=96", "proxy.stereo_planes=24",

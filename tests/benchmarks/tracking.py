@@ -135,8 +135,8 @@ def prepare(name: str, case: Case, work: Path) -> Path:
 
 def write_walk(folder: Path, layout: str, frames: int, laps: float) -> Path:
     """A walk in the made-up world as a folder of pictures, with traj.txt beside it."""
-    from pipelines.world.clip import ClipOptions, make_world
-    from pipelines.world.write import write_sequence
+    from tests.world.clip import ClipOptions, make_world
+    from tests.world.write import write_sequence
 
     if not (folder / "traj.txt").exists():
         options = ClipOptions(frames=frames, width=480, height=360, laps=laps)
@@ -231,8 +231,8 @@ def adjustment_timed() -> Iterator[list[float]]:
 
 def walk_case(name: str, work: Path) -> Case:
     """walk_N: the first N frames of a walk of four laps of 250 frames through the made-up room."""
-    from pipelines.world.clip import ClipOptions, make_world, render_frame
-    from pipelines.world.write import write_sequence
+    from tests.world.clip import ClipOptions, make_world, render_frame
+    from tests.world.write import write_sequence
 
     count = int(name.removeprefix("walk_"))
     folder = work / name

@@ -6,7 +6,7 @@ from pathlib import Path
 from click.testing import CliRunner, Result
 
 from msgs_cli.main import main
-from pipelines.world import ClipOptions
+from tests.world import ClipOptions
 
 QUICK = (
     "run.threads=1", "run.device=cpu", "frames.max_features=600", "proxy.stereo_side=96", "proxy.stereo_planes=24",

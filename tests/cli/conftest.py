@@ -9,7 +9,7 @@ import pytest
 from cli_runs import OPTIONS, QUICK, FinishedRun, invoke
 
 from formats.video_writer import write_video
-from pipelines.world import iter_clip, make_world, write_sequence
+from tests.world import iter_clip, make_world, write_sequence
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -14,7 +14,7 @@ import pytest
 
 from formats.video_writer import write_video
 from pipelines.run_folder_names import STAGES
-from pipelines.world import ClipOptions, iter_clip, make_world
+from tests.world import ClipOptions, iter_clip, make_world
 
 SETTINGS = (
     "run.threads=2", "mapping.passes=2", "mapping.min_iterations=40", "mapping.snapshot_every=15",

@@ -16,7 +16,7 @@ from formats.errors import InputError
 from formats.video import iter_video
 from formats.video_writer import write_video
 from pipelines.types import Intrinsics
-from pipelines.world import (
+from tests.world import (
     ClipOptions,
     World,
     WorldFrame,
@@ -25,7 +25,7 @@ from pipelines.world import (
     walk,
     write_sequence,
 )
-from pipelines.world.shapes import TOP, Material, Solid, box, cylinder, sphere
+from tests.world.shapes import TOP, Material, Solid, box, cylinder, sphere
 
 OPTIONS = ClipOptions(frames=40, width=160, height=120, laps=1.0)
 
@@ -163,7 +163,7 @@ def test_noise_exposure_and_blur_do_what_they_say(world: World) -> None:
 
 def test_solids_are_where_they_are_said_to_be() -> None:
     """Rays against each kind of solid, judged by dense signed distances along the ray."""
-    from pipelines.world.cast import pack_solids, trace
+    from tests.world.cast import pack_solids, trace
 
     paint = Material("plain", (0.5, 0.5, 0.5))
     distances: list[tuple[Solid, Callable[[NDArray], NDArray]]] = [
@@ -198,7 +198,7 @@ def test_solids_are_where_they_are_said_to_be() -> None:
 
 
 def test_texture_coordinates_invert() -> None:
-    from pipelines.world.cast import pack_solids, point_on_face, surface
+    from tests.world.cast import pack_solids, point_on_face, surface
 
     paint = Material("plain", (0.5, 0.5, 0.5))
     solids = [box("b", (1, 2, 3), (1.0, 0.6, 0.4), paint, 0.7), sphere("s", (0, 1, 0), 0.8, paint)]

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.evaluation.camera_paths import orbit, resampled, smoothed
 from pipelines.upright.cameras import cameras_up
-from pipelines.world import make_world, walk
+from tests.world import make_world, walk
 
 
 @pytest.fixture(scope="module")

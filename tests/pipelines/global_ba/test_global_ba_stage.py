@@ -31,8 +31,8 @@ from pipelines.run_folder import (
 )
 from pipelines.stages import StageContext
 from pipelines.types import SparseModel, Trajectory
-from pipelines.world.clip import WorldFrame
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames, small_motion
+from tests.world.clip import WorldFrame
 
 __all__ = ["make_run", "open_stage", "room_frames"]
 Array = NDArray[np.float64]

@@ -12,8 +12,8 @@ from pipelines.progress import SilentProgress
 from pipelines.run_folder import RunFolder, save_calibration, save_frames, save_sparse_model
 from pipelines.stages import StageContext
 from pipelines.types import Calibration, Frame
-from pipelines.world import ClipOptions, make_world, render_frame
 from tests.pipelines.kept import keep_correspondences
+from tests.world import ClipOptions, make_world, render_frame
 
 
 @pytest.fixture(scope="session")

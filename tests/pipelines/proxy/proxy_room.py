@@ -11,7 +11,7 @@ from pipelines.geometry.camera import project
 from pipelines.proxy.sequence import Sequence
 from pipelines.run_folder import write_json
 from pipelines.types import Calibration, Frame, Intrinsics, SparseModel
-from pipelines.world import WorldFrame
+from tests.world import WorldFrame
 
 UNIT = 0.5
 """The backbone's unit is two metres: nothing may take it for metres."""

@@ -19,7 +19,7 @@ from pipelines.proxy.regions.structure import FLOOR, OTHER, Gravity
 from pipelines.proxy.regions.voxels import Voxels, voxel_keys
 from pipelines.proxy.sequence import resample_linear
 from pipelines.types import VOID, Frame
-from pipelines.world.room import CLASSES
+from tests.world.room import CLASSES
 
 NAMES = tuple(name for name, _ in CLASSES)
 UP = Gravity(np.array([0.0, 0, 1]), True)

@@ -21,7 +21,7 @@ from pipelines.proxy.symmetry import MirrorPlane, find_mirror_planes, mirror_pai
 from pipelines.run_folder import RunFolder, save_mirror_pairs
 from pipelines.stages import StageContext
 from pipelines.types import Calibration, Features, Frame, Intrinsics, MirrorPairs, SparseModel
-from pipelines.world import WorldFrame
+from tests.world import WorldFrame
 
 CAMERA = Intrinsics(320, 240, 260, 260, 160, 120)
 HALF = np.array([2.0, 1.5, 3.0])

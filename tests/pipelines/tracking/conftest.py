@@ -30,8 +30,8 @@ from pipelines.run_folder import (
 from pipelines.stages import StageContext
 from pipelines.tracking.bundle import Bundle
 from pipelines.types import Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, SparseModel
-from pipelines.world.clip import ClipOptions, WorldFrame, make_world, render_frame
 from tests.pipelines.kept import keep_correspondences
+from tests.world.clip import ClipOptions, WorldFrame, make_world, render_frame
 
 Array = NDArray[np.float64]
 

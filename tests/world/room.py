@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.world.build import Scene
-from pipelines.world.light import Light
-from pipelines.world.shapes import BACK, BOTTOM, FRONT, LEFT, RIGHT, ROOM, TOP, Material, Solid, box, cylinder, sphere
-from pipelines.world.shapes import turned as _turned
+from tests.world.build import Scene
+from tests.world.light import Light
+from tests.world.shapes import BACK, BOTTOM, FRONT, LEFT, RIGHT, ROOM, TOP, Material, Solid, box, cylinder, sphere
+from tests.world.shapes import turned as _turned
 
 LENGTH, WIDTH, HEIGHT = 6.4, 5.2, 2.7
 CLASSES: tuple[tuple[str, tuple[int, int, int]], ...] = (

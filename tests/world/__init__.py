@@ -1,8 +1,8 @@
 """A synthetic world with exact truth, for the demo and the tests."""
 
-from pipelines.world.build import World
-from pipelines.world.clip import ClipOptions, WorldFrame, make_world, render_frame, render_view, walk
-from pipelines.world.write import iter_clip, write_sequence
+from tests.world.build import World
+from tests.world.clip import ClipOptions, WorldFrame, make_world, render_frame, render_view, walk
+from tests.world.write import iter_clip, write_sequence
 
 __all__ = [
     "ClipOptions",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.world import corridor
+from tests.world import corridor
 
 EYE_HEIGHT = 1.45
 

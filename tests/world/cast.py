@@ -9,7 +9,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from pipelines.jit import kernel
-from pipelines.world.shapes import BOX, CYLINDER, FACE_COUNT, ROOM, SPHERE, Solid
+from tests.world.shapes import BOX, CYLINDER, FACE_COUNT, ROOM, SPHERE, Solid
 
 TILE = 8
 NOTHING = 1e30

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.random import Generator
 
-from pipelines.world.textures import Color, Image, fractal_noise, planks, plaster, wood
+from tests.world.textures import Color, Image, fractal_noise, planks, plaster, wood
 
 _LETTERS = np.array(list("ABCDEFGHIKLMNOPRSTUVWXYZ"))
 

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.world import pictures, textures
-from pipelines.world.cast import SolidArrays, pack_solids
-from pipelines.world.light import Light, bake_light
-from pipelines.world.shapes import FACE_COUNT, Material, Solid
+from tests.world import pictures, textures
+from tests.world.cast import SolidArrays, pack_solids
+from tests.world.light import Light, bake_light
+from tests.world.shapes import FACE_COUNT, Material, Solid
 
 _PAINTERS: dict[str, textures.Painter] = {
     name: getattr(module, name)

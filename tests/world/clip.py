@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.types import Intrinsics
-from pipelines.world.build import World, build_world
-from pipelines.world.cast import render_rays
-from pipelines.world.corridor import ring_corridor
-from pipelines.world.paths import corridor_walk, room_walk
-from pipelines.world.room import furnished_room
+from tests.world.build import World, build_world
+from tests.world.cast import render_rays
+from tests.world.corridor import ring_corridor
+from tests.world.paths import corridor_walk, room_walk
+from tests.world.room import furnished_room
 
 LAYOUTS = {"room": furnished_room, "corridor": ring_corridor}
 _WALKS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {

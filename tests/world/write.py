@@ -11,8 +11,8 @@ import numpy as np
 from formats.atomic import write_text
 from formats.images import write_grey_png, write_rgb
 from pipelines.progress import Progress, SilentProgress
-from pipelines.world.build import World
-from pipelines.world.clip import ClipOptions, WorldFrame, render_frame
+from tests.world.build import World
+from tests.world.clip import ClipOptions, WorldFrame, render_frame
 
 
 def iter_clip(world: World, options: ClipOptions, progress: Progress | None = None) -> Iterator[WorldFrame]:

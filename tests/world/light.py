@@ -10,8 +10,8 @@ from numba import prange
 from numpy.typing import NDArray
 
 from pipelines.jit import kernel
-from pipelines.world.cast import SolidArrays, point_on_face, surface, trace
-from pipelines.world.shapes import FACE_COUNT, Solid
+from tests.world.cast import SolidArrays, point_on_face, surface, trace
+from tests.world.shapes import FACE_COUNT, Solid
 
 LIGHT_TEXEL = 0.09
 _AMBIENT = 0.12

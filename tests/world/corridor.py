@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.world.build import Scene
-from pipelines.world.light import Light
-from pipelines.world.room import DARK, OAK
-from pipelines.world.shapes import BACK, FRONT, LEFT, RIGHT, ROOM, Material, Solid, box, cylinder
+from tests.world.build import Scene
+from tests.world.light import Light
+from tests.world.room import DARK, OAK
+from tests.world.shapes import BACK, FRONT, LEFT, RIGHT, ROOM, Material, Solid, box, cylinder
 
 OUTER, INNER, HEIGHT = 9.0, 5.4, 2.6
 CLASSES: tuple[tuple[str, tuple[int, int, int]], ...] = (
