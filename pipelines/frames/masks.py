@@ -51,14 +51,26 @@ class FrameMasks:
         self._cards = _cards(config)
         self._folder, self._picked, self._threads = folder, picked, threads
 
-    def find_people(self, frames: Sequence[Frame], progress: Progress) -> None:
-        """Look for people in these frames; what is on disk stays."""
+    def find_people(self, frames: Sequence[Frame], keyframes: Sequence[int], progress: Progress) -> None:
+        """Look for people in the keyframes, and in every frame up to the next keyframe on either side of one that shows
+        any; what is on disk stays."""
         if self._cards is None:
             return
         finder = PeopleFinder(self._cards, self._threads)
+        self._search(finder, [frames[k] for k in keyframes], progress)
+        shown = [i for i, k in enumerate(keyframes) if self._shows_people(frames[k])]
+        ends = [0, *keyframes, len(frames) - 1]
+        near = sorted({k for i in shown for k in range(ends[i], ends[i + 2] + 1)})
+        self._search(finder, [frames[k] for k in near], progress)
+
+    def _search(self, finder: PeopleFinder, frames: Sequence[Frame], progress: Progress) -> None:
         todo = [f for f in frames if load_left_out(self._folder, f) is None]
         for frame in progress.track(todo, "people", len(todo)):
             save_left_out(self._folder, frame, finder.left_out(read_rgb(self._picked / frame.name)))
+
+    def _shows_people(self, frame: Frame) -> bool:
+        found = load_left_out(self._folder, frame)
+        return found is not None and bool(found.any())
 
     def left_out(self, frame: Frame, width: int, height: int) -> NDArray[np.bool_] | None:
         """(height, width) of a picked frame; None where all of it is scene."""

@@ -62,7 +62,7 @@ def run(context: StageContext) -> dict[str, Any]:
         context.config, source, context.snapshot / "people", context.snapshot / "picked", context.threads
     )
     keyframes = _keyframes(context, frames, masks)
-    masks.find_people([frames[k] for k in keyframes], context.progress)
+    masks.find_people(frames, keyframes, context.progress)
     structure = _structure(context, camera, origin == "given", frames, keyframes, masks)
     lens = make_lens(structure.model.cameras[1])
     calibration = _calibration(context, lens, origin, structure.focal_sd)

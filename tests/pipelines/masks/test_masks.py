@@ -16,7 +16,7 @@ from pipelines.config import ArticleConfig, MappingConfig, load_config
 from pipelines.correspondence.features import extract_features
 from pipelines.correspondence.flow import corners
 from pipelines.frames.keyframes import KeyframeOptions, choose_keyframes
-from pipelines.frames.masks import check_masks, mask_inputs
+from pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
 from pipelines.frames.source import open_source
 from pipelines.gaussians.adam import AdamTable
 from pipelines.gaussians.render import Rendering
@@ -24,11 +24,12 @@ from pipelines.mapping.objective import Objective
 from pipelines.mapping.views import View, make_view
 from pipelines.masks.files import open_masks
 from pipelines.masks.people import PeopleFinder, join_people, people_cards
+from pipelines.progress import SilentProgress
 from pipelines.proxy.models.registry import ModelStore
 from pipelines.proxy.providers import DepthEstimate, LabelEstimate
 from pipelines.proxy.stereo.bands import Bands
 from pipelines.proxy.stereo.sweep import sweep_cost
-from pipelines.types import VOID, Intrinsics
+from pipelines.types import VOID, Frame, Intrinsics
 from tests.pipelines.proxy.tiny_tflite import write_tflite
 
 HEIGHT, WIDTH = 96, 128
@@ -191,6 +192,29 @@ def test_stand_ins_of_the_networks_find_the_blue_person(stand_ins: ModelStore, p
     stand_ins.path(model).write_bytes(bytes(model.bytes))
     with pytest.raises(InputError, match="Download it again"):
         check_masks(pictures, load_config())
+
+
+def test_frames_between_are_searched_where_a_keyframe_shows_people(
+    stand_ins: ModelStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The blue person walks through frames 5 to 7; keyframes are 0, 3, 6 and 9."""
+    frames = [Frame(i, f"{i:06d}.png", i / 10, i, 1.0) for i in range(13)]
+    for frame in frames:
+        image = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+        if 5 <= frame.id <= 7:
+            image[20:80, 40:70] = (0, 0, 255)
+        write_rgb(tmp_path / "picked" / frame.name, image)
+    masks = FrameMasks(load_config(), open_source(tmp_path / "picked"), tmp_path / "people", tmp_path / "picked", 1)
+    masks.find_people(frames, [0, 3, 6, 9], SilentProgress())
+    searched = sorted(int(p.name[:6]) for p in (tmp_path / "people").iterdir())
+    assert searched == [0, *range(3, 10)]
+    assert [f.id for f in frames if masks.left_out(f, WIDTH, HEIGHT) is not None] == [5, 6, 7]
+
+    def never(self: PeopleFinder, image: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        raise AssertionError("what is on disk stays")
+
+    monkeypatch.setattr(PeopleFinder, "left_out", never)
+    masks.find_people(frames, [0, 3, 6, 9], SilentProgress())
 
 
 def test_the_real_networks_find_the_woman_and_leave_rooms_alone(shared_data: Path, tmp_path: Path) -> None:
