@@ -1,0 +1,125 @@
+"""A network in, names in the world out: a stand-in of the contract in the made room, the real file in a real one."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from proxy_room import Room
+from test_proxy_names import depth_of
+from tiny_tflite import write_tflite
+
+from formats.datasets import open_sequence
+from formats.images import read_depth_png, read_rgb
+from pipelines.evaluation.class_map import match_classes
+from pipelines.evaluation.label_score import count_labels, score
+from pipelines.progress import SilentProgress
+from pipelines.proxy.models.registry import ModelStore
+from pipelines.proxy.networks.card import Card
+from pipelines.proxy.networks.labels import network_labels
+from pipelines.proxy.networks.labels_provider import OnnxLabels
+from pipelines.proxy.networks.network_pass import ResultCache, Workplace
+from pipelines.proxy.networks.session import Network
+from pipelines.proxy.providers import DepthEstimate
+from pipelines.proxy.sequence import Sequence, resample_nearest
+from pipelines.types import VOID, Calibration, Frame, Intrinsics, SparseModel
+from pipelines.world.room import CLASSES
+
+KINDS = ("wall", "floor", "furniture")
+COLOURS = np.array([(255, 0, 0), (0, 255, 0), (0, 0, 255)], np.uint8)
+
+
+def provider(card: Card, sequence: Sequence, folder: Path) -> OnnxLabels:
+    folder.mkdir()
+    cache = ResultCache(folder / "cache", 0)
+    return OnnxLabels(card, Workplace(sequence, lambda: folder, 1, "cpu", SilentProgress(), cache), 16)
+
+
+def alone(card: Card, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    network = Network(card, 1, "cpu")
+    height, width = image.shape[:2]
+    output = network.run(image, network.box(width, height))["output"]
+    ids = network_labels(network, output, width, height)[0]
+    return np.where(ids < 0, VOID, ids).astype(np.uint8)
+
+
+def in_order_of(names: tuple[str, ...], provider: OnnxLabels, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The provider's labels as indices into `names`."""
+    places = [names.index(n) if n in names else VOID for n in provider.classes().names]
+    return np.array(places + [VOID] * (256 - len(places)), np.uint8)[labels]
+
+
+def painted(room: Room, kinds: NDArray[np.uint8], seed: int) -> dict[int, NDArray[np.uint8]]:
+    """The frames in the colours that the stand-in knows, with forty mistakes that are others in every frame."""
+    out = {}
+    for frame in room.frames:
+        image = COLOURS[kinds[room.views[frame.id].labels]]
+        rng = np.random.default_rng([seed, frame.id])
+        for x, y, kind in zip(*(rng.integers(0, n, 40) for n in (240, 180, 3)), strict=True):
+            image[y : y + 16, x : x + 16] = COLOURS[kind]
+        out[frame.id] = image
+    return out
+
+
+def test_frames_of_a_stand_in_name_the_made_room_together(room: Room, tmp_path: Path) -> None:
+    kinds = np.array([KINDS.index(n) if n in KINDS else 2 for n, _ in CLASSES] + [2] * 256, np.uint8)[:256]
+    pictures = painted(room, kinds, 0)
+    weight = [[8.0, -4.0, -4.0], [-4.0, 8.0, -4.0], [-4.0, -4.0, 8.0]]
+    file = write_tflite(tmp_path / "net.tflite", weight, [0, 0, 0], "argmax", (96, 128))
+    card = Card("segmentation", file, "image", "scores", 1.0, (0.5,) * 3, (0.5,) * 3, kind="logits", classes=KINDS)
+    sequence = replace(room.sequence(), read_image=lambda frame: pictures[frame.id])
+    found = provider(card, sequence, tmp_path / "work")
+    found.prepare(room.frames, lambda f: depth_of(room, f))
+    confusion = np.zeros((2, 3, 4), np.int64)
+    for frame in room.frames:
+        shown = in_order_of(KINDS, found, found.estimate(frame, depth_of(room, frame)).labels)
+        for total, labels in zip(confusion, (alone(card, pictures[frame.id]), shown), strict=True):
+            total += count_labels(labels, kinds[room.views[frame.id].labels], 3, 3)
+    single, together = (score(c) for c in confusion)
+    assert single is not None
+    assert together is not None
+    assert 0.5 < single.mean_iou + 0.1 < together.mean_iou < 0.999
+
+
+def test_frames_of_the_real_network_name_a_room_better_together(shared_data: Path, tmp_path: Path) -> None:
+    """Ten views of a rendered room, half a second apart, at their true poses and depths."""
+    room, numbers = shared_data / "whiteroom", list(range(0, 150, 15))
+    store = ModelStore.open(tmp_path / "cache")
+    store.take(shared_data / "models", [store.get("ade20k-small")])
+    card = store.card(store.get("ade20k-small"))
+    camera = Intrinsics(640, 480, 525.0, 525.0, 320.0, 240.0)
+    frames = [Frame(i, f"{n:06d}.jpg", n / 30, n, 1.0) for i, n in enumerate(numbers)]
+    poses = np.linalg.inv(np.loadtxt(room / "traj.txt").reshape(-1, 4, 4)[numbers])
+    nothing = np.zeros(0, np.int64)
+    model = SparseModel(
+        np.arange(len(frames)), poses, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), nothing, nothing, np.zeros((0, 2))
+    )
+    sequence = Sequence(
+        frames, Calibration(camera, "given", 0.0, (0.0,) * 4), camera.at_most(320), model,
+        lambda f: read_rgb(room / "rgb" / f.name),
+    )  # fmt: skip
+
+    def depth(frame: Frame) -> DepthEstimate:
+        metres = read_depth_png(room / "depth" / f"{frame.source_index:06d}.png").astype(np.float32) / 1000
+        small = resample_nearest(metres, 240, 320)
+        return DepthEstimate(small, (small > 0).astype(np.float32) * 0.8)
+
+    found = provider(card, sequence, tmp_path / "work")
+    found.prepare(frames, depth)
+    truth = open_sequence(room)
+    names = tuple(dict.fromkeys((*card.labels, *found.classes().names)))
+    matching = match_classes(names, card.labels, truth.class_names, None)
+    assert matching is not None
+    confusion = np.zeros((2, len(truth.class_names), len(names) + 1), np.int64)
+    by_number = {int(Path(name).stem): i for i, name in enumerate(truth.names)}
+    for frame in frames:
+        labels = truth.labels(by_number[frame.source_index])
+        if labels is None:
+            continue
+        shown = in_order_of(names, found, found.estimate(frame, depth(frame)).labels)
+        single = alone(card, sequence.image(frame))
+        for total, seen in zip(confusion, (single, shown), strict=True):
+            total += count_labels(seen, resample_nearest(labels, 240, 320), len(names), len(truth.class_names))
+    scores = [score(matching.joined(c)) for c in confusion]
+    assert all(s is not None for s in scores)
+    assert scores[0].mean_iou + 0.05 < scores[1].mean_iou < 0.99
