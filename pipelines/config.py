@@ -220,6 +220,18 @@ class ArticleConfig:
     )
     label_image: bool = setting(False, "eq. (20) for the labels instead of cross-entropy", stages=_MAPPING)
     class_growth: bool = setting(False, "grow the map where it shows another class than the label", stages=_MAPPING)
+    keyframe_miou: float = setting(
+        0.0,
+        "eq. (12): a step beside a new keyframe is on one whose labels agree less than this, 0.65 there; 0 = on any",
+        stages=_MAPPING,
+        within=(0, 1),
+    )
+    loop_steps: int = setting(
+        0,
+        "eq. (25): steps by labels and depth of the poses at a loop's ends, before map and poses are refined; 0 = none",
+        stages=("global_ba",),
+        within=(0, 10_000),
+    )
     boundary_clip: float = setting(
         0.0,
         "clip gradients beside class boundaries to this times their mean; 0 = off",

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.proxy.reliability import semantic_agreement
 from pipelines.types import VOID
 
 Array = NDArray[np.float64]
@@ -56,18 +57,6 @@ def richness(summaries: Sequence[LabelSummary], theta: float = 0.5) -> Array:
     return quantiles(theta * entropy + (1 - theta) * boundary)
 
 
-def mean_iou(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
-    """Mean over the classes in either label image (same shape) of intersection over union; 0 when nothing is known."""
-    both = (first != VOID) & (second != VOID)
-    a, b = first[both], second[both]
-    present = np.union1d(a, b)
-    if len(present) == 0:
-        return 0.0
-    counts = np.bincount(a[a == b], minlength=256)
-    union = np.bincount(a, minlength=256) + np.bincount(b, minlength=256) - counts
-    return float((counts[present] / union[present]).mean())
-
-
 def structure_similarity(first: Array, second: Array) -> float:
     """StructSim of eq. (24): cosine in 0..1 between two graphs of regions (C, C)."""
     norms = float(np.linalg.norm(first) * np.linalg.norm(second))
@@ -76,5 +65,6 @@ def structure_similarity(first: Array, second: Array) -> float:
 
 def similarity(first: LabelSummary, second: LabelSummary, appearance: float, weights: tuple[float, ...]) -> float:
     """Sim of eq. (24): α₁ mIoU + α₂ appearance + α₃ StructSim."""
-    parts = (mean_iou(first.labels, second.labels), appearance, structure_similarity(first.graph, second.graph))
+    agreement = semantic_agreement(first.labels, second.labels) or 0.0
+    parts = (agreement, appearance, structure_similarity(first.graph, second.graph))
     return float(np.dot(weights, parts))

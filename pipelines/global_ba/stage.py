@@ -16,6 +16,7 @@ from pipelines.geometry import se3
 from pipelines.global_ba.candidates import loop_candidates
 from pipelines.global_ba.close import Closed, close_loops
 from pipelines.global_ba.joint import Refined, refine_together
+from pipelines.global_ba.local import adjust_views, loop_keyframes
 from pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_found
 from pipelines.global_ba.move_map import follow_keyframes, move_map
 from pipelines.global_ba.semantics import LabelSummary, summarise_labels
@@ -69,7 +70,7 @@ def run(context: StageContext) -> dict[str, Any]:
         model = to_sparse_model(closed.state)
         fields = align_depths(model, closed.report, context.run.load_calibration().intrinsics, context.run.find_proxy)
     save_depth_fields(context.folder, fields)
-    refined = refine(context, gaussian_map, trajectory, fields, moved_px)
+    refined = refine(context, gaussian_map, trajectory, fields, moved_px, found)
     return save(context, model, trajectory, gaussian_map, found, closed, refined, moved_px)
 
 
@@ -199,7 +200,12 @@ def largest_motion(context: StageContext, state: TrackState, model: SparseModel)
 
 
 def refine(
-    context: StageContext, gaussian_map: GaussianMap, trajectory: Trajectory, fields: DepthFields, moved_px: float
+    context: StageContext,
+    gaussian_map: GaussianMap,
+    trajectory: Trajectory,
+    fields: DepthFields,
+    moved_px: float,
+    found: FoundLoops,
 ) -> Refined | None:
     """Map and poses together where the adjustment has moved them, or always, or never, as the settings say."""
     settings = context.config.global_ba
@@ -208,6 +214,9 @@ def refine(
     mapping = context.config.mapping
     given = load_views(context.run, trajectory, mapping, context.config.article, context.device, fields)
     views = given.views
+    if steps := context.config.article.loop_steps:
+        ends = loop_keyframes(found.loops, [v.frame_id for v in views])
+        views = adjust_views(views, ends, gaussian_map, mapping, steps)
     exposure = context.run.load_exposure()
     gains = {int(i): g for i, g in zip(exposure["frame_ids"], exposure["log_gains"], strict=True)}
     offsets = {int(i): o for i, o in zip(exposure["frame_ids"], exposure["offsets"], strict=True)}

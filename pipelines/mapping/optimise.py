@@ -51,8 +51,9 @@ def optimise_map(
     and offsets (N, 3) to start from.
     """
     state = OptimiserState.load(snapshot, views) or OptimiserState.fresh(views, classes, initial, exposure)
-    schedule = Schedule.plan(views, settings, seed, seeding=initial is None, passes=passes)
-    optimiser = MapOptimiser(views, classes, settings, article or ArticleConfig(), state)
+    article = article or ArticleConfig()
+    schedule = Schedule.plan(views, settings, seed, initial is None, passes, article.keyframe_miou)
+    optimiser = MapOptimiser(views, classes, settings, article, state)
     remaining = range(state.iteration, schedule.total)
     for iteration in (progress or SilentProgress()).track(remaining, label, len(remaining)):
         optimiser.visit(schedule.step(iteration))

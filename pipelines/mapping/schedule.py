@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipelines.config import MappingConfig
 from pipelines.depth.posed import overlaps
+from pipelines.mapping.article.label_choice import label_likeness
 from pipelines.mapping.covisibility import keyframe_weights
 from pipelines.mapping.views import View
 
@@ -68,15 +69,24 @@ class Schedule:
 
     @staticmethod
     def plan(
-        views: Sequence[View], settings: MappingConfig, seed: int, seeding: bool, passes: float | None
+        views: Sequence[View],
+        settings: MappingConfig,
+        seed: int,
+        seeding: bool,
+        passes: float | None,
+        keyframe_miou: float = 0.0,
     ) -> Schedule:
-        """The schedule for these views; `passes` overrides that of the settings, which also have a least count."""
+        """The schedule for these views; `passes` overrides that of the settings, which also have a least count;
+        `keyframe_miou` is T_sem of eq. (12), 0 leaves it away."""
         visits = round(passes * len(views)) if passes is not None else round(settings.passes * len(views))
         if passes is None:
             visits = max(visits, settings.min_iterations)
         steps = (WINDOW_STEPS + 1) * len(views) if seeding else 0
         reliability = np.array([float(v.trust.mean()) for v in views])
-        return Schedule(seed, len(views), steps, visits, overlaps([v.posed_depth() for v in views]), reliability)
+        overlap = overlaps([v.posed_depth() for v in views])
+        if keyframe_miou > 0:
+            overlap = np.where(label_likeness(views) < keyframe_miou, overlap, 0.0)
+        return Schedule(seed, len(views), steps, visits, overlap, reliability)
 
     @property
     def total(self) -> int:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pipelines.correspondence.retrieval import describe, learn_vocabulary
-from pipelines.global_ba.semantics import mean_iou, richness, similarity, structure_similarity, summarise_labels
-from pipelines.types import VOID, Features
+from pipelines.global_ba.semantics import richness, similarity, structure_similarity, summarise_labels
+from pipelines.types import Features
 
 
 def stripes(count: int) -> np.ndarray:
@@ -26,15 +26,6 @@ def test_only_the_top_tenth_is_rich() -> None:
         summarise_labels(rng.integers(0, rng.integers(1, 9), (90, 120)).astype(np.uint8), 9) for _ in range(40)
     ]
     assert 1 <= (richness(summaries) > 0.9).sum() <= 5
-
-
-def test_mean_iou_of_known_pictures() -> None:
-    first = np.array([[0, 0, 1, 1]], np.uint8)
-    second = np.array([[0, 1, 1, VOID]], np.uint8)
-    # Known in both: three pixels; class 0: 1 of 2, class 1: 1 of 2.
-    assert mean_iou(first, second) == pytest.approx(0.5)
-    assert mean_iou(first, first) == 1
-    assert mean_iou(first, np.full_like(first, VOID)) == 0
 
 
 def test_structure_knows_neighbours() -> None:

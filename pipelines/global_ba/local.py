@@ -1,0 +1,63 @@
+"""The local semantic adjustment of a loop's keyframes, MSGS-SLAM eq. (25): poses by labels and depth, the map held."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import torch
+
+from pipelines.config import MappingConfig
+from pipelines.gaussian_map import GaussianMap
+from pipelines.gaussians.adam import AdamTable, gradients_of
+from pipelines.gaussians.render import render
+from pipelines.geometry import se3
+from pipelines.global_ba.verify import Loop
+from pipelines.mapping import losses
+from pipelines.mapping.optimise import scene_depth
+from pipelines.mapping.views import View
+
+_RATE = 1e-3
+"""Of Adam, rotations in radians and translations in units of the world; the article has 3e-3 for its tracking."""
+_POSE_WEIGHT = 100.0
+"""Of the squared twist: a hundredth of the depth away costs as much as a hundredth of the depth's error."""
+_AROUND = 2
+"""Keyframes to either side of each end of a loop that are adjusted with it."""
+
+
+def loop_keyframes(loops: Sequence[Loop], keyframe_ids: Sequence[int]) -> set[int]:
+    """Frame ids of the keyframes at both ends of the loops, and of those beside them."""
+    place = {frame_id: n for n, frame_id in enumerate(keyframe_ids)}
+    ends = {place[i] for loop in loops for i in (loop.edge.frame1_id, loop.edge.frame2_id)}
+    return {k for n in ends for k in keyframe_ids[max(n - _AROUND, 0) : n + _AROUND + 1]}
+
+
+def adjust_views(
+    views: Sequence[View], chosen: Collection[int], gaussian_map: GaussianMap, settings: MappingConfig, steps: int
+) -> list[View]:
+    """The views, those of the `chosen` frame ids at the poses that best explain labels and depth, near where they were.
+
+    A pose that explains them no better than before stays.
+    """
+    unit = scene_depth(views)
+    return [_adjusted(v, gaussian_map, settings, steps, unit) if v.frame_id in chosen else v for v in views]
+
+
+def _adjusted(view: View, gaussian_map: GaussianMap, settings: MappingConfig, steps: int, unit: float) -> View:
+    weight = losses.depth_weight(view.trust)
+    table = AdamTable({"twist": torch.zeros(6, device=view.image.device)})
+    best, pose = float("inf"), view.cam_from_world
+    for _ in range(steps + 1):
+        twist = table.values["twist"]
+        shown = render(
+            gaussian_map.means, gaussian_map.radii, gaussian_map.opacities, gaussian_map.class_logits,
+            view.cam_from_world, view.intrinsics, twist=twist,
+        )  # fmt: skip
+        loss = settings.depth_weight * losses.depth_loss(shown.depth, view.depth, weight, unit)
+        loss = loss + settings.label_weight * losses.label_loss(shown.features, view.channels, view.label_weight)
+        loss = loss + _POSE_WEIGHT * ((twist[:3] / unit).square().sum() + twist[3:].square().sum())
+        if (value := float(loss.detach())) < best:
+            best, pose = value, se3.exp(twist.detach().double()) @ view.cam_from_world
+        (gradient,) = gradients_of(loss, (table,))
+        table.step(gradient, {"twist": _RATE})
+    return replace(view, cam_from_world=pose)

@@ -1,0 +1,98 @@
+"""What the article's choice and weights of keyframes do, eqs. (10) to (14), on runs with a network's labels.
+
+    python tests/benchmarks/terms.py RUN.msgs ... [--keyframes 14] [--json FILE]
+
+Each finished run's first keyframes are mapped again at 320 pixels, four passes, every eighth frame held out, with one
+term off or on at a time. Labels: share of the pixels that the map labels as its input. θ^γ of eq. (3) is told from the
+run's own labels.
+"""
+
+# ruff: noqa: E402 (the packages are found only once the path is set)
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+import numpy as np
+
+from pipelines.config import ArticleConfig, MappingConfig
+from pipelines.mapping import schedule
+from pipelines.mapping.load import MappingInput, load_views
+from pipelines.mapping.measure import mean_figures, measure_view
+from pipelines.mapping.optimise import optimise_map
+from pipelines.proxy.reliability import GAMMA, theta
+from pipelines.run_folder import RunFolder
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "(10), (11) off: any past keyframe": {"_covisible": lambda self, now, rng: int(rng.integers(now))},
+    "(11) with T_geo = 0.3": {"t_geo": 0.3},
+    "(12) with T_sem = 0.65": {"article": ArticleConfig(keyframe_miou=0.65)},
+    "(13) off: tau = 0": {"TIME_DECAY": 0.0},
+    "(14) off: delta = 0": {"RELIABILITY_DECAY": 0.0},
+    "default, another seed": {"seed": 1},
+}
+
+
+def trial(given: MappingInput, change: dict[str, Any]) -> dict[str, float]:
+    """Figures of the map with one change, which is undone again."""
+    kept = (schedule.TIME_DECAY, schedule.RELIABILITY_DECAY, schedule.Schedule._covisible, schedule.overlaps)
+    settings = MappingConfig(passes=4.0, min_iterations=0)
+    try:
+        for name in ("TIME_DECAY", "RELIABILITY_DECAY"):
+            setattr(schedule, name, change.get(name, getattr(schedule, name)))
+        if "_covisible" in change:
+            schedule.Schedule._covisible = change["_covisible"]  # type: ignore[method-assign]
+        if limit := change.get("t_geo", 0.0):
+            schedule.overlaps = lambda views: np.where((o := kept[3](views)) > limit, o, 0.0)
+        result = optimise_map(
+            given.views, len(given.class_ids), settings, change.get("seed", 0), article=change.get("article")
+        )
+    finally:
+        schedule.TIME_DECAY, schedule.RELIABILITY_DECAY = kept[:2]
+        schedule.Schedule._covisible, schedule.overlaps = kept[2:]  # type: ignore[method-assign]
+    rows = zip(given.views, result.cam_from_world, result.log_gains, result.offsets, strict=True)
+    nothing = np.zeros(3, np.float32)
+    held = [measure_view(result.gaussian_map, v, v.cam_from_world.numpy(), nothing, nothing) for v in given.held_out]
+    seen = mean_figures([measure_view(result.gaussian_map, *row) for row in rows], "keyframe")
+    return {"gaussians": len(result.gaussian_map), **seen, **mean_figures(held, "held_out")}
+
+
+def stretch(run: RunFolder, count: int) -> MappingInput:
+    """The views of the first keyframes, and the held-out frames between them."""
+    settings = MappingConfig(max_side=320, hold_out=8)
+    given = load_views(run, run.load_trajectory("tracking"), settings)
+    views = given.views[:count]
+    held = [v for v in given.held_out if v.frame_id < views[-1].frame_id]
+    return MappingInput(views, held, given.class_ids)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", type=Path)
+    parser.add_argument("--keyframes", type=int, default=14)
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    found: dict[str, Any] = {}
+    for path in given.runs:
+        run = RunFolder(path)
+        agreement = run.load_proxy_report().get("label_agreement", 0.0)
+        found[path.stem] = {"theta^gamma at the mean agreement": round(theta(agreement) ** GAMMA, 4)}
+        print(path.stem, json.dumps(found[path.stem]), flush=True)
+        views = stretch(run, given.keyframes)
+        for name, change in VARIANTS.items():
+            found[path.stem][name] = trial(views, change)
+            print(path.stem, name, json.dumps(found[path.stem][name]), flush=True)
+    if given.json:
+        given.json.write_text(json.dumps(found, indent=1))
+
+
+if __name__ == "__main__":
+    main()
