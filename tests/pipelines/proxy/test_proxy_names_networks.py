@@ -23,7 +23,7 @@ from pipelines.proxy.networks.session import Network
 from pipelines.proxy.providers import DepthEstimate
 from pipelines.proxy.sequence import Sequence, resample_nearest
 from pipelines.types import VOID, Calibration, Frame, Intrinsics, SparseModel
-from pipelines.world.room import CLASSES
+from tests.world.room import CLASSES
 
 KINDS = ("wall", "floor", "furniture")
 COLOURS = np.array([(255, 0, 0), (0, 255, 0), (0, 0, 255)], np.uint8)
