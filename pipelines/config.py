@@ -331,6 +331,11 @@ def _require_within(value: Any, known: Field[Any], where: str) -> None:
         raise InputError(f"{where} is {_range_text(known)}; got {value!r:.40}")
 
 
+def allowed_values(known: Field[Any]) -> str:
+    """What a setting may be, in words; "" for anything of its type."""
+    return " | ".join(known.metadata["choices"]) or (_range_text(known) if known.metadata["within"] else "")
+
+
 def _range_text(known: Field[Any]) -> str:
     low, high = known.metadata["within"]
     return f"{low:.10g} to {high:.10g}" + (", or 0" if known.metadata["or_zero"] else "")
@@ -392,7 +397,7 @@ def config_to_toml(config: Config, comments: bool = True) -> str:
         lines.append(f"[{section.name}]")
         for f in fields(values):
             if comments:
-                allowed = " | ".join(f.metadata["choices"]) or (_range_text(f) if f.metadata["within"] else "")
+                allowed = allowed_values(f)
                 lines.append(f"# {f.metadata['help']}" + (f" ({allowed})" if allowed else ""))
             lines.append(f"{f.name} = {_toml_value(getattr(values, f.name))}")
         lines.append("")

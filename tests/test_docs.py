@@ -1,16 +1,29 @@
-"""What the README and the benchmarks' README say exists: commands, options, settings, files."""
+"""What the README, the benchmarks' README and the site say exists: commands, options, settings, files, messages."""
 
+import ast
 import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 
 import click
 import pytest
 
 from msgs_cli.main import main
-from pipelines.config import load_config
+from pipelines.config import Config, load_config
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCS = [ROOT / "README.md", ROOT / "tests" / "benchmarks" / "README.md"]
+SITE = ROOT / "docs"
+DOCS = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "tests" / "benchmarks" / "README.md",
+    *sorted(SITE.glob("*.md")),
+]
 
 
 def texts() -> str:
@@ -22,6 +35,8 @@ def test_commands_and_options_exist() -> None:
     assert len(found) > 6
     for name, rest in found:
         assert name in main.commands, name
+        if isinstance(main.commands[name], click.Group):
+            continue  # its own commands are made below
         options = {o for p in main.commands[name].params if isinstance(p, click.Option) for o in p.opts}
         for option in re.findall(r"--[a-z-]+", rest):
             assert option in options, f"msgs-slam {name} {option}"
@@ -53,3 +68,80 @@ def test_pictures_are_there_and_small() -> None:
     assert names
     for name in names:
         assert 10_000 < (ROOT / name).stat().st_size < 300_000, name
+
+
+@pytest.mark.parametrize("line", sorted(set(re.findall(r"^msgs-slam [a-z].*$", texts(), flags=re.MULTILINE))))
+def test_commands_of_the_docs_are_understood(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names, options and the kind of every value, by the program's own parser; nothing is run."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "DATASET").mkdir()
+    (tmp_path / "video.msgs").mkdir()
+    command: click.Command = main
+    words = shlex.split(line.partition(">")[0], comments=True)[1:]
+    with click.Context(main) as context:
+        while isinstance(command, click.Group):
+            _, found, words = command.resolve_command(context, words)
+            assert found is not None
+            command = found
+    command.make_context(command.name, words)
+
+
+def messages() -> Iterator[str]:
+    """Every text in the code that is longer than a word, with … in place of what is filled in."""
+    for room in ("msgs_cli", "pipelines", "formats"):
+        for path in (ROOT / room).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.JoinedStr):
+                    yield "".join(str(v.value) if isinstance(v, ast.Constant) else "…" for v in node.values)
+                elif isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value:
+                    yield node.value
+
+
+def test_messages_explained_are_still_given() -> None:
+    """As a whole, or as the beginning of a longer one."""
+    text = (SITE / "troubleshooting.md").read_text(encoding="utf-8")
+    explained = [m.strip() for m in re.findall(r"^### (.*)$", text, flags=re.MULTILINE)]
+    given = {re.sub(r"…+", "…", m) for m in messages()}
+    assert len(explained) > 30
+    assert [m for m in explained if not any(g.startswith(re.sub(r"…+", "…", m)) for g in given)] == []
+
+
+def test_site_is_built_without_a_broken_link(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    pages = {path.stem: path.read_text(encoding="utf-8") for path in tmp_path.glob("*.html")}
+    assert {path.stem for path in SITE.glob("*.md")} | {"settings"} <= set(pages)
+    assert "mapping" in pages["settings"]
+    for name in main.commands:
+        assert f"msgs-slam {name}" in pages["commands"], name
+    assert pages["method"].count("<math") > 20
+    assert "arithmatex" not in pages["method"]
+    assert "world_from_cam" in pages["python"]
+    # Nothing is fetched from elsewhere: the site works from the disk.
+    for name, page in pages.items():
+        assert not re.findall(r'(?:src|<link[^>]* href)="https?://[^"]*"', page), name
+
+
+def test_settings_page_has_every_setting() -> None:
+    pytest.importorskip("mkdocs")
+    pytest.importorskip("latex2mathml")
+    sys.path.insert(0, str(SITE))
+    try:
+        from hooks import settings_page
+    finally:
+        sys.path.pop(0)
+    page = settings_page()
+    for section in fields(Config):
+        for key in fields(getattr(Config(), section.name)):
+            assert f"| `{key.name}` |" in page.split(f"## {section.name}\n")[1].split("\n## ")[0], key.name
+
+
+def test_dockerfile_copies_what_is_here_and_asks_for_the_same_torch() -> None:
+    text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    copied = [name for line in re.findall(r"^COPY (?!--from)(.*) \S+$", text, re.MULTILINE) for name in line.split()]
+    assert {"setup.py", "pipelines", "formats", "msgs_cli"} <= set(copied)
+    assert [name for name in copied if not (ROOT / name).exists()] == []
+    wanted = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
+    assert re.findall(r'"(torch[^"]*)"', text) == [name for name in wanted if name.startswith("torch")]

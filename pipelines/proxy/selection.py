@@ -72,27 +72,27 @@ class Choice:
 
 def choose_depth(config: ProxyConfig) -> Choice:
     """Raises InputError for a provider that does not exist or a card that is none."""
-    return _choose(config.depth, "proxy.depth", "multiview", "depth")
+    return _choose(config.depth, "proxy.depth", tuple(OWN_DEPTH), "depth")
 
 
 def choose_semantics(config: ProxyConfig) -> Choice:
     """Raises InputError for a provider that does not exist or a card that is none."""
-    return _choose(config.semantics, "proxy.semantics", "segments", "segmentation")
+    return _choose(config.semantics, "proxy.semantics", tuple(OWN_SEMANTICS), "segmentation")
 
 
-def _choose(text: str, setting: str, embedded: str, task: str) -> Choice:
-    kind, rest = split_choice(text, setting, ("auto", embedded, "files", "onnx"))
+def _choose(text: str, setting: str, own: tuple[str, ...], task: str) -> Choice:
+    kind, rest = split_choice(text, setting, ("auto", *own, "files", "onnx"))
     card = _cached(task) if kind == "auto" else _read(rest) if kind == "onnx" else None
     if card is not None:
         return Choice("onnx", card=card)
-    return Choice("files", rest) if kind == "files" else Choice(embedded)
+    return Choice("files", rest) if kind == "files" else Choice(own[0] if kind == "auto" else kind)
 
 
 def open_depth(around: Surroundings) -> DepthProvider:
     """Raises InputError when the provider cannot work on this video."""
     choice = choose_depth(around.config)
-    if choice.kind == "multiview":
-        return _multiview(around)
+    if choice.kind in OWN_DEPTH:
+        return OWN_DEPTH[choice.kind](around)
     learned: DepthProvider = open_learned_depth(around, choice)
     if isinstance(learned, OnnxDepth) and choice.card is not None and choice.card.relative:
         learned = AlignedDepth(learned, around.sequence, choice.card.relative)
@@ -119,8 +119,8 @@ def open_learned_depth(around: Surroundings, choice: Choice) -> FilesDepth | Rec
 def open_semantics(around: Surroundings) -> SemanticsProvider:
     """Raises InputError when the provider cannot work on this video."""
     choice = choose_semantics(around.config)
-    if choice.kind == "segments":
-        return SegmentLabels(around.sequence, around.config.max_classes, around.progress)
+    if choice.kind in OWN_SEMANTICS:
+        return OWN_SEMANTICS[choice.kind](around)
     return open_learned_semantics(around, choice)
 
 
@@ -189,6 +189,15 @@ def missing_networks() -> str | None:
 def _multiview(around: Surroundings) -> MultiviewDepth:
     settings = StereoSettings(side=around.config.stereo_side, planes=around.config.stereo_planes)
     return MultiviewDepth(around.sequence, settings, lambda: around.scratch("stereo"), around.threads, around.progress)
+
+
+def _segments(around: Surroundings) -> SegmentLabels:
+    return SegmentLabels(around.sequence, around.config.max_classes, around.progress)
+
+
+OWN_DEPTH: dict[str, Callable[[Surroundings], DepthProvider]] = {"multiview": _multiview}
+OWN_SEMANTICS: dict[str, Callable[[Surroundings], SemanticsProvider]] = {"segments": _segments}
+"""Providers that need neither files nor a network; a new one is a line here. `auto` falls back to the first."""
 
 
 def _fused(around: Surroundings, learned: DepthProvider) -> DepthProvider:

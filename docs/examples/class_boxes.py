@@ -1,0 +1,29 @@
+"""Export: the box of each class in the upright world, as a table for spreadsheets."""
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+
+from formats.atomic import write_text
+from pipelines.export.writers import map_cloud
+from pipelines.outcome import Outcome
+
+
+def write_class_boxes(outcome: Outcome, folder: Path) -> list[Path]:
+    """class_boxes.csv: name, Gaussians, and lowest and highest x, y, z of nine tenths of them.
+
+    `outcome` stands in the world of the exported files already; a class without Gaussians has no row.
+    """
+    cloud = map_cloud(outcome)
+    rows = [["class", "gaussians", "x0", "y0", "z0", "x1", "y1", "z1"]]
+    for label, name in enumerate(outcome.classes.names):
+        mine = cloud.means[cloud.class_ids == label] if cloud.class_ids is not None else cloud.means[:0]
+        if len(mine):
+            low, high = np.quantile(mine, (0.05, 0.95), axis=0)
+            rows.append([name, str(len(mine)), *(f"{v:.3f}" for v in (*low, *high))])
+    table = io.StringIO()
+    csv.writer(table, lineterminator="\n").writerows(rows)
+    write_text(folder / "class_boxes.csv", table.getvalue())
+    return [folder / "class_boxes.csv"]

@@ -1,0 +1,26 @@
+"""The commands of the ten-minute tour, run on a tiny finished run; those that make one are run by other tests."""
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+from cli_runs import FinishedRun, invoke
+
+TOUR = Path(__file__).resolve().parents[2] / "docs" / "tour.md"
+MADE_ELSEWHERE = {"reconstruct", "demo", "view", "doctor", "models"}
+
+
+def test_the_tour_can_be_followed(finished_run: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(finished_run.folder, tmp_path / "video.msgs")
+    (tmp_path / "DATASET").symlink_to(finished_run.truth)
+    monkeypatch.chdir(tmp_path)
+    lines = re.findall(r"^msgs-slam (.*)$", TOUR.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    followed = [words for line in lines if (words := shlex.split(line, comments=True))[0] not in MADE_ELSEWHERE]
+    assert {words[0] for words in followed} == {"status", "report", "render", "export", "evaluate"}
+    for words in followed:
+        done = invoke(*words)
+        assert done.exit_code == 0, (words, done.output)
+    made = ("out.mp4", "elsewhere/point_cloud.spz", "video.msgs/report.html", "video.msgs/evaluation/evaluation.json")
+    assert [name for name in made if not (tmp_path / name).exists()] == []
