@@ -18,8 +18,8 @@ from pipelines.progress import SilentProgress
 from pipelines.proxy import selection
 from pipelines.run_folder import RunFolder
 from pipelines.types import Calibration, Frame
-from pipelines.world import ClipOptions, make_world, render_frame
 from tests.pipelines.proxy.proxy_room import UNIT, Room, perfect_backbone
+from tests.world import ClipOptions, make_world, render_frame
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
 OracleRun = Callable[..., RunFolder]
