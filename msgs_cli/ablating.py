@@ -58,8 +58,7 @@ def ablate(
     set_up_logging(quiet, verbose)
     from formats.datasets import open_sequence
     from pipelines.config import load_config
-    from pipelines.evaluation.ablation import ABLATIONS, ablate
-    from pipelines.evaluation.ablation_table import ablation_table
+    from pipelines.evaluation.ablation import ABLATIONS, ablate, ablation_table
     from pipelines.reconstruct import default_run_folder
 
     texts = [f"mapping.hold_out={hold_out}", *overrides, *source_settings(about_source)]

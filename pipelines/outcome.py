@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from pipelines.run_folder import RunFolder
 from pipelines.settings_file import load_settings
 from pipelines.types import VOID, Calibration, ClassTable, Frame, Metres, SparseModel, Trajectory
 
+T = TypeVar("T")
 _MAP_STAGES = ("global_ba", "mapping")
 _POSE_STAGES = ("global_ba", "mapping", "tracking")
 
@@ -172,6 +174,12 @@ def _load_exposure(run: RunFolder, map_stage: str, trajectory: Trajectory) -> Ex
             order = np.argsort(times, kind="stable")
             return Exposure(times[order], arrays["log_gains"][order], arrays["offsets"][order])
     return None
+
+
+def evenly(items: Sequence[T], most: int) -> list[T]:
+    """At most `most` of them, evenly spread, first and last among them."""
+    picked = np.unique(np.linspace(0, len(items) - 1, min(len(items), most)).round().astype(int))
+    return [items[i] for i in picked]
 
 
 def labels_of_channels(channels: NDArray, label_of_channel: NDArray[np.uint8]) -> NDArray[np.uint8]:

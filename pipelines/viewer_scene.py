@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from formats.errors import InputError
 from formats.gaussian_files import read_gaussians
 from formats.reading import reaching
-from pipelines.evaluation.measure import evenly
 from pipelines.gaussian_map import decided_channels
-from pipelines.outcome import Outcome, labels_of_channels, load_outcome
+from pipelines.outcome import Outcome, evenly, labels_of_channels, load_outcome
 from pipelines.proxy.palette import class_colors
 from pipelines.run_folder import MESH, RunFolder
 from pipelines.types import Frame

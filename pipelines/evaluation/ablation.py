@@ -16,7 +16,6 @@ from formats.errors import InputError
 from formats.jsonfile import read_json_object, write_json
 from pipelines.branch import branch
 from pipelines.config import Config, config_to_toml, load_config
-from pipelines.evaluation.ablation_table import ablation_table
 from pipelines.evaluation.evaluate import evaluate_run
 from pipelines.progress import Progress
 from pipelines.reconstruct import all_stages, reconstruct
@@ -218,3 +217,26 @@ def _value(
         missing.setdefault(column, at["missing"] if at else "every picture is equal to its frame")
         return None
     return factor * float(at)
+
+
+def ablation_table(result: dict[str, Any]) -> str:
+    """The protocol, a row a variant, then what could not be measured and what each row switches."""
+    rows = result["rows"]
+    columns = list(dict.fromkeys(c for row in rows for c in row["mean"]))
+    lines = [f"# Ablations of {result['source']} against {result['truth']}", ""]
+    lines += [f"- {note}" for note in result["notes"]]
+    lines += ["", "| | " + " | ".join(["seeds", *columns]) + " |", "| --- " * (len(columns) + 2) + "|"]
+    for row in rows:
+        cells = [_cell(row, column) for column in columns]
+        lines.append(f"| {row['name']} | {', '.join(map(str, row['seeds']))} | " + " | ".join(cells) + " |")
+    lines += ["", *(f"- {c}: – ({why})" for c, why in result["missing"].items() if c not in columns)]
+    lines += [f"- {row['name']}: {', '.join(row['settings']) or 'all terms'}" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(row: dict[str, Any], column: str) -> str:
+    if column not in row["mean"]:
+        return "–"
+    mean, sd = row["mean"][column], row["sd"].get(column)
+    digits = 0 if column == "Gaussians" else 4 if column in ("SSIM", "LPIPS") else 2
+    return f"{mean:.{digits}f}" + ("" if sd is None else f" ± {sd:.{digits}f}")

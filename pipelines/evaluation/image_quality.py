@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from pipelines.gaussians.ssim import TAPS, similarity
 from pipelines.types import require_shape
-
-_C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
-_TAPS, _SIGMA = 11, 1.5
 
 
 def psnr(image: NDArray, truth: NDArray, mask: NDArray[np.bool_] | None = None) -> float:
@@ -34,18 +32,8 @@ def ssim(image: NDArray, truth: NDArray) -> float:
     window lies in the image. Raises ValueError for images smaller than the window.
     """
     require_shape("image", image, truth.shape)
-    if min(image.shape[:2]) < _TAPS:
-        raise ValueError(f"ssim: images need at least {_TAPS} pixels a side, got {image.shape[:2]}")
-    a, b = image.astype(np.float64), truth.astype(np.float64)
-    mean_a, mean_b = _blurred(a), _blurred(b)
-    var_a, var_b = _blurred(a * a) - mean_a**2, _blurred(b * b) - mean_b**2
-    covariance = _blurred(a * b) - mean_a * mean_b
-    similarity = ((2 * mean_a * mean_b + _C1) * (2 * covariance + _C2)) / (
-        (mean_a**2 + mean_b**2 + _C1) * (var_a + var_b + _C2)
-    )
-    edge = _TAPS // 2
-    return float(similarity[edge:-edge, edge:-edge].mean())
-
-
-def _blurred(image: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(cv2.GaussianBlur(image, (_TAPS, _TAPS), _SIGMA), np.float64)
+    if min(image.shape[:2]) < TAPS:
+        raise ValueError(f"ssim: images need at least {TAPS} pixels a side, got {image.shape[:2]}")
+    a, b = (torch.from_numpy(x.astype(np.float64) / 255) for x in (image, truth))
+    edge = TAPS // 2
+    return float(similarity(a, b)[0][edge:-edge, edge:-edge].mean())

@@ -21,7 +21,7 @@ from pipelines.evaluation.views import MapView, view_map
 from pipelines.frames.source_pixels import FramePixels
 from pipelines.gaussians.render import track_gn
 from pipelines.mapping.load import split_frames
-from pipelines.outcome import Outcome
+from pipelines.outcome import Outcome, evenly
 from pipelines.progress import Progress
 
 KEYFRAMES, BETWEEN, HELD_OUT = "keyframes", "between", "held out"
@@ -152,13 +152,6 @@ def refined_pose(outcome: Outcome, frame_id: int, cam_from_world: NDArray[np.flo
         outcome.calibration.intrinsics, torch.as_tensor(photo, device=m.means.device),
     )  # fmt: skip
     return fit.cam_from_world.cpu().numpy() if fit.converged else cam_from_world
-
-
-def evenly(ids: list[int], most: int) -> list[int]:
-    """At most `most` of the ids, evenly spread, first and last among them."""
-    if len(ids) <= most:
-        return ids
-    return [ids[i] for i in np.unique(np.linspace(0, len(ids) - 1, most).round().astype(int))]
 
 
 def _measure(

@@ -10,17 +10,12 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from pipelines.evaluation.surface_error import (
-    depth_points,
-    sample_surface,
-    seen_in_depth,
-    surface_error,
-    thinned,
-)
+from pipelines.evaluation.surface_error import depth_points, sample_surface, seen_in_depth, surface_error, thinned
 from pipelines.evaluation.trajectory_error import AbsoluteError
 from pipelines.evaluation.truth import MatchedTruth
 from pipelines.outcome import Outcome
 from pipelines.run_folder import MESH
+from pipelines.types import Intrinsics
 from pipelines.upright.world import FIRST, load_world
 
 SAMPLES = 200_000
@@ -58,11 +53,11 @@ def _load(path: Path) -> tuple[NDArray, NDArray] | None:
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-_SeenView = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]
+_SeenView = tuple[NDArray[np.float32], Intrinsics, NDArray[np.float64]]
 
 
 def true_surface(matched: MatchedTruth) -> tuple[NDArray[np.float64], list[_SeenView]]:
-    """Points of the true depth of up to `VIEWS` frames, thinned; and (depth, matrix, cam_from_world) of each.
+    """Points of the true depth of up to `VIEWS` frames, thinned; and (depth, camera, cam_from_world) of each.
 
     A lens with distortion is left out: its depth does not follow the pinhole that the points are made with.
     """
@@ -75,17 +70,17 @@ def true_surface(matched: MatchedTruth) -> tuple[NDArray[np.float64], list[_Seen
         depth = sequence.depth(int(matched.image[row]))
         if depth is None:
             continue
-        camera = sequence.camera.resized(depth.shape[1], depth.shape[0])
-        matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+        k = sequence.camera.resized(depth.shape[1], depth.shape[0])
+        camera = Intrinsics(k.width, k.height, k.fx, k.fy, k.cx, k.cy)
         pose = matched.world_from_cam[row]
-        points.append(depth_points(depth, matrix, pose, stride=max(1, depth.shape[1] // 320)))
-        views.append((depth, matrix, np.linalg.inv(pose)))
+        points.append(depth_points(depth, camera, pose, stride=max(1, depth.shape[1] // 320)))
+        views.append((depth, camera, np.linalg.inv(pose)))
     return (thinned(np.concatenate(points), CELL) if points else np.zeros((0, 3))), views
 
 
 def _seen(points: NDArray[np.float64], views: list[_SeenView]) -> NDArray[np.bool_]:
     seen = np.zeros(len(points), dtype=bool)
-    for depth, matrix, cam_from_world in views:
+    for depth, camera, cam_from_world in views:
         left = np.flatnonzero(~seen)
-        seen[left] = seen_in_depth(points[left], depth, matrix, cam_from_world, SLACK)
+        seen[left] = seen_in_depth(points[left], depth, camera, cam_from_world, SLACK)
     return seen

@@ -27,9 +27,6 @@ from pipelines.types import LoopEdge, SparseModel
 from pipelines.upright.world import FIRST, load_world
 from pipelines.wording import lost_text
 
-MEASURED_VIEWS = 60
-SHOWN_VIEWS = 8
-
 
 def write_report(run: RunFolder, path: Path | None = None, progress: Progress | None = None) -> Path:
     """Write RUN/report.html, or `path`; returns where. What has not been done yet is left out.

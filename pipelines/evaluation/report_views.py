@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from pipelines.evaluation.facts import Capture
 from pipelines.evaluation.html import image, section
 from pipelines.evaluation.image_quality import psnr
-from pipelines.evaluation.measure import evenly, render_outcome
+from pipelines.evaluation.measure import render_outcome
 from pipelines.evaluation.pictures import depth_picture, depth_range, labels_on_photo
 from pipelines.evaluation.plots import BLUE, GREEN, GREY, ORANGE, RED, Line, Marks, bars, plot
-from pipelines.outcome import Outcome
+from pipelines.outcome import Outcome, evenly
 from pipelines.progress import Progress
 from pipelines.types import VOID
 

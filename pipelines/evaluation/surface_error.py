@@ -8,6 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pipelines.geometry import se3
+from pipelines.geometry.camera import project, unproject_depth
+from pipelines.types import Intrinsics
+
 Points = NDArray[np.float64]
 
 
@@ -63,28 +67,19 @@ def thinned(points: Points, cell: float) -> Points:
     return points[np.unique(number, return_index=True)[1]]
 
 
-def depth_points(
-    depth: NDArray, matrix: NDArray[np.float64], world_from_cam: NDArray[np.float64], stride: int = 1
-) -> Points:
-    """(P, 3) world points of every `stride`-th pixel with a depth; `matrix` (3, 3) has pixel centres at +0.5."""
-    v, u = np.mgrid[0 : depth.shape[0] : stride, 0 : depth.shape[1] : stride]
-    z = depth[::stride, ::stride].astype(np.float64)
-    pixels = np.stack([u + 0.5, v + 0.5, np.ones_like(z)], axis=-1)
-    points = (pixels @ np.linalg.inv(matrix).T * z[..., None])[z > 0]
-    return points @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+def depth_points(depth: NDArray, camera: Intrinsics, world_from_cam: NDArray[np.float64], stride: int = 1) -> Points:
+    """(P, 3) world points of every `stride`-th pixel with a depth."""
+    points = unproject_depth(depth, camera)[::stride, ::stride]
+    return se3.transform(world_from_cam, points[depth[::stride, ::stride] > 0])
 
 
 def seen_in_depth(
-    points: Points, depth: NDArray, matrix: NDArray[np.float64], cam_from_world: NDArray[np.float64], slack: float
+    points: Points, depth: NDArray, camera: Intrinsics, cam_from_world: NDArray[np.float64], slack: float
 ) -> NDArray[np.bool_]:
     """(N,) whether a point lies in the picture and no further than `slack` metres behind the depth seen there."""
-    in_cam = points @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
-    z = in_cam[:, 2]
-    pixels = in_cam @ matrix.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = np.floor(pixels[:, 0] / z), np.floor(pixels[:, 1] / z)
-    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < depth.shape[1]) & (v < depth.shape[0])
-    seen = np.zeros(len(points), dtype=bool)
-    there = depth[v[inside].astype(np.int64), u[inside].astype(np.int64)]
-    seen[inside] = (there > 0) & (z[inside] < there + slack)
+    xy, z = project(se3.transform(cam_from_world, points), camera)
+    # Pixels of points behind the camera are NaN, which compares false.
+    seen = np.asarray(((xy >= 0) & (xy < (camera.width, camera.height))).all(axis=1))
+    column, row = xy[seen].astype(np.int64).T
+    seen[seen] = (depth[row, column] > 0) & (z[seen] < depth[row, column] + slack)
     return seen

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry import se3
 from pipelines.geometry.alignment import Similarity, align_points
 from pipelines.types import require_shape
 
@@ -98,14 +99,4 @@ def relative_error(
     scaled[:, :3, 3] *= scale
     motion, truth = (np.linalg.inv(p[:-delta]) @ p[delta:] for p in (scaled, true_world_from_cam))
     difference = np.linalg.inv(truth) @ motion
-    return RelativeError(
-        np.linalg.norm(difference[:, :3, 3], axis=1), np.degrees(_rotation_angles(difference[:, :3, :3]))
-    )
-
-
-def _rotation_angles(rotations: Array) -> Array:
-    """(N,) radians; from sine and cosine, so that small angles keep their digits."""
-    skew = rotations - rotations.transpose(0, 2, 1)
-    sine = np.sqrt(skew[:, 0, 1] ** 2 + skew[:, 0, 2] ** 2 + skew[:, 1, 2] ** 2) / 2
-    cosine = (np.trace(rotations, axis1=1, axis2=2) - 1) / 2
-    return np.arctan2(sine, cosine)
+    return RelativeError(np.linalg.norm(difference[:, :3, 3], axis=1), np.degrees(se3.rotation_angle(difference)))

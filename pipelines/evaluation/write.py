@@ -12,7 +12,7 @@ from formats.images import write_rgb
 from formats.jsonfile import write_json
 from pipelines.evaluation.class_map import ClassMap
 from pipelines.evaluation.evaluate import evaluate_outcome
-from pipelines.evaluation.measure import evenly, render_outcome
+from pipelines.evaluation.measure import render_outcome
 from pipelines.evaluation.pictures import (
     Picture,
     class_colors_by_name,
@@ -27,7 +27,7 @@ from pipelines.evaluation.table import evaluation_table
 from pipelines.evaluation.truth import MatchedTruth, match_truth
 from pipelines.frames.source_pixels import FramePixels
 from pipelines.geometry.alignment import Similarity, align_points
-from pipelines.outcome import Outcome, load_outcome
+from pipelines.outcome import Outcome, evenly, load_outcome
 from pipelines.progress import Progress
 from pipelines.run_folder import RunFolder
 

@@ -1,9 +1,6 @@
-"""What the finished map shows as depth: rendered median depth with a weight, of a few views evenly spread."""
+"""What the finished map shows as depth: rendered median depth with a weight."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -13,14 +10,6 @@ from pipelines.export.volume import DepthView
 from pipelines.gaussian_map import GaussianMap
 from pipelines.gaussians.render import median_depth, render
 from pipelines.types import Intrinsics
-
-T = TypeVar("T")
-
-
-def spread(items: Sequence[T], most: int) -> list[T]:
-    """At most `most` of them, evenly spread."""
-    picked = np.unique(np.linspace(0, len(items) - 1, min(len(items), most)).round().astype(int))
-    return [items[i] for i in picked]
 
 
 @torch.no_grad()

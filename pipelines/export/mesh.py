@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from formats.mesh import write_mesh_glb, write_mesh_ply
 from pipelines.config import ExportConfig
-from pipelines.export.depth_views import depth_view, spread
+from pipelines.export.depth_views import depth_view
 from pipelines.export.paint import PaintedView, paint
 from pipelines.export.surface import extract_surface, without_floaters
 from pipelines.export.volume import DepthView, fuse
 from pipelines.gaussian_map import GaussianMap, decided_channels
 from pipelines.gaussians.render import get_threads, render
-from pipelines.outcome import Outcome
+from pipelines.outcome import Outcome, evenly
 from pipelines.progress import Progress
 from pipelines.types import VOID, SemanticMesh
 
@@ -30,7 +30,7 @@ LEAST_WEIGHT = 1.5
 def make_mesh(outcome: Outcome, settings: ExportConfig, progress: Progress) -> SemanticMesh:
     """The surface of the map as the keyframes see it; without a vertex where nothing is seen twice."""
     trajectory, gaussian_map = outcome.trajectory, outcome.require_map()
-    poses = spread(list(trajectory.cam_from_world[trajectory.is_keyframe]), settings.max_views)
+    poses = evenly(list(trajectory.cam_from_world[trajectory.is_keyframe]), settings.max_views)
     camera = outcome.calibration.intrinsics.at_most(settings.mesh_side)
     views = [depth_view(gaussian_map, p, camera) for p in progress.track(poses, "depth views", len(poses))]
     voxel = settings.voxel * _median_depth(views)

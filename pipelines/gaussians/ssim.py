@@ -15,7 +15,7 @@ from pipelines.gaussians.render.jit import kernel
 
 C1, C2 = 0.01**2, 0.03**2
 """Constants of Wang et al. 2004 for images in 0..1."""
-_TAPS, _SIGMA = 11, 1.5
+TAPS, _SIGMA = 11, 1.5
 
 
 def ssim_map(rendered: Tensor, target: Tensor) -> Tensor:
@@ -106,13 +106,13 @@ def blur(image: Tensor) -> Tensor:
     if image.device.type == "cpu" and image.dtype in (torch.float32, torch.float64):
         # OpenCV's separable filter is about ten times torch's depthwise convolution on a CPU.
         return torch.from_numpy(_blur_array(np.ascontiguousarray(image.detach().numpy())))
-    taps = torch.as_tensor(cv2.getGaussianKernel(_TAPS, _SIGMA), dtype=image.dtype, device=image.device).flatten()
+    taps = torch.as_tensor(cv2.getGaussianKernel(TAPS, _SIGMA), dtype=image.dtype, device=image.device).flatten()
     planes = image.permute(2, 0, 1)[:, None]
-    planes = functional.conv2d(planes, taps[None, None, :, None], padding=(_TAPS // 2, 0))
-    planes = functional.conv2d(planes, taps[None, None, None, :], padding=(0, _TAPS // 2))
+    planes = functional.conv2d(planes, taps[None, None, :, None], padding=(TAPS // 2, 0))
+    planes = functional.conv2d(planes, taps[None, None, None, :], padding=(0, TAPS // 2))
     return planes[:, 0].permute(1, 2, 0)
 
 
 def _blur_array(image: NDArray) -> NDArray:
-    taps = cv2.getGaussianKernel(_TAPS, _SIGMA)
+    taps = cv2.getGaussianKernel(TAPS, _SIGMA)
     return cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_CONSTANT).reshape(image.shape)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.export.depth_views import depth_view, spread
-from pipelines.outcome import Outcome
+from pipelines.export.depth_views import depth_view
+from pipelines.outcome import Outcome, evenly
 from pipelines.proxy.regions.structure import Gravity, find_gravity, floor_plane, name_structure
 from pipelines.proxy.regions.voxels import Voxels, gather_frame, merge, select
 from pipelines.upright.cameras import cameras_up
@@ -44,11 +44,11 @@ def find_upright(outcome: Outcome) -> Upright:
     """
     trajectory = outcome.trajectory
     prior = cameras_up(trajectory.world_from_cam[trajectory.is_posed])
-    rows = spread(np.flatnonzero(trajectory.is_keyframe).tolist(), _PICTURES)
+    rows = evenly(np.flatnonzero(trajectory.is_keyframe).tolist(), _PICTURES)
     poses = trajectory.cam_from_world[rows]
     pictures = (outcome.run.image(outcome.frames[row]) for row in rows)
     lines = up_of_lines(pictures, poses, outcome.calibration.intrinsics, prior)
-    voxels = surface_voxels(outcome, spread(list(poses), _VIEWS))
+    voxels = surface_voxels(outcome, evenly(list(poses), _VIEWS))
     level = find_gravity(voxels, prior) if len(voxels) else Gravity(prior, False)
     if not (lines.is_sure or level.is_sure):
         return Upright(prior, "", None)

@@ -11,6 +11,7 @@ from pipelines.evaluation.surface_error import (
     surface_error,
     thinned,
 )
+from pipelines.types import Intrinsics
 
 
 def test_samples_lie_on_the_surface_and_spread_by_area() -> None:
@@ -48,17 +49,17 @@ def test_a_missing_half_costs_completeness_alone() -> None:
 
 
 def test_depth_gives_points_where_they_are_and_tells_what_is_seen() -> None:
-    matrix = np.array([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
+    camera = Intrinsics(40, 30, 50.0, 50.0, 20.0, 15.0)
     depth = np.full((30, 40), 2.0)
     depth[:, :10] = 0
     pose = np.eye(4)
     pose[:3, 3] = (1, 0, 0)
-    points = depth_points(depth, matrix, pose)
+    points = depth_points(depth, camera, pose)
     assert len(points) == 30 * 30
     np.testing.assert_allclose(points[:, 2], 2)
     np.testing.assert_allclose(points[0], [1 + (10.5 - 20) / 50 * 2, (0.5 - 15) / 50 * 2, 2])
     probes = points[[465, 465, 465]] + np.array([[0, 0, -0.5], [0, 0, 0.01], [0, 0, 0.5]])
     outside = np.array([[9.0, 0, 2], [1.0, 0, -2]])
-    seen = seen_in_depth(np.concatenate([probes, outside]), depth, matrix, np.linalg.inv(pose), 0.05)
+    seen = seen_in_depth(np.concatenate([probes, outside]), depth, camera, np.linalg.inv(pose), 0.05)
     assert seen.tolist() == [True, True, False, False, False]
     assert len(thinned(np.repeat(points, 3, axis=0), 1e-6)) == len(points)
