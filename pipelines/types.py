@@ -13,10 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
 
 VOID = 255
 """Label of a pixel whose class is unknown."""
@@ -28,6 +31,12 @@ def require_shape(name: str, array: NDArray, expected: Sequence[int | None]) -> 
     if len(shape) != len(expected) or any(e is not None and s != e for s, e in zip(shape, expected, strict=True)):
         want = tuple("any" if e is None else e for e in expected)
         raise ValueError(f"{name}: got shape {shape}, expected {want}")
+
+
+def rows_by(group: NDArray[np.integer], count: int) -> list[NDArray[np.int64]]:
+    """For each of the groups 0 to `count` - 1 the rows of `group` (Q,) that hold its number, in order."""
+    order = np.argsort(group, kind="stable")
+    return np.split(order, np.searchsorted(group[order], np.arange(1, count)))
 
 
 @dataclass(frozen=True)
@@ -145,6 +154,39 @@ class SparseModel:
         require_shape("colors", self.colors, (p, 3))
         require_shape("obs_point", self.obs_point, (o,))
         require_shape("obs_xy", self.obs_xy, (o, 2))
+
+    @cached_property
+    def centers(self) -> NDArray[np.float64]:
+        """(N, 3) of the cameras in the world."""
+        return np.asarray(np.linalg.inv(self.cam_from_world)[:, :3, 3], np.float64).reshape(-1, 3)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of `centers`."""
+        return cKDTree(self.centers)
+
+    @cached_property
+    def _rows(self) -> list[NDArray[np.int64]]:
+        return rows_by(self.obs_frame, len(self.frame_ids))
+
+    def observations_of(self, index: int) -> NDArray[np.int64]:
+        """Rows of the observations that the keyframe made, in order."""
+        return self._rows[index]
+
+    @cached_property
+    def seen(self) -> csr_matrix:
+        """(N, P) bool: which keyframe observes which point."""
+        shape = len(self.frame_ids), len(self.points_in_world)
+        return csr_matrix((np.ones(len(self.obs_frame), bool), (self.obs_frame, self.obs_point)), shape)
+
+    @cached_property
+    def seen_by(self) -> csr_matrix:
+        """(P, N) bool: the same by point."""
+        return self.seen.T.tocsr()
+
+    def points_of(self, index: int) -> NDArray[np.int64]:
+        """Sorted indices of the points that the keyframe observes."""
+        return self.seen.indices[self.seen.indptr[index] : self.seen.indptr[index + 1]].astype(np.int64)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ them where there are any.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from pipelines.types import Features, Vocabulary
 _WORDS = 64
 _TRAINING_DESCRIPTORS = 20000
 _ROUNDS = 12
+_BLOCK = 256
 
 
 def describe(features: Features, vocabulary: Vocabulary) -> NDArray[np.float32]:
@@ -56,9 +58,28 @@ def unit(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
-def likeness(vectors: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(N, N) products of unit vectors (N, D), rounded: the order in which a BLAS adds must not choose between pairs."""
-    return np.round(vectors.astype(np.float64) @ vectors.T.astype(np.float64), 9)
+@dataclass(frozen=True)
+class Looks:
+    """How alike frames look: the mean over kinds of descriptors, each unit vectors (N, D), of their products.
+
+    Row by row, because nobody has room for the likeness of every pair of a long recording.
+    """
+
+    kinds: tuple[NDArray[np.float32], ...]
+
+    def __len__(self) -> int:
+        return len(self.kinds[0])
+
+    def rows(self, part: slice) -> NDArray[np.float64]:
+        """(R, N) of the frames `part` with all; rounded: the order in which a BLAS adds must not choose between
+        pairs."""
+        return np.mean([np.round(_products(v[part], v), 9) for v in self.kinds], axis=0)
+
+
+def _products(some: NDArray[np.float32], vectors: NDArray[np.float32]) -> NDArray[np.float64]:
+    """(R, N) in double precision, without a copy of all vectors in it."""
+    rows, blocks = some.astype(np.float64), range(0, len(vectors), _BLOCK)
+    return np.concatenate([rows @ vectors[i : i + _BLOCK].astype(np.float64).T for i in blocks], axis=1)
 
 
 def sequential_pairs(count: int, overlap: int) -> list[tuple[int, int]]:
@@ -68,24 +89,29 @@ def sequential_pairs(count: int, overlap: int) -> list[tuple[int, int]]:
     return [(i, i + s) for i in range(count) for s in steps if i + s < count]
 
 
-def loop_pairs(alike: NDArray[np.floating], allowed: NDArray[np.bool_], per_frame: int) -> list[tuple[int, int]]:
-    """For each frame the `per_frame` most alike ones of those allowed (N, N), as sorted unique (i, j), i < j.
+def loop_pairs(
+    looks: Looks, allowed: Callable[[slice], NDArray[np.bool_]], per_frame: int, least: float = 0.0
+) -> list[tuple[int, int]]:
+    """For each frame the `per_frame` most alike ones of those `allowed` (rows of (N, N)) that are more alike than
+    `least`, as sorted unique (i, j), i < j.
 
     Of neighbouring candidates only the best is taken: five views of one place tell less than five places.
     """
     pairs: set[tuple[int, int]] = set()
-    for i in range(len(alike)):
-        score = np.where(allowed[i], alike[i], 0.0)
-        for _ in range(per_frame):
-            j = int(np.argmax(score))
-            if score[j] <= 0:
-                break
-            pairs.add((min(i, j), max(i, j)))
-            score[max(0, j - 1) : j + 2] = 0.0
+    for first in range(0, len(looks), _BLOCK):
+        part = slice(first, min(first + _BLOCK, len(looks)))
+        scores = np.where(allowed(part), looks.rows(part) - least, 0.0)
+        for i, score in enumerate(scores, first):
+            for _ in range(per_frame):
+                j = int(np.argmax(score))
+                if score[j] <= 0:
+                    break
+                pairs.add((min(i, j), max(i, j)))
+                score[max(0, j - 1) : j + 2] = 0.0
     return sorted(pairs)
 
 
-def far_apart(count: int, gap: int) -> NDArray[np.bool_]:
-    """(N, N): which of `count` frames lie at least `gap` places apart."""
+def far_apart(count: int, gap: int) -> Callable[[slice], NDArray[np.bool_]]:
+    """Rows of (N, N): which of `count` frames lie at least `gap` places apart."""
     index = np.arange(count)
-    return np.abs(index[:, None] - index) >= gap
+    return lambda part: np.abs(index[part, None] - index) >= gap

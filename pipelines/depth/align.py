@@ -79,7 +79,7 @@ def _posed(maps: ProxyMaps, intrinsics: Intrinsics, cam_from_world: Array) -> Po
 
 def _anchors(model: SparseModel, k: int, full: Intrinsics, small: Intrinsics) -> Anchors:
     """The model's points in the pixels of the k-th keyframe that sees them."""
-    mine = model.obs_frame == k
+    mine = model.observations_of(k)
     points = model.points_in_world[model.obs_point[mine]]
     depth = points @ model.cam_from_world[k, 2, :3] + model.cam_from_world[k, 2, 3]
     return Anchors(model.obs_xy[mine] * [small.width / full.width, small.height / full.height], depth)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.spatial import cKDTree
 
 from pipelines.geometry.camera import project, unproject
 from pipelines.types import Intrinsics
@@ -16,6 +19,9 @@ Array = NDArray[np.float64]
 NEIGHBOURS = 16
 _LEAST_OVERLAP = 0.2
 _OVERLAP_SAMPLES = 16
+CANDIDATES = 256
+_REACH = 1.5
+"""What lies farther from a camera than this times what it shows is hidden behind that."""
 
 
 @dataclass(frozen=True)
@@ -49,23 +55,85 @@ class PosedDepth:
         return xy, z, np.asarray(inside, dtype=bool)
 
 
-def overlaps(views: Sequence[PosedDepth]) -> Array:
-    """(N, N) η[i, j], MSGS-SLAM eq. (10): the fraction of view i's back-projected samples inside view j's image."""
-    out = np.eye(len(views))
-    for i, view in enumerate(views):
-        xy, depth, _ = view.grid(_OVERLAP_SAMPLES)
-        if len(xy) == 0:
-            continue
-        points = view.in_world(xy, depth)
-        for j, other in enumerate(views):
-            out[i, j] = other.seen(points)[2].mean()
-    return out
+def overlaps(views: Sequence[PosedDepth]) -> sparse.csr_matrix:
+    """(N, N) η[i, j], MSGS-SLAM eq. (10): the fraction of view i's back-projected samples inside view j's image.
+
+    Only where view j may see what i shows: where that lies no farther from j than what j itself shows, and in the
+    spread over near and far ones of at most CANDIDATES views. So the cost grows with the number of views, not with its
+    square.
+    """
+    grids = [v.grid(_OVERLAP_SAMPLES) for v in views]
+    seen = [v.in_world(xy, depth) for v, (xy, depth, _) in zip(views, grids, strict=True)]
+    centers = np.array([v.in_world(np.zeros((1, 2)), np.zeros(1))[0] for v in views]).reshape(-1, 3)
+    reach = np.array([_largest(np.linalg.norm(p - c, axis=1)) for p, c in zip(seen, centers, strict=True)])
+    near = _Candidates(centers, _REACH * reach)
+    matrices = np.array([v.intrinsics.matrix @ v.cam_from_world[:3] for v in views]).reshape(-1, 3, 4)
+    sizes = np.array([(v.intrinsics.width, v.intrinsics.height) for v in views]).reshape(-1, 2)
+    rows, columns, shares = [], [], []
+    for i, points in enumerate(seen):
+        others = near.of(i, points)
+        inside = _inside(points, matrices[others], sizes[others]).mean(1) if len(points) else np.zeros(0)
+        share = np.where(others == i, 1.0, inside) if len(points) else np.ones(len(others))
+        rows.append(np.full(len(others), i))
+        columns.append(others)
+        shares.append(share)
+    places = (_joined(rows), _joined(columns))
+    found = sparse.csr_matrix((np.concatenate([np.zeros(0), *shares]), places), (len(views), len(views)))
+    found.eliminate_zeros()
+    return found
+
+
+@dataclass(frozen=True)
+class _Candidates:
+    """Which cameras may see points, by their centres (N, 3) and how far they see, reach (N,)."""
+
+    centers: Array
+    reach: Array
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.centers)
+
+    def of(self, index: int, points: Array) -> NDArray[np.int64]:
+        """Sorted indices, `index` among them."""
+        if len(points) == 0:
+            return np.array([index])
+        middle = points.mean(0)
+        radius = _largest(np.linalg.norm(points - middle, axis=1))
+        others = np.sort(np.array(self._tree.query_ball_point(middle, self.reach.max() + radius), np.int64))
+        distance = np.linalg.norm(self.centers[others] - middle, axis=1)
+        others = others[(distance <= self.reach[others] + radius) & (others != index)]
+        if len(others) > CANDIDATES:
+            apart = np.linalg.norm(self.centers[others] - self.centers[index], axis=1)
+            spread = np.linspace(0, len(others) - 1, CANDIDATES).astype(int)
+            others = others[np.argsort(apart, kind="stable")[spread]]
+        return np.sort(np.append(others, index))
+
+
+def _inside(points: Array, matrices: Array, sizes: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(C, Q) whether points (Q, 3) lie inside the pictures of cameras with projections (C, 3, 4)."""
+    u, v, z = np.moveaxis(matrices[:, :, :3] @ points.T + matrices[:, :, 3:], 1, 0)
+    width, height = sizes[:, :1], sizes[:, 1:]
+    return np.asarray((z > 0) & (u >= 0) & (u < width * z) & (v >= 0) & (v < height * z))
+
+
+def _largest(distances: Array) -> float:
+    """Of all but the farthest twentieth, which may be errors; 0 of none."""
+    return float(np.percentile(distances, 95)) if len(distances) else 0.0
+
+
+def _joined(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    return np.concatenate([np.zeros(0, np.int64), *parts])
 
 
 def neighbours(views: Sequence[PosedDepth]) -> list[tuple[int, int]]:
     """Ordered pairs of views that see the same; of many, a spread over near and far ones."""
     pairs = []
-    for i, row in enumerate(overlaps(views)):
-        seeing = [int(j) for j in np.argsort(-row, kind="stable") if j != i and row[j] > _LEAST_OVERLAP]
+    overlap = overlaps(views)
+    for i in range(len(views)):
+        row = slice(overlap.indptr[i], overlap.indptr[i + 1])
+        others, share = overlap.indices[row], overlap.data[row]
+        order = np.argsort(-share, kind="stable")
+        seeing = [int(others[n]) for n in order if others[n] != i and share[n] > _LEAST_OVERLAP]
         pairs += [(i, j) for j in seeing[:: max(len(seeing) // NEIGHBOURS, 1)][:NEIGHBOURS]]
     return pairs

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.proxy.reliability import semantic_agreement
+from pipelines.proxy.reliability import mean_iou
 from pipelines.types import VOID
 
 Array = NDArray[np.float64]
@@ -57,14 +57,24 @@ def richness(summaries: Sequence[LabelSummary], theta: float = 0.5) -> Array:
     return quantiles(theta * entropy + (1 - theta) * boundary)
 
 
-def structure_similarity(first: Array, second: Array) -> float:
-    """StructSim of eq. (24): cosine in 0..1 between two graphs of regions (C, C)."""
-    norms = float(np.linalg.norm(first) * np.linalg.norm(second))
-    return float((first * second).sum() / norms) if norms > 0 else 0.0
+def structure_similarity(first: Array, others: Array) -> Array:
+    """(K,) StructSim of eq. (24): cosine in 0..1 between the graph of regions (C, C) and others (K, C, C)."""
+    norms = np.linalg.norm(first) * np.linalg.norm(others, axis=(1, 2))
+    return np.asarray((first * others).sum((1, 2)) / np.where(norms > 0, norms, np.inf), np.float64)
 
 
-def similarity(first: LabelSummary, second: LabelSummary, appearance: float, weights: tuple[float, ...]) -> float:
-    """Sim of eq. (24): α₁ mIoU + α₂ appearance + α₃ StructSim."""
-    agreement = semantic_agreement(first.labels, second.labels) or 0.0
-    parts = (agreement, appearance, structure_similarity(first.graph, second.graph))
-    return float(np.dot(weights, parts))
+def similarity(
+    first: LabelSummary, others: Sequence[LabelSummary], appearance: Array, weights: tuple[float, ...], least: float
+) -> Array:
+    """(K,) Sim of eq. (24): α₁ mIoU + α₂ appearance + α₃ StructSim of one keyframe with others; 0 where it cannot be
+    more than `least`."""
+    if not others:
+        return np.zeros(0)
+    structure = structure_similarity(first.graph, np.stack([o.graph for o in others]))
+    beside = weights[1] * appearance + weights[2] * structure
+    may = np.flatnonzero(beside + weights[0] > least)
+    out = np.zeros(len(others))
+    if len(may):
+        labels = np.stack([others[k].labels for k in may.tolist()])
+        out[may] = beside[may] + weights[0] * mean_iou(first.labels, labels)
+    return out

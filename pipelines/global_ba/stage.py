@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.correspondence.retrieval import likeness, unit
+from pipelines.correspondence.retrieval import Looks, unit
 from pipelines.depth.fields import DepthFields
 from pipelines.depth.scales import sample_proxy
 from pipelines.gaussian_map import GaussianMap
@@ -83,13 +83,13 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
     pictures = Pictures(run, run.load_frames(), context.config.frames)
     views = load_keyframe_views(context, model, pictures)
     ids = model.frame_ids.tolist()
-    looks = likeness(np.stack([pictures.descriptor(i) for i in ids]))
+    kinds = [np.stack([pictures.descriptor(i) for i in ids])]
     learned = run.load_descriptors()
     if all(i in learned for i in ids):  # the article's DINOSim counts half
         seen = np.stack([learned[i] for i in ids])
-        looks = (looks + likeness(unit(seen - seen.mean(0)))) / 2
+        kinds.append(unit(seen - seen.mean(0)).astype(np.float32))
     refused = {pair for pair, matches in run.load_tried().items() if matches == 0}
-    pairs = loop_candidates(model, looks, load_summaries(run, model), refused, settings)
+    pairs = loop_candidates(model, Looks(tuple(kinds)), load_summaries(run, model), refused, settings)
     tracked = context.progress.track(pairs, "loops", len(pairs))
     found = find_loops(tracked, views, run.load_calibration().intrinsics, settings, seed)
     save_found(snapshot, found)

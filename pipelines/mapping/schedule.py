@@ -8,6 +8,7 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 
 from pipelines.config import MappingConfig
 from pipelines.depth.posed import overlaps
@@ -64,7 +65,7 @@ class Schedule:
     views: int
     seeding: int
     visits: int
-    overlap: NDArray[np.float64]
+    overlap: csr_matrix
     reliability: NDArray[np.float64]
 
     @staticmethod
@@ -116,12 +117,13 @@ class Schedule:
         return Step(iteration, view, float(weights[view]), 1.0, True, Seeding.REST, False, False, False, False)
 
     def _covisible(self, now: int, rng: np.random.Generator) -> int:
-        overlap = self.overlap[now, :now]
+        row = slice(*self.overlap.indptr[now : now + 2])
+        others, overlap = self.overlap.indices[row], self.overlap.data[row]
         # η > 0.08 of the article; where nobody sees the same, anybody will do.
-        chances = np.where(overlap > 0.08, overlap, 0.0)
-        if chances.sum() == 0:
+        seeing = (others < now) & (overlap > 0.08)
+        if not seeing.any():
             return int(rng.integers(now))
-        return int(rng.choice(now, p=chances / chances.sum()))
+        return int(rng.choice(others[seeing], p=overlap[seeing] / overlap[seeing].sum()))
 
     def _kind_of_pass(self, number: int) -> tuple[bool, bool]:
         """Whether the pass is coarse, and whether the map grows in it: by whole passes, or half of the views would get

@@ -14,6 +14,8 @@ SLOPE, MIDDLE = 10.0, 0.3
 EDGE_STEP = 0.1
 """Unit of the log-depth gradient: a change of depth by 10 % from one pixel to the next. A wall or floor seen at an
 angle stays far below it, an occlusion edge far above."""
+_BLOCK = 256
+"""Label images that are compared at once."""
 
 
 def reliability(depth: NDArray[np.float32], confidence: NDArray[np.float32], theta: float) -> NDArray[np.float32]:
@@ -45,14 +47,28 @@ def squared_log_gradient(depth: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def semantic_agreement(labels: NDArray[np.uint8], warped: NDArray[np.uint8]) -> float | None:
     """m_t: mean IoU over the classes of two (h, w) label images, where neither is void; None without such pixels."""
-    both = (labels != VOID) & (warped != VOID)
-    if not both.any():
+    if not ((labels != VOID) & (warped != VOID)).any():
         return None
-    a, b = labels[both].astype(np.int64), warped[both].astype(np.int64)
-    joint = np.bincount(a * 256 + b, minlength=65536).reshape(256, 256)
-    union = joint.sum(0) + joint.sum(1) - np.diag(joint)
-    present = union > 0
-    return float((np.diag(joint)[present] / union[present]).mean())
+    return float(mean_iou(labels, warped[None])[0])
+
+
+def mean_iou(first: NDArray[np.uint8], others: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """(K,) of a label image (h, w) with others (K, h, w): the mean over the classes in either of intersection over
+    union, where both are known; 0 when nothing is."""
+    known = np.append(first[first != VOID], others[others != VOID])
+    classes = int(known.max()) + 1 if len(known) else 1
+    size = (classes + 1) ** 2
+    mine = np.minimum(first, classes).ravel().astype(np.int64) * (classes + 1)
+    out = [np.zeros(0)]
+    for first_row in range(0, len(others), _BLOCK):
+        block = np.minimum(others[first_row : first_row + _BLOCK], classes)
+        place = np.arange(len(block))[:, None] * size + mine + block.reshape(len(block), -1)
+        counts = np.bincount(place.ravel(), minlength=len(block) * size)
+        both = counts.reshape(len(block), classes + 1, classes + 1)[:, :-1, :-1]
+        shared = np.einsum("kcc->kc", both)
+        union = both.sum(1) + both.sum(2) - shared
+        out.append((shared / np.maximum(union, 1)).sum(1) / np.maximum((union > 0).sum(1), 1))
+    return np.concatenate(out)
 
 
 def theta(agreement: float) -> float:

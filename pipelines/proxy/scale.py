@@ -63,7 +63,7 @@ def depth_at_points(
     if model is None or frame.id not in sequence.cam_from_world:
         return np.empty(0), np.empty(0)
     index = int(np.flatnonzero(model.frame_ids == frame.id)[0])
-    points = model.points_in_world[model.obs_point[model.obs_frame == index]]
+    points = model.points_in_world[model.obs_point[model.observations_of(index)]]
     cam_from_world = model.cam_from_world[index]
     xy, z = project(points @ cam_from_world[:3, :3].T + cam_from_world[:3, 3], camera)
     ok = (z > 0) & (xy > 0).all(1) & (xy < [camera.width, camera.height]).all(1)

@@ -19,10 +19,10 @@ from pipelines.correspondence.database import write_database
 from pipelines.correspondence.features import extract_features
 from pipelines.correspondence.matching import MatchOptions, VerifiedPair, match_pair
 from pipelines.correspondence.retrieval import (
+    Looks,
     describe,
     far_apart,
     learn_vocabulary,
-    likeness,
     loop_pairs,
     sequential_pairs,
 )
@@ -139,8 +139,8 @@ class StructureFromMotion:
         return list(self.progress.track(found, "features", len(keyframe_ids)))
 
     def _proposed(self, features: Sequence[Features], vocabulary: Vocabulary) -> list[tuple[int, int]]:
-        alike = likeness(np.stack([describe(f, vocabulary) for f in features]))
-        loops = loop_pairs(alike, far_apart(len(features), self.config.overlap + 1), self.config.loop_candidates)
+        looks = Looks((np.stack([describe(f, vocabulary) for f in features]),))
+        loops = loop_pairs(looks, far_apart(len(features), self.config.overlap + 1), self.config.loop_candidates)
         return sorted({*sequential_pairs(len(features), self.config.overlap), *loops})
 
     def _pairs(self, features: Sequence[Features], proposed: Sequence[tuple[int, int]]) -> list[VerifiedPair]:

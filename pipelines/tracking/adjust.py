@@ -16,7 +16,7 @@ from pipelines.depth.fields import DepthFields
 from pipelines.depth.scales import COARSE, WorldScale
 from pipelines.tracking.bundle import Bundle, adjust_bundle, adjust_pose
 from pipelines.tracking.state import TrackState
-from pipelines.types import Intrinsics, ProxyMaps, SparseModel
+from pipelines.types import Intrinsics, ProxyMaps, SparseModel, rows_by
 
 Array = NDArray[np.float64]
 
@@ -135,11 +135,11 @@ def sample_depths(
     """Proxy depths of the keyframes at the bundle's observations."""
     depth, reliability = np.zeros(len(bundle.obs_cam)), np.zeros(len(bundle.obs_cam))
     has_depth = np.zeros(len(frame_ids), bool)
-    for c, frame_id in enumerate(frame_ids):
-        maps = load_proxy(frame_id) if frame_id in state.keyframes else None
+    keyframes = set(state.keyframes)
+    for c, (frame_id, mine) in enumerate(zip(frame_ids, rows_by(bundle.obs_cam, len(frame_ids)), strict=True)):
+        maps = load_proxy(frame_id) if frame_id in keyframes else None
         if maps is None:
             continue
-        mine = np.flatnonzero(bundle.obs_cam == c)
         depth[mine], reliability[mine] = scales.sample_proxy(maps, bundle.obs_xy[mine], intrinsics)
         has_depth[c] = bool((depth[mine] > 0).sum() >= 5)
     fields = np.zeros((len(frame_ids), COARSE.size))
@@ -152,8 +152,8 @@ def set_scale(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics) -> Bundle
     usable = (ties.depth > 0) & (z > 0)
     log_ratio = np.where(usable, np.log(np.where(usable, z, 1) / np.where(usable, ties.depth, 1)), 0.0)
     middles = np.zeros(len(ties.fields))
-    for c in np.flatnonzero(ties.has_depth):
-        mine = usable & (bundle.obs_cam == c)
+    for c, rows in enumerate(rows_by(bundle.obs_cam, len(middles))):
+        mine = rows[usable[rows]] if ties.has_depth[c] else rows[:0]
         middles[c] = scales.keyframe_scale(log_ratio[mine], ties.reliability[mine])
     used = usable & ties.has_depth[bundle.obs_cam]
     basis = COARSE.at(bundle.obs_xy[used], intrinsics.width, intrinsics.height)
@@ -196,10 +196,7 @@ def consistent(bundle: Bundle, intrinsics: Intrinsics) -> NDArray[np.bool_]:
 def write_back(state: TrackState, bundle: Bundle, frame_ids: list[int]) -> None:
     """Poses, points and the sightings that are left, into the state; points nobody sees stay unused."""
     state.points = bundle.points
-    order = np.argsort(bundle.obs_cam, kind="stable")
-    bounds = np.searchsorted(bundle.obs_cam[order], np.arange(len(frame_ids) + 1))
-    for c, frame_id in enumerate(frame_ids):
-        mine = order[bounds[c] : bounds[c + 1]]
+    for c, (frame_id, mine) in enumerate(zip(frame_ids, rows_by(bundle.obs_cam, len(frame_ids)), strict=True)):
         seen = state.sightings[frame_id]
         state.poses[frame_id] = bundle.cam_from_world[c]
         state.sightings[frame_id] = seen.select(np.isin(seen.point, bundle.obs_point[mine]))

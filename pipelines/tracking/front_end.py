@@ -59,7 +59,7 @@ class FrontEnd:
             seen, solved = relocalise(frame_id, self.state, self.pictures, self.intrinsics, self.seed)
             reason += f"; {len(seen)} matched in similar keyframes, {_count(solved)} agree"
         if solved is not None and self.is_trusted(seen, solved):
-            segment = self.state.segment_of_point(int(seen.point[solved.inliers][0]))
+            segment = self.state.segment_of_point(int(seen.point[solved.inliers][0]), frame_id)
             self.state.add_frame(frame_id, solved.cam_from_world, seen.select(solved.inliers), False, segment)
             self.extend_at(frame_id)
         elif not (self._by_rendering(frame_id) or (may_start and self._start(frame_id, start))):

@@ -51,11 +51,12 @@ def normalise(state: TrackState) -> None:
 
 def to_trajectory(state: TrackState, frames: list[Frame]) -> Trajectory:
     """All frames, posed or with the reason why not."""
+    keyframes = set(state.keyframes)
     return Trajectory(
         frame_ids=np.array([f.id for f in frames], np.int64),
         timestamps=np.array([f.timestamp for f in frames]),
         cam_from_world=np.array([state.poses.get(f.id, np.eye(4)) for f in frames]),
-        is_keyframe=np.array([f.id in state.keyframes for f in frames]),
+        is_keyframe=np.array([f.id in keyframes for f in frames]),
         lost_reasons=tuple("" if f.id in state.poses else state.lost.get(f.id, "not tracked") for f in frames),
     )
 

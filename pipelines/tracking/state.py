@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,7 @@ class Sightings:
 
 FEATURE_SD = 0.5
 """Pixels: how exactly a feature of structure from motion is known."""
+_NEAR_KEYFRAMES = 8
 NO_SIGHTINGS = Sightings(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
 
 
@@ -66,10 +68,8 @@ class TrackState:
     def from_backbone(model: SparseModel, sd: float) -> TrackState:
         """The keyframes and points of structure from motion as segment 0."""
         state = TrackState(model.points_in_world.copy(), model.colors.copy())
-        order = np.argsort(model.obs_frame, kind="stable")
-        bounds = np.searchsorted(model.obs_frame[order], np.arange(len(model.frame_ids) + 1))
         for k, frame_id in enumerate(int(i) for i in model.frame_ids):
-            mine = order[bounds[k] : bounds[k + 1]]
+            mine = model.observations_of(k)
             seen = Sightings(model.obs_point[mine].astype(np.int64), model.obs_xy[mine], np.full(len(mine), sd))
             state.add_frame(frame_id, model.cam_from_world[k], seen, is_keyframe=True, segment=0)
         return state
@@ -84,7 +84,9 @@ class TrackState:
         self.segment[frame_id] = segment
         self.lost.pop(frame_id, None)
         if is_keyframe:
-            self.keyframes = sorted({*self.keyframes, frame_id})
+            place = bisect_left(self.keyframes, frame_id)
+            if self.keyframes[place : place + 1] != [frame_id]:
+                self.keyframes.insert(place, frame_id)
 
     def add_segment(self, other: TrackState) -> None:
         """The keyframes of another world that are not posed yet, with their points, as a segment of their own."""
@@ -101,9 +103,10 @@ class TrackState:
         self.colors = np.concatenate([self.colors, colors])
         return np.arange(first, len(self.points))
 
-    def segment_of_point(self, point: int) -> int:
-        """The segment of the keyframes that see a point."""
-        return next(self.segment[k] for k in self.keyframes if point in self.sightings[k].point)
+    def segment_of_point(self, point: int, frame_id: int) -> int:
+        """The segment of the keyframes that see a point; `frame_id` is near them, as a rule."""
+        nearest = self.nearest_keyframes(frame_id, _NEAR_KEYFRAMES)
+        return next(self.segment[k] for k in chain(nearest, self.keyframes) if point in self.sightings[k].point)
 
     def median_depth(self, frame_id: int) -> float:
         """Of the points the frame sees; 1 when it sees none."""

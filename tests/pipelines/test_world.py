@@ -20,8 +20,10 @@ from tests.world import (
     ClipOptions,
     World,
     WorldFrame,
+    building,
     make_world,
     render_frame,
+    render_view,
     walk,
     write_sequence,
 )
@@ -95,6 +97,25 @@ def test_walk_is_smooth_closed_and_never_turns_on_the_spot(layout: str, world: W
     )
     # Radians of turn for each metre walked: pure rotation would be infinite.
     assert (turns / steps).max() < 2.5
+
+
+def test_the_building_goes_on_without_a_hole_and_without_the_whole_of_it() -> None:
+    """Every ray ends at a surface, and a place looks the same from whatever module it is built."""
+    path = building.Walk(400).poses(np.arange(0, 400, 0.2))
+    steps = np.linalg.norm(np.diff(path[:, :3, 3], axis=0), axis=1)
+    assert 0.8 < steps.min() / np.median(steps) < steps.max() / np.median(steps) < 1.3
+    back = building.Walk(40, turns=2).poses(np.array([0.0, 10, 20, 30, 40]))[:, 0, 3]
+    assert back[[1, 3]] == pytest.approx(back[0] + 5)
+    assert back[[2, 4]] == pytest.approx(back[0])
+    options = ClipOptions(width=48, height=36)
+    for pose in path[[0, 20, 51]]:  # in the first room, and in its door
+        color, depth, solid = render_view(building.around(building.module_at(pose[0, 3]), 0.05), options, pose)
+        assert (solid >= 0).all()
+        assert depth.min() > 0.3
+        assert color.std() > 0.02
+    again = building.module.__wrapped__(2, 0.05)
+    assert again.atlas.codes.tobytes() == building.module(2, 0.05).atlas.codes.tobytes()
+    assert building.module_at(path[-1, 0, 3]) > 30
 
 
 def test_camera_keeps_its_distance_and_sees_many_classes(world: World, corridor: World) -> None:

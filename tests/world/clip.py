@@ -90,7 +90,7 @@ def render_frame(world: World, options: ClipOptions, index: int) -> WorldFrame:
     for k in (k for k in range(blurs) if k != middle):
         color = color + render_view(world, options, poses[k])[0]
     labels = np.append(world.labels, np.uint8(0))[solid_at]
-    rgb = _develop((color / np.float32(blurs)).astype(np.float32), options, index)
+    rgb = develop((color / np.float32(blurs)).astype(np.float32), options, index)
     return WorldFrame(rgb, depth, labels, poses[middle], index / options.fps)
 
 
@@ -133,7 +133,7 @@ def _undistorted(distorted: NDArray[np.float64], k1: float) -> NDArray[np.float6
     return points
 
 
-def _develop(color: NDArray[np.float32], options: ClipOptions, index: int) -> NDArray[np.uint8]:
+def develop(color: NDArray[np.float32], options: ClipOptions, index: int) -> NDArray[np.uint8]:
     """Linear light to sRGB bytes, with the exposure and the noise of the options."""
     phase = 2 * np.pi * index / max(options.frames, 1)
     exposed = np.clip(color * (1 + options.exposure_swing * np.sin(3 * phase)), 0, 1)

@@ -13,6 +13,8 @@ _UNSEEN_WEIGHT = 0.3
 """Weight of a point that should be in the other view but was not matched there: it may be hidden."""
 _NEAR_MARGIN, _FAR_MARGIN = 0.7, 1.5
 _LEAST_POINTS = 12
+_MOST_CANDIDATES = 128
+"""So many that share points, and so many of the nearest, are compared: a longer recording has no better ones."""
 
 
 def choose_neighbours(
@@ -26,26 +28,30 @@ def choose_neighbours(
     points, ids = _points_of(model, index)
     if len(points) == 0 or len(model.frame_ids) < 2:
         return np.empty(0, np.int64)
-    centers = np.linalg.inv(model.cam_from_world)[:, :3, 3]
-    scores = np.array(
-        [
-            0.0
-            if j == index
-            else _pair_score(model, intrinsics, points, ids, centers[index], centers[j], j, best_angle)
-            for j in range(len(model.frame_ids))
-        ]
-    )
+    others = _candidates(model, index)
+    centers = model.centers[others]
+    center = model.centers[index]
+    scores = np.array([_pair_score(model, intrinsics, points, ids, center, j, best_angle) for j in others.tolist()])
     chosen: list[int] = []
-    for _ in range(count):
+    for _ in range(min(count, len(others))):
         best = int(scores.argmax())
         if scores[best] < 0.02 * min(len(points), _MAX_POINTS):
             break
-        chosen.append(best)
-        reach = 0.35 * np.linalg.norm(centers[best] - centers[index]) + 1e-12
+        chosen.append(int(others[best]))
+        reach = 0.35 * np.linalg.norm(centers[best] - center) + 1e-12
         similarity = np.exp(-0.5 * (np.linalg.norm(centers - centers[best], axis=1) / reach) ** 2)
         scores *= 1 - 0.9 * similarity
         scores[best] = 0
     return np.array(chosen, np.int64)
+
+
+def _candidates(model: SparseModel, index: int) -> NDArray[np.int64]:
+    """Sorted indices of the keyframes worth a look: those that share most points, and the nearest ones."""
+    shared = np.asarray(model.seen_by[model.points_of(index)].sum(0)).ravel()
+    sharing = np.argsort(-shared, kind="stable")[:_MOST_CANDIDATES]
+    nearest = model.tree.query(model.centers[index], min(_MOST_CANDIDATES, len(model.frame_ids)))[1]
+    found = np.union1d(sharing[shared[sharing] > 0], nearest)
+    return found[found != index]
 
 
 def depth_range(model: SparseModel, index: int, companions: NDArray[np.int64]) -> tuple[float, float] | None:
@@ -74,7 +80,7 @@ def _points_of(
     model: SparseModel, index: int, everything: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Points a keyframe observes and their ids, an even sample of them unless `everything`."""
-    ids = np.unique(model.obs_point[model.obs_frame == index])
+    ids = model.points_of(index)
     if not everything and len(ids) > _MAX_POINTS:
         ids = ids[np.linspace(0, len(ids) - 1, _MAX_POINTS).astype(np.int64)]
     return model.points_in_world[ids], ids
@@ -86,7 +92,6 @@ def _pair_score(
     points: NDArray[np.float64],
     ids: NDArray[np.int64],
     center: NDArray[np.float64],
-    other_center: NDArray[np.float64],
     other: int,
     best_angle: float,
 ) -> float:
@@ -95,10 +100,10 @@ def _pair_score(
     inside = (z > 0) & (xy > 0).all(1) & (xy < [intrinsics.width, intrinsics.height]).all(1)
     if not inside.any():
         return 0.0
-    a, b = points - center, points - other_center
+    a, b = points - center, points - model.centers[other]
     cosine = (a * b).sum(1) / np.maximum(np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1), 1e-12)
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     spread = np.where(angle < best_angle, 0.4 * best_angle, 1.5 * best_angle)
     weight = np.exp(-0.5 * ((angle - best_angle) / spread) ** 2)
-    seen = np.isin(ids, model.obs_point[model.obs_frame == other])
+    seen = np.isin(ids, model.points_of(other), assume_unique=True)
     return float((inside * weight * np.where(seen, 1.0, _UNSEEN_WEIGHT)).sum())

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipelines.depth.align import align_keyframes
 from pipelines.depth.fields import FINE, DepthFields, field_scales
-from pipelines.depth.posed import overlaps
+from pipelines.depth.posed import CANDIDATES, PosedDepth, overlaps
 from pipelines.depth.see_through import contradicted
 from pipelines.mapping.load import MappingInput
 from pipelines.run_folder import RunFolder, save_depth_fields
@@ -105,12 +105,41 @@ def test_fields_come_back_from_disk(tmp_path, truth: Maps, align: Callable[..., 
 
 
 def test_overlap_is_one_with_oneself_and_less_elsewhere(room: MappingInput) -> None:
-    overlap = overlaps([v.posed_depth() for v in room.views])
+    overlap = overlaps([v.posed_depth() for v in room.views]).toarray()
     assert np.allclose(np.diag(overlap), 1)
     assert (overlap >= 0).all()
     assert (overlap <= 1).all()
     neighbours, far = np.diag(overlap, 1).mean(), np.diag(overlap, len(overlap) - 2).mean()
     assert far < neighbours < 1
+
+
+def test_overlap_is_compared_only_where_a_view_may_see(room: MappingInput) -> None:
+    """As by comparing every pair, for views of one room; nothing for those of a room far away."""
+    posed = [v.posed_depth() for v in room.views]
+    found = overlaps(posed).toarray()
+    for i, view in enumerate(posed):
+        points = view.in_world(*view.grid(16)[:2])
+        every = np.array([1.0 if other is view else other.seen(points)[2].mean() for other in posed])
+        assert found[i] == pytest.approx(every, abs=1e-9)
+    away = np.eye(4)
+    away[:3, 3] = 1000
+    there = [replace(v, cam_from_world=v.cam_from_world @ away) for v in posed]
+    both = overlaps([*posed, *there]).toarray()
+    assert both[: len(posed), : len(posed)] == pytest.approx(found)
+    assert not both[: len(posed), len(posed) :].any()
+
+
+def test_of_very_many_views_a_spread_is_compared(room: MappingInput) -> None:
+    small = replace(room.views[0].posed_depth().intrinsics.resized(4, 3))
+    depth = np.ones((3, 4), np.float32)
+    crowd = []
+    for k in range(CANDIDATES + 50):
+        pose = np.eye(4)
+        pose[0, 3] = 1e-3 * k
+        crowd.append(PosedDepth(small, pose, depth, depth))
+    overlap = overlaps(crowd)
+    assert np.diff(overlap.indptr).max() == CANDIDATES + 1
+    assert overlap[0, [1, CANDIDATES + 49]].toarray().min() > 0.5  # the nearest and the farthest
 
 
 def test_depth_that_others_see_through_is_found(room: MappingInput) -> None:

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.config import GlobalBaConfig, TrackingConfig
-from pipelines.correspondence.retrieval import describe, learn_vocabulary, likeness
+from pipelines.correspondence.retrieval import Looks, describe, learn_vocabulary
 from pipelines.geometry import se3
 from pipelines.geometry.alignment import align_points
 from pipelines.geometry.camera import project
@@ -46,7 +46,7 @@ class Walk:
     def pairs(self, refused: Collection[tuple[int, int]] = ()) -> list[tuple[int, int]]:
         nothing = [summarise_labels(np.full((4, 4), 255, np.uint8), 3)] * len(self.features)
         vocabulary = learn_vocabulary(self.features, 0)
-        looks = likeness(np.stack([describe(f, vocabulary) for f in self.features]))
+        looks = Looks((np.stack([describe(f, vocabulary) for f in self.features]),))
         return loop_candidates(self.model, looks, nothing, refused, SETTINGS)
 
     def find(self) -> FoundLoops:

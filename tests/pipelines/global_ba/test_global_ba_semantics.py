@@ -31,10 +31,15 @@ def test_only_the_top_tenth_is_rich() -> None:
 def test_structure_knows_neighbours() -> None:
     a = summarise_labels(stripes(4), 4)
     shuffled = summarise_labels(np.array([0, 2, 1, 3], np.uint8)[stripes(4)], 4)
-    assert structure_similarity(a.graph, a.graph) == pytest.approx(1)
-    assert structure_similarity(a.graph, shuffled.graph) < 1
-    assert similarity(a, a, 1.0, (0.4, 0.3, 0.3)) == pytest.approx(1)
-    assert similarity(a, shuffled, 0.0, (0.4, 0.3, 0.3)) < 0.6
+    same, other = structure_similarity(a.graph, np.stack([a.graph, shuffled.graph]))
+    assert same == pytest.approx(1)
+    assert other < 1
+    weights = (0.4, 0.3, 0.3)
+    same, other = similarity(a, [a, shuffled], np.array([1.0, 0.0]), weights, 0.0)
+    assert same == pytest.approx(1)
+    assert 0 < other < 0.6
+    # What cannot pass is not compared label by label.
+    assert similarity(a, [a, shuffled], np.array([1.0, 0.0]), weights, 0.7)[1] == 0
 
 
 def test_the_same_place_looks_alike_and_others_by_chance() -> None:

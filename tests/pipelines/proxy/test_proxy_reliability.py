@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipelines.proxy.compact import compact
-from pipelines.proxy.reliability import EDGE_STEP, MIDDLE, reliability, semantic_agreement, theta, warp_labels
+from pipelines.proxy.reliability import EDGE_STEP, MIDDLE, mean_iou, reliability, semantic_agreement, theta, warp_labels
 from pipelines.types import VOID, Intrinsics, ProxyMaps
 
 RNG = np.random.default_rng(3)
@@ -80,3 +80,13 @@ def test_compact_maps_lose_only_what_they_may() -> None:
     assert error.max() < 4.1e-3
     assert 0 < np.abs(small.confidence - CONFIDENCE).max() < 0.0162
     np.testing.assert_array_equal(compact(small).depth, small.depth)
+
+
+def test_mean_iou_of_known_pictures() -> None:
+    first = np.array([[0, 0, 1, 1]], np.uint8)
+    second = np.array([[0, 1, 1, VOID]], np.uint8)
+    # Known in both: three pixels; class 0: 1 of 2, class 1: 1 of 2.
+    others = np.stack([second, first, np.full_like(first, VOID)])
+    assert mean_iou(first, others) == pytest.approx([0.5, 1, 0])
+    assert mean_iou(np.full_like(first, VOID), others).tolist() == [0, 0, 0]
+    assert mean_iou(first, others[:0]).shape == (0,)

@@ -1,0 +1,127 @@
+"""Walks of any length: what a keyframe costs in every stage, in time and memory, and how good the result is, by length.
+
+    python tests/benchmarks/long.py --work RUNS                        walks of 15, 30 and 60 seconds
+    python tests/benchmarks/long.py --work RUNS 60 300 1200 --json rows.json
+    python tests/benchmarks/long.py --work RUNS 60x10                  60 seconds of walk, ten times forth and back
+    python tests/benchmarks/long.py --work RUNS --fps 10 --size 640x480 --set mapping.passes=5
+
+The walk leads through a building of rooms and corridors that is made as it is read (`tests/world/building.py`): exact
+poses, depth and classes. Every stage runs in a process of its own, so that its peak of memory is its own. What lies
+finished in RUNS is not done again, so that a longer walk can be added to a table later.
+"""
+
+# ruff: noqa: E402 (the packages are found only once the path is set)
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+import numpy as np
+
+from formats.images import read_rgb
+from formats.video_writer import write_video
+from pipelines.run_folder_names import STAGES
+from tests.world import ClipOptions, write_sequence
+from tests.world.building import Walk, around, frames
+
+
+def make_clip(folder: Path, walk: Walk, size: tuple[int, int], fps: float) -> tuple[Path, Path]:
+    """video.mkv, without loss, and truth/ with poses, depth and classes; holds one picture at a time."""
+    options = ClipOptions(frames=round(walk.seconds * fps), width=size[0], height=size[1], fps=fps)
+    stamp, done = {**asdict(walk), "size": list(size), "fps": fps}, folder / "clip.json"
+    video, truth = folder / "video.mkv", folder / "truth"
+    if not done.exists() or json.loads(done.read_text()) != stamp:
+        write_sequence(truth, around(0, 0.01), options, frames(walk, options))
+        write_video(video, (read_rgb(p) for p in sorted((truth / "rgb").iterdir())), fps)
+        done.write_text(json.dumps(stamp))
+    return video, truth
+
+
+def msgs_slam(*arguments: object) -> None:
+    """Run the tool as a user does; its errors end this script."""
+    subprocess.run([sys.executable, "-m", "msgs_cli.main", *map(str, arguments)], check=True, stdout=sys.stderr)
+
+
+def run_walk(name: str, work: Path, size: tuple[int, int], fps: float, settings: list[str]) -> dict[str, Any]:
+    """One row: the walk made, reconstructed stage by stage, evaluated."""
+    seconds, _, turns = name.partition("x")
+    folder = work / f"walk_{name}_{size[0]}"
+    video, truth = make_clip(folder, Walk(float(seconds), int(turns or 0)), size, fps)
+    run = folder / "video.msgs"
+    chosen = [part for setting in settings for part in ("--set", setting)]
+    for stage in STAGES:
+        msgs_slam("reconstruct", video, "--out", run, "--until", stage, "-q", *chosen)
+    if not (run / "evaluation" / "evaluation.json").exists():
+        msgs_slam("evaluate", run, "--truth", truth, "-q")
+    return row_of(name, run, truth)
+
+
+def row_of(name: str, run: Path, truth: Path) -> dict[str, Any]:
+    """Figures of a finished and evaluated run."""
+    stages = json.loads((run / "manifest.json").read_text())["stages"]
+    found = json.loads((run / "evaluation" / "evaluation.json").read_text())
+    centers = np.loadtxt(truth / "traj.txt").reshape(-1, 4, 4)[:, :3, 3]
+    path = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
+    keyframes = stages["tracking"]["figures"]["keyframes"]
+    ate = found["trajectory"].get("sim3 all", {}).get("rmse")
+    views = [v["psnr"] for v in found["views"] if "psnr" in v] if isinstance(found["views"], list) else []
+    return {
+        "walk": name,
+        "path_m": round(path, 1),
+        "frames": stages["frames"]["figures"]["frames"],
+        "posed": stages["tracking"]["figures"]["posed"],
+        "keyframes": keyframes,
+        "seconds_a_keyframe": {s: round(stages[s]["seconds"] / keyframes, 3) for s in STAGES},
+        "peak_mb": {s: round(stages[s]["peak_memory_mb"]) for s in STAGES},
+        "run_mb": round(sum(f.stat().st_size for f in run.rglob("*") if f.is_file()) / 1e6, 1),
+        "ate_cm": None if ate is None else round(100 * ate, 2),
+        "ate_share_of_path": None if ate is None else round(ate / path, 6),
+        "psnr_db": found["images"].get("keyframes", {}).get("psnr"),
+        "worst_psnr_db": round(min(views), 2) if views else None,
+        "depth_l1_cm": round(100 * found["depth"]["scaled_l1"], 2) if "scaled_l1" in found["depth"] else None,
+    }
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown: one row a walk, then seconds a keyframe and peak memory of every stage."""
+    plain = [k for k in rows[0] if k not in ("seconds_a_keyframe", "peak_mb")]
+    lines = ["| " + " | ".join(plain) + " |", "|" + " --- |" * len(plain)]
+    lines += ["| " + " | ".join(str(row[k]) for k in plain) + " |" for row in rows]
+    for key in ("seconds_a_keyframe", "peak_mb"):
+        lines += ["", f"| {key} | " + " | ".join(STAGES) + " | all |", "|" + " --- |" * (len(STAGES) + 2)]
+        for row in rows:
+            values = row[key].values()
+            together = round(sum(values), 3) if key == "seconds_a_keyframe" else max(values)
+            lines.append(f"| {row['walk']} | " + " | ".join(map(str, [*values, together])) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("walks", nargs="*", default=["15", "30", "60"], help="SECONDS, or SECONDSxTURNS forth and back")
+    parser.add_argument("--work", type=Path, default=Path("long_runs"))
+    parser.add_argument("--size", default="240x180")
+    parser.add_argument("--fps", type=float, default=5.0, help="of the video")
+    parser.add_argument("--set", dest="settings", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    width, height = (int(x) for x in arguments.size.split("x"))
+    where = arguments.work, (width, height), arguments.fps, arguments.settings
+    rows = [run_walk(name, *where) for name in arguments.walks]
+    print(table(rows))
+    if arguments.json:
+        arguments.json.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
