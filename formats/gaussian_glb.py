@@ -7,8 +7,6 @@ do not know the extension: they show a cloud of coloured points.
 
 from __future__ import annotations
 
-import json
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +17,10 @@ from formats.atomic import write_bytes
 from formats.errors import InputError
 from formats.gaussian_ply import SH_C0
 from formats.gaussians import GaussianCloud, unit_quaternions
+from formats.glb import glb_bytes, glb_parts
 from formats.reading import parsing, read_bytes
 
 EXTENSION = "KHR_gaussian_splatting"
-_JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _BYTE, _FLOAT = 5121, 5126
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _LABEL = "_LABEL"
@@ -53,7 +51,7 @@ def write_gaussian_glb(path: Path, cloud: GaussianCloud, class_names: tuple[str,
     if cloud.class_ids is not None:
         arrays[_LABEL] = cloud.class_ids.astype(np.float32)
     chunks = [np.ascontiguousarray(a, "<u1" if a.dtype == np.uint8 else "<f4").tobytes() for a in arrays.values()]
-    write_bytes(path, _container(_document(arrays, chunks, class_names), b"".join(chunks)))
+    write_bytes(path, glb_bytes(_document(arrays, chunks, class_names), b"".join(chunks)))
 
 
 def _document(arrays: dict[str, NDArray[Any]], chunks: list[bytes], class_names: tuple[str, ...]) -> dict[str, Any]:
@@ -89,17 +87,6 @@ def _document(arrays: dict[str, NDArray[Any]], chunks: list[bytes], class_names:
     }
 
 
-def _container(document: dict[str, Any], binary: bytes) -> bytes:
-    """The GLB of a document and its one buffer; both chunks padded to four bytes."""
-    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    binary += b"\0" * (-len(binary) % 4)
-    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
-    return b"".join(
-        [head, struct.pack("<II", len(text), _JSON), text, struct.pack("<II", len(binary), _BINARY), binary]
-    )
-
-
 def read_gaussian_glb(path: Path) -> GaussianCloud:
     """The first primitive of Gaussians in a GLB by this or another program; higher harmonics are dropped.
 
@@ -108,26 +95,13 @@ def read_gaussian_glb(path: Path) -> GaussianCloud:
     """
     data = read_bytes(path)
     with parsing(path, "GLB file with Gaussians", "export it again, uncompressed"):
-        document, binary = _chunks(data)
+        document, binary = glb_parts(data)
         primitives = [p for m in document.get("meshes", []) for p in m["primitives"]]
         found = next((p for p in primitives if EXTENSION in p.get("extensions", {})), None)
         if found is None:
             raise InputError(f"{path} holds no Gaussians ({EXTENSION}): it is a GLB of something else")
         arrays = {name: _accessor(document, binary, i) for name, i in found["attributes"].items() if name != "COLOR_0"}
         return _cloud(arrays)
-
-
-def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
-    magic, version, _ = struct.unpack_from("<4sII", data)
-    if magic != b"glTF" or version != 2:
-        raise ValueError("it does not begin like a GLB of version 2")
-    length, kind = struct.unpack_from("<II", data, 12)
-    document = json.loads(data[20 : 20 + length])
-    after = 20 + length
-    binary_length, binary_kind = struct.unpack_from("<II", data, after)
-    if (kind, binary_kind) != (_JSON, _BINARY):
-        raise ValueError("its two parts are not the document and its bytes")
-    return document, data[after + 8 : after + 8 + binary_length]
 
 
 def _accessor(document: dict[str, Any], binary: bytes, index: int) -> NDArray[np.float32]:

@@ -160,9 +160,18 @@ def write_grey_png(path: Path, values: NDArray[np.uint8] | NDArray[np.uint16]) -
 
 def _save(path: Path, image: Image.Image, **options: Any) -> None:
     """Encoded in memory first: Pillow's encoders do not notice when a disk takes only a part of what they write."""
+    write_bytes(path, _encoded(image, **options))
+
+
+def jpeg_bytes(rgb: NDArray[np.uint8], quality: int = 90) -> bytes:
+    """(H, W, 3) uint8 as a JPEG with full colour resolution, for files that hold others."""
+    return _encoded(Image.fromarray(np.ascontiguousarray(rgb)), format="JPEG", quality=quality, subsampling=0)
+
+
+def _encoded(image: Image.Image, **options: Any) -> bytes:
     buffer = io.BytesIO()
     image.save(buffer, **options)
-    write_bytes(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def decode_rgb(data: bytes, name: str) -> NDArray[np.uint8]:

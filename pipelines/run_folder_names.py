@@ -1,4 +1,4 @@
 """Names of stages and exports, apart from everything heavy so that `--help` is instant."""
 
 STAGES = ("frames", "proxy", "tracking", "mapping", "global_ba", "export")
-EXPORTS = ("colmap", "ply", "spz", "glb", "mesh", "tum")
+EXPORTS = ("colmap", "ply", "spz", "glb", "mesh", "texture", "tum")

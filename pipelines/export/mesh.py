@@ -27,12 +27,22 @@ LEAST_WEIGHT = 1.5
 """A voxel seen with less weight, in views at the median depth, has no surface."""
 
 
-def make_mesh(outcome: Outcome, settings: ExportConfig, progress: Progress) -> SemanticMesh:
-    """The surface of the map as the keyframes see it; without a vertex where nothing is seen twice."""
-    trajectory, gaussian_map = outcome.trajectory, outcome.require_map()
-    poses = evenly(list(trajectory.cam_from_world[trajectory.is_keyframe]), settings.max_views)
+def keyframe_rows(outcome: Outcome, settings: ExportConfig) -> list[int]:
+    """The rows of the trajectory whose views the mesh is made from."""
+    return evenly(np.flatnonzero(outcome.trajectory.is_keyframe).tolist(), settings.max_views)
+
+
+def depth_views(outcome: Outcome, settings: ExportConfig, progress: Progress) -> list[DepthView]:
+    """What the map shows as depth in each of the `keyframe_rows`."""
+    rows, gaussian_map = keyframe_rows(outcome, settings), outcome.require_map()
     camera = outcome.calibration.intrinsics.at_most(settings.mesh_side)
-    views = [depth_view(gaussian_map, p, camera) for p in progress.track(poses, "depth views", len(poses))]
+    poses = outcome.trajectory.cam_from_world
+    return [depth_view(gaussian_map, poses[r], camera) for r in progress.track(rows, "depth views", len(rows))]
+
+
+def make_mesh(outcome: Outcome, views: list[DepthView], settings: ExportConfig, progress: Progress) -> SemanticMesh:
+    """The surface of the map as the keyframes see it; without a vertex where nothing is seen twice."""
+    gaussian_map = outcome.require_map()
     voxel = settings.voxel * _median_depth(views)
     volume = fuse(views, voxel, TRUNCATION, settings.max_blocks, get_threads())
     least = LEAST_WEIGHT if len(views) >= 4 else 0.5

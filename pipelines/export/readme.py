@@ -25,6 +25,9 @@ point_cloud.glb           only with --set export.splat_glb=true: the map in glTF
                           attribute _LABEL; programs that do not know the extension show coloured points.
 mesh.ply, mesh.glb        the surface with a colour and a label (PLY: property label, GLB: attribute _LABEL) at each
                           vertex. MeshLab, Blender, trimesh.
+mesh_textured.obj, .mtl, .png, mesh_textured.glb   only with --set export.texture=true: a tenth of the mesh's vertices,
+                          and its surface as a picture made from the keyframes' photographs, exposure removed. OBJ: a
+                          group for each class.
 classes.json              number, name and colour of each class; 255 is "unknown".
 scale.json                how many metres a unit of the run is, its relative standard deviation, and who says so.
 world.json                what the axes are, what told which way is up, and how this world lies to the run's own.
@@ -34,8 +37,8 @@ world.json                what the axes are, what told which way is up, and how 
 _UPRIGHT = """\
 Axes: z is up, told by the {told_by}; {height}.
 {heading}. The formats that lay down which way is up follow their own
-rule: in mesh.glb, point_cloud.spz and point_cloud.glb y is up. A viewer that takes y for up shows the PLY files on
-their back: turn them by -90 degrees about x.
+rule: in all GLB files and in point_cloud.spz y is up. A viewer that takes y for up shows the PLY files on their
+back: turn them by -90 degrees about x.
 """
 
 _OWN_HEADING = """\

@@ -11,7 +11,8 @@ from formats.digest import file_sha256
 from formats.gps import read_track
 from formats.mesh import read_mesh_ply
 from pipelines.config import Config, ExportConfig
-from pipelines.export.mesh import make_mesh, mesh_figures, write_mesh
+from pipelines.export.mesh import depth_views, make_mesh, mesh_figures, write_mesh
+from pipelines.export.textured import make_textured, write_textured
 from pipelines.export.writers import (
     write_colmap,
     write_glb_file,
@@ -48,10 +49,8 @@ def run(context: StageContext) -> dict[str, Any]:
     write_all_but_mesh(outcome, world, settings, context.folder)
     if world.earth is not None:
         save_metres(context.folder, found.metres)
-    mesh = _finished_mesh(context.folder)
-    if mesh is None:
-        mesh = make_mesh(outcome, settings, context.progress)
-        write_mesh(mesh, outcome.classes.names, context.folder, world.gltf_from_exported)
+    finished = _finished_mesh(context.folder)
+    mesh, _ = write_meshes(outcome, world, settings, mesh_kinds(settings), context.folder, context.progress, finished)
     if len(mesh.faces) == 0:
         context.warn("the mesh is empty: no surface is seen by enough keyframes")
     return {
@@ -62,6 +61,33 @@ def run(context: StageContext) -> dict[str, Any]:
         **world_figures(world),
         **metres_figures(found.metres),
     }
+
+
+def write_meshes(
+    outcome: Outcome,
+    world: World,
+    settings: ExportConfig,
+    kinds: tuple[str, ...],
+    folder: Path,
+    progress: Progress,
+    finished: SemanticMesh | None = None,
+) -> tuple[SemanticMesh, list[Path]]:
+    """Make the mesh, unless it is `finished`, and write those `kinds` of it ("mesh", "texture") that are not yet."""
+    if finished is not None and "texture" not in kinds:
+        return finished, []
+    views, names, axes = depth_views(outcome, settings, progress), outcome.classes.names, world.gltf_from_exported
+    mesh, paths = finished, []
+    if mesh is None:
+        mesh = make_mesh(outcome, views, settings, progress)
+        paths += write_mesh(mesh, names, folder, axes) if "mesh" in kinds else []
+    if "texture" in kinds and len(mesh.faces):
+        paths += write_textured(make_textured(outcome, mesh, views, settings, progress), names, folder, axes)
+    return mesh, paths
+
+
+def mesh_kinds(settings: ExportConfig) -> tuple[str, ...]:
+    """What `write_meshes` is to write when nothing in particular is asked for."""
+    return ("mesh", "texture") if settings.texture else ("mesh",)
 
 
 def guess_metres(context: StageContext, outcome: Outcome, settings: ExportConfig) -> Metres | None:
@@ -164,21 +190,21 @@ def export_run(
     if outcome.metres is not None and outcome.metres.is_guess and settings.scale == "free":
         outcome = replace(outcome, metres=None)
 
-    def mesh() -> list[Path]:
-        made = make_mesh(outcome, settings, progress or SilentProgress())
-        return write_mesh(made, outcome.classes.names, folder, world.gltf_from_exported)
+    def mesh(*kinds: str) -> list[Path]:
+        return write_meshes(outcome, world, settings, kinds, folder, progress or SilentProgress())[1]
 
     writers: dict[str, Callable[[], list[Path]]] = {
         "colmap": lambda: write_colmap(outcome, folder),
         "ply": lambda: write_ply(outcome, settings.sh_rest, folder),
         "spz": lambda: write_spz_file(outcome, world, folder),
         "glb": lambda: write_glb_file(outcome, world, folder),
-        "mesh": mesh,
+        "mesh": lambda: mesh("mesh"),
+        "texture": lambda: mesh("texture"),
         "tum": lambda: write_trajectory(outcome, folder),
     }
     if only:
         return [*writers[only](), write_world(outcome, world, folder)]
-    return write_all_but_mesh(outcome, world, settings, folder) + mesh()
+    return write_all_but_mesh(outcome, world, settings, folder) + mesh(*mesh_kinds(settings))
 
 
 def _kept_world(outcome: Outcome, settings: ExportConfig) -> World | None:

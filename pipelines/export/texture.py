@@ -1,0 +1,213 @@
+"""A texture painted from photographs: each texel the mean of the few keyframes that see its place best."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.export.atlas import Atlas, owners
+from pipelines.export.volume import DepthView
+from pipelines.gaussians.render.threads import for_each
+from pipelines.geometry.camera import project
+from pipelines.jit import kernel
+from pipelines.progress import Progress
+from pipelines.types import Intrinsics
+
+AGREES = 0.03
+"""Relative difference up to which the depth of a view confirms that it sees a place."""
+BEST_VIEWS = 6
+POWER = 4.0
+"""A view counts with this power of its pixels a length on the surface, times how sharp it is."""
+_FEATHER = 0.04
+"""Weights fade over this part of the picture's width beside its rim and beside steps of the depth."""
+_BAND = 64
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A keyframe to paint from: what it sees as depth, its full camera, how sharp it is among the others (1 = as most),
+    and `photo` () -> (H, W, 3) float32 0..1 without exposure."""
+
+    depth_view: DepthView
+    camera: Intrinsics
+    sharpness: float
+    photo: Callable[[], NDArray[np.float32]]
+
+
+def texels_wanted(vertices: NDArray[np.float32], faces: NDArray[np.int32], shots: Sequence[Shot]) -> float:
+    """Texels a unit of length at which half the vertices keep the pixels of the view that sees them closest."""
+    normals = vertex_normals(vertices, faces)
+    density = np.stack([_density(vertices, normals, shot)[0] for shot in shots]).max(0)
+    return float(np.median(density[density > 0])) if (density > 0).any() else 1.0
+
+
+def paint_texture(atlas: Atlas, shots: Sequence[Shot], progress: Progress) -> NDArray[np.uint8]:
+    """(height, width, 3) RGB; what no view sees has its vertices' colours, what no face covers those beside it."""
+    vertices, faces = atlas.mesh.vertices, atlas.mesh.faces
+    weights = best_views(vertices, vertex_normals(vertices, faces), shots)[:, atlas.corner_vertex]
+    owner = owners(atlas)
+    total = np.zeros((atlas.height, atlas.width, 4), np.float32)
+    for shot, weight in zip(progress.track(shots, "texture", len(shots)), weights, strict=True):
+        if weight.any():
+            _add(total, owner, atlas, shot, weight)
+    base = (atlas.mesh.colors / np.float32(255))[atlas.corner_vertex]
+    _in_bands(atlas.height, lambda a, b: _finish(total[a:b], owner[a:b], a, atlas.corners, atlas.corner_faces, base))
+    return np.round(_filled(total)[..., :3].clip(0, 1) * 255).astype(np.uint8)
+
+
+def vertex_normals(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> NDArray[np.float64]:
+    """(V, 3) unit normals, faces weighted by their area; 0 for a vertex without faces."""
+    corners = vertices[faces].astype(np.float64)
+    of_face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros((len(vertices), 3))
+    for k in range(3):
+        np.add.at(total, faces[:, k], of_face)
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+
+
+def best_views(
+    vertices: NDArray[np.float32], normals: NDArray[np.float64], shots: Sequence[Shot]
+) -> NDArray[np.float32]:
+    """(N, V) how much each shot counts at each vertex: 0 for all but the `BEST_VIEWS` best, 1 the best of all."""
+    weights = np.zeros((len(shots), len(vertices)), np.float32)
+    for n, shot in enumerate(shots):
+        density, place = _density(vertices, normals, shot)
+        seen = density > 0
+        weights[n, seen] = (shot.sharpness * density[seen]) ** POWER * _feather(shot.depth_view)[
+            place[seen, 1], place[seen, 0]
+        ]
+    weights /= np.maximum(weights.max(0), np.finfo(np.float32).tiny)
+    if len(shots) > BEST_VIEWS:
+        least = np.partition(weights, len(shots) - BEST_VIEWS, axis=0)[len(shots) - BEST_VIEWS]
+        weights[weights < least] = 0
+    return weights
+
+
+def _density(
+    vertices: NDArray[np.float32], normals: NDArray[np.float64], shot: Shot
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """(V,) pixels a unit of length along the foreshortened direction, 0 where unseen; (V, 2) pixel of the view."""
+    view, pose = shot.depth_view, shot.depth_view.cam_from_world
+    in_cam = vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+    xy, z = project(in_cam, view.intrinsics)
+    size = np.array([view.intrinsics.width, view.intrinsics.height])
+    inside = np.all((xy >= 0) & (xy < size), axis=1)
+    place = np.where(inside.reshape(-1, 1), xy, 0).astype(np.int64)
+    depth, weight = view.depth[place[:, 1], place[:, 0]], view.weight[place[:, 1], place[:, 0]]
+    seen = inside & (weight > 0) & (np.abs(depth - z) < AGREES * np.abs(z))
+    towards = -(normals @ pose[:3, :3].T * in_cam).sum(1) / np.maximum(np.linalg.norm(in_cam, axis=1), 1e-9)
+    density = shot.camera.fx * towards / np.where(seen, z, 1)
+    return np.where(seen, density.clip(0), 0), place
+
+
+def _feather(view: DepthView) -> NDArray[np.float32]:
+    """(H, W) 0..1: distance from the rim of what the view sees, in units of `_FEATHER`."""
+    valid = np.pad((view.weight > 0).astype(np.uint8), 1)
+    away = cv2.distanceTransform(valid, cv2.DIST_L2, 3)[1:-1, 1:-1]
+    return np.minimum(away / (_FEATHER * view.depth.shape[1]), 1).astype(np.float32)
+
+
+def _in_bands(rows: int, task: Callable[[int, int], None]) -> None:
+    for_each(lambda n: task(n * _BAND, min((n + 1) * _BAND, rows)), -(-rows // _BAND))
+
+
+def _add(
+    total: NDArray[np.float32], owner: NDArray[np.int32], atlas: Atlas, shot: Shot, weight: NDArray[np.float32]
+) -> None:
+    """Add what the shot shows at each texel, times its weight there."""
+    view, k, small = shot.depth_view, shot.camera, shot.depth_view.intrinsics
+    pose, photo = view.cam_from_world, np.ascontiguousarray(shot.photo(), np.float32)
+    in_cam = (atlas.mesh.vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])[atlas.corner_vertex]
+    camera = np.array([k.fx, k.fy, k.cx, k.cy, small.width / k.width, small.height / k.height])
+    depth = np.where(view.weight > 0, view.depth, 0).astype(np.float32)
+
+    def band(a: int, b: int) -> None:
+        _sample(
+            total[a:b], owner[a:b], a, atlas.corners, atlas.corner_faces, in_cam, weight, photo, depth, camera, AGREES
+        )
+
+    _in_bands(atlas.height, band)
+
+
+@kernel
+def _shares(x, y, corners, a, b, c):  # type: ignore[no-untyped-def]
+    """Barycentric coordinates of a texel; beyond the sides, where they are negative, they go on."""
+    ax, ay = corners[a, 0], corners[a, 1]
+    bx, by = corners[b, 0], corners[b, 1]
+    cx, cy = corners[c, 0], corners[c, 1]
+    twice = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+    second = ((x - ax) * (cy - ay) - (cx - ax) * (y - ay)) / twice
+    third = ((bx - ax) * (y - ay) - (x - ax) * (by - ay)) / twice
+    return 1 - second - third, second, third
+
+
+@kernel
+def _sample(total, owner, top, corners, faces, in_cam, weight, photo, depth, camera, agrees):  # type: ignore[no-untyped-def]
+    rows, columns = owner.shape
+    height, width = photo.shape[:2]
+    fx, fy, cx, cy, ratio_x, ratio_y = camera
+    for row in range(rows):
+        for column in range(columns):
+            f = owner[row, column]
+            if f < 0:
+                continue
+            a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+            if weight[a] + weight[b] + weight[c] <= 0:
+                continue
+            p, q, r = _shares(column + 0.5, row + top + 0.5, corners, a, b, c)
+            share = p * weight[a] + q * weight[b] + r * weight[c]
+            z = p * in_cam[a, 2] + q * in_cam[b, 2] + r * in_cam[c, 2]
+            if share <= 0 or z <= 0:
+                continue
+            u = fx * (p * in_cam[a, 0] + q * in_cam[b, 0] + r * in_cam[c, 0]) / z + cx
+            v = fy * (p * in_cam[a, 1] + q * in_cam[b, 1] + r * in_cam[c, 1]) / z + cy
+            if u < 0.5 or v < 0.5 or u >= width - 0.5 or v >= height - 0.5:
+                continue
+            if abs(depth[int(v * ratio_y), int(u * ratio_x)] - z) >= agrees * z:
+                continue
+            left, above = int(u - 0.5), int(v - 0.5)
+            right, below = min(left + 1, width - 1), min(above + 1, height - 1)
+            s, t = u - 0.5 - left, v - 0.5 - above
+            for k in range(3):
+                upper = photo[above, left, k] * (1 - s) + photo[above, right, k] * s
+                lower = photo[below, left, k] * (1 - s) + photo[below, right, k] * s
+                total[row, column, k] += share * (upper * (1 - t) + lower * t)
+            total[row, column, 3] += share
+
+
+@kernel
+def _finish(total, owner, top, corners, faces, base):  # type: ignore[no-untyped-def]
+    """Sums become colours with weight 1; where nothing was added, those of the vertices. Texels of no face stay 0."""
+    for row in range(owner.shape[0]):
+        for column in range(owner.shape[1]):
+            f = owner[row, column]
+            if f < 0:
+                continue
+            weight = total[row, column, 3]
+            a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+            p, q, r = _shares(column + 0.5, row + top + 0.5, corners, a, b, c)
+            for k in range(3):
+                if weight > 1e-12:
+                    total[row, column, k] /= weight
+                else:
+                    total[row, column, k] = p * base[a, k] + q * base[b, k] + r * base[c, k]
+            total[row, column, 3] = 1
+
+
+def _filled(total: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H, W, 4) colours times weights: texels without weight get the mean of those near, by ever coarser pictures
+    (pull and push), so that no viewer's filter or small picture of the texture shows a seam."""
+    height, width = total.shape[:2]
+    if min(height, width) < 2:
+        return total
+    coarse = np.asarray(cv2.resize(total, (-(-width // 2), -(-height // 2)), interpolation=cv2.INTER_AREA), np.float32)
+    weight = coarse[..., 3:]
+    coarse = np.where(weight > 0, coarse / np.maximum(weight, 1e-9), 0).astype(np.float32)
+    fine = np.asarray(cv2.resize(_filled(coarse), (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+    empty = total[..., 3] == 0
+    total[empty] = fine[empty]
+    return total

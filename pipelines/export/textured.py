@@ -1,0 +1,68 @@
+"""The mesh with a texture: lighter, unwrapped, painted from the keyframes, written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from formats.textured_mesh import TexturedMesh, write_textured_glb, write_textured_obj
+from pipelines.config import ExportConfig
+from pipelines.export.atlas import simplified, unwrapped
+from pipelines.export.mesh import keyframe_rows
+from pipelines.export.texture import Shot, paint_texture, texels_wanted
+from pipelines.export.volume import DepthView
+from pipelines.outcome import Outcome
+from pipelines.progress import Progress
+from pipelines.types import Frame, SemanticMesh
+
+
+def make_textured(
+    outcome: Outcome, mesh: SemanticMesh, views: Sequence[DepthView], settings: ExportConfig, progress: Progress
+) -> TexturedMesh:
+    """A tenth of the mesh's vertices, and a picture of its surface from the keyframes that `views` are of."""
+    shots = _shots(outcome, views, settings)
+    light = simplified(mesh)
+    atlas = unwrapped(light, texels_wanted(light.vertices, light.faces, shots), settings.texture_side)
+    texture = paint_texture(atlas, shots, progress)
+    uv = (atlas.corners / (atlas.width, atlas.height)).astype(np.float32)
+    return TexturedMesh(light.vertices, light.labels, atlas.corner_vertex, uv, atlas.corner_faces, texture)
+
+
+def write_textured(
+    mesh: TexturedMesh, class_names: tuple[str, ...], folder: Path, gltf_from_world: NDArray[np.float64]
+) -> list[Path]:
+    """mesh_textured.obj with its .mtl and .png, and mesh_textured.glb in axes that gltf_from_world (3, 3) turns to."""
+    paths = write_textured_obj(folder / "mesh_textured.obj", mesh, class_names)
+    turned = replace(mesh, vertices=(mesh.vertices @ gltf_from_world.T).astype(np.float32))
+    write_textured_glb(folder / "mesh_textured.glb", turned, class_names)
+    return [*paths, folder / "mesh_textured.glb"]
+
+
+def _shots(outcome: Outcome, views: Sequence[DepthView], settings: ExportConfig) -> list[Shot]:
+    frame_of = {f.id: f for f in outcome.frames}
+    frames = [frame_of[int(outcome.trajectory.frame_ids[r])] for r in keyframe_rows(outcome, settings)]
+    measured = np.array([f.sharpness for f in frames])
+    # Blank walls count as blurred in themselves: neighbours, which see about the same, tell what is sharp there.
+    usual = median_filter(measured, size=7, mode="nearest")
+    sharpness = np.sqrt(np.minimum(measured / np.maximum(usual, 1e-9), 1))
+    return [_shot(outcome, *of_one) for of_one in zip(frames, views, sharpness.tolist(), strict=True)]
+
+
+def _shot(outcome: Outcome, frame: Frame, view: DepthView, sharpness: float) -> Shot:
+    hidden = outcome.run.left_out(frame)
+    if hidden is not None:
+        size = (view.depth.shape[1], view.depth.shape[0])
+        kept = cv2.resize(hidden.astype(np.uint8), size, interpolation=cv2.INTER_AREA) == 0
+        view = replace(view, weight=np.where(kept, view.weight, 0).astype(np.float32))
+
+    def photo() -> NDArray[np.float32]:
+        picture = outcome.run.image(frame).astype(np.float32) / np.float32(255)
+        return picture if outcome.exposure is None else outcome.exposure.remove(picture, frame.timestamp)
+
+    return Shot(view, outcome.calibration.intrinsics, sharpness, photo)

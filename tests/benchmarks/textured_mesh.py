@@ -1,0 +1,168 @@
+"""The textured mesh against the one with vertex colours: both drawn from the cameras of a run, against its pictures.
+
+    python tests/benchmarks/textured_mesh.py RUN.msgs [--folder DIR]      exported files of the run, or those in DIR
+
+dB over the pixels that both meshes cover, with each picture's exposure, mean over pictures; "between" are the frames
+that no mesh was made from. Drawn with four samples a pixel.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+import cv2
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from formats.images import read_rgb, write_rgb
+from formats.mesh import read_mesh_ply
+from pipelines.evaluation.image_quality import psnr
+from pipelines.geometry.camera import project
+from pipelines.jit import kernel
+from pipelines.outcome import load_outcome
+from pipelines.run_folder import RunFolder
+from pipelines.types import Intrinsics
+from pipelines.upright.world import read_world
+
+SAMPLES = 2
+"""A side of a pixel."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--folder", type=Path, help="where the exported files lie; default: in the run")
+    parser.add_argument("--every", type=int, default=1, help="draw every n-th frame")
+    parser.add_argument("--picture", type=Path, help="write photograph, vertex colours and texture side by side")
+    args = parser.parse_args()
+    measure(args.run, args.folder or args.run / "export", args.every, args.picture)
+
+
+def measure(root: Path, folder: Path, every: int, picture: Path | None) -> None:
+    """One line for the keyframes, one for the frames between."""
+    outcome = load_outcome(RunFolder(root))
+    outcome = outcome.moved(read_world(folder / "world.json").exported_from_run)
+    trajectory, camera = outcome.trajectory, outcome.calibration.intrinsics
+    plain = read_mesh_ply(folder / "mesh.ply")
+    drawers = [
+        VertexColours(plain.vertices, plain.faces, plain.colors),
+        Textured(folder / "mesh_textured.obj", folder / "mesh_textured.png"),
+    ]
+    rows: dict[bool, list[tuple[float, ...]]] = {True: [], False: []}
+    sheets = []
+    for row in np.flatnonzero(trajectory.is_posed)[::every]:
+        frame = next(f for f in outcome.frames if f.id == trajectory.frame_ids[row])
+        photo, drawn = outcome.run.image(frame), []
+        for drawer in drawers:
+            color, covered = drawer.draw(trajectory.cam_from_world[row], camera)
+            if outcome.exposure is not None:
+                color = outcome.exposure.apply(color, frame.timestamp)
+            drawn.append((np.round(color.clip(0, 1) * 255).astype(np.uint8), covered))
+        both = drawn[0][1] & drawn[1][1]
+        if both.any():
+            figures = [psnr(color, photo, both) for color, _ in drawn]
+            rows[bool(trajectory.is_keyframe[row])].append((*figures, *(covered.mean() for _, covered in drawn)))
+        sheets.append(np.concatenate([photo, *(np.where(c[..., None], d, 0) for d, c in drawn)], axis=1))
+    textured = drawers[1]
+    print(f"{root.name}: vertices {len(plain.vertices)} / {textured.count}, texture {textured.picture.shape[:2]}")
+    for is_keyframe, name in ((True, "keyframes"), (False, "between")):
+        if rows[is_keyframe]:
+            a, b, seen, seen_textured = np.mean(rows[is_keyframe], axis=0)
+            print(
+                f"  {name} {len(rows[is_keyframe])}: vertex colours {a:.2f} dB, texture {b:.2f} dB ({b - a:+.2f}); "
+                f"covered {100 * seen:.1f} / {100 * seen_textured:.1f} %"
+            )
+    if picture is not None:
+        picked = np.linspace(0, len(sheets) - 1, min(len(sheets), 5)).astype(int)
+        write_rgb(picture, np.concatenate([sheets[i] for i in picked]))
+
+
+class Drawer:
+    """Triangles to samples; what colour a sample has is for subclasses to say."""
+
+    def __init__(self, vertices: NDArray, faces: NDArray) -> None:
+        self.vertices, self.faces = vertices.astype(np.float64), np.ascontiguousarray(faces, np.int32)
+
+    def draw(self, cam_from_world: NDArray, camera: Intrinsics) -> tuple[NDArray, NDArray]:
+        """color (H, W, 3) 0..1, covered (H, W) bool: every sample of the pixel shows a face."""
+        fine = camera.resized(camera.width * SAMPLES, camera.height * SAMPLES)
+        in_cam = self.vertices @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
+        xy, z = project(in_cam, fine)
+        face, shares = np.full((fine.height, fine.width), -1, np.int32), np.zeros((fine.height, fine.width, 3))
+        draw_faces(np.nan_to_num(xy), np.where(z > 1e-3, z, 0), self.faces, face, shares)
+        hit = face >= 0
+        color = np.zeros((*hit.shape, 3), np.float32)
+        color[hit] = self.colors_at(face[hit], shares[hit])
+        blocks = (camera.height, SAMPLES, camera.width, SAMPLES)
+        return color.reshape(*blocks, 3).mean(axis=(1, 3)), hit.reshape(blocks).all(axis=(1, 3))
+
+    def colors_at(self, face: NDArray, shares: NDArray) -> NDArray:
+        raise NotImplementedError
+
+
+class VertexColours(Drawer):
+    def __init__(self, vertices: NDArray, faces: NDArray, colors: NDArray) -> None:
+        super().__init__(vertices, faces)
+        self.colors = colors / np.float32(255)
+
+    def colors_at(self, face: NDArray, shares: NDArray) -> NDArray:
+        return np.einsum("nk,nkc->nc", shares, self.colors[self.faces[face]])
+
+
+class Textured(Drawer):
+    """As trimesh reads it from the OBJ."""
+
+    def __init__(self, path: Path, picture: Path) -> None:
+        mesh = trimesh.load(path, process=False, force="mesh")
+        super().__init__(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+        self.uv, self.picture = np.asarray(mesh.visual.uv), read_rgb(picture)
+        self.count = len(np.unique(self.vertices, axis=0))
+
+    def colors_at(self, face: NDArray, shares: NDArray) -> NDArray:
+        uv = np.einsum("nk,nkc->nc", shares, self.uv[self.faces[face]])
+        height, width = self.picture.shape[:2]
+        x, y = (uv[:, 0] * width - 0.5).astype(np.float32), ((1 - uv[:, 1]) * height - 0.5).astype(np.float32)
+        out = np.empty((len(face), 3), np.float32)
+        for a in range(0, len(face), 30000):  # OpenCV takes pictures of at most 32767 a side
+            part = slice(a, a + 30000)
+            out[part] = cv2.remap(self.picture, x[None, part], y[None, part], cv2.INTER_LINEAR)[0] / np.float32(255)
+        return out
+
+
+@kernel
+def draw_faces(xy, z, faces, face, shares):  # type: ignore[no-untyped-def]
+    """The nearest face at every sample, with perspective-correct barycentric shares; z 0 = behind the camera."""
+    height, width = face.shape
+    nearest = np.full((height, width), np.inf)
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        if z[a] <= 0 or z[b] <= 0 or z[c] <= 0:
+            continue
+        ax, ay, bx, by, cx, cy = xy[a, 0], xy[a, 1], xy[b, 0], xy[b, 1], xy[c, 0], xy[c, 1]
+        twice = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+        if twice == 0:
+            continue
+        for row in range(max(int(min(ay, by, cy) - 0.5), 0), min(int(max(ay, by, cy) + 0.5), height - 1) + 1):
+            for column in range(max(int(min(ax, bx, cx) - 0.5), 0), min(int(max(ax, bx, cx) + 0.5), width - 1) + 1):
+                x, y = column + 0.5, row + 0.5
+                q = ((x - ax) * (cy - ay) - (cx - ax) * (y - ay)) / twice
+                r = ((bx - ax) * (y - ay) - (x - ax) * (by - ay)) / twice
+                p = 1 - q - r
+                if p < 0 or q < 0 or r < 0:
+                    continue
+                p, q, r = p / z[a], q / z[b], r / z[c]
+                depth = 1 / (p + q + r)
+                if depth < nearest[row, column]:
+                    nearest[row, column], face[row, column] = depth, f
+                    shares[row, column, 0] = p * depth
+                    shares[row, column, 1] = q * depth
+                    shares[row, column, 2] = r * depth
+
+
+if __name__ == "__main__":
+    main()

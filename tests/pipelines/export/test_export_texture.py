@@ -1,0 +1,170 @@
+"""A lighter mesh, its charts, and a texture painted from views whose truth is known."""
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+
+from pipelines.export import texture
+from pipelines.export.atlas import Atlas, owners, simplified, unwrapped
+from pipelines.export.texture import Shot, best_views, paint_texture, texels_wanted, vertex_normals
+from pipelines.export.volume import DepthView
+from pipelines.gaussians.render.threads import get_threads, set_threads
+from pipelines.progress import SilentProgress
+from pipelines.types import VOID, Intrinsics, SemanticMesh
+
+CAMERA = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
+FULL = CAMERA.resized(320, 240)
+RADIUS = 0.5
+
+
+def waves(points: NDArray[np.float64]) -> NDArray[np.float32]:
+    """The true colour of places: a pattern finer than the lighter mesh's triangles."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    return (0.5 + 0.4 * np.stack([np.sin(40 * x), np.sin(40 * y), np.sin(40 * z)], axis=-1)).astype(np.float32)
+
+
+def view_of_sphere(angle: float, camera: Intrinsics) -> tuple[NDArray, NDArray, NDArray]:
+    """cam_from_world, exact depth (0 beside the sphere) and picture of the coloured sphere from a distance of 2."""
+    forward = -np.array([np.cos(angle), 0.3 * np.sin(3 * angle), np.sin(angle)])
+    forward /= np.linalg.norm(forward)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = pose[:3, :3] @ (2.0 * forward)
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
+    center = pose[:3, 3]
+    a, b, c = (rays**2).sum(-1), rays @ center, center @ center - RADIUS**2
+    root = b**2 - a * c
+    depth = np.where(root > 0, (b - np.sqrt(np.maximum(root, 0))) / a, 0)
+    points = (rays * depth[..., None] - center) @ pose[:3, :3]
+    return pose, depth.astype(np.float32), np.where(depth[..., None] > 0, waves(points), 0)
+
+
+def shot(angle: float, sharpness: float = 1.0, photo: NDArray[np.float32] | None = None) -> Shot:
+    pose, depth, _ = view_of_sphere(angle, CAMERA)
+    shown = view_of_sphere(angle, FULL)[2] if photo is None else photo
+    return Shot(DepthView(CAMERA, pose, depth, (depth > 0).astype(np.float32)), FULL, sharpness, lambda: shown)
+
+
+SHOTS = [shot(a) for a in np.arange(12) * np.pi / 6]
+
+
+@pytest.fixture(scope="module")
+def fine() -> SemanticMesh:
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS)
+    labels = np.where(ball.vertices[:, 0] < 0, 3, VOID).astype(np.uint8)
+    grey = np.full((len(ball.vertices), 3), 128, np.uint8)
+    return SemanticMesh(ball.vertices.astype(np.float32), ball.faces.astype(np.int32), grey, labels)
+
+
+@pytest.fixture(scope="module")
+def atlas(fine: SemanticMesh) -> Atlas:
+    light = simplified(fine)
+    return unwrapped(light, texels_wanted(light.vertices, light.faces, SHOTS), 4096)
+
+
+@pytest.fixture(scope="module")
+def painted(atlas: Atlas) -> NDArray[np.uint8]:
+    return paint_texture(atlas, SHOTS, SilentProgress())
+
+
+def cross(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    return first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+
+
+def places(atlas: Atlas) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Texels well inside of faces, and where on the mesh they lie."""
+    owner = owners(atlas)
+    rows, columns = np.nonzero(owner >= 0)
+    corners = atlas.corner_faces[owner[rows, columns]]
+    a, b, c = np.moveaxis(atlas.corners[corners], 1, 0)
+    xy = np.stack([columns, rows], 1) + 0.5
+    twice = cross(b - a, c - a)
+    shares = np.stack([cross(b - xy, c - xy), cross(c - xy, a - xy), cross(a - xy, b - xy)], 1) / twice[:, None]
+    points = np.einsum("nk,nkd->nd", shares, atlas.mesh.vertices[atlas.corner_vertex[corners]].astype(np.float64))
+    inside = np.zeros(owner.shape, bool)
+    inside[rows, columns] = (shares >= 0).all(1)
+    return inside, points[(shares >= 0).all(1)]
+
+
+def test_a_tenth_of_the_vertices_keeps_shape_and_labels(fine: SemanticMesh) -> None:
+    light = simplified(fine)
+    assert 0.08 < len(light.vertices) / len(fine.vertices) <= 0.1
+    off = np.abs(np.linalg.norm(light.vertices, axis=1) - RADIUS)
+    assert 0 < off.max() < 0.01 * RADIUS
+    clear = np.abs(light.vertices[:, 0]) > 0.05
+    assert ((light.labels == 3) == (light.vertices[:, 0] < 0))[clear].all()
+    assert trimesh.Trimesh(light.vertices, light.faces, process=False).is_watertight
+
+
+def test_charts_do_not_overlap_and_keep_the_faces(atlas: Atlas) -> None:
+    np.testing.assert_array_equal(atlas.corner_vertex[atlas.corner_faces], atlas.mesh.faces)
+    a, b, c = np.moveaxis(atlas.corners[atlas.corner_faces], 1, 0)
+    flat = np.abs(cross(b - a, c - a)) / 2
+    # Where charts lay over each other, faces would own fewer texels than they have area.
+    assert np.bincount(owners(atlas)[places(atlas)[0]]).sum() == pytest.approx(flat.sum(), rel=0.02)
+    assert atlas.corners.min() >= 0
+    assert (atlas.corners <= (atlas.width, atlas.height)).all()
+
+
+def test_texels_have_the_colours_of_their_places(atlas: Atlas, painted: NDArray[np.uint8]) -> None:
+    inside, points = places(atlas)
+    seen = np.abs(points[:, 1]) < 0.8 * RADIUS  # the poles are not
+    error = np.abs(painted[inside] / 255 - waves(points / np.linalg.norm(points, axis=1, keepdims=True) * RADIUS))[seen]
+    assert 0 < error.mean() < 0.02
+    assert np.percentile(error, 99) < 0.1
+
+
+def test_what_nobody_sees_has_the_vertices_colours(atlas: Atlas) -> None:
+    alone = paint_texture(atlas, SHOTS[:1], SilentProgress())
+    inside, points = places(atlas)
+    behind = points @ SHOTS[0].depth_view.cam_from_world[2, :3] > 0.1
+    assert behind.any()
+    assert (alone[inside][behind] == 128).all()
+    assert (alone[inside][~behind] != 128).any(axis=1).mean() > 0.6
+
+
+def test_no_texel_is_left_black(atlas: Atlas) -> None:
+    """What lies beside charts goes on with their colours, for small pictures of the texture."""
+    nothing = shot(0.0)
+    nothing.depth_view.weight[:] = 0
+    assert (owners(atlas) < 0).any()
+    assert (paint_texture(atlas, [nothing], SilentProgress()) == 128).all()
+
+
+def test_blurred_and_hidden_views_count_less(atlas: Atlas) -> None:
+    vertices, normals = atlas.mesh.vertices, vertex_normals(atlas.mesh.vertices, atlas.mesh.faces)
+    weights = best_views(vertices, normals, [SHOTS[0], shot(0.0, sharpness=0.5), SHOTS[6]])
+    seen = weights[0] > 0
+    np.testing.assert_allclose(weights[1, seen], weights[0, seen] / 2**texture.POWER, rtol=1e-5)
+    assert not (seen & (weights[2] > 0)).any()  # the other side
+    assert ((best_views(vertices, normals, SHOTS) > 0).sum(0) <= texture.BEST_VIEWS).all()
+
+
+def test_an_occluder_in_front_is_not_painted_on(atlas: Atlas) -> None:
+    """A board before one camera, which its depth knows of, leaves no trace."""
+    pose, depth, _ = view_of_sphere(0.0, CAMERA)
+    full = view_of_sphere(0.0, FULL)[2].copy()
+    depth[40:80, 60:100], full[80:160, 120:200] = 1.0, (1.0, 0.0, 1.0)
+    board = Shot(DepthView(CAMERA, pose, depth, (depth > 0).astype(np.float32)), FULL, 1.0, lambda: full)
+    with_board = paint_texture(atlas, [board], SilentProgress())
+    assert not ((with_board[..., 0] > 240) & (with_board[..., 1] < 20)).any()
+
+
+def test_threads_do_not_change_a_byte(atlas: Atlas, painted: NDArray[np.uint8]) -> None:
+    before = get_threads()
+    try:
+        set_threads(1 if before > 1 else 2)
+        again = unwrapped(atlas.mesh, texels_wanted(atlas.mesh.vertices, atlas.mesh.faces, SHOTS), 4096)
+        assert again.corners.tobytes() == atlas.corners.tobytes()
+        assert paint_texture(again, SHOTS, SilentProgress()).tobytes() == painted.tobytes()
+    finally:
+        set_threads(before)
+
+
+def test_the_side_is_kept(atlas: Atlas) -> None:
+    small = unwrapped(atlas.mesh, 1e4, 200)
+    assert 150 < max(small.width, small.height) <= 200
