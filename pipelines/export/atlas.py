@@ -38,14 +38,17 @@ class Atlas:
 
 
 def simplified(mesh: SemanticMesh, share: float = SHARE) -> SemanticMesh:
-    """About that share of the vertices (Garland and Heckbert 1997); colour and label are the nearest vertex's."""
+    """At most that share of the vertices (Garland and Heckbert 1997); colour and label are the nearest vertex's."""
     from fast_simplification import simplify
 
-    # A pair of triangles goes with each vertex; along open rims fewer, hence a little less than the share.
-    wanted = max(int(0.97 * share * len(mesh.faces)), 4)
-    points, faces = simplify(mesh.vertices, mesh.faces, target_count=wanted, agg=_SMOOTH)
-    points = points.astype(np.float32)
-    used, renumbered = np.unique(faces[_areas(points, faces) > 0], return_inverse=True)
+    most, wanted = share * len(mesh.vertices), share * len(mesh.faces)
+    for _ in range(3):  # along open rims there are more vertices to a face than elsewhere
+        points, faces = simplify(mesh.vertices, mesh.faces, target_count=max(int(wanted), 4), agg=_SMOOTH)
+        points = points.astype(np.float32)
+        used, renumbered = np.unique(faces[_areas(points, faces) > 0], return_inverse=True)
+        if len(used) <= most:
+            break
+        wanted *= 0.99 * most / len(used)
     _, nearest = cKDTree(mesh.vertices).query(points[used])
     return SemanticMesh(
         points[used], renumbered.reshape(-1, 3).astype(np.int32), mesh.colors[nearest], mesh.labels[nearest]

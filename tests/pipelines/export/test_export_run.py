@@ -1,8 +1,10 @@
 """The exported files of a run, read by other programs' libraries."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import plyfile
 import pycolmap
@@ -16,12 +18,14 @@ from formats.gaussian_glb import read_gaussian_glb
 from formats.spz import read_spz
 from pipelines.config import ExportConfig
 from pipelines.export.stage import export_run
+from pipelines.geometry.camera import project
 from pipelines.outcome import Outcome, load_outcome
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import EXPORTS
 from pipelines.upright.world import read_world
 
 OracleRun = Callable[..., RunFolder]
+SETTINGS = ExportConfig(spz=True, splat_glb=True, texture=True, texture_side=512, voxel=0.03)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +36,7 @@ def run(oracle_run: OracleRun) -> RunFolder:
 @pytest.fixture(scope="module")
 def folder(run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("exported")
-    paths = export_run(run, folder, settings=ExportConfig(spz=True, splat_glb=True, voxel=0.03))
+    paths = export_run(run, folder, settings=SETTINGS)
     assert all(p.exists() for p in paths)
     return folder
 
@@ -98,6 +102,31 @@ def test_mesh_lies_on_the_map_and_stands_upright(folder: Path, exported: Outcome
     np.testing.assert_allclose(glb.vertices[:, 2], -mesh.vertices[:, 1], atol=1e-5)
 
 
+def test_texture_shows_the_photographs(run: RunFolder, folder: Path, exported: Outcome) -> None:
+    mesh, whole = (trimesh.load(folder / n, force="mesh", process=False) for n in ("mesh_textured.obj", "mesh.ply"))
+    assert len(np.unique(mesh.vertices, axis=0)) <= 0.1 * len(whole.vertices)
+    colors = mesh.visual.to_color().vertex_colors[:, :3].astype(int)
+    frame = exported.frames[0]
+    pose, k = exported.trajectory.cam_from_world[0], exported.calibration.intrinsics
+    xy, z = project(mesh.vertices @ pose[:3, :3].T + pose[:3, 3], k)
+    inside = (z > 0) & (xy > 0).all(1) & (xy < (k.width, k.height)).all(1)
+    place = np.where(inside[:, None], xy, 0).astype(int)
+    depth = cv2.resize(run.load_proxy(frame.id).depth, (k.width, k.height), interpolation=cv2.INTER_NEAREST)
+    seen = inside & (np.abs(depth[place[:, 1], place[:, 0]] - z) < 0.02 * z)
+    difference = np.abs(colors - run.image(frame)[place[:, 1], place[:, 0]])[seen].mean(axis=1)
+    assert seen.sum() > 50
+    assert 0 < np.median(difference) < 8
+    glb = trimesh.load(folder / "mesh_textured.glb", force="mesh", process=False)
+    np.testing.assert_allclose(np.ptp(glb.vertices, axis=0)[[0, 2, 1]], np.ptp(mesh.vertices, axis=0), atol=1e-4)
+
+
+def test_texture_alone(run: RunFolder, tmp_path: Path) -> None:
+    few = replace(SETTINGS, texture=False, max_views=2, mesh_side=160)
+    names = [path.name for path in export_run(run, tmp_path, "texture", settings=few)]
+    assert names == [*(f"mesh_textured.{kind}" for kind in ("obj", "mtl", "png", "glb")), "world.json"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
+
+
 def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
     expected = {
         "colmap": "transforms.json",
@@ -106,7 +135,7 @@ def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
         "glb": "point_cloud.glb",
         "tum": "trajectory.txt",
     }
-    for only in set(EXPORTS) - {"mesh"}:
+    for only in set(EXPORTS) - {"mesh", "texture"}:
         export_run(run, tmp_path / only, only, settings=ExportConfig(axes="first"))
         assert (tmp_path / only / expected[only]).exists()
         assert not (tmp_path / only / "README.txt").exists()
