@@ -24,12 +24,14 @@ _SURE = 0.75
 """Both networks' mean over a candidate. Chosen on 70 pictures of 7 recordings: people had 0.82 and more, other things
 0.67 and less, but for one rucksack."""
 _LEAST_SHARE = 0.001
-_REACH = 0.06
+_REACH = 0.12
 """Of the picture's long side: what the person network sees so near a candidate belongs to it (feet, hair, hands)."""
+_HARDLY = 0.1
+"""Where the person network sees this little, the vague rim of the class is no person."""
 _MARGIN = 0.012
-"""Of the long side: the rim that is left out around people, whose borders are soft in both networks. With both numbers
-99.3 % of a woman pasted into 12 pictures of a room were found and 3.1 % of the picture beside her; with a third of
-the reach and two thirds of the rim 96.2 and 1.4 %."""
+"""Of the long side: the rim that is left out around people, whose borders are soft in both networks. With these
+numbers 99.4 % of a woman pasted into 45 pictures of a room were found, 96.8 % in the worst of them, and 3.3 % of the
+picture beside her; with half the reach 98.6, 87.4 and 3.0 %."""
 
 
 @dataclass(frozen=True)
@@ -87,11 +89,10 @@ def join_people(person: NDArray[np.float32], by_class: NDArray[np.float32]) -> N
     if not found.any():
         return found
     side = max(person.shape)
-    found |= (person > 0.5) & _grown(found, _REACH * side)
+    found = found & (person > _HARDLY) | (person > 0.5) & _grown(found, _REACH * side)
     return _grown(found, _MARGIN * side)
 
 
 def _grown(area: NDArray[np.bool_], by: float) -> NDArray[np.bool_]:
-    size = 2 * max(1, round(by)) + 1
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    return cv2.dilate(area.astype(np.uint8), disc).astype(bool)
+    away = cv2.distanceTransform((~area).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(away <= max(1.0, by))
