@@ -63,7 +63,11 @@ class PeopleFinder:
 
     def left_out(self, image: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """(h, w) where an RGB image (h, w, 3) shows people, with a rim around them."""
-        return join_people(person_probability(self._person, image), self._class_probability(image))
+        person = person_probability(self._person, image)
+        # Half of the smallest piece has to be likelier a person than not: often that spares the larger network.
+        if (person > 0.5).mean() < _LEAST_SHARE / 2:
+            return np.zeros(person.shape, bool)
+        return join_people(person, self._class_probability(image))
 
     def _class_probability(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         card, box = self._classes.card, self._classes.box(image.shape[1], image.shape[0])
