@@ -13,7 +13,7 @@ def spread_votes(
 ) -> NDArray[np.float32]:
     """(h, w, C) votes smoothed along the image (h, w, 3) by the domain transform (Gastal and Oliveira, SIGGRAPH 2011):
     a vote fades over `reach` pixels of like colour, and faster where the colour changes by about `color_sd`."""
-    out = np.array(votes, np.float32)
+    out = np.array(votes, np.float32, order="C")
     for iteration in range(2):
         fade = np.exp(-np.sqrt(2.0) / (reach * 0.5**iteration))
         _pass_rows(out, _fading(image, 1, fade, reach / color_sd))
