@@ -15,16 +15,20 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, UnidentifiedImageError
+from pillow_heif import register_heif_opener
 
 from formats.atomic import write_bytes
 from formats.errors import InputError
 from formats.reading import opened, parsing, reaching
 
+register_heif_opener()
+
 MAX_IMAGE_PIXELS = 120_000_000
 """A larger picture is refused by its header, before memory is spent on it (phones go to 108 million)."""
 
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
-_FORMATS = ("JPEG", "PNG", "BMP", "DIB", "TIFF", "WEBP", "GIF")
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif"})
+_FORMATS = ("JPEG", "PNG", "BMP", "DIB", "TIFF", "WEBP", "GIF", "HEIF")
+_PLAIN_FORMATS = ("JPEG", "MPO", "PNG")
 _ADVICE = "copy it again or remove it"
 _TURNS = {
     1: None,
@@ -37,7 +41,7 @@ _TURNS = {
     8: Image.Transpose.ROTATE_90,
 }
 """What makes a picture upright, by EXIF's orientation."""
-_UNREADABLE_SUFFIXES = frozenset({".heic", ".heif", ".dng", ".cr2", ".nef", ".arw", ".raw"})
+_UNREADABLE_SUFFIXES = frozenset({".dng", ".cr2", ".nef", ".arw", ".raw"})
 _FULL_FRAME_WIDTH_MM = 36.0
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
 _MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}
@@ -92,16 +96,17 @@ def is_depth_map(path: Path) -> bool:
 
 
 def is_plain(path: Path) -> bool:
-    """Whether other programs see the image as it is seen here: neither turned nor transparent, 8 bits a channel.
+    """Whether other programs see the image as it is seen here: a JPEG or PNG, whatever it is called, neither turned nor
+    transparent, 8 bits a channel.
 
     Raises InputError as `read_rgb` does.
     """
     with _opened(Path(path)) as image:
-        return image.mode in ("RGB", "L") and _orientation(image) == 1
+        return image.format in _PLAIN_FORMATS and image.mode in ("RGB", "L") and _orientation(image) == 1
 
 
 def read_rgb(path: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB, turned upright as EXIF says; 16 bit is cut to 8, grey tripled, an alpha channel dropped.
+    """(H, W, 3) uint8 RGB, turned upright as EXIF or HEIF says; 10 to 16 bits become 8, grey is tripled, alpha dropped.
 
     Raises InputError for a missing, truncated, oversized or unreadable file.
     """

@@ -474,7 +474,7 @@ DOORS: dict[str, Door] = {
     ),
     **{
         f"picture {name.split('.')[1]}": Door(make_picture(name), picture, name)
-        for name in ("a.jpg", "a.png", "a.tif", "a.webp")
+        for name in ("a.jpg", "a.png", "a.tif", "a.webp", "a.heic")
     },
     "bmp": Door(lambda f: Image.fromarray(_rgb()).save(f / "a.bmp"), picture, "a.bmp"),
     "16 bit PNG": Door(lambda f: write_grey_png(f / "a.png", np.ones((24, 32), np.uint16)), maps, "a.png"),

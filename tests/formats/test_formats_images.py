@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import struct
 import zlib
+from datetime import datetime
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
+from pillow_heif import from_bytes
 
 from formats.errors import InputError
 from formats.image_times import frame_number, read_image_times
 from formats.images import (
     decode_rgb,
     exif_focal_px,
+    exif_gps,
     exif_time,
     image_size,
+    is_plain,
     list_images,
     natural_key,
     read_depth_png,
@@ -55,8 +59,8 @@ def test_folders_without_images_are_explained(tmp_path: Path) -> None:
         list_images(tmp_path / "none")
     with pytest.raises(InputError, match="no images in"):
         list_images(tmp_path)
-    (tmp_path / "IMG_1.HEIC").touch()
-    with pytest.raises(InputError, match=r"\.heic files are not supported"):
+    (tmp_path / "IMG_1.DNG").touch()
+    with pytest.raises(InputError, match=r"\.dng files are not supported"):
         list_images(tmp_path)
 
 
@@ -101,6 +105,54 @@ def test_exif_orientation_agrees_with_opencv(tmp_path: Path, picture: np.ndarray
     assert ours.shape == theirs.shape
     assert np.abs(ours.astype(int) - theirs).max() <= 2
     assert image_size(tmp_path / "a.jpg") == (ours.shape[1], ours.shape[0])
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_heic_is_upright(tmp_path: Path, picture: np.ndarray, orientation: int) -> None:
+    """Turned by the file's own boxes, not by EXIF again: libheif does it, and says so to nobody."""
+    for name in ("a.jpg", "b.heic"):
+        image = Image.fromarray(picture)
+        image.getexif()[ExifTags.Base.Orientation] = orientation
+        image.save(tmp_path / name, quality=95, **({"exif": image.getexif()} if name == "a.jpg" else {}))
+    jpeg, heic = read_rgb(tmp_path / "a.jpg"), read_rgb(tmp_path / "b.heic")
+    assert image_size(tmp_path / "b.heic") == (heic.shape[1], heic.shape[0])
+    assert heic.shape == jpeg.shape
+    assert 0 < np.abs(heic.astype(int) - jpeg).mean() < 3
+
+
+def test_heic_tells_focal_length_time_and_place(tmp_path: Path, picture: np.ndarray) -> None:
+    exif = Image.Exif()
+    camera, gps = exif.get_ifd(ExifTags.IFD.Exif), exif.get_ifd(ExifTags.IFD.GPSInfo)
+    camera[ExifTags.Base.FocalLengthIn35mmFilm] = 26
+    camera[ExifTags.Base.DateTimeOriginal] = "2024:05:06 07:08:09"
+    gps |= {1: "S", 2: (10.0, 30.0, 0.0), 3: "E", 4: (20.0, 15.0, 36.0), 6: 120.5}
+    Image.fromarray(picture).save(tmp_path / "IMG_1.HEIC", exif=exif)
+    path = tmp_path / "IMG_1.HEIC"
+    assert list_images(tmp_path) == [path]
+    assert exif_focal_px(path, 6000, 4000) == pytest.approx(26 * 6000 / 36, rel=1e-6)
+    assert exif_time(path) == (datetime(2024, 5, 6, 7, 8, 9) - datetime(1970, 1, 1)).total_seconds()
+    assert exif_gps(path) == pytest.approx((-10.5, 20.26, 120.5))
+    path.rename(tmp_path / "IMG_1.jpg")  # phones' programs send them under that name
+    assert not is_plain(tmp_path / "IMG_1.jpg")
+    whole = (tmp_path / "IMG_1.jpg").read_bytes()
+    path.write_bytes(whole[: len(whole) * 2 // 3])
+    with pytest.raises(InputError, match="damaged or no image"):
+        read_rgb(path)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif", "a.heic"])
+def test_deep_pictures_have_no_bands(tmp_path: Path, name: str) -> None:
+    """Every one of the 256 levels of a ramp of 16 bits (of 10 in HEIC), each where it belongs."""
+    ramp = np.repeat(np.linspace(0, 65535, 2048).astype(np.uint16)[None], 8, axis=0)
+    if name == "a.heic":
+        deep = from_bytes("RGB;16", (2048, 8), np.repeat(ramp[..., None], 3, axis=2).tobytes())
+        deep.save(tmp_path / name, quality=-1, chroma=444)
+    else:
+        cv2.imwrite(str(tmp_path / name), np.repeat(ramp[..., None], 3, axis=2))
+    levels = read_rgb(tmp_path / name).astype(int)
+    assert len(np.unique(levels)) > 250
+    assert np.abs(levels - ramp[..., None] / 257).max() < 1.5
+    assert (np.diff(levels[4, :, 1]) >= 0).all()
 
 
 def test_unreadable_images_are_explained(tmp_path: Path, picture: np.ndarray) -> None:
