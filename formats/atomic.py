@@ -90,6 +90,12 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode("utf-8"))
 
 
+def copy_file(source: Path, target: Path) -> None:
+    """A copy, atomically: what is given away may be edited without changing what it came from."""
+    with atomic_path(target) as temporary:
+        shutil.copyfile(source, temporary)
+
+
 def _flush_to_disk(path: Path) -> None:
     with path.open("rb+") as file:
         os.fsync(file.fileno())

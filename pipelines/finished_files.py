@@ -89,10 +89,24 @@ class FinishedFiles:
         return path
 
     def damaged(self, stage: str) -> list[str]:
-        """Names of the files of a finished stage that are gone or not as it left them. Reads all of them."""
+        """Names of the files of a finished stage that are gone or not as it left them. Reads all of them. Those of the
+        pieces, runs inside the run, count for the export, which makes them."""
         manifest = self.manifest()
         files = manifest.records[stage].files if manifest and stage in manifest.records else {}
-        return [name for name, expected in files.items() if not self._is_intact(self.stage(stage) / name, *expected)]
+        own = [name for name, expected in files.items() if not self._is_intact(self.stage(stage) / name, *expected)]
+        names = {name.partition("/")[0] for name in files if stage == "export" and name.startswith("piece_")}
+        return own + [f"../{name}/{file}" for name in sorted(names) for file in type(self)(self.root / name)._wrong()]
+
+    def _wrong(self) -> list[str]:
+        """The same over all stages, inside the run."""
+        if (manifest := self.manifest()) is None:
+            return [self.manifest_file.name]
+        return [f"{stage}/{name}" for stage in manifest.records for name in self.damaged(stage)]
+
+    @property
+    def is_piece(self) -> bool:
+        """Whether this is a run inside another one."""
+        return self.root.name.startswith("piece_") and type(self)(self.root.parent).manifest_file.exists()
 
     def _is_intact(self, path: Path, size: int, digest: str) -> bool:
         try:

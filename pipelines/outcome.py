@@ -58,7 +58,7 @@ class Outcome:
     is done; label_of_channel (C,) takes a class channel of the map to its label. `metric`: whether the world's unit is
     the metre of the proxy depth. vocabulary: the classes that the network which labelled it knows, () without one.
     `move`: how all of it has been moved out of the run's own world. `metres`: how long the unit is, as far as the
-    export could tell. piece: "" for the largest one, which has all there is; of another, trajectory and points."""
+    export could tell."""
 
     run: RunFolder
     records: Mapping[str, StageRecord]
@@ -77,7 +77,6 @@ class Outcome:
     vocabulary: tuple[str, ...]
     move: Similarity | None = None
     metres: Metres | None = None
-    piece: str = ""
 
     @property
     def source_is_folder(self) -> bool:
@@ -93,8 +92,6 @@ class Outcome:
 
     def load_sparse(self) -> SparseModel | None:
         """Points and their observations as the last stage that has any left them."""
-        if self.piece:
-            return self.run.load_sparse("tracking", self.piece)
         for stage in (self.pose_stage, "tracking"):
             if self.run.has_sparse(stage):
                 return self._in_this_world(self.run.load_sparse(stage))
@@ -121,12 +118,9 @@ class Outcome:
         )
 
     def pieces(self) -> list[Outcome]:
-        """What nothing joins to the rest, each in a world of its own without metres, largest first."""
-        names = self.run.pieces("tracking")
-        return [
-            replace(self, piece=n, trajectory=self.run.load_trajectory("tracking", n), metric=False, metres=None)
-            for n in names
-        ]
+        """What nothing joins to the rest, each in a world of its own, largest first, as far as it is made."""
+        pieces = [RunFolder(self.run.root / name) for name in self.run.pieces("tracking")]
+        return [load_outcome(p) for p in pieces if p.manifest_file.exists() and "tracking" in load_records(p)]
 
     def frame_row(self, frame_id: int) -> int:
         """Row of a frame in the trajectory."""

@@ -72,6 +72,8 @@ def resume(
 ) -> dict[str, StageRecord]:
     """Go on with a run from its own settings, or from `config`."""
     require_run(run)
+    if run.is_piece:
+        raise InputError(f"{run.root} is a piece of {run.root.parent}: type `msgs-slam resume {run.root.parent}`")
     origin = load_source(run)
     source = Path(origin.path)
     config = _with_device(config or load_settings(run))

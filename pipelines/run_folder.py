@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from itertools import count, takewhile
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -155,11 +155,11 @@ class RunFolder(FinishedFiles):
 
     def pieces(self, stage: str) -> list[str]:
         """Folders inside `stage` ("frames", "tracking") of the pieces that nothing joins to the rest, largest first."""
-        return list(takewhile(lambda piece: self.has(stage, piece + SPARSE), (f"piece_{n}/" for n in count(2))))
+        return list(takewhile(lambda piece: self.has(stage, f"{piece}/{SPARSE}"), (f"piece_{n}" for n in count(2))))
 
     def load_trajectory(self, stage: str, piece: str = "") -> Trajectory:
         """The poses as `stage` ("tracking", "mapping" or "global_ba") left them."""
-        path = self.file(stage, piece + TRAJECTORY)
+        path = self.file(stage, str(PurePosixPath(piece, TRAJECTORY)))
         arrays = load_layout(path, stored.TRAJECTORY)
         with reading(path, "trajectory"):
             stored.require_increasing("frame_ids", arrays["frame_ids"])
@@ -173,7 +173,7 @@ class RunFolder(FinishedFiles):
 
     def load_sparse(self, stage: str, piece: str = "") -> SparseModel:
         """Keyframe poses and points as `stage` left them."""
-        return load_sparse_model(self.file(stage, piece + SPARSE))
+        return load_sparse_model(self.file(stage, str(PurePosixPath(piece, SPARSE))))
 
     def load_depth_fields(self, stage: str) -> DepthFields:
         """What brings proxy depths into the world of `stage`, tracking or global_ba."""

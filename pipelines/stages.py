@@ -47,7 +47,7 @@ class StageContext:
 
     `folder` is the stage's own unfinished folder: it writes its result there, and may keep snapshots under
     `folder / "snapshot"`, which is removed when the stage ends well. What an interrupted attempt with the same
-    settings and inputs has left in `folder` is still there when the stage starts again.
+    settings and inputs has left in `folder` is still there when the stage starts again. `stages` are all of the run.
     """
 
     run: RunFolder
@@ -56,6 +56,7 @@ class StageContext:
     folder: Path
     progress: Progress
     warnings: list[str] = field(default_factory=list)
+    stages: list[Stage] = field(default_factory=list)
 
     @property
     def snapshot(self) -> Path:
@@ -131,7 +132,9 @@ def run_stages(
         if record is None or record.fingerprint != fingerprint or run.damaged(stage.name):
             if _drop(records, stage.name):
                 write_manifest(run.manifest_file, Manifest(origin, records))
-            record = _run_one(stage, run, source, config, progress, fingerprint, inputs[stage.name])
+            folder = run.partial(stage.name)
+            context = StageContext(run, source, config, folder, progress, stages=stages)
+            record = _run_one(stage, context, fingerprint, inputs[stage.name])
             records[stage.name] = record
             write_manifest(run.manifest_file, Manifest(origin, records))
             for later in STAGES[STAGES.index(stage.name) + 1 :]:  # made from what is no longer there
@@ -181,13 +184,10 @@ def next_upstream(upstream: str, record: StageRecord) -> str:
     return hashlib.sha256((upstream + record.content).encode()).hexdigest()
 
 
-def _run_one(
-    stage: Stage, run: RunFolder, source: Path, config: Config, progress: Progress, fingerprint: str, inputs: Any
-) -> StageRecord:
+def _run_one(stage: Stage, context: StageContext, fingerprint: str, inputs: Any) -> StageRecord:
     stop_if_asked()
-    folder = run.partial(stage.name)
+    run, folder = context.run, context.folder
     journal = _open_partial(folder, fingerprint)
-    context = StageContext(run, source, config, folder, progress)
     started = time.monotonic()
     try:
         with watched_by(journal):
@@ -214,7 +214,7 @@ def _run_one(
         context.warnings,
         content_digest(files),
         inputs,
-        settings_of(config, stage.name),
+        settings_of(context.config, stage.name),
     )
 
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from formats.errors import InputError
-from formats.mesh import read_mesh_glb
+from formats.mesh import read_mesh_ply
 from pipelines.viewer_door import guarding
-from pipelines.viewer_scene import MODES, ViewerCamera, ViewerScene, load_scene
+from pipelines.viewer_scene import MODES, ViewerCamera, ViewerScene, load_scenes
 
 _FRUSTUM = 0.09
 _PREVIEW_WIDTH = 480
@@ -27,34 +27,49 @@ def open_viewer(path: Path, host: str = "127.0.0.1", port: int = 8080) -> Viewer
 
     Raises InputError without viser, for a path that cannot be shown, or a port that is taken.
     """
-    scene = load_scene(path)
+    scenes = load_scenes(path)
     try:
         import viser
     except ImportError as error:
         raise InputError("the viewer needs viser: pip install 'msgs-slam[viewer]'") from error
     try:
         with guarding(host):
-            server = viser.ViserServer(host=host, port=port, label=f"MSGS-SLAM {plain(scene.title)}", verbose=False)
+            server = viser.ViserServer(host=host, port=port, label=f"MSGS-SLAM {plain(scenes[0].title)}", verbose=False)
     except OSError as error:
         raise InputError(f"port {port} cannot be used ({error.strerror}): choose another with --port") from error
-    return Viewer(server, scene)
+    return Viewer(server, scenes)
 
 
 class Viewer:
-    """The map as splats, the camera path with a frustum a keyframe, the mesh, and the controls for them."""
+    """The map as splats, the camera path with a frustum a keyframe, the mesh, and the controls for them; of one scene
+    at a time, the first of `scenes` to begin with."""
 
-    def __init__(self, server: Any, scene: ViewerScene) -> None:
-        self.server, self.scene = server, scene
+    def __init__(self, server: Any, scenes: list[ViewerScene]) -> None:
+        self.server, self.scenes = server, scenes
         server.gui.configure_theme(show_logo=False)
-        server.scene.set_up_direction(scene.up)
-        self._splats: Any = None
+        self.boxes: dict[str, Any] = {}
+        self._load(scenes[0])
+        self._add_controls()
+        server.on_client_connect(self._place)
+
+    def _load(self, scene: ViewerScene) -> None:
+        """Everything of the scene, and nothing else."""
+        self.scene = scene
+        self.server.scene.reset()
+        self.server.scene.set_up_direction(scene.up)
         self.show(MODES[0])
         self._cameras = [self._add_camera(i, camera) for i, camera in enumerate(scene.cameras)]
         self._path = self._add_path()
         self._mesh = self._add_mesh()
-        self.boxes: dict[str, Any] = {}
-        self._add_controls()
-        self._place_clients()
+
+    def choose(self, number: int) -> None:
+        """Show another scene, as it begins."""
+        self._load(self.scenes[number])
+        self.mode.value = MODES[0]
+        for name, box in self.boxes.items():
+            box.value = name != "Mesh"
+        for client in self.server.get_clients().values():
+            self._place(client)
 
     @property
     def url(self) -> str:
@@ -92,7 +107,12 @@ class Viewer:
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        gui.add_markdown(f"**{plain(self.scene.title)}**: {len(self.scene.centers):,} Gaussians")
+        titles = [f"{plain(s.title)}: {len(s.centers):,} Gaussians" for s in self.scenes]
+        if len(titles) == 1:
+            gui.add_markdown(titles[0])
+        else:
+            self.pieces = gui.add_dropdown("Piece", titles)
+            self.pieces.on_update(lambda _: self.choose(titles.index(self.pieces.value)))
         modes = tuple(m for m in MODES if m in self.scene.colors or m == "depth")
         self.mode = gui.add_dropdown("Gaussians", modes)
         self.mode.on_update(lambda event: self.show(self.mode.value, event.client))
@@ -101,8 +121,8 @@ class Viewer:
         self._checkbox("Show Gaussians", True, lambda on: setattr(self._splats, "visible", on))
         if self._cameras:
             self._checkbox("Cameras", True, self._show_cameras)
-        if self._mesh is not None:
-            self._checkbox("Mesh", False, lambda on: setattr(self._mesh, "visible", on))
+        if any(scene.mesh_file for scene in self.scenes):
+            self._checkbox("Mesh", False, self._show_mesh)
         if self.scene.cameras:
             blank = np.full((30, 40, 3), 235, np.uint8)
             self.preview = gui.add_image(blank, label="frame (click a camera)", format="jpeg")
@@ -118,6 +138,10 @@ class Viewer:
     def _show_cameras(self, on: bool) -> None:
         for handle in [*self._cameras, *([self._path] if self._path is not None else [])]:
             handle.visible = on
+
+    def _show_mesh(self, on: bool) -> None:
+        if self._mesh is not None:
+            self._mesh.visible = on
 
     def _add_camera(self, number: int, camera: ViewerCamera) -> Any:
         wxyz, position = self._pose(camera)
@@ -149,21 +173,17 @@ class Viewer:
             client.camera.wxyz, client.camera.position = wxyz, position
             client.camera.fov = camera.fov
 
-    def _place_clients(self) -> None:
-        """Whoever opens the page starts behind and above the first camera, or outside a scene without cameras."""
-
-        def place(client: Any) -> None:
-            if self.scene.cameras:
-                _, position = self._pose(self.scene.cameras[0])
-                forward = self.scene.cameras[0].world_from_cam[:3, 2]
-                with client.atomic():
-                    client.camera.position = position - 0.9 * forward + 0.5 * self.scene.up
-                    client.camera.look_at = position + 1.5 * forward
-                return
-            client.camera.position = self._outside()
-            client.camera.look_at = np.median(self.scene.centers, axis=0)
-
-        self.server.on_client_connect(place)
+    def _place(self, client: Any) -> None:
+        """Behind and above the first camera, or outside a scene without cameras."""
+        if self.scene.cameras:
+            _, position = self._pose(self.scene.cameras[0])
+            forward = self.scene.cameras[0].world_from_cam[:3, 2]
+            with client.atomic():
+                client.camera.position = position - 0.9 * forward + 0.5 * self.scene.up
+                client.camera.look_at = position + 1.5 * forward
+            return
+        client.camera.position = self._outside()
+        client.camera.look_at = np.median(self.scene.centers, axis=0)
 
     def _add_path(self) -> Any:
         if len(self.scene.path) < 2:
@@ -176,7 +196,7 @@ class Viewer:
     def _add_mesh(self) -> Any:
         if self.scene.mesh_file is None:
             return None
-        found = read_mesh_glb(self.scene.mesh_file)
+        found = read_mesh_ply(self.scene.mesh_file)
         mesh = trimesh.Trimesh(found.vertices, found.faces, vertex_colors=found.colors, process=False)
         return self.server.scene.add_mesh_trimesh("/mesh", mesh, scale=self.scene.scale, visible=False)
 

@@ -68,20 +68,22 @@ class ViewerScene:
         return np.ascontiguousarray(colors.reshape(-1, 3)[:, ::-1])
 
 
-def load_scene(path: Path) -> ViewerScene:
-    """Of a run folder or a file of Gaussians. Raises InputError for anything else, or a run without a map."""
+def load_scenes(path: Path) -> list[ViewerScene]:
+    """Of a run folder and its pieces, largest first, or of a file of Gaussians. Raises InputError for anything else, or
+    a run without a map."""
     with reaching(path):
         is_file, is_folder = path.is_file(), path.is_dir()
     if is_file:
-        return _from_file(path)
+        return [_from_file(path)]
     if not is_folder:
         raise InputError(f"{path}: there is no such run folder or splat file")
-    return _from_run(load_outcome(RunFolder(path)))
+    outcome = load_outcome(RunFolder(path))
+    return [_from_run(outcome), *(_from_run(piece) for piece in outcome.pieces() if piece.gaussian_map is not None)]
 
 
 def _from_run(outcome: Outcome) -> ViewerScene:
     world, up = load_world(outcome.run), up_in_run(outcome)
-    outcome = outcome if world is None else outcome.moved(world.exported_from_run)
+    outcome, run = outcome if world is None else outcome.moved(world.exported_from_run), outcome.run
     m = outcome.require_map()
     t, k = outcome.trajectory, outcome.calibration.intrinsics
     means, radii = m.means.cpu().numpy(), m.radii.detach().cpu().numpy()
@@ -93,7 +95,7 @@ def _from_run(outcome: Outcome) -> ViewerScene:
     channels = decided_channels(m.class_logits).cpu().numpy()
     labels = labels_of_channels(channels, outcome.label_of_channel) if m.class_logits.shape[1] else None
     return ViewerScene(
-        title=outcome.run.root.name,
+        title=f"{run.root.parent.name}, {run.root.name.replace('_', ' ')}" if run.is_piece else run.root.name,
         centers=(means * scale).astype(np.float32),
         covariances=((radii * scale) ** 2)[:, None, None].astype(np.float32) * np.eye(3, dtype=np.float32),
         opacities=m.opacities.detach().cpu().numpy()[:, None].astype(np.float32),

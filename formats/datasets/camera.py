@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,8 @@ _SAME_SHAPE = 0.01
 class Camera:
     """Intrinsics in pixels, first pixel's centre at (0.5, 0.5); distortion k1, k2, p1, p2[, k3] as OpenCV has it.
 
-    `fisheye` says that the distortion is the equidistant k1..k4 instead.
+    `fisheye` says that the distortion is the equidistant k1..k4 instead; `is_nominal` that these are the numbers of the
+    kind of camera, not a calibration of this one.
     """
 
     width: int
@@ -31,6 +32,7 @@ class Camera:
     cy: float
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     fisheye: bool = False
+    is_nominal: bool = field(default=False, repr=False)  # a source is known by the text of its camera
 
     def __post_init__(self) -> None:
         values = np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion], dtype=np.float64)

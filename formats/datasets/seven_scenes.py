@@ -63,7 +63,7 @@ def _camera(path: Path, size: tuple[int, int], focal: float) -> Camera:
     width, height = size
     if not path.is_file():
         scale = width / 640
-        return Camera(width, height, focal * scale, focal * scale, width / 2, height / 2)
+        return Camera(width, height, focal * scale, focal * scale, width / 2, height / 2, is_nominal=True)
     k = read_table(path, 3)
     if k.shape != (3, 3):
         raise InputError(f"{path} has {len(k)} rows of 3 numbers, expected a 3x3 calibration matrix")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +42,7 @@ def read_capture(outcome: Outcome, sparse: SparseModel | None) -> Capture:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Consecutive frames that are lost for one reason; seconds in the source."""
+    """Consecutive frames that are lost for one reason, or in one other piece; seconds in the source."""
 
     first: int
     last: int
@@ -51,7 +52,7 @@ class Stretch:
 
 
 def lost_stretches(outcome: Outcome) -> list[Stretch]:
-    """Lost frames, neighbours with the same reason together."""
+    """Lost frames, neighbours with the same reason together, whatever its counts of points are."""
     t = outcome.trajectory
     stretches: list[Stretch] = []
     for row, reason in enumerate(t.lost_reasons):
@@ -59,11 +60,15 @@ def lost_stretches(outcome: Outcome) -> list[Stretch]:
             continue
         frame, time = int(t.frame_ids[row]), float(t.timestamps[row])
         previous = stretches[-1] if stretches else None
-        if previous and previous.last == frame - 1 and previous.reason == reason:
-            stretches[-1] = Stretch(previous.first, frame, previous.start, time, reason)
+        if previous and previous.last == frame - 1 and _kind(previous.reason) == _kind(reason):
+            stretches[-1] = Stretch(previous.first, frame, previous.start, time, previous.reason)
         else:
             stretches.append(Stretch(frame, frame, time, time, reason))
     return stretches
+
+
+def _kind(reason: str) -> str:
+    return re.sub(r"(?<!piece_)\d+", "", reason)
 
 
 def advice(
@@ -112,7 +117,7 @@ def _about_motion(outcome: Outcome, sparse: SparseModel | None, loops: list[Loop
     lost = int((~t.is_posed).sum())
     if lost:
         found.append(
-            f"{lost} of {len(t.frame_ids)} frames have no pose. The lost stretches are listed below: walk there again "
+            f"{lost} of {len(t.frame_ids)} frames have no pose here. The stretches are listed below: walk there again "
             "slowly, and look back at what is already known."
         )
     centers = t.centers[t.is_posed]

@@ -48,6 +48,7 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
             "" if evaluation is None else _truth_section(evaluation, run),
             "" if views is None else section("What the map shows", views.sheet),
             "" if views is None else class_section(outcome, views),
+            *(_piece_section(piece, progress or SilentProgress()) for piece in outcome.pieces()),
             _time_section(outcome),
             _export_section(outcome),
             _settings_section(outcome),
@@ -62,17 +63,22 @@ def _load_loops(outcome: Outcome) -> list[LoopEdge]:
     return outcome.run.load_loops() if "global_ba" in outcome.records else []
 
 
-def _heading(outcome: Outcome, views: RenderedViews | None, loops: list[LoopEdge]) -> str:
+def _figures(outcome: Outcome, views: RenderedViews | None) -> list[tuple[str, str]]:
     t = outcome.trajectory
-    pairs = [
-        ("frames posed", f"{int(t.is_posed.sum())} / {len(t.frame_ids)}"),
-        ("keyframes", str(int(t.is_keyframe.sum()))),
-        ("focal length, px", f"{outcome.calibration.intrinsics.fx:.1f}"),
-    ]
+    pairs = [("frames posed", f"{int(t.is_posed.sum())} / {len(t.frame_ids)}")]
+    pairs.append(("keyframes", str(int(t.is_keyframe.sum()))))
     if outcome.gaussian_map is not None:
         pairs.append(("Gaussians", f"{len(outcome.gaussian_map):,}"))
     if views is not None and views.psnr:
         pairs.append(("keyframe PSNR, dB", f"{np.mean(views.psnr):.1f}"))
+    return pairs
+
+
+def _heading(outcome: Outcome, views: RenderedViews | None, loops: list[LoopEdge]) -> str:
+    pairs = [*_figures(outcome, views), ("focal length, px", f"{outcome.calibration.intrinsics.fx:.1f}")]
+    if pieces := outcome.pieces():
+        apart = sum(int(p.trajectory.is_posed.sum()) for p in pieces)
+        pairs.append((f"frames in {len(pieces)} further {'piece' if len(pieces) == 1 else 'pieces'}", str(apart)))
     if "global_ba" in outcome.records:
         pairs.append(("loops closed", str(len(loops))))
     pairs.append(("seconds", f"{sum(r.seconds for r in outcome.records.values()):.0f}"))
@@ -112,11 +118,11 @@ def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[Loo
     if "global_ba" in outcome.records:
         text = ", ".join(f"{e.frame1_id}–{e.frame2_id} ({e.inliers} matches)" for e in loops[:12])
         rows.append(("loops", f"{len(loops)}: {text}" if loops else "none"))
-    lost = lost_stretches(outcome)
-    names = [f"frames {s.first}–{s.last} ({s.start:.2f}–{s.end:.2f} s): {s.reason}" for s in lost]
-    rows.append(("lost stretches", "; ".join(names) if names else f"none of {len(t.frame_ids)} frames"))
+    lost = [f"frames {s.first}–{s.last} ({s.start:.2f}–{s.end:.2f} s): {s.reason}" for s in lost_stretches(outcome)]
+    rows.append(("lost stretches", f"{len(lost)}, below" if lost else f"none of {len(t.frame_ids)} frames"))
     warnings = [f"{stage}: {w}" for stage, record in outcome.records.items() for w in record.warnings]
-    extra = f"<h3>Warnings</h3>{bullets(warnings)}" if warnings else ""
+    listed = {"Lost stretches": lost, "Warnings": warnings}
+    extra = "".join(f"<h3>{title}</h3>{bullets(lines)}" for title, lines in listed.items() if lines)
     return section("What was found", table(("", ""), rows), extra)
 
 
@@ -125,6 +131,21 @@ def _scale_text(outcome: Outcome) -> str:
         return lengths(outcome.metres, outcome.metric)
     exported = "export" in outcome.records
     return lengths(None, False) if exported else "free so far: the export says how many metres a unit is about"
+
+
+def _piece_section(piece: Outcome, progress: Progress) -> str:
+    """What nothing joins to the rest: a run of its own inside the run, in short."""
+    views = None if piece.gaussian_map is None else render_views(piece, progress)
+    t = piece.trajectory
+    seconds = f"{t.timestamps[0]:.1f} to {t.timestamps[-1]:.1f}"
+    name = piece.run.root.name
+    return section(
+        f"Apart from the rest: {name.replace('_', ' ')}",
+        chips([*_figures(piece, views), ("seconds of the source", seconds)]),
+        "<p>Nothing tells how it lies to the rest: it has a world and a unit of its own. "
+        f"<code>msgs-slam report {escape(str(piece.run.root))}</code> says more; view and render take it, too.</p>",
+        '<div class="two">', *trajectory_plots(piece, None), "</div>", "" if views is None else views.sheet,
+    )  # fmt: skip
 
 
 def _path_section(outcome: Outcome) -> str:

@@ -30,6 +30,7 @@ mesh_textured.obj, .mtl, .png, mesh_textured.glb   only with --set export.textur
                           group for each class.
 classes.json              number, name and colour of each class; 255 is "unknown".
 scale.json                how many metres a unit of the run is, its relative standard deviation, and who says so.
+piece_2/ and so on        only where nothing joins some frames to the rest: the same of them, in a world of their own.
 world.json                what the axes are, what told which way is up, and how this world lies to the run's own.
 
 """

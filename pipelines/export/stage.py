@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from formats.atomic import copy_file
 from formats.digest import file_sha256
 from formats.gps import read_track
 from formats.mesh import read_mesh_ply
@@ -25,9 +26,11 @@ from pipelines.export.writers import (
 from pipelines.metres.files import save_metres
 from pipelines.metres.find import Machine, find_metres
 from pipelines.outcome import Outcome, load_outcome
+from pipelines.pieces import make_pieces
 from pipelines.progress import Progress, SilentProgress
 from pipelines.proxy.networks.identity import card_identity
 from pipelines.proxy.selection import metric_card
+from pipelines.records import load_records
 from pipelines.run_folder import RunFolder
 from pipelines.stages import Stage, StageContext
 from pipelines.types import Metres, SemanticMesh
@@ -45,7 +48,7 @@ def run(context: StageContext) -> dict[str, Any]:
         context.warn(reason)
     found = replace(found, metres=gps_metres(world) or guess_metres(context, found, settings))
     outcome = on_earth(found.moved(world.exported_from_run), world)
-    write_pieces(found, context.folder)
+    write_pieces(context)
     write_all_but_mesh(outcome, world, settings, context.folder)
     if world.earth is not None:
         save_metres(context.folder, found.metres)
@@ -131,10 +134,16 @@ def export_inputs(source: Path, config: Config) -> list[str]:
     return track if card is None else [card_identity(card), *track]
 
 
-def write_pieces(found: Outcome, folder: Path) -> list[Path]:
-    """piece_2 and so on: the COLMAP model and the trajectory of what nothing joins to the rest."""
-    places = [(piece, folder / piece.piece) for piece in found.pieces()]
-    return [path for piece, place in places for path in write_colmap(piece, place) + write_trajectory(piece, place)]
+def write_pieces(context: StageContext) -> None:
+    """piece_2 and so on: what nothing joins to the rest, each with all the files of an export, or with its poses."""
+    for piece in make_pieces(context):
+        if "export" in (records := load_records(piece)):
+            for name in records["export"].files:
+                copy_file(piece.file("export", name), context.folder / piece.root.name / name)
+        elif "tracking" in records:
+            found = load_outcome(piece, context.device)
+            write_colmap(found, context.folder / piece.root.name)
+            write_trajectory(found, context.folder / piece.root.name)
 
 
 def find_world(outcome: Outcome, settings: ExportConfig) -> tuple[World, list[str]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from formats.atomic import atomic_path, write_text
+from formats.atomic import copy_file, write_text
 from formats.colmap import write_colmap_model
 from formats.compact_gaussians import write_compact
 from formats.gaussian_glb import write_gaussian_glb
@@ -36,9 +35,9 @@ def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
     names = tuple(name_of[int(i)] for i in trajectory.frame_ids[posed])
     camera = (k.width, k.height, k.fx, k.fy, k.cx, k.cy)
     for name in names:
-        place_image(outcome.run.file("frames", name), folder / "frames" / name)
+        copy_file(outcome.run.file("frames", name), folder / "frames" / name)
         if (mask := outcome.run.mask_file(name)) is not None:
-            place_image(mask, folder / "masks" / mask.name)
+            copy_file(mask, folder / "masks" / mask.name)
     points = seen_points(outcome.load_sparse(), trajectory.frame_ids[posed])
     write_colmap_model(folder / "sparse" / "0", *camera, names, trajectory.cam_from_world[posed], *points)
     paths = [f"frames/{name}" for name in names]
@@ -63,12 +62,6 @@ def seen_points(
     return (
         model.points_in_world[used], model.colors[used], image[kept], place[model.obs_point[kept]], model.obs_xy[kept],
     )  # fmt: skip
-
-
-def place_image(source: Path, target: Path) -> None:
-    """A copy, not a link: what is given away may be edited without changing the run that it came from."""
-    with atomic_path(target) as temporary:
-        shutil.copyfile(source, temporary)
 
 
 def map_cloud(outcome: Outcome) -> GaussianCloud:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from formats.atomic import atomic_path
+from formats.atomic import copy_file
 from formats.errors import InputError
 from formats.images import read_rgb, write_rgb
 from formats.jsonfile import read_json, write_json
@@ -83,10 +82,11 @@ def _known_camera(context: StageContext, source: AnySource) -> tuple[pycolmap.Ca
         given = read_intrinsics(config.intrinsics, source.width, source.height)
         return to_pycolmap(given.resized(width, height)), "given"
     known = source.known_camera() if isinstance(source, RecordingSource) else None
-    if known is not None and not known.fisheye:
+    if known is not None and not known.fisheye and not known.is_nominal:
         return to_pycolmap(known.resized(width, height)), "given"
     if known is not None:
-        context.warn("the data set's lens is a fisheye: its focal length is a start only, the frames calibrate it")
+        if known.fisheye:
+            context.warn("the data set's lens is a fisheye: its focal length is a start only, the frames calibrate it")
         return unknown_camera(width, height, known.fx * width / source.width, is_prior=True), "self-calibrated"
     exif = source.exif_focal()
     if exif is not None:
@@ -158,16 +158,11 @@ def _save_picked(context: StageContext, source: AnySource, picture: VideoFrame, 
     if original is None:
         write_rgb(path, reduced)
     else:
-        _copy(original, path)
+        copy_file(original, path)
 
 
 def _picked(context: StageContext, name: str) -> Path:
     return context.snapshot / "picked" / name
-
-
-def _copy(source: Path, target: Path) -> None:
-    with atomic_path(target) as temporary:
-        shutil.copyfile(source, temporary)
 
 
 # keyframes and structure ----------------------------------------------------------------------------------------
@@ -305,7 +300,7 @@ def _write_frames(context: StageContext, source: AnySource, frames: list[Frame],
     missing = [f for f in frames if not (context.folder / f.name).exists()]
     if lens.shift_px <= _SIGNIFICANT_SHIFT_PX:
         for frame in context.progress.track(missing, "frames", len(missing)):
-            _copy(_picked(context, frame.name), context.folder / frame.name)
+            copy_file(_picked(context, frame.name), context.folder / frame.name)
         return
     by_index = {f.source_index: f for f in missing}
 

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipelines.structure.lens import with_second_radial
+from pipelines.structure.lens import set_lens
 
 _CAUCHY_PX = 1.0
 _MAX_REPROJECTION_PX = 4.0
@@ -38,7 +38,7 @@ def adjust(model: pycolmap.Reconstruction, refine_camera: bool) -> float:
         return 0.0
     solve(model, images, refine_camera)
     simple_focal = float(model.cameras[1].focal_length)
-    with_second_radial(model.cameras[1])
+    set_lens(model.cameras[1], 2)
     solve(model, images, refine_camera)
     _remove_wild(model)
     # Before points are removed: the adjuster keeps pointers into the model.

@@ -38,10 +38,10 @@ def unknown_camera(width: int, height: int, focal: float, is_prior: bool) -> pyc
     return made
 
 
-def with_second_radial(camera: pycolmap.Camera) -> None:
-    """Turn a SIMPLE_RADIAL camera into a RADIAL one in place, its second coefficient zero."""
-    params = [*camera.params, 0.0]
-    camera.model = pycolmap.CameraModelId.RADIAL
+def set_lens(camera: pycolmap.Camera, coefficients: int) -> None:
+    """Turn a SIMPLE_RADIAL or RADIAL camera into one of one or two radial coefficients, in place, a new one zero."""
+    params = [*camera.params, 0.0][: 3 + coefficients]
+    camera.model = (pycolmap.CameraModelId.SIMPLE_RADIAL, pycolmap.CameraModelId.RADIAL)[coefficients - 1]
     camera.params = params
 
 

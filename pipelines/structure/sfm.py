@@ -30,6 +30,7 @@ from pipelines.correspondence.snapshots import Snapshots
 from pipelines.progress import Progress
 from pipelines.structure.adjust import adjust
 from pipelines.structure.consistency import ModelReport, judge, without_misplaced
+from pipelines.structure.lens import set_lens
 from pipelines.structure.mappers import calibrate_focal, map_globally, map_incrementally
 from pipelines.structure.parallax import HOW_TO_FILM, require_parallax
 from pipelines.structure.seams import cut, take_out
@@ -38,6 +39,10 @@ from pipelines.types import Features, Vocabulary
 _PAIRS_PER_BLOCK = 64
 _MIN_KEYFRAMES = 3
 _MIN_POINTS = 30
+LENS_HELD = "global-lens-held"
+_UNSURE_FOCAL = 0.03
+_AS_GOOD = 0.98
+"""The second attempt's share of the first one's score, from which it is as good and its surer focal length decides."""
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -60,6 +65,14 @@ class Structure:
     tried: list[tuple[int, int]]
     pairs: list[VerifiedPair]
     pieces: list[pycolmap.Reconstruction]
+
+
+@dataclass(frozen=True)
+class _Adjusted:
+    model: pycolmap.Reconstruction
+    mapper: str
+    focal_sd: float
+    score: float
 
 
 @dataclass(frozen=True)
@@ -87,18 +100,30 @@ class StructureFromMotion:
         xy = [f.xy for f in features]
         known_focal = self.camera.mean_focal_length() if self.camera.has_prior_focal_length else None
         require_parallax(pairs, xy, (self.camera.width, self.camera.height), known_focal)
-        found = self._map(features, pairs)
+        found = self._adjusted(features, pairs, ("global", "incremental"))
         if found is None:
             raise InputError(
                 f"no structure could be found: {len(pairs)} pairs of {len(features)} views match. The views have too "
                 f"little texture, blur or overlap. {HOW_TO_FILM}, slowly and in good light"
             )
-        model, mapper, _ = found
-        focal_sd = adjust(model, refine_camera=not self.is_fixed)
-        report = judge(model, pairs, xy, len(features), self.config.overlap)
-        cut(model, report.parts)
-        pieces = self._pieces(features, pairs, model)
-        return Structure(model, report, mapper, focal_sd, features, vocabulary, tried, pairs, pieces)
+        if found.focal_sd > _UNSURE_FOCAL * found.model.cameras[1].mean_focal_length():
+            # A lens that is bent before the poses stand can run away with the focal length.
+            again = self._adjusted(features, pairs, (LENS_HELD,))
+            if again is not None and again.focal_sd < found.focal_sd and again.score >= _AS_GOOD * found.score:
+                found = again
+        found, pieces = self._largest_first(found, self._pieces(features, pairs, found.model))
+        report = judge(found.model, pairs, xy, len(features), self.config.overlap)
+        cut(found.model, report.parts)
+        return Structure(found.model, report, found.mapper, found.focal_sd, features, vocabulary, tried, pairs, pieces)
+
+    def _adjusted(
+        self, features: Sequence[Features], pairs: Sequence[VerifiedPair], mappers: Sequence[str]
+    ) -> _Adjusted | None:
+        found = self._map(features, pairs, mappers)
+        if found is None:
+            return None
+        model, mapper, report = found
+        return _Adjusted(model, mapper, adjust(model, refine_camera=not self.is_fixed), report.score)
 
     def _pieces(
         self, features: Sequence[Features], pairs: Sequence[VerifiedPair], model: pycolmap.Reconstruction
@@ -126,6 +151,25 @@ class StructureFromMotion:
             if len(report.parts[0]) >= self.config.least_piece and report.is_consistent:
                 take_out(piece, [k for part in report.parts[1:] for k in part])
                 pieces.append(piece)
+
+    def _largest_first(
+        self, found: _Adjusted, pieces: list[pycolmap.Reconstruction]
+    ) -> tuple[_Adjusted, list[pycolmap.Reconstruction]]:
+        """The largest model, which calibrates the camera of all where it is surer of it, and the others."""
+        models = [found.model, *pieces]
+        largest = max(models, key=lambda m: m.num_reg_images())
+        if largest is found.model:
+            return found, pieces
+        others = [m for m in models if m is not largest]
+        if not self.is_fixed:
+            again = pycolmap.Reconstruction(largest)
+            set_lens(again.cameras[1], 1)
+            if (focal_sd := adjust(again, refine_camera=True)) < found.focal_sd:
+                largest, found = again, replace(found, focal_sd=focal_sd)
+                for other in others:
+                    other.cameras[1].params = again.cameras[1].params.tolist()
+                    adjust(other, refine_camera=False)
+        return replace(found, model=largest), others
 
     def _features(self, keyframe_ids: Sequence[int]) -> list[Features]:
         def extract(frame_id: int) -> Features:
@@ -158,13 +202,16 @@ class StructureFromMotion:
         return list(itertools.chain.from_iterable(found))
 
     def _map(
-        self, features: Sequence[Features], pairs: Sequence[VerifiedPair]
+        self,
+        features: Sequence[Features],
+        pairs: Sequence[VerifiedPair],
+        mappers: Sequence[str] = ("global", "incremental"),
     ) -> tuple[pycolmap.Reconstruction, str, ModelReport] | None:
-        """The better of the global and the incremental model, None where neither is any; the second is only made when
-        the first is doubtful."""
+        """The best of the mappers' models, None where none is any; the next is only made when those before it are
+        doubtful."""
         xy = [f.xy for f in features]
         best: tuple[pycolmap.Reconstruction, str, ModelReport] | None = None
-        wanted = ("global", "incremental") if self.config.mapper == "auto" else (self.config.mapper,)
+        wanted = [name for name in mappers if self.config.mapper in ("auto", name)]
         for name in self.progress.track(wanted, "mapping", len(wanted)):
             if best is not None and best[2].is_sound:
                 break
@@ -186,8 +233,9 @@ class StructureFromMotion:
         write_database(database, self.camera, [f"{i:06d}" for i in range(len(features))], features, pairs)
         if not self.camera.has_prior_focal_length:
             calibrate_focal(database, self.seed)
-        run = map_globally if name == "global" else map_incrementally
-        return run(database, work, not self.is_fixed, self.seed)
+        if name == "incremental":
+            return map_incrementally(database, work, not self.is_fixed, self.seed)
+        return map_globally(database, work, not self.is_fixed, self.seed, bend_lens=name != LENS_HELD)
 
 
 def parallel_map(function: Callable[[T], R], items: Iterable[T], threads: int) -> Iterator[R]:

@@ -18,7 +18,7 @@ def keep_largest_segment(state: TrackState) -> None:
     largest = min(counts, key=lambda s: (-counts[s], s))
     for frame_id in sorted(state.poses):
         if state.segment[frame_id] != largest:
-            state.lost[frame_id] = "tracked, but this stretch could not be joined to the rest"
+            state.lost.setdefault(frame_id, "tracked, but this stretch could not be joined to the rest")
             for table in (state.poses, state.sightings, state.segment):
                 del table[frame_id]
     state.keyframes = [k for k in state.keyframes if k in state.poses]
@@ -29,13 +29,14 @@ def take_pieces(state: TrackState, least: int) -> list[TrackState]:
     counts = Counter(state.segment.values())
     order = sorted(counts, key=lambda s: (-counts[s], s))[1:]
     pieces = []
-    for segment in (s for s in order if counts[s] >= least):
+    for number, segment in enumerate((s for s in order if counts[s] >= least), 2):
         inside = [i for i in sorted(state.poses) if state.segment[i] == segment]
         poses, sightings = {i: state.poses[i] for i in inside}, {i: state.sightings[i] for i in inside}
         keyframes = [k for k in state.keyframes if k in poses]
         piece = TrackState(state.points, state.colors, poses, sightings, keyframes, segment=dict.fromkeys(inside, 0))
         normalise(piece)
         pieces.append(piece)
+        state.lost |= dict.fromkeys(inside, f"in piece_{number}, which nothing joins to the rest")
     return pieces
 
 

@@ -69,14 +69,12 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
         state.done += 1
         if state.done % settings.snapshot_every == 0 or is_asked():
             state.save(snapshot)
+    add_pieces(state, context.run, context.config.frames.least_piece)
     # Frames before the first keyframe could not be followed from anywhere; now there are neighbours behind them.
     for frame_id in sorted(state.lost, reverse=True):
         front_end.track(frame_id, may_start=False)
-    add_pieces(state, context.run, context.config.frames.least_piece)
-    for order in (sorted(state.lost), sorted(state.lost, reverse=True)):
-        for frame_id in order if context.run.pieces("frames") else ():
-            if frame_id in state.lost:
-                front_end.track(frame_id, may_start=False)
+    for frame_id in sorted(state.lost) if context.run.pieces("frames") else ():
+        front_end.track(frame_id, may_start=False)
     join_segments(state, pictures, intrinsics, context.config.run.seed)
     return state
 

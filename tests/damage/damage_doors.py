@@ -69,7 +69,7 @@ from pipelines.proxy.networks.head import load_linear_head
 from pipelines.proxy.networks.network_pass import ResultCache
 from pipelines.proxy.networks.session import Network
 from pipelines.structure.calibration import read_intrinsics
-from pipelines.viewer_scene import load_scene
+from pipelines.viewer_scene import load_scenes
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 4
 
@@ -141,7 +141,7 @@ def gaussians(path: Path) -> None:
 
 
 def viewer_scene(path: Path) -> None:
-    scene = load_scene(path)
+    (scene,) = load_scenes(path)
     finite(scene.centers, "centers")
     finite(scene.covariances, "covariances")
 

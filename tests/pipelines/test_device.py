@@ -24,7 +24,7 @@ from pipelines.progress import SilentProgress
 from pipelines.render_run import render_run
 from pipelines.run_folder import RunFolder
 from pipelines.stages import Stage, StageContext
-from pipelines.viewer_scene import load_scene
+from pipelines.viewer_scene import load_scenes
 from tests.pipelines.mapping.small_run import make_run
 from tests.pretend_device import DEVICE, PretendTensor, WrongDeviceError, pretended
 
@@ -91,7 +91,7 @@ def test_it_is_drawn_there(run: RunFolder, tmp_path: Path) -> None:
 
 
 def test_it_is_viewed_from_there(run: RunFolder) -> None:
-    assert len(load_scene(run.root).centers) > 100
+    assert len(load_scenes(run.root)[0].centers) > 100
 
 
 def test_a_misplaced_copy_to_the_cpu_is_found(

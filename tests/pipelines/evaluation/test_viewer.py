@@ -22,13 +22,13 @@ from scipy.spatial.transform import Rotation
 from formats.errors import InputError
 from formats.gaussian_ply import read_gaussian_ply
 from pipelines.run_folder import RunFolder
-from pipelines.viewer_scene import load_scene
+from pipelines.viewer_scene import load_scenes
 
 OracleRun = Callable[..., RunFolder]
 
 
 def test_scene_of_a_run(oracle_run: OracleRun) -> None:
-    scene = load_scene(oracle_run().root)
+    scene = load_scenes(oracle_run().root)[0]
     m = len(scene.centers)
     assert scene.covariances.shape == (m, 3, 3)
     assert set(scene.colors) == {"colour", "classes"}
@@ -41,7 +41,7 @@ def test_scene_of_a_run(oracle_run: OracleRun) -> None:
 
 
 def test_depth_is_seen_from_the_camera(oracle_run: OracleRun) -> None:
-    scene = load_scene(oracle_run().root)
+    scene = load_scenes(oracle_run().root)[0]
     camera = scene.cameras[0].world_from_cam
     position, forward = camera[:3, 3] * scene.scale, camera[:3, 2]
     depth = (scene.centers - position) @ forward
@@ -58,20 +58,20 @@ def test_depth_is_seen_from_the_camera(oracle_run: OracleRun) -> None:
 def test_scene_of_a_splat_file_by_another_program(shared_data: Path) -> None:
     folder = shared_data / "format_cases"
     path = folder / "ply_other_writers" / "test-splat.3-points-from-train.ply"
-    scene, cloud = load_scene(path), read_gaussian_ply(path)
+    (scene,), cloud = load_scenes(path), read_gaussian_ply(path)
     assert len(scene.centers) == 3
     # The covariance's eigenvalues are the squared scales, however it is turned.
     expected = np.sort(np.exp(2 * cloud.log_scales), axis=1) * scene.scale**2
     np.testing.assert_allclose(np.linalg.eigvalsh(scene.covariances), expected, rtol=1e-3, atol=1e-9)
     with pytest.raises(InputError, match="LFS"):
-        load_scene(folder / "lfs_pointer" / "point_cloud.ply")
+        load_scenes(folder / "lfs_pointer" / "point_cloud.ply")
 
 
 def test_what_cannot_be_shown_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such run"):
-        load_scene(tmp_path / "nowhere")
+        load_scenes(tmp_path / "nowhere")
     with pytest.raises(InputError):
-        load_scene(tmp_path)
+        load_scenes(tmp_path)
 
 
 # in the browser -------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import pytest
 from formats.datasets.camera import Camera
 from formats.errors import InputError
 from pipelines.structure.calibration import read_intrinsics
-from pipelines.structure.lens import distortion_of, make_lens, to_pycolmap, unknown_camera, with_second_radial
+from pipelines.structure.lens import distortion_of, make_lens, set_lens, to_pycolmap, unknown_camera
 
 
 def test_numbers_on_the_command_line() -> None:
@@ -148,6 +148,6 @@ def test_a_second_coefficient_changes_nothing_by_itself() -> None:
     camera.params = [600.0, 320.0, 240.0, -0.07]
     points = np.random.default_rng(0).uniform([-0.4, -0.4, 0.6], [0.4, 0.4, 1.4], (20, 3))
     before = camera.img_from_cam(points)
-    with_second_radial(camera)
+    set_lens(camera, 2)
     assert camera.model == pycolmap.CameraModelId.RADIAL
     np.testing.assert_array_equal(camera.img_from_cam(points), before)

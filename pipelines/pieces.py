@@ -1,0 +1,78 @@
+"""Pieces: each stretch that nothing joins to the rest of a run becomes a small run inside it, RUN/piece_2 and so on.
+
+A piece has its own frames, world and unit of length. Its first stage takes them out of the run around it, the others
+are those of any run, and so is all that reads it.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from hashlib import sha256
+from typing import Any
+
+import numpy as np
+
+from formats.atomic import copy_file
+from formats.errors import DiskFullError, InputError
+from pipelines.config import Config
+from pipelines.records import load_records
+from pipelines.run_folder import (
+    RunFolder,
+    save_backbone,
+    save_calibration,
+    save_features,
+    save_frames,
+    save_matching,
+)
+from pipelines.stages import Stage, StageContext, run_stages
+
+
+def make_pieces(context: StageContext) -> list[RunFolder]:
+    """Bring the pieces that tracking has found up to date, largest first, and remove those it no longer finds; a piece
+    of which no map can be made is told of."""
+    run, names = context.run, context.run.pieces("tracking")
+    for old in run.root.glob("piece_*"):
+        if old.name not in names:
+            shutil.rmtree(old)
+    records, made = load_records(run), []
+    for name in names:
+        piece = RunFolder(run.root / name)
+        piece.root.mkdir(exist_ok=True)
+        origin = sha256(f"{name} {records['frames'].content} {records['tracking'].content}".encode()).hexdigest()
+        stages = [Stage("frames", take_frames, "the frames of the piece"), *context.stages[1:]]
+        try:
+            run_stages(stages, piece, context.source, origin, _settings(context.config), context.progress)
+        except DiskFullError:
+            raise
+        except InputError as error:
+            context.warn(f"{name} is posed, and could not be made whole: {error}")
+        made.append(piece)
+    return made
+
+
+def _settings(config: Config) -> Config:
+    """Those of the run around it; a length that is known in one picture tells nothing of another world."""
+    height = config.proxy.scale_ref.strip().startswith("height")
+    return config if height else replace(config, proxy=replace(config.proxy, scale_ref=""))
+
+
+def take_frames(context: StageContext) -> dict[str, Any]:
+    """The stage `frames` of a piece: its frames counted anew, and what the run around it knows of them."""
+    around, name = RunFolder(context.run.root.parent), context.run.root.name
+    posed = np.flatnonzero(around.load_trajectory("tracking", name).is_posed).tolist()
+    frames, number = around.load_frames(), {old: new for new, old in enumerate(posed)}
+    for frame in (frames[i] for i in posed):
+        copy_file(around.image_file(frame), context.folder / frame.name)
+        if (mask := around.mask_file(frame.name)) is not None:
+            copy_file(mask, context.folder / "masks" / mask.name)
+    save_frames(context.folder, [replace(frames[old], id=new) for old, new in number.items()])
+    save_calibration(context.folder, around.load_calibration())
+    model = around.load_sparse("tracking", name)
+    save_backbone(context.folder, replace(model, frame_ids=np.array([number[i] for i in model.frame_ids.tolist()])))
+    for old, new in number.items():
+        if (features := around.load_features(old)) is not None:
+            save_features(context.folder, new, features)
+    tried = {(number[i], number[j]): n for (i, j), n in around.load_tried().items() if i in number and j in number}
+    save_matching(context.folder, around.load_vocabulary(), tried)
+    return {"frames": len(posed), "keyframes": len(model.frame_ids), "of_the_run": [posed[0], posed[-1]]}

@@ -1,0 +1,96 @@
+"""What nothing joins to the rest becomes a run inside the run: mapped, exported, shown, repaired with it."""
+
+import hashlib
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from click.testing import CliRunner
+
+from formats.images import write_rgb
+from formats.mesh import read_mesh_ply
+from msgs_cli.main import main
+from pipelines.evaluation.report import write_report
+from pipelines.geometry.alignment import align_points
+from pipelines.outcome import load_outcome
+from pipelines.run_folder import RunFolder
+from pipelines.viewer_scene import load_scenes
+from tests.pipelines.frames.conftest import WALK_FRAMES, render, sideways, write_walk
+
+APART = 9
+SETTINGS = (
+    "run.threads=1", "run.device=cpu", "frames.max_features=500", "frames.overlap=5", "frames.loop_candidates=2",
+    "frames.least_piece=5", "proxy.stereo_side=96", "proxy.stereo_planes=24", "proxy.depth=multiview",
+    "proxy.semantics=segments", "mapping.passes=1", "mapping.min_iterations=10", "mapping.max_side=96",
+    "mapping.max_gaussians=4000", "export.voxel=0.05", "export.scale=free",
+)  # fmt: skip
+
+
+def invoke(*arguments: object) -> str:
+    result = CliRunner().invoke(main, [str(a) for a in arguments])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def digests(folder: Path) -> dict[str, str]:
+    files = [p for p in sorted(folder.rglob("*")) if p.is_file()]
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A walk, cut to the walk through the mirrored room, of which no picture fits the others."""
+    folder = tmp_path_factory.mktemp("pieces")
+    write_walk(folder / "pictures", sideways(WALK_FRAMES))
+    for i, (center, rotation) in enumerate(sideways(APART)):
+        mirrored = np.ascontiguousarray(render(center, rotation)[:, ::-1])
+        write_rgb(folder / "pictures" / f"view_{WALK_FRAMES + i:03d}.png", mirrored)
+    settings = [x for s in SETTINGS for x in ("--set", s)]
+    invoke("reconstruct", folder / "pictures", "--out", folder / "both.msgs", *settings, "-q")
+    return RunFolder(folder / "both.msgs")
+
+
+def test_a_piece_has_all_that_a_run_has(whole: RunFolder) -> None:
+    outcome = load_outcome(whole)
+    (piece,) = outcome.pieces()
+    assert [f.name for f in piece.frames] == [f"view_{WALK_FRAMES + i:03d}.png" for i in range(APART)]
+    assert len(piece.require_map()) > 500
+    assert (
+        whole.load_trajectory("tracking").lost_reasons[WALK_FRAMES + 3] == "in piece_2, which nothing joins to the rest"
+    )
+    centres, truth = piece.trajectory.centers, np.array([c for c, _ in sideways(APART)]) * [-1, 1, 1]
+    apart = align_points(centres, truth, with_scale=True).apply(centres) - truth
+    assert 0 < np.linalg.norm(apart, axis=1).max() < 0.05
+    exported = whole.stage("export") / "piece_2"
+    assert pycolmap.Reconstruction(exported / "sparse" / "0").num_reg_images() == APART
+    assert len(read_mesh_ply(exported / "mesh.ply").faces) > 100
+    assert (exported / "point_cloud.ply").read_bytes() == piece.run.file("export", "point_cloud.ply").read_bytes()
+
+
+def test_report_viewer_and_status_show_it(whole: RunFolder, tmp_path: Path) -> None:
+    html = write_report(whole, tmp_path / "report.html").read_text()
+    assert "Apart from the rest: piece 2" in html
+    assert f"frames {WALK_FRAMES}–{WALK_FRAMES + APART - 1}" in html
+    scenes = load_scenes(whole.root)
+    assert [s.title for s in scenes] == ["both.msgs", "both.msgs, piece 2"]
+    assert all(len(s.centers) > 500 and s.mesh_file for s in scenes)
+    assert "piece_2" in invoke("status", whole.root)
+
+
+def test_damage_inside_a_piece_is_named_and_mended_to_the_same_bytes(whole: RunFolder, tmp_path: Path) -> None:
+    copy = RunFolder(Path(shutil.copytree(whole.root, tmp_path / "both.msgs")))
+    before = digests(copy.root / "piece_2" / "mapping"), digests(copy.stage("export"))
+    path = copy.root / "piece_2" / "mapping" / "map.safetensors"
+    data = path.read_bytes()
+    path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    (copy.root / "piece_3").mkdir()  # of an earlier state of the run
+    assert "piece_2/mapping/map.safetensors" in invoke("status", copy.root)
+    refused = CliRunner().invoke(main, ["resume", str(copy.root / "piece_2")])
+    assert refused.exit_code == 1
+    assert "is a piece of" in refused.output
+    invoke("resume", copy.root, "-q")
+    assert (digests(copy.root / "piece_2" / "mapping"), digests(copy.stage("export"))) == before
+    assert copy.damaged("export") == []
+    assert not (copy.root / "piece_3").exists()
