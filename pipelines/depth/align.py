@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,9 +93,9 @@ def fit_fields(views: Sequence[PosedDepth], anchors: Mapping[int, Anchors], expe
     samples = [_Samples.of(v) for v in views]
     near = neighbours(views)
     for _ in range(ROUNDS if views else 0):
-        parts = [_point_equations(n, views[n], found, fields) for n, found in sorted(anchors.items())]
-        parts += [_pair_equations(i, j, samples[i], views[j], fields) for i, j in near]
-        fields = solve_fields(parts, fields, start, PRIOR)
+        points = (_point_equations(n, views[n], found, fields) for n, found in sorted(anchors.items()))
+        pairs = (_pair_equations(i, j, samples[i], views[j], fields) for i, j in near)
+        fields = solve_fields(chain(points, pairs), fields, start, PRIOR)
     return fields
 
 

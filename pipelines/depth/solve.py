@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from scipy.sparse.linalg import cg
 from pipelines.depth.fields import Basis, Grid
 
 Array = NDArray[np.float64]
+_ROWS_AT_ONCE = 200_000
 
 
 @dataclass(frozen=True)
@@ -58,24 +60,35 @@ class Equations:
         return Equations(columns, basis.weights, residual, sd, share)
 
 
-def solve_fields(parts: Sequence[Equations], fields: Array, expected: Array, prior: Prior) -> Array:
+def solve_fields(parts: Iterable[Equations], fields: Array, expected: Array, prior: Prior) -> Array:
     """(N, nodes) the fields after one step: Cauchy-weighted equations, and `expected` (N, nodes) as far as the prior
     holds them to it."""
-    normal = sparse.kron(sparse.identity(len(fields)), prior.normal(), format="csr")
-    right = -(normal @ (fields - expected).reshape(-1))
-    rows, columns, weights, residuals = [], [], [], []
-    offset = 0
-    for part in parts:
-        certainty = np.sqrt(part.share / (1 + (part.residual / part.sd) ** 2)) / part.sd
-        rows.append(np.repeat(np.arange(offset, offset + len(certainty)), part.columns.shape[1]))
-        columns.append(part.columns.ravel())
-        weights.append((part.weights * certainty[:, None]).ravel())
-        residuals.append(part.residual * certainty)
-        offset += len(certainty)
-    if offset:
-        places = (np.concatenate(rows), np.concatenate(columns))
-        design = sparse.csr_matrix((np.concatenate(weights), places), shape=(offset, fields.size))
-        normal = normal + design.T @ design
-        right = right - design.T @ np.concatenate(residuals)
+    normals = [sparse.kron(sparse.identity(len(fields)), prior.normal(), format="csr")]
+    right = -(normals[0] @ (fields - expected).reshape(-1))
+    for design, residual in _designs(parts, fields.size):
+        normals.append((design.T @ design).tocsr())
+        right = right - design.T @ residual
+        # Like sizes are added to each other: the whole is not copied for every part.
+        while len(normals) > 1 and normals[-2].nnz <= 2 * normals[-1].nnz:
+            normals[-2:] = [normals[-2] + normals[-1]]
+    normal = sum(normals[:-1], normals[-1])
     change, _ = cg(normal, right, rtol=1e-6, maxiter=500, M=sparse.diags(1 / normal.diagonal()))
     return fields + change.reshape(fields.shape)
+
+
+def _designs(parts: Iterable[Equations], size: int) -> Iterator[tuple[sparse.csr_matrix, Array]]:
+    """The weighted equations as matrices (Q, size) of some hundred thousand rows, and their residuals (Q,): all of a
+    long recording would take gigabytes."""
+    waiting: list[Equations] = []
+    for part in chain(parts, (None,)):
+        if part is not None:
+            waiting.append(part)
+        if waiting and (part is None or sum(len(p.residual) for p in waiting) >= _ROWS_AT_ONCE):
+            certainties = [np.sqrt(p.share / (1 + (p.residual / p.sd) ** 2)) / p.sd for p in waiting]
+            certainty = np.concatenate(certainties)
+            each = [(c[:, None] * p.weights).ravel() for c, p in zip(certainties, waiting, strict=True)]
+            starts = np.cumsum(np.concatenate([[0], *(np.full(len(p.residual), p.columns.shape[1]) for p in waiting)]))
+            columns = np.concatenate([p.columns.ravel() for p in waiting])
+            design = sparse.csr_matrix((np.concatenate(each), columns, starts), shape=(len(certainty), size))
+            yield design, np.concatenate([p.residual for p in waiting]) * certainty
+            waiting.clear()

@@ -54,11 +54,13 @@ def optimise_map(
     article = article or ArticleConfig()
     schedule = Schedule.plan(views, settings, seed, initial is None, passes, article.keyframe_miou)
     optimiser = MapOptimiser(views, classes, settings, article, state)
+    # A map and its visits grow together: were it written every so many visits, all of it would be written ever longer.
+    every = max(settings.snapshot_every, len(views))
     remaining = range(state.iteration, schedule.total)
     for iteration in (progress or SilentProgress()).track(remaining, label, len(remaining)):
         optimiser.visit(schedule.step(iteration))
         state.iteration = iteration + 1
-        if snapshot is not None and (state.iteration % settings.snapshot_every == 0 or is_asked()):
+        if snapshot is not None and (state.iteration % every == 0 or is_asked()):
             state.save(snapshot)
     optimiser.growth.prune()
     return state.result(views, schedule.total)

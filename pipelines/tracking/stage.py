@@ -20,6 +20,9 @@ from pipelines.tracking.state import FEATURE_SD, TrackState
 from pipelines.types import Frame
 from pipelines.wording import stretches
 
+SNAPSHOTS = 20
+"""Of a long recording no more are taken: each holds all that is known so far."""
+
 
 def run(context: StageContext) -> dict[str, Any]:
     """Keyframes from structure from motion, every other frame against them, then everything adjusted together."""
@@ -63,11 +66,12 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
     intrinsics = context.run.load_calibration().intrinsics
     times = {f.id: f.timestamp for f in frames}
     front_end = FrontEnd(state, pictures, times, intrinsics, settings, context.config.run.seed, weights)
+    every = max(settings.snapshot_every, len(frames) // SNAPSHOTS)
     for frame in context.progress.track(frames[state.done :], "tracking", len(frames) - state.done):
         if frame.id not in state.poses:
             front_end.track(frame.id)
         state.done += 1
-        if state.done % settings.snapshot_every == 0 or is_asked():
+        if state.done % every == 0 or is_asked():
             state.save(snapshot)
     add_pieces(state, context.run, context.config.frames.least_piece)
     # Frames before the first keyframe could not be followed from anywhere; now there are neighbours behind them.

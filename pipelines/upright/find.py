@@ -79,10 +79,10 @@ def surface_voxels(outcome: Outcome, cam_from_world: Sequence[Array]) -> Voxels:
     seen = np.concatenate([np.zeros(0), *(v.depth[v.weight > 0] for v in views)])
     size = float(np.median(seen)) / _VOXELS_PER_DEPTH if len(seen) else 1.0
     black = np.zeros((camera.height, camera.width, 3), np.uint8)
-    rows = [
+    rows = (
         gather_frame(v.depth, v.weight, black, camera, np.linalg.inv(v.cam_from_world).astype(np.float64), size)
         for v in views
-    ]
+    )
     voxels = merge(size, rows)
     return select(voxels, voxels.weight > _LEAST_WEIGHT)
 

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from pipelines.config import GlobalBaConfig
 from pipelines.correspondence.retrieval import Looks, far_apart, loop_pairs, unit
+from pipelines.depth.align import fit_fields
 from pipelines.depth.posed import PosedDepth, neighbours
 from pipelines.depth.see_through import contradicted
 from pipelines.geometry import se3
@@ -148,9 +149,14 @@ def _segments(s: Synthetic) -> None:
             state.segment_of_point(int(point), k)
 
 
+def _fields(s: Synthetic) -> None:
+    fit_fields(s.views, {})
+
+
 CASES: dict[str, tuple[str, Callable[[Synthetic], Any]]] = {
     "which views see the same (three times a mapping)": ("views", lambda s: neighbours(s.views)),
     "depth that others see through": ("views", lambda s: contradicted(s.views)),
+    "depth fields, tracking": ("views", _fields),
     "stereo: views to match, of 60 keyframes": ("model", _stereo),
     "loops by look, frames": ("looks", _loops_by_look),
     "loops by look and labels, global_ba": ("looks model summaries", _loop_candidates),

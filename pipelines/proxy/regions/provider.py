@@ -82,8 +82,8 @@ class SegmentLabels:
         """All frames' surface in voxels (V,), which way is up, and floor, ceiling, wall, surface or other (V,)."""
         posed = [f for f in frames if f.id in self._world_from_cam]
         self._size = _scene_depth([depth_of(f) for f in posed[:: max(1, len(posed) // 12)]]) / _VOXELS_PER_DEPTH
-        rows = [self._gather(f, depth_of(f)) for f in self._progress.track(posed, "regions", len(posed))]
-        voxels = merge(self._size, rows)
+        tracked = self._progress.track(posed, "regions", len(posed))
+        voxels = merge(self._size, (self._gather(f, depth_of(f)) for f in tracked))
         voxels = select(voxels, voxels.weight > _LEAST_WEIGHT)
         cameras = np.array([self._world_from_cam[f.id] for f in posed])
         gravity = find_gravity(voxels, -cameras[:, :3, 1].mean(0))

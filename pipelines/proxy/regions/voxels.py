@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -13,6 +14,8 @@ from pipelines.types import Intrinsics
 
 _BITS = 21
 _HALF = 1 << (_BITS - 1)
+_WAITING = 500_000
+"""Voxels of single frames that wait to be summed, at least."""
 _OFFSETS = np.array([(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], np.int64)
 
 
@@ -109,12 +112,22 @@ def gather_frame(
     return _sum_by_key(keys[use], values)
 
 
-def merge(size: float, frames: list[tuple[NDArray[np.int64], NDArray[np.float64]]]) -> Voxels:
-    """All frames' voxels together."""
-    keys, total = _sum_by_key(
-        np.concatenate([np.empty(0, np.int64), *(f[0] for f in frames)]),
-        np.concatenate([np.empty((0, 10)), *(f[1] for f in frames)]),
-    )
+def merge(size: float, frames: Iterable[tuple[NDArray[np.int64], NDArray[np.float64]]]) -> Voxels:
+    """All frames' voxels together: memory grows with the scene, not with the number of frames."""
+    keys, total = np.empty(0, np.int64), np.empty((0, 10))
+    waiting: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
+
+    def together() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        return _sum_by_key(
+            np.concatenate([keys, *(k for k, _ in waiting)]), np.concatenate([total, *(v for _, v in waiting)])
+        )
+
+    for row in frames:
+        waiting.append(row)
+        if sum(len(k) for k, _ in waiting) > max(len(keys), _WAITING):
+            keys, total = together()
+            waiting.clear()
+    keys, total = together()
     weight = np.maximum(total[:, :1], 1e-12)
     normal = total[:, 4:7]
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.depth.align import align_keyframes
+from pipelines.depth import solve
+from pipelines.depth.align import align_keyframes, fit_fields
 from pipelines.depth.fields import FINE, DepthFields, field_scales
 from pipelines.depth.posed import CANDIDATES, PosedDepth, overlaps
 from pipelines.depth.see_through import contradicted
@@ -140,6 +141,16 @@ def test_of_very_many_views_a_spread_is_compared(room: MappingInput) -> None:
     overlap = overlaps(crowd)
     assert np.diff(overlap.indptr).max() == CANDIDATES + 1
     assert overlap[0, [1, CANDIDATES + 49]].toarray().min() > 0.5  # the nearest and the farthest
+
+
+def test_equations_in_parts_have_the_same_solution(room: MappingInput, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a long recording there are never all equations at once."""
+    posed = [v.posed_depth() for v in room.views[:6]]
+    at_once = fit_fields(posed, {})
+    monkeypatch.setattr(solve, "_ROWS_AT_ONCE", 900)
+    in_parts = fit_fields(posed, {})
+    assert np.abs(at_once).max() > 1e-4
+    assert in_parts == pytest.approx(at_once, abs=1e-9)
 
 
 def test_depth_that_others_see_through_is_found(room: MappingInput) -> None:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from proxy_room import UNIT, Room
 
@@ -11,12 +12,13 @@ from pipelines.evaluation.label_score import count_labels, score
 from pipelines.progress import SilentProgress
 from pipelines.proxy.networks.labels import best_classes
 from pipelines.proxy.providers import DepthEstimate
+from pipelines.proxy.regions import voxels
 from pipelines.proxy.regions.belonging import one_name_each, place_likelihood
 from pipelines.proxy.regions.named import NamedScene, Vocabulary
 from pipelines.proxy.regions.posture import name_likelihood
 from pipelines.proxy.regions.provider import SegmentLabels
 from pipelines.proxy.regions.structure import FLOOR, OTHER, Gravity
-from pipelines.proxy.regions.voxels import Voxels, voxel_keys
+from pipelines.proxy.regions.voxels import Voxels, merge, voxel_keys
 from pipelines.proxy.sequence import resample_linear
 from pipelines.types import VOID, Frame
 from tests.world.room import CLASSES
@@ -132,3 +134,16 @@ def test_rooms_hold_no_cars_and_streets_do() -> None:
     assert place_likelihood(room, names, weight)[1] < 0.2
     assert (place_likelihood(room, names, weight)[[0, 2]] == 1).all()
     assert (place_likelihood(street, names, weight) == 1).all()
+
+
+def test_voxels_of_many_frames_are_summed_as_they_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To the same bytes as all at once."""
+    rng = np.random.default_rng(0)
+    frames = [(np.sort(rng.integers(0, 60, 40)), rng.random((40, 10))) for _ in range(30)]
+    at_once = merge(0.05, frames)
+    monkeypatch.setattr(voxels, "_WAITING", 100)
+    as_they_come = merge(0.05, iter(frames))
+    assert len(at_once) == 60
+    for name in ("keys", "weight", "position", "normal", "color"):
+        assert getattr(as_they_come, name).tobytes() == getattr(at_once, name).tobytes()
+    assert len(merge(0.05, [])) == 0
