@@ -22,6 +22,7 @@ os.environ.setdefault("OPENCV_VIDEOIO_DEBUG", "0")
 import cv2
 
 from formats.errors import InputError
+from formats.hdr_video import HdrCapture, can_tone_map, hdr_transfer
 from formats.images import IMAGE_SUFFIXES
 from formats.reading import opened
 
@@ -90,6 +91,7 @@ class VideoReader(Iterator[VideoFrame]):
 
     After the end `timestamps` holds the time of every decoded frame and `missing_frames` how many frames the header
     promised beyond those: more than a few mean a truncated or damaged file. `repaired_timestamps` counts the repairs.
+    `hdr` is "HLG" or "PQ" where the file says so, `tone_mapped` whether its frames are then brought to sRGB.
 
     Raises InputError at construction as `probe_video` does.
     """
@@ -98,7 +100,9 @@ class VideoReader(Iterator[VideoFrame]):
         self._path = Path(path)
         _require_video_bytes(self._path)
         self._wanted = _as_predicate(wanted)
-        self._capture = _open(self._path)
+        self.hdr = hdr_transfer(self._path)
+        self.tone_mapped = bool(self.hdr) and can_tone_map()
+        self._capture = HdrCapture(self._path, self.hdr) if self.tone_mapped else _open(self._path)
         self.info = _read_info(self._capture, self._path)
         self._clock = _Clock(self.info.fps)
         self.ended = False
@@ -232,7 +236,7 @@ def _undecodable(path: Path) -> InputError:
     )
 
 
-def _read_info(capture: cv2.VideoCapture, path: Path) -> VideoInfo:
+def _read_info(capture: cv2.VideoCapture | HdrCapture, path: Path) -> VideoInfo:
     width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
     height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
     if width < 1 or height < 1:

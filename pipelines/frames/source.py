@@ -70,7 +70,7 @@ class VideoSource:
                 _require_size(frame.rgb, self.width, self.height, f"frame {frame.source_index} of {self.path}")
                 yield frame
             if warn is not None:
-                _warn_of_damage(self.path, reader, warn)
+                _warn_of_the_file(self.path, reader, warn)
 
     def name(self, frame_id: int, index: int) -> str:
         """000000.jpg, 000001.jpg, ..."""
@@ -204,8 +204,12 @@ def _require_size(rgb: NDArray[np.uint8], width: int, height: int, what: str) ->
         )
 
 
-def _warn_of_damage(path: Path, reader: VideoReader, warn: Warn) -> None:
+def _warn_of_the_file(path: Path, reader: VideoReader, warn: Warn) -> None:
     decoded = len(reader.timestamps)
+    if reader.tone_mapped:
+        warn(f"{path.name} is HDR ({reader.hdr}): its light is brought to the range of ordinary pictures")
+    elif reader.hdr:
+        warn(f"{path.name} is HDR ({reader.hdr}), its colours come out flat: pip install 'msgs-slam[hdr]' mends that")
     # Containers count a frame or two too many in passing; that is no damage.
     if reader.missing_frames > max(2, reader.info.frame_count_claimed // 50):
         warn(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import struct
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -223,3 +225,83 @@ def test_times_always_increase(stored: list[float]) -> None:
     assert times[0] == 0
     assert all(b > a for a, b in itertools.pairwise(times))
     assert np.isfinite(times).all()
+
+
+def hdr_signal(srgb: np.ndarray, transfer: str) -> np.ndarray:
+    """(..., 3) uint16 BT.2020 signal of pictures (0..1), white is diffuse white; ITU-R BT.2100's forward curves."""
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    wide = linear @ np.array([[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]]).T
+    if transfer == "HLG":
+        scene = wide * 0.26496
+        signal = np.where(
+            scene <= 1 / 12, np.sqrt(3 * scene), 0.17883277 * np.log(12 * scene.clip(0.03) - 0.28466892) + 0.55991073
+        )
+    else:
+        power = (wide * 203 / 10000) ** 0.1593017578125
+        signal = ((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power)) ** 78.84375
+    return np.round(signal.clip(0, 1) * 65535).astype(np.uint16)
+
+
+def write_hdr(path: Path, pictures: list[np.ndarray], transfer: str) -> None:
+    """10 bit HEVC that says its transfer function, pictures as uint16 RGB."""
+    options = {"crf": "4", "preset": "ultrafast", "x265-params": "log-level=none:pools=1:frame-threads=1"}
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx265", rate=10, options=options)
+        stream.width, stream.height, stream.pix_fmt = pictures[0].shape[1], pictures[0].shape[0], "yuv420p10le"
+        context = stream.codec_context
+        context.color_trc, context.color_primaries = {"PQ": 16, "HLG": 18}[transfer], 9
+        context.colorspace, context.color_range = 9, 1
+        for picture in pictures:
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb48le")
+            container.mux(stream.encode(frame.reformat(format="yuv420p10le", dst_colorspace=9, dst_color_range=1)))
+        container.mux(stream.encode())
+
+
+@pytest.mark.parametrize("transfer", ["HLG", "PQ"])
+def test_hdr_has_the_colours_of_the_scene(tmp_path: Path, transfer: str) -> None:
+    patches = np.random.default_rng(0).uniform(0.05, 0.8, (4, 6, 3))
+    picture = np.kron(patches, np.ones((16, 16, 1)))
+    write_hdr(tmp_path / "a.mp4", [hdr_signal(picture, transfer)] * 3, transfer)
+    reader = iter_video(tmp_path / "a.mp4")
+    frames = list(reader)
+    assert (reader.hdr, reader.tone_mapped, reader.missing_frames) == (transfer, True, 0)
+    assert [f.timestamp for f in frames] == pytest.approx([0, 0.1, 0.2])
+    seen = frames[1].rgb[8::16, 8::16].astype(float)
+    assert 0 < np.abs(seen - 255 * patches).mean() < 2.5
+
+
+def test_hdr_has_no_bands_and_no_blown_whites(tmp_path: Path) -> None:
+    ramp = np.repeat(np.linspace(0, 65535, 1024)[None, :, None], 32, axis=0).repeat(3, axis=2).astype(np.uint16)
+    write_hdr(tmp_path / "a.mp4", [ramp], "HLG")
+    (frame,) = iter_video(tmp_path / "a.mp4")
+    levels = frame.rgb[16, :, 1].astype(int)
+    assert len(np.unique(levels)) > 240
+    assert np.diff(levels).min() >= -1  # a codec
+    assert np.diff(levels).max() <= 3
+    assert 235 < levels[768] < 250  # diffuse white; what is brighter still rises
+    assert levels[1000] > levels[768]
+
+
+def test_hdr_upright(tmp_path: Path) -> None:
+    """A phone held upright writes its turn into the track's matrix."""
+    picture = np.zeros((64, 96, 3))
+    picture[:32, :48] = 0.7, 0.2, 0.2
+    write_hdr(tmp_path / "a.mp4", [hdr_signal(picture, "HLG")] * 2, "HLG")
+    data = bytearray((tmp_path / "a.mp4").read_bytes())
+    place = data.index(b"tkhd") + 4 + 40
+    data[place : place + 36] = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30)
+    (tmp_path / "b.mp4").write_bytes(data)
+    info = probe_video(tmp_path / "b.mp4")
+    assert (info.width, info.height) == (64, 96)
+    turned = next(iter_video(tmp_path / "b.mp4")).rgb
+    lying = next(iter_video(tmp_path / "a.mp4")).rgb
+    assert (turned == np.rot90(lying, -1)).all()  # as OpenCV turns such a file
+
+
+def test_ordinary_videos_are_not_taken_for_hdr(counted_video: Path, tmp_path: Path) -> None:
+    assert not iter_video(counted_video).hdr
+    write_hdr(tmp_path / "a.mp4", [np.zeros((64, 64, 3), np.uint16)] * 5, "PQ")
+    data = (tmp_path / "a.mp4").read_bytes()
+    (tmp_path / "cut.mp4").write_bytes(data[: len(data) * 2 // 3])
+    with pytest.raises(InputError, match="no picture can be decoded"):
+        list(iter_video(tmp_path / "cut.mp4"))
