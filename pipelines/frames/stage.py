@@ -54,7 +54,7 @@ def run(context: StageContext) -> dict[str, Any]:
     """See `StageContext`; raises InputError for a source that cannot be used."""
     config = context.config.frames
     source = open_source(context.source, context.config.run.format)
-    camera, origin = _known_camera(context, source)
+    camera, origin = known_camera(context, source)
     _require_reasonable(config, source)
     frames = _pick(context, source)
     masks = FrameMasks(
@@ -74,7 +74,7 @@ def run(context: StageContext) -> dict[str, Any]:
     return _figures(frames, structure, calibration) | masked
 
 
-def _known_camera(context: StageContext, source: AnySource) -> tuple[pycolmap.Camera, str]:
+def known_camera(context: StageContext, source: AnySource) -> tuple[pycolmap.Camera, str]:
     """The camera of the reduced frames as far as it is known before, and where from."""
     config = context.config.frames
     width, height = reduced_size(source.width, source.height, config.max_side)

@@ -91,14 +91,16 @@ def test_tum_cameras_are_distorted(tmp_path: Path, known: Known, number: str, fx
     camera = open_sequence(path).camera
     assert camera is not None
     assert camera.is_distorted
+    assert not camera.is_nominal
     assert (camera.fx / WIDTH * 640, camera.distortion[0]) == pytest.approx((fx, k1))
 
 
 def test_tum_folder_of_another_name_says_that_it_guesses(tmp_path: Path, known: Known) -> None:
     _tum_folder(tmp_path / "mine", known)
     sequence = open_sequence(tmp_path / "mine")
-    assert "assumed" in sequence.notes[0]
+    assert "expected" in sequence.notes[0]
     assert sequence.camera is not None
+    assert sequence.camera.is_nominal
     assert sequence.camera.cx == pytest.approx(WIDTH / 2)
 
 

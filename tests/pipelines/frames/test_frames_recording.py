@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layouts import LAYOUTS, START, tum
+from layouts import LAYOUTS, START, seven_scenes, tum
 
 from formats.datasets import Camera, Sequence, open_sequence
 from formats.errors import InputError
@@ -17,6 +17,7 @@ from pipelines.evaluation.evaluate import evaluate_run
 from pipelines.frames.recording import RecordingSource
 from pipelines.frames.source import FolderSource, open_source
 from pipelines.frames.source_pixels import FramePixels
+from pipelines.frames.stage import known_camera
 from pipelines.progress import SilentProgress
 from pipelines.proxy.files.recording import RecordingDepth, RecordingLabels
 from pipelines.proxy.inputs import proxy_inputs
@@ -24,6 +25,7 @@ from pipelines.proxy.selection import Surroundings, open_depth_files, open_label
 from pipelines.proxy.sequence import Sequence as ProxySequence
 from pipelines.reconstruct import reconstruct
 from pipelines.run_folder import RunFolder
+from pipelines.stages import StageContext
 from pipelines.structure.lens import distortion_of, make_lens, to_pycolmap
 from pipelines.types import VOID, Calibration, Frame, Intrinsics
 from tests.pipelines.part_of_sequence import part_of
@@ -58,6 +60,17 @@ def test_each_layout_is_recognised_and_read(layout: str, short: Sequence, tmp_pa
     np.testing.assert_allclose(found, expected, atol=1e-3)
     assert len({source.name(i, i) for i in range(5)}) == 5
     assert open_source(path, format).expected_frames == 5
+
+
+def test_a_camera_of_a_file_is_fixed_and_one_of_the_kind_is_a_start(short: Sequence, tmp_path: Path) -> None:
+    path = seven_scenes(short, tmp_path / "set")
+    context = StageContext(RunFolder(tmp_path), path, Config(), tmp_path, SilentProgress())
+    camera, origin = known_camera(context, open_source(path))
+    assert (origin, camera.params.tolist()) == ("given", pytest.approx([208, 208, 120, 90], abs=20))
+    (path / "camera-intrinsics-color.txt").unlink()
+    camera, origin = known_camera(context, open_source(path))
+    assert (origin, camera.model.name, camera.has_prior_focal_length) == ("self-calibrated", "SIMPLE_RADIAL", True)
+    assert camera.params.tolist() == [525 * 240 / 640, 120, 90, 0]
 
 
 @pytest.mark.parametrize("layout", [name for name, row in LAYOUTS.items() if row[3]])
