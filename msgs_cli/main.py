@@ -91,7 +91,7 @@ UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], h
 
 
 @main.command()
-@click.argument("source", type=click.Path(path_type=Path))
+@click.argument("sources", metavar="SOURCE...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--out", type=FOLDER, metavar="RUN", help="The run folder. Default: the source's name + .msgs, here.")
 @settings_options
 @source_options
@@ -102,7 +102,7 @@ UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], h
 )  # fmt: skip
 @verbosity_options
 def reconstruct(
-    source: Path,
+    sources: tuple[Path, ...],
     out: Path | None,
     config_file: Path | None,
     overrides: tuple[str, ...],
@@ -112,23 +112,24 @@ def reconstruct(
     verbose: bool,
     **about_source: str | None,
 ) -> None:
-    """Reconstruct SOURCE, a video, a folder of images or a data set, into a run folder.
+    """Reconstruct SOURCE, a video, a folder of images or a data set, into a run folder; of several videos by one camera
+    of one place, one run.
 
     No option is needed. Stopped at any moment, the same command, or `msgs-slam resume RUN`, goes on where it was; with
     a changed setting only the stages that depend on it run again.
     """
     set_up_logging(quiet, verbose)
     from pipelines.config import load_config
-    from pipelines.reconstruct import default_run_folder, existing_config
+    from pipelines.reconstruct import default_run_folder, existing_config, one_source
     from pipelines.reconstruct import reconstruct as run_reconstruct
     from pipelines.run_folder import RunFolder
 
-    run = RunFolder(out) if out else default_run_folder(source)
+    run = RunFolder(out) if out else default_run_folder(sources[0])
     texts = source_settings(about_source)
     texts += [f"mapping.hold_out={hold_out}"] if hold_out is not None else []
     config = load_config(config_file, [*overrides, *texts], base=existing_config(run))
     with stopping_softly(f"Go on with: msgs-slam resume {run.root}"):
-        records = run_reconstruct(source, run, config, make_progress(quiet), until)
+        records = run_reconstruct(one_source(sources, run), run, config, make_progress(quiet), until)
     if not quiet:
         _print_summary(run.root, records)
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from formats.atomic import write_text
 from formats.digest import file_sha256, files_sha256
 from formats.errors import InputError
 from formats.image_times import times_file
@@ -13,7 +15,7 @@ from formats.images import list_images
 from pipelines.config import Config
 from pipelines.device import settle_device
 from pipelines.frames.recording import open_recording
-from pipelines.frames.source import require_source
+from pipelines.frames.source import LIST_SUFFIX, require_source, video_files
 from pipelines.lock import LOCK, locked
 from pipelines.progress import Progress
 from pipelines.records import StageRecord, load_records, load_source, recorded_config
@@ -39,6 +41,17 @@ def default_run_folder(source: Path) -> RunFolder:
     """`video.msgs` in the working folder for `…/video.mp4`."""
     name = source.resolve().stem if source.is_file() else source.resolve().name
     return RunFolder(Path(f"{name}.msgs"))
+
+
+def one_source(sources: Sequence[Path], run: RunFolder) -> Path:
+    """The source itself, or for several videos of one place a list of them, written beside the run."""
+    if len(sources) == 1:
+        return sources[0]
+    path = run.root.with_suffix(LIST_SUFFIX)
+    if any("\n" in str(source) for source in sources):
+        raise InputError("a video's name holds a line break: rename it")
+    write_text(path, "".join(f"{source.resolve()}\n" for source in sources))
+    return path
 
 
 def existing_config(run: RunFolder) -> Config | None:
@@ -111,7 +124,8 @@ def source_digest(source: Path, format: str) -> str:
         head = f"{recording.format} {recording.camera}".encode() + recording.timestamps.tobytes()
         return files_sha256(zip(recording.names, recording.image_paths, strict=True), head)
     if source.is_file():
-        return file_sha256(source)
+        files = video_files(source)
+        return file_sha256(source) if files == (source,) else files_sha256((str(i), f) for i, f in enumerate(files))
     images, times = list_images(source), times_file(source)
     return files_sha256(sorted((p.name, p) for p in [*images, *([times] if times else [])]))
 

@@ -14,11 +14,16 @@ from formats.errors import InputError
 from formats.image_times import read_image_times
 from formats.images import exif_focal_px, image_size, is_depth_map, list_images, read_rgb
 from formats.reading import reaching, require_file
+from formats.textfile import read_text
 from formats.video import VideoFrame, VideoReader, probe_video
 from pipelines.frames.originals import reusable, written_names
 from pipelines.frames.recording import RecordingSource, open_recording
 
 Warn = Callable[[str], None]
+LIST_SUFFIX = ".videos"
+_LONGEST_LIST = 100_000
+_PAUSE = 10.0
+"""Seconds on the clock of the run between two videos: no velocity goes on from one to the next."""
 
 
 class Source(Protocol):
@@ -51,26 +56,33 @@ class Source(Protocol):
 
 @dataclass
 class VideoSource:
-    """A video file."""
+    """A video file, or several of one place by one camera: see `video_files`. Their frames are counted on."""
 
     path: Path
+    files: tuple[Path, ...] = field(init=False)
     width: int = field(init=False)
     height: int = field(init=False)
     expected_frames: int = field(init=False)
     has_times: bool = field(init=False, default=True)
 
     def __post_init__(self) -> None:
-        info = probe_video(self.path)
-        self.width, self.height, self.expected_frames = info.width, info.height, info.frame_count_claimed
+        self.files = video_files(self.path)
+        found = {file.name: probe_video(file) for file in self.files}
+        _require_one_size(self.path, {name: (i.width, i.height) for name, i in found.items()}, "videos")
+        self.width, self.height = next((i.width, i.height) for i in found.values())
+        self.expected_frames = sum(i.frame_count_claimed for i in found.values())
 
     def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
         """See `Source.read`; a truncated or damaged file is told to `warn` at the end."""
-        with VideoReader(self.path, wanted) as reader:
-            for frame in reader:
-                _require_size(frame.rgb, self.width, self.height, f"frame {frame.source_index} of {self.path}")
-                yield frame
-            if warn is not None:
-                _warn_of_the_file(self.path, reader, warn)
+        first, start = 0, 0.0
+        for file in self.files:
+            with VideoReader(file, None if wanted is None else lambda i, n=first: n + i in wanted) as reader:  # type: ignore[misc]
+                for index, time, rgb in reader:
+                    _require_size(rgb, self.width, self.height, f"frame {index} of {file}")
+                    yield VideoFrame(first + index, start + time, rgb)
+                if warn is not None:
+                    _warn_of_the_file(file, reader, warn)
+                first, start = first + len(reader.timestamps), start + reader.timestamps[-1] + _PAUSE
 
     def name(self, frame_id: int, index: int) -> str:
         """000000.jpg, 000001.jpg, ..."""
@@ -83,6 +95,18 @@ class VideoSource:
     def exif_focal(self) -> float | None:
         """Videos state none."""
         return None
+
+
+def video_files(path: Path) -> tuple[Path, ...]:
+    """The videos that a text file of the suffix .videos names, one a line, seen from its folder; of any other file
+    itself."""
+    if path.suffix != LIST_SUFFIX:
+        return (path,)
+    lines = [line.strip() for line in read_text(path, _LONGEST_LIST).splitlines()]
+    files = tuple(path.parent / line for line in lines if line)
+    if not files or LIST_SUFFIX in {file.suffix for file in files}:
+        raise InputError(f"{path} names no videos: write the name of one on each line")
+    return files
 
 
 @dataclass
@@ -106,7 +130,7 @@ class FolderSource:
             raise InputError(
                 f"none of the {len(self._images)} images in {self.path} can be read: they are damaged, copy them again"
             )
-        _require_one_size(self.path, sizes)
+        _require_one_size(self.path, sizes, "images")
         self.width, self.height = next(iter(sizes.values()))
         times = read_image_times(self._images)
         self.has_times = times is not None
@@ -184,15 +208,15 @@ def require_source(path: Path) -> None:
     require_file(path)
 
 
-def _require_one_size(folder: Path, sizes: dict[str, tuple[int, int]]) -> None:
+def _require_one_size(folder: Path, sizes: dict[str, tuple[int, int]], what: str) -> None:
     first_name, first = next(iter(sizes.items()))
     others = [name for name, size in sizes.items() if size != first]
     if others:
         width, height = sizes[others[0]]
         raise InputError(
-            f"the images of {folder} differ in size: {first_name} is {first[0]}x{first[1]}, {others[0]} is "
-            f"{width}x{height} ({len(others)} of {len(sizes)} differ from the first): keep the images of one camera "
-            "and one orientation in the folder"
+            f"the {what} of {folder} differ in size: {first_name} is {first[0]}x{first[1]}, {others[0]} is "
+            f"{width}x{height} ({len(others)} of {len(sizes)} differ from the first): keep the {what} of one camera "
+            "and one orientation together"
         )
 
 

@@ -12,8 +12,11 @@ from PIL import Image
 
 from formats.errors import InputError
 from formats.images import read_rgb, write_grey_png, write_rgb
+from formats.video_writer import write_video
 from pipelines.frames.source import FolderSource, VideoSource, open_source
 from pipelines.frames.stage import run
+from pipelines.reconstruct import one_source, source_digest
+from pipelines.run_folder import RunFolder
 from pipelines.stages import StageContext
 
 
@@ -161,3 +164,30 @@ def test_a_truncated_video_is_read_to_its_end_with_a_warning(shared_data: Path) 
     assert (source.width, source.height) == (423, 181)
     assert len(said) == 1
     assert "180 frames, 150 decode" in said[0]
+
+
+def test_videos_of_one_place_are_one_source(tmp_path: Path) -> None:
+    shades = {"a": (10, 40, 70), "b": (130, 160)}
+    paths = [
+        write_video(tmp_path / f"{name}.avi", [np.full((48, 64, 3), v, np.uint8) for v in values], 10.0)
+        for name, values in shades.items()
+    ]
+    run = RunFolder(tmp_path / "both.msgs")
+    assert one_source(paths[:1], run) == paths[0]
+    source = open_source(one_source(paths, run))
+    frames = list(source.read())
+    assert [f.source_index for f in frames] == [0, 1, 2, 3, 4]
+    assert [round(float(f.rgb.mean()), -1) for f in frames] == [10, 40, 70, 130, 160]
+    gaps = np.diff([f.timestamp for f in frames])
+    np.testing.assert_allclose(gaps[[0, 1, 3]], 0.1, atol=1e-6)
+    assert gaps[2] > 5
+    assert [f.source_index for f in source.read({1, 4})] == [1, 4]
+    digest = source_digest(tmp_path / "both.videos", "auto")
+    (tmp_path / "both.videos").write_text("b.avi\na.avi\n")
+    assert source_digest(tmp_path / "both.videos", "auto") != digest
+    write_video(tmp_path / "b.avi", [np.zeros((48, 80, 3), np.uint8)] * 2, 10.0)
+    with pytest.raises(InputError, match=r"videos of .*both.videos differ in size: b\.avi is 80x48, a\.avi"):
+        open_source(tmp_path / "both.videos")
+    (tmp_path / "both.videos").write_text("both.videos\n")
+    with pytest.raises(InputError, match="names no videos"):
+        open_source(tmp_path / "both.videos")
