@@ -67,7 +67,7 @@ class VideoSource:
 
     def __post_init__(self) -> None:
         self.files = video_files(self.path)
-        found = {file.name: probe_video(file) for file in self.files}
+        found = {str(file): probe_video(file) for file in self.files}
         _require_one_size(self.path, {name: (i.width, i.height) for name, i in found.items()}, "videos")
         self.width, self.height = next((i.width, i.height) for i in found.values())
         self.expected_frames = sum(i.frame_count_claimed for i in found.values())
