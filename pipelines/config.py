@@ -41,6 +41,10 @@ class RunConfig:
     threads: int = setting(0, "CPU threads, 0 = all cores; the same count gives the same bytes", within=(0, 1024))
     format: str = setting("auto", "layout of the source: a data set's; images = a video or plain images; auto looks")
     device: str = setting("auto", "where dense work runs; auto takes a GPU if there is one", ("auto", "cpu", "cuda"))
+    memory_mb: int = setting(
+        0, "plan with this much memory; less makes long recordings slower, nothing else. 0 = half of the machine's",
+        within=(100, 10_000_000), or_zero=True,
+    )  # fmt: skip
     cache_mb: int = setting(
         2000, "results of networks are kept over runs, at most this many megabytes; 0 = none", within=(0, 1_000_000)
     )
@@ -57,7 +61,6 @@ class FramesConfig:
         or_zero=True,
     )
     max_side: int = setting(960, "longer images are reduced to this many pixels on the long side", within=(64, 8192))
-    max_frames: int = setting(5000, "more picked frames than this are refused", within=(2, 1_000_000))
     intrinsics: str = setting("", "fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file; empty = find them")
     parallax: float = setting(
         0.025, "a new keyframe when points have moved by this fraction of the image width", within=(0.001, 0.5)

@@ -37,11 +37,15 @@ FIXED = frozenset(f"{section}.{name}" for section, names in _FIXED.items() for n
 """Constants now, beside the code that uses them, at what was their default."""
 
 
+GONE = {"frames.max_frames": "however many frames there are, they are taken"}
+
+
 def explain_retired(keys: Iterable[str]) -> str:
     """What has become of the settings among `keys` (section.name) that there were once; "" for none of them."""
     keys = list(keys)
     moved = [f"{k} is {MOVED[k]} now (off unless set)" for k in keys if k in MOVED]
     fixed = [k for k in keys if k in FIXED]
+    moved += [f"{k} is no more: {GONE[k]}" for k in keys if k in GONE]
     if fixed:
         moved.append(f"{', '.join(fixed)}: fixed at what was the default")
     return "; ".join(moved)

@@ -13,6 +13,7 @@ from formats.reading import opened
 from pipelines.config import Config, config_to_toml, merge_known_settings, merge_settings
 from pipelines.progress import log
 from pipelines.records import load_records, load_source, recorded_config
+from pipelines.retired_settings import GONE
 
 if TYPE_CHECKING:
     from pipelines.run_folder import RunFolder
@@ -47,7 +48,11 @@ def load_settings(run: RunFolder) -> Config:
             f"`msgs-slam resume {run.root}`: what the finished stages were made with is kept in manifest.json. "
             "(Settings are changed with --set SECTION.KEY=VALUE, or with --config FILE, which may be a copy of it)"
         )
-    return merge_settings(Config(), read_toml(run.settings_file), where=str(run.settings_file))
+    values = read_toml(run.settings_file)
+    for key in GONE:  # the program has written it, when it was one
+        section, _, name = key.partition(".")
+        values.get(section, {}).pop(name, None)
+    return merge_settings(Config(), values, where=str(run.settings_file))
 
 
 def _check(run: RunFolder, text: str) -> str:

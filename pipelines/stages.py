@@ -36,6 +36,7 @@ from pipelines.run_folder_names import STAGES
 from pipelines.settings_file import save_settings
 from pipelines.stage_identity import stage_identity
 from pipelines.stopping import stop_if_asked
+from pipelines.streamed import memory_room
 
 FINGERPRINT = "fingerprint"
 """File of an unfinished folder: the work it belongs to."""
@@ -69,6 +70,11 @@ class StageContext:
     def threads(self) -> int:
         """How many CPU threads to use."""
         return self.config.run.threads or os.cpu_count() or 1
+
+    @property
+    def memory_room(self) -> float:
+        """How many bytes of memory to plan with."""
+        return memory_room(self.config.run.memory_mb)
 
     @property
     def device(self) -> str:

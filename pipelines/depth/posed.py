@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -55,20 +55,24 @@ class PosedDepth:
         return xy, z, np.asarray(inside, dtype=bool)
 
 
-def overlaps(views: Sequence[PosedDepth]) -> sparse.csr_matrix:
+def overlaps(views: Iterable[PosedDepth]) -> sparse.csr_matrix:
     """(N, N) η[i, j], MSGS-SLAM eq. (10): the fraction of view i's back-projected samples inside view j's image.
 
     Only where view j may see what i shows: where that lies no farther from j than what j itself shows, and in the
     spread over near and far ones of at most CANDIDATES views. So the cost grows with the number of views, not with its
     square.
     """
-    grids = [v.grid(_OVERLAP_SAMPLES) for v in views]
-    seen = [v.in_world(xy, depth) for v, (xy, depth, _) in zip(views, grids, strict=True)]
-    centers = np.array([v.in_world(np.zeros((1, 2)), np.zeros(1))[0] for v in views]).reshape(-1, 3)
+    seen, poses, projections, picture_sizes = [], [], [], []
+    for view in views:  # once: they may be read from disk
+        xy, depth, _ = view.grid(_OVERLAP_SAMPLES)
+        seen.append(view.in_world(xy, depth))
+        poses.append(view.cam_from_world)
+        projections.append(view.intrinsics.matrix @ view.cam_from_world[:3])
+        picture_sizes.append((view.intrinsics.width, view.intrinsics.height))
+    centers: Array = np.linalg.inv(np.array(poses).reshape(-1, 4, 4))[:, :3, 3].astype(np.float64)
     reach = np.array([_largest(np.linalg.norm(p - c, axis=1)) for p, c in zip(seen, centers, strict=True)])
     near = _Candidates(centers, _REACH * reach)
-    matrices = np.array([v.intrinsics.matrix @ v.cam_from_world[:3] for v in views]).reshape(-1, 3, 4)
-    sizes = np.array([(v.intrinsics.width, v.intrinsics.height) for v in views]).reshape(-1, 2)
+    matrices, sizes = np.array(projections).reshape(-1, 3, 4), np.array(picture_sizes).reshape(-1, 2)
     rows, columns, shares = [], [], []
     for i, points in enumerate(seen):
         others = near.of(i, points)
@@ -78,7 +82,7 @@ def overlaps(views: Sequence[PosedDepth]) -> sparse.csr_matrix:
         columns.append(others)
         shares.append(share)
     places = (_joined(rows), _joined(columns))
-    found = sparse.csr_matrix((np.concatenate([np.zeros(0), *shares]), places), (len(views), len(views)))
+    found = sparse.csr_matrix((np.concatenate([np.zeros(0), *shares]), places), (len(seen), len(seen)))
     found.eliminate_zeros()
     return found
 
@@ -126,11 +130,11 @@ def _joined(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
     return np.concatenate([np.zeros(0, np.int64), *parts])
 
 
-def neighbours(views: Sequence[PosedDepth]) -> list[tuple[int, int]]:
+def neighbours(views: Iterable[PosedDepth]) -> list[tuple[int, int]]:
     """Ordered pairs of views that see the same; of many, a spread over near and far ones."""
     pairs = []
     overlap = overlaps(views)
-    for i in range(len(views)):
+    for i in range(overlap.shape[0]):
         row = slice(overlap.indptr[i], overlap.indptr[i + 1])
         others, share = overlap.indices[row], overlap.data[row]
         order = np.argsort(-share, kind="stable")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,11 @@ SEES_THROUGH = 0.08
 _TRUSTED = 0.5
 
 
-def contradicted(views: Sequence[PosedDepth]) -> list[NDArray[np.bool_]]:
-    """(H, W) of each view: pixels whose depth more of the others (two at least) see through than confirm."""
+def contradicted(views: Sequence[PosedDepth]) -> Iterator[NDArray[np.bool_]]:
+    """(H, W) of each view in turn: pixels whose depth more of the others (two at least) see through than confirm."""
     seeing: dict[int, list[int]] = {}
     for i, j in neighbours(views):
         seeing.setdefault(i, []).append(j)
-    out = []
     for i, view in enumerate(views):
         votes = np.zeros(view.depth[::STRIDE, ::STRIDE].shape, np.int16)
         through = np.zeros_like(votes)
@@ -32,8 +31,7 @@ def contradicted(views: Sequence[PosedDepth]) -> list[NDArray[np.bool_]]:
             through += seen_through
         bad = (through >= 2) & (through > votes)
         height, width = view.depth.shape
-        out.append(np.repeat(np.repeat(bad, STRIDE, axis=0), STRIDE, axis=1)[:height, :width])
-    return out
+        yield np.repeat(np.repeat(bad, STRIDE, axis=0), STRIDE, axis=1)[:height, :width]
 
 
 def _votes(view: PosedDepth, other: PosedDepth) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

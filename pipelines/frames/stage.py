@@ -52,10 +52,9 @@ AnySource = VideoSource | FolderSource | RecordingSource
 
 def run(context: StageContext) -> dict[str, Any]:
     """See `StageContext`; raises InputError for a source that cannot be used."""
-    config = context.config.frames
     source = open_source(context.source, context.config.run.format)
     camera, origin = known_camera(context, source)
-    _require_reasonable(config, source)
+    _require_several(source)
     frames = _pick(context, source)
     masks = FrameMasks(
         context.config, source, context.snapshot / "people", context.snapshot / "picked", context.threads
@@ -97,20 +96,15 @@ def known_camera(context: StageContext, source: AnySource) -> tuple[pycolmap.Cam
 def check(source: Path, config: Config) -> None:
     """Raise InputError for a source, or a camera given for it, that cannot be used."""
     opened = open_source(source, config.run.format)
-    _require_reasonable(config.frames, opened)
+    _require_several(opened)
     check_masks(source, config)
     if config.frames.intrinsics:
         read_intrinsics(config.frames.intrinsics, opened.width, opened.height)
 
 
-def _require_reasonable(config: FramesConfig, source: AnySource) -> None:
+def _require_several(source: AnySource) -> None:
     if isinstance(source, FolderSource) and source.expected_frames - len(source.unreadable) < 2:
         raise InputError(f"{source.path} holds one image only; a reconstruction needs several views of a scene")
-    if not source.has_times and source.expected_frames > config.max_frames:
-        raise InputError(
-            f"{source.path} holds {source.expected_frames} images, more than frames.max_frames = {config.max_frames}: "
-            f"remove some, or allow more with --set frames.max_frames={source.expected_frames}"
-        )
 
 
 # picking --------------------------------------------------------------------------------------------------------
@@ -131,11 +125,6 @@ def _pick(context: StageContext, source: AnySource) -> list[Frame]:
     rate = config.rate if source.has_times else 0.0
     frames = []
     for picture, score in sharpest_of_windows(pictures, rate):
-        if len(frames) == config.max_frames:
-            raise InputError(
-                f"{source.path} gives more than frames.max_frames = {config.max_frames} frames at {config.rate:g} a "
-                "second: lower the rate (--set frames.rate=...), cut the video, or raise frames.max_frames"
-            )
         frame_id = len(frames)
         timestamp = picture.timestamp if source.has_times else _untimed(config, frame_id)
         name = source.name(frame_id, picture.source_index)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +36,7 @@ class Refined:
 def refine_together(
     context: StageContext,
     gaussian_map: GaussianMap,
-    views: list[View],
+    views: Sequence[View],
     exposure: tuple[NDArray[np.float32], NDArray[np.float32]],
     classes: int,
     settings: MappingConfig,
@@ -58,7 +59,7 @@ def refine_together(
 @torch.no_grad()
 def keyframe_psnr(
     gaussian_map: GaussianMap,
-    views: list[View],
+    views: Sequence[View],
     poses: NDArray[np.float64],
     log_gains: NDArray[np.float32],
     offsets: NDArray[np.float32],

@@ -212,7 +212,8 @@ def refine(
     if settings.joint == "never" or (settings.joint == "moved" and moved_px < JOINT_PX):
         return None
     mapping = context.config.mapping
-    given = load_views(context.run, trajectory, mapping, context.config.article, context.device, fields)
+    article, memory = context.config.article, context.memory_room
+    given = load_views(context.run, trajectory, mapping, article, context.device, fields, memory)
     views = given.views
     if steps := context.config.article.loop_steps:
         ends = loop_keyframes(found.loops, [v.frame_id for v in views])

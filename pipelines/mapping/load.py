@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -15,15 +16,19 @@ from pipelines.depth.see_through import contradicted
 from pipelines.mapping.article.mirrors import Mirrors
 from pipelines.mapping.views import View, make_view, occurring_classes
 from pipelines.run_folder import RunFolder
+from pipelines.streamed import Streamed
 from pipelines.types import Frame, Intrinsics, ProxyMaps, Trajectory
+
+VIEWS_SHARE = 0.25
+"""Of the memory that there is: as much again takes the map with its optimiser, and half of it the program itself."""
 
 
 @dataclass(frozen=True)
 class MappingInput:
     """views: keyframes that make the map; held_out: frames that only measure it; class_ids: label of each channel."""
 
-    views: list[View]
-    held_out: list[View]
+    views: Sequence[View]
+    held_out: Sequence[View]
     class_ids: tuple[int, ...]
 
 
@@ -34,11 +39,13 @@ def load_views(
     article: ArticleConfig | None = None,
     device: torch.device | str = "cpu",
     fields: DepthFields | None = None,
+    memory: float = math.inf,
 ) -> MappingInput:
     """The keyframes of `trajectory` with images and proxies, in order.
 
-    Depths are in the unit of the world by `fields`, those of tracking unless others are given; what other views see
-    through is unknown.
+    Of `memory`, bytes, a quarter is for views; what has no room there is read again when
+    it is visited. Depths are in the unit of the world by `fields`, those of tracking unless others are given; what
+    other views see through is unknown.
     """
     frames = {f.id: f for f in run.load_frames()}
     full = run.load_calibration().intrinsics
@@ -46,27 +53,36 @@ def load_views(
     fields = fields or run.load_depth_fields("tracking")
     symmetry = run.load_symmetry() if article and article.symmetry_weight > 0 else {}
     kept, measured = split_frames(trajectory, settings.hold_out)
-    maps = {i: run.load_proxy(i) for i in kept + measured if run.has_proxy(i)}
-    class_ids = occurring_classes([maps[i].labels for i in kept if i in maps])
+    class_ids = occurring_classes(run.load_proxy(i).labels for i in kept if run.has_proxy(i))
     poses = dict(zip(trajectory.frame_ids.tolist(), trajectory.cam_from_world, strict=True))
 
     def load(frame_id: int) -> View:
         frame = frames[frame_id]
-        scaled = fields.in_world(frame_id, maps[frame_id]) if frame_id in maps else None
+        maps = run.find_proxy(frame_id)
+        scaled = None if maps is None else fields.in_world(frame_id, maps)
         view = load_view(run, frame, intrinsics, poses[frame_id], scaled, class_ids, device)
         if frame_id not in symmetry:
             return view
         field = torch.from_numpy(fields.scales(frame_id, *view.depth.shape)).to(device)
         return replace(view, mirrors=Mirrors.of(symmetry[frame_id], full, intrinsics, device).scaled(field))
 
-    views = without_contradicted_depth([load(i) for i in kept])
-    return MappingInput(views, [load(i) for i in measured], class_ids)
+    def streamed(ids: list[int], room: float) -> Streamed[View]:
+        return Streamed(len(ids), lambda n: load(ids[n]), lambda v: v.nbytes, room)
+
+    views = without_contradicted_depth(streamed(kept, VIEWS_SHARE * memory))
+    return MappingInput(views, streamed(measured, VIEWS_SHARE * memory / 8), class_ids)
 
 
-def without_contradicted_depth(views: Sequence[View]) -> list[View]:
+def without_contradicted_depth(views: Streamed[View]) -> Streamed[View]:
     """The views, their depth unknown where others see through it."""
-    wrong = contradicted([v.posed_depth() for v in views])
-    return [v.without_depth_at(torch.from_numpy(w)) for v, w in zip(views, wrong, strict=True)]
+    posed = Streamed(len(views), lambda i: views[i].posed_depth(), lambda p: p.depth.nbytes, 0)
+    wrong = [np.packbits(w) for w in contradicted(posed)]
+
+    def masked(index: int, view: View) -> View:
+        pixels = np.unpackbits(wrong[index], count=view.depth.numel()).reshape(view.depth.shape)
+        return view.without_depth_at(torch.from_numpy(pixels > 0))
+
+    return views.changed(masked)
 
 
 def load_view(

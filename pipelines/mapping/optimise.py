@@ -22,9 +22,12 @@ from pipelines.mapping.state import Exposures, OptimisedMap, OptimiserState, exp
 from pipelines.mapping.views import View, halved
 from pipelines.progress import Progress, SilentProgress
 from pipelines.stopping import is_asked
+from pipelines.streamed import Streamed
 
 MAP_RATES = {"means": 3e-4, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2, "class_logits": 6e-2}
 """Learning rates of Adam, of positions in units of the scene's median depth."""
+HALVES_ROOM = 250e6
+"""Bytes of views at half the size that are kept; to halve one takes a hundredth of a visit."""
 POSE_RATE, EXPOSURE_RATE = 1e-4, 1e-2
 """Of rotations (radians) and translations (times the median depth); of gains and offsets."""
 LOW_TRUST_STEP = 4.0
@@ -78,7 +81,7 @@ class MapOptimiser:
         state: OptimiserState,
     ) -> None:
         self.views, self.settings, self.article, self.state = views, settings, article, state
-        self.halves = [halved(v) for v in views]
+        self.halves = Streamed(len(views), lambda i: halved(views[i]), lambda v: v.nbytes, HALVES_ROOM)
         self.unit = scene_depth(views)
         self.objective = Objective(settings, article, classes, self.unit)
         self.growth = Growth(views, classes, settings, article, state, self.unit)

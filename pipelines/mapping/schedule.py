@@ -84,7 +84,7 @@ class Schedule:
             visits = max(visits, settings.min_iterations)
         steps = (WINDOW_STEPS + 1) * len(views) if seeding else 0
         reliability = np.array([float(v.trust.mean()) for v in views])
-        overlap = overlaps([v.posed_depth() for v in views])
+        overlap = overlaps(v.posed_depth() for v in views)
         if keyframe_miou > 0:
             overlap = np.where(label_likeness(views) < keyframe_miou, overlap, 0.0)
         return Schedule(seed, len(views), steps, visits, overlap, reliability)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,8 @@ def run(context: StageContext) -> dict[str, Any]:
     """Views, depth that agrees between them, the optimised map; poses and exposures refined with it."""
     settings, seed = context.config.mapping, context.config.run.seed
     trajectory = context.run.load_trajectory("tracking")
-    given = load_views(context.run, trajectory, settings, context.config.article, context.device)
+    article, memory = context.config.article, context.memory_room
+    given = load_views(context.run, trajectory, settings, article, context.device, memory=memory)
     _require_views(given, context)
 
     views = given.views
@@ -74,7 +76,7 @@ def _figures(context: StageContext, given: MappingInput, result: OptimisedMap, m
 
 
 def _measure_held_out(
-    held_out: list[View], views: list[View], result: OptimisedMap, moved: Trajectory
+    held_out: Sequence[View], views: Sequence[View], result: OptimisedMap, moved: Trajectory
 ) -> list[ViewFigures]:
     """Frames the map has never seen, at their poses and at the exposure of their neighbours in time."""
     if not held_out:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -35,6 +36,12 @@ class View:
     channel_confidence: Tensor
     mirrors: Mirrors | None = None
     scene: Tensor | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Memory it takes."""
+        tensors = (self.image, self.depth, self.reliability, self.channels, self.channel_confidence, self.scene)
+        return sum(t.nbytes for t in tensors if t is not None)
 
     @property
     def colors(self) -> Tensor:
@@ -141,7 +148,7 @@ def halved_scene(scene: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.from_numpy(shown).to(scene.device)
 
 
-def occurring_classes(all_labels: list[NDArray[np.uint8]], least_share: float = 1e-5) -> tuple[int, ...]:
+def occurring_classes(all_labels: Iterable[NDArray[np.uint8]], least_share: float = 1e-5) -> tuple[int, ...]:
     """The classes that make up at least `least_share` of the labelled pixels, in order."""
     counts = np.zeros(256, np.int64)
     for labels in all_labels:

@@ -155,7 +155,7 @@ def _fields(s: Synthetic) -> None:
 
 CASES: dict[str, tuple[str, Callable[[Synthetic], Any]]] = {
     "which views see the same (three times a mapping)": ("views", lambda s: neighbours(s.views)),
-    "depth that others see through": ("views", lambda s: contradicted(s.views)),
+    "depth that others see through": ("views", lambda s: list(contradicted(s.views))),
     "depth fields, tracking": ("views", _fields),
     "stereo: views to match, of 60 keyframes": ("model", _stereo),
     "loops by look, frames": ("looks", _loops_by_look),

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import time
 from dataclasses import dataclass, replace
@@ -39,6 +40,7 @@ from pipelines.evaluation.views import view_map
 from pipelines.mapping.load import without_contradicted_depth
 from pipelines.mapping.optimise import optimise_map
 from pipelines.mapping.views import View, make_view, occurring_classes
+from pipelines.streamed import Streamed
 from pipelines.types import VOID, Intrinsics, ProxyMaps
 
 
@@ -103,7 +105,7 @@ def agreeing(views: list[View]) -> list[View]:
     fields = fit_fields([v.posed_depth() for v in views], {}).reshape(-1, FINE.rows, FINE.columns)
     scales = [field_scales(f, *v.depth.shape) for f, v in zip(fields, views, strict=True)]
     scaled = [replace(v, depth=v.depth * torch.from_numpy(s)) for v, s in zip(views, scales, strict=True)]
-    return without_contradicted_depth(scaled)
+    return list(without_contradicted_depth(Streamed(len(scaled), scaled.__getitem__, lambda v: v.nbytes, math.inf)))
 
 
 def measure(sequence: Sequence, shots: list[Shot], camera: Intrinsics, config: Config) -> dict[str, float]:

@@ -8,7 +8,7 @@ import pytest
 
 from formats.errors import InputError
 from pipelines.config import Config, config_to_dict, config_to_toml, load_config
-from pipelines.retired_settings import FIXED, MOVED
+from pipelines.retired_settings import FIXED, GONE, MOVED
 
 
 @pytest.mark.parametrize("comments", [True, False])
@@ -70,13 +70,15 @@ def test_settings_of_earlier_versions_are_refused_with_what_became_of_them(tmp_p
         load_config(overrides=["mapping.kappa=5"])
     file = tmp_path / "old.toml"
     file.write_text("[mapping]\npasses = 3\nmean_rate = 0.1\nprune_weight = 0.0\n")
+    with pytest.raises(InputError, match=r"frames\.max_frames is no more: however many"):
+        load_config(overrides=["frames.max_frames=5"])
     with pytest.raises(InputError, match=r"mapping\.mean_rate, mapping\.prune_weight: fixed at what was the default"):
         load_config(file)
 
 
 def test_retired_settings_are_retired() -> None:
     known = {f"{section}.{key}" for section, values in config_to_dict(Config()).items() for key in values}
-    assert not known & {*MOVED, *FIXED}
+    assert not known & {*MOVED, *FIXED, *GONE}
     assert set(MOVED.values()) <= known
     assert len(known) <= 75
 

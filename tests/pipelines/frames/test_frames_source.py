@@ -114,11 +114,6 @@ def test_an_empty_folder_is_refused(tmp_path: Path, make_context: Callable[..., 
         run(make_context(tmp_path / "none"))
 
 
-def test_too_many_frames_are_refused(video: Path, make_context: Callable[..., StageContext]) -> None:
-    with pytest.raises(InputError, match=r"more than frames\.max_frames = 5"):
-        run(make_context(video, "frames.max_frames=5"))
-
-
 def test_picked_frames_are_reduced_and_not_picked_twice_unless_they_are_gone(
     tmp_path: Path, make_context: Callable[..., StageContext]
 ) -> None:

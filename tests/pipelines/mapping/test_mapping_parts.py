@@ -28,6 +28,21 @@ def walk(count: int = 6) -> Trajectory:
     return Trajectory(np.arange(count), np.arange(count) * 0.1, poses, keyframes, lost)
 
 
+def test_views_without_room_are_the_same_views(small_run: RunFolder, room: MappingInput) -> None:
+    """Read again at every use, those that others contradict left out as ever."""
+    trajectory, settings = small_run.load_trajectory("tracking"), MappingConfig(hold_out=8)
+    given = load_views(small_run, trajectory, settings, memory=0)
+    assert [len(given.views), len(given.held_out)] == [len(room.views), len(room.held_out)]
+    assert given.class_ids == room.class_ids
+    for ours, theirs in zip([*given.views, *given.held_out], [*room.views, *room.held_out], strict=True):
+        assert ours.frame_id == theirs.frame_id
+        for name in ("cam_from_world", "image", "depth", "reliability", "channels", "channel_confidence"):
+            assert torch.equal(getattr(ours, name), getattr(theirs, name))
+    first = given.views[0]
+    assert given.views[1] is given.views[1]
+    assert given.views[0] is not first
+
+
 def test_views_hold_what_the_run_says(small_run: RunFolder, room: MappingInput) -> None:
     assert len(room.views) == 14
     assert [v.frame_id for v in room.held_out] == [4, 12]
@@ -145,6 +160,7 @@ def test_a_view_without_proxy_counts_by_its_colours(small_run: RunFolder) -> Non
         image=small_run.image, left_out=small_run.left_out,
     )  # fmt: skip
     run.has_proxy = lambda i: i != 2
+    run.find_proxy = lambda i: small_run.find_proxy(i) if i != 2 else None
     loaded = load_views(run, small_run.load_trajectory("tracking"), MappingConfig())  # type: ignore[arg-type]
     assert loaded.views[2].depth.max() == 0
     assert loaded.views[2].trust.max() == 0

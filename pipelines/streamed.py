@@ -1,0 +1,82 @@
+"""Things of which a long recording has more than memory holds: made again when they are needed again."""
+
+from __future__ import annotations
+
+import os
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Generic, TypeVar, overload
+
+T = TypeVar("T")
+
+_UNKNOWN_MACHINE = 8_000_000_000
+_CONTAINER = Path("/sys/fs/cgroup")
+
+
+class Streamed(Sequence[T], Generic[T]):
+    """The values of `make` for 0 to `count` - 1, those used last kept while they need at most `room` bytes together.
+
+    `make` gives the same value whenever it is called with the same number, so that nobody sees what is kept.
+    """
+
+    def __init__(self, count: int, make: Callable[[int], T], size_of: Callable[[T], int], room: float) -> None:
+        self._count, self._make, self._size_of, self._room = count, make, size_of, room
+        self._kept: OrderedDict[int, T] = OrderedDict()
+        self._used = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    @overload
+    def __getitem__(self, index: int) -> T: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[T]: ...
+    def __getitem__(self, index: int | slice) -> T | list[T]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(self._count)[index]]
+        key = range(self._count)[index]  # raises IndexError, counts from the end
+        if key not in self._kept:
+            value = self._kept[key] = self._make(key)
+            self._used += self._size_of(value)
+            while self._used > self._room and len(self._kept) > 1:
+                self._used -= self._size_of(self._kept.popitem(last=False)[1])
+        self._kept.move_to_end(key)
+        return self._kept[key]
+
+    def changed(self, function: Callable[[int, T], T]) -> Streamed[T]:
+        """The same with `function` of number and value applied; takes over what is kept here, and the room."""
+        make = self._make
+        other = Streamed(self._count, lambda i: function(i, make(i)), self._size_of, self._room)
+        while self._kept:
+            key, value = self._kept.popitem(last=False)
+            other._kept[key] = function(key, value)
+        other._used, self._used = self._used, 0
+        return other
+
+
+def memory_room(memory_mb: int) -> float:
+    """Bytes that the process may need: `run.memory_mb`, for 0 half of what the machine (or its container) has."""
+    return memory_mb * 1e6 if memory_mb else machine_memory() / 2
+
+
+def machine_memory() -> float:
+    """Bytes of memory of the machine, or of the container where that has less; 8 GB where nobody tells."""
+    return min([_physical_memory(), *_container_limits()])
+
+
+def _physical_memory() -> float:
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    return float(_UNKNOWN_MACHINE)
+
+
+def _container_limits() -> list[float]:
+    """Of cgroups, version 2 and 1."""
+    found = []
+    for name in ("memory.max", "memory/memory.limit_in_bytes"):
+        try:
+            found.append(float((_CONTAINER / name).read_text(encoding="ascii")))
+        except (OSError, ValueError):  # no such file; "max"
+            continue
+    return found
