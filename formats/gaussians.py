@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +56,12 @@ class GaussianCloud:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def only(self, rows: NDArray) -> GaussianCloud:
+        """Those of a mask (M,) or of indices."""
+        arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "dropped_sh_degree"}
+        chosen: dict[str, Any] = {name: None if a is None else a[rows] for name, a in arrays.items()}
+        return replace(self, **chosen)
 
 
 def unit_quaternions(quat: NDArray) -> NDArray[np.float32]:

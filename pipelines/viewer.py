@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from formats.errors import InputError
 from formats.mesh import read_mesh_ply
 from pipelines.viewer_door import guarding
 from pipelines.viewer_scene import MODES, ViewerCamera, ViewerScene, load_scenes
+from pipelines.viewer_tools import Selection, Tape
 
 _FRUSTUM = 0.09
 _PREVIEW_WIDTH = 480
@@ -41,15 +43,18 @@ def open_viewer(path: Path, host: str = "127.0.0.1", port: int = 8080) -> Viewer
 
 
 class Viewer:
-    """The map as splats, the camera path with a frustum a keyframe, the mesh, and the controls for them; of one scene
-    at a time, the first of `scenes` to begin with."""
+    """The map as splats, the camera path with a frustum a keyframe, the mesh, the controls for them and the tools; of
+    one scene at a time, the first of `scenes` to begin with."""
 
     def __init__(self, server: Any, scenes: list[ViewerScene]) -> None:
         self.server, self.scenes = server, scenes
         server.gui.configure_theme(show_logo=False)
         self.boxes: dict[str, Any] = {}
+        self._sending = threading.Lock()
+        self.selection: Selection | None = None
         self._load(scenes[0])
         self._add_controls()
+        self._add_tools()
         server.on_client_connect(self._place)
 
     def _load(self, scene: ViewerScene) -> None:
@@ -64,7 +69,9 @@ class Viewer:
 
     def choose(self, number: int) -> None:
         """Show another scene, as it begins."""
+        self._remove_tools()
         self._load(self.scenes[number])
+        self._add_tools()
         self.mode.value = MODES[0]
         for name, box in self.boxes.items():
             box.value = name != "Mesh"
@@ -80,9 +87,15 @@ class Viewer:
         """Colour the Gaussians by one of `MODES`; depth is seen from where `client` looks, else the first camera."""
         s = self.scene
         colors = s.depth_colors(*self._eye(client)) if mode == "depth" else s.colors[mode]
-        self._splats = self.server.scene.add_gaussian_splats(
-            "/map", s.centers, s.covariances, colors.astype(np.float32) / 255, s.opacities
-        )
+        with self._sending:
+            rows = np.arange(len(s.cloud)) if self.selection is None else np.flatnonzero(self.selection.rows)
+            box = self.boxes.get("Show Gaussians")
+            visible = len(rows) > 0 and (box is None or bool(box.value))
+            rows = rows if len(rows) else np.zeros(1, np.int64)  # a page cannot be sent none
+            self._splats = self.server.scene.add_gaussian_splats(
+                "/map", s.centers[rows], s.covariances[rows], colors[rows].astype(np.float32) / 255,
+                s.opacities[rows], visible=visible,
+            )  # fmt: skip
 
     def _eye(self, client: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(position, direction of view) as shown."""
@@ -103,6 +116,7 @@ class Viewer:
 
     def stop(self) -> None:
         """End the server."""
+        self._remove_tools()
         self.server.stop()
 
     def _add_controls(self) -> None:
@@ -126,6 +140,19 @@ class Viewer:
         if self.scene.cameras:
             blank = np.full((30, 40, 3), 235, np.uint8)
             self.preview = gui.add_image(blank, label="frame (click a camera)", format="jpeg")
+
+    def _add_tools(self) -> None:
+        self._tools = self.server.gui.add_folder("Tools")
+        with self._tools:
+            self.selection = Selection(self.server, self.scene, lambda: self.show(self.mode.value))
+            self.tape = Tape(self.server, self.scene, self.selection)
+
+    def _remove_tools(self) -> None:
+        if self.selection is not None:
+            self.tape.switch.value = False
+            self.selection.rest()
+            self._tools.remove()
+            self.selection = None
 
     def _show_depth(self, event: Any) -> None:
         self.mode.value = "depth"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -12,12 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from formats.errors import InputError
 from formats.gaussian_files import read_gaussians
+from formats.gaussians import GaussianCloud
 from formats.reading import reaching
+from pipelines.export.stage import on_earth
+from pipelines.export.writers import map_cloud
 from pipelines.gaussian_map import decided_channels
 from pipelines.outcome import Outcome, evenly, labels_of_channels, load_outcome
 from pipelines.proxy.palette import class_colors
 from pipelines.run_folder import MESH, RunFolder
-from pipelines.types import Frame
+from pipelines.types import Frame, Metres
 from pipelines.upright.world import load_world, up_in_run
 
 MODES = ("colour", "classes", "depth")
@@ -38,21 +42,50 @@ class ViewerCamera:
 
 @dataclass(frozen=True)
 class ViewerScene:
-    """centers (M, 3), covariances (M, 3, 3), opacities (M, 1); colors: mode → (M, 3) uint8, of all modes but depth,
-    which is seen from somewhere; `scale` multiplies the run's lengths for show; up (3,); path (N, 3) camera centres;
-    mesh_file of the run, if there is one."""
+    """cloud: the M Gaussians in the world of the exported files; labels (M,) uint8 indices into `class_names`, VOID for
+    none, or None without classes; `scale` multiplies the world's lengths for show; up (3,); path (N, 3) camera centres
+    as shown; mesh_file of the run, if there is one; is_metric, metres: what a unit of the world is."""
 
     title: str
-    centers: NDArray[np.float32]
-    covariances: NDArray[np.float32]
-    opacities: NDArray[np.float32]
-    colors: dict[str, NDArray[np.uint8]]
+    cloud: GaussianCloud
     scale: float
     up: NDArray[np.float64]
+    labels: NDArray[np.uint8] | None = None
+    class_names: tuple[str, ...] = ()
+    class_colors: tuple[tuple[int, int, int], ...] = ()
     cameras: list[ViewerCamera] = field(default_factory=list)
     path: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
     mesh_file: Path | None = None
     run: RunFolder | None = None
+    is_metric: bool = False
+    metres: Metres | None = None
+
+    @cached_property
+    def centers(self) -> NDArray[np.float32]:
+        """(M, 3) as shown."""
+        return (self.cloud.means * self.scale).astype(np.float32)
+
+    @cached_property
+    def covariances(self) -> NDArray[np.float32]:
+        """(M, 3, 3) as shown."""
+        turn = Rotation.from_quat(self.cloud.quat_wxyz[:, [1, 2, 3, 0]]).as_matrix()
+        axes = turn * (np.exp(self.cloud.log_scales) * self.scale)[:, None, :]
+        return (axes @ axes.transpose(0, 2, 1)).astype(np.float32)
+
+    @cached_property
+    def opacities(self) -> NDArray[np.float32]:
+        """(M, 1)."""
+        return (1 / (1 + np.exp(-self.cloud.opacity_logits)))[:, None].astype(np.float32)
+
+    @cached_property
+    def colors(self) -> dict[str, NDArray[np.uint8]]:
+        """Mode → (M, 3), of all modes but depth, which is seen from somewhere."""
+        colors = {"colour": np.round(np.clip(self.cloud.colors, 0, 1) * 255).astype(np.uint8)}
+        if self.labels is not None and self.class_colors:
+            table = np.full((256, 3), 128, np.uint8)
+            table[: len(self.class_colors)] = np.array(self.class_colors, np.uint8)
+            colors["classes"] = table[self.labels]
+        return colors
 
     def depth_colors(self, position: NDArray[np.float64], forward: NDArray[np.float64]) -> NDArray[np.uint8]:
         """(M, 3) near red, far blue: the depth of each Gaussian along the unit vector `forward` from `position` (3,),
@@ -82,26 +115,24 @@ def load_scenes(path: Path) -> list[ViewerScene]:
 
 
 def _from_run(outcome: Outcome) -> ViewerScene:
-    world, up = load_world(outcome.run), up_in_run(outcome)
-    outcome, run = outcome if world is None else outcome.moved(world.exported_from_run), outcome.run
-    m = outcome.require_map()
+    world, up, run = load_world(outcome.run), up_in_run(outcome), outcome.run
+    outcome = outcome if world is None else on_earth(outcome.moved(world.exported_from_run), world)
+    m, cloud = outcome.require_map(), map_cloud(outcome)
     t, k = outcome.trajectory, outcome.calibration.intrinsics
-    means, radii = m.means.cpu().numpy(), m.radii.detach().cpu().numpy()
     centers = t.centers[t.is_posed]
-    scale = _scale(means, centers)
+    scale = _scale(cloud.means, centers)
     fov, aspect = 2 * float(np.arctan(k.height / 2 / k.fy)), k.width / k.height
     ids = evenly(t.frame_ids[t.is_keyframe].tolist(), MOST_CAMERAS)
     world_from_cam = t.world_from_cam
     channels = decided_channels(m.class_logits).cpu().numpy()
-    labels = labels_of_channels(channels, outcome.label_of_channel) if m.class_logits.shape[1] else None
     return ViewerScene(
         title=f"{run.root.parent.name}, {run.root.name.replace('_', ' ')}" if run.is_piece else run.root.name,
-        centers=(means * scale).astype(np.float32),
-        covariances=((radii * scale) ** 2)[:, None, None].astype(np.float32) * np.eye(3, dtype=np.float32),
-        opacities=m.opacities.detach().cpu().numpy()[:, None].astype(np.float32),
-        colors=_colors(m.colors.cpu().numpy(), labels, list(outcome.classes.colors)),
+        cloud=cloud,
         scale=scale,
         up=up if world is None else world.exported_from_run.rotation @ up,
+        labels=labels_of_channels(channels, outcome.label_of_channel) if m.class_logits.shape[1] else None,
+        class_names=outcome.classes.names,
+        class_colors=outcome.classes.colors,
         cameras=[
             ViewerCamera(outcome.frames[row], world_from_cam[row], fov, aspect)
             for row in (outcome.frame_row(i) for i in ids)
@@ -109,6 +140,8 @@ def _from_run(outcome: Outcome) -> ViewerScene:
         path=centers * scale,
         mesh_file=outcome.run.file("export", MESH) if outcome.run.has("export", MESH) else None,
         run=outcome.run,
+        is_metric=outcome.metric,
+        metres=outcome.metres,
     )
 
 
@@ -116,18 +149,15 @@ def _from_file(path: Path) -> ViewerScene:
     cloud = read_gaussians(path)
     if len(cloud) == 0:
         raise InputError(f"{path}: holds no Gaussians")
-    scale = _scale(cloud.means, np.zeros((0, 3)))
-    turn = Rotation.from_quat(cloud.quat_wxyz[:, [1, 2, 3, 0]]).as_matrix()
-    axes = turn * (np.exp(cloud.log_scales) * scale)[:, None, :]
     classes = 0 if cloud.class_ids is None else int(cloud.class_ids.max()) + 1
     return ViewerScene(
         title=path.name,
-        centers=(cloud.means * scale).astype(np.float32),
-        covariances=(axes @ axes.transpose(0, 2, 1)).astype(np.float32),
-        opacities=(1 / (1 + np.exp(-cloud.opacity_logits)))[:, None].astype(np.float32),
-        colors=_colors(cloud.colors, cloud.class_ids, list(class_colors(classes))),
-        scale=scale,
+        cloud=cloud,
+        scale=_scale(cloud.means, np.zeros((0, 3))),
         up=np.array([0.0, -1.0, 0.0]),
+        labels=cloud.class_ids,
+        class_names=tuple(f"class {i}" for i in range(classes)),
+        class_colors=class_colors(classes),
     )
 
 
@@ -136,15 +166,3 @@ def _scale(means: NDArray, centers: NDArray) -> float:
     points = np.concatenate([means.astype(np.float64), centers])
     low, high = np.quantile(points, (0.05, 0.95), axis=0)
     return _USUAL_SIZE / max(float((high - low).max()), 1e-9)
-
-
-def _colors(
-    rgb: NDArray, labels: NDArray[np.uint8] | None, palette: list[tuple[int, int, int]]
-) -> dict[str, NDArray[np.uint8]]:
-    """(M, 3) in own colours, and in those of the classes where there are labels."""
-    colors = {"colour": np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)}
-    if labels is not None and palette:
-        table = np.full((256, 3), 128, np.uint8)
-        table[: len(palette)] = np.array(palette, np.uint8)
-        colors["classes"] = table[labels]
-    return colors

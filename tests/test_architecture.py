@@ -92,10 +92,34 @@ def test_nothing_is_unpickled() -> None:
                     assert any(k.arg == "allow_pickle" for k in node.keywords), f"{path}:{node.lineno}"
 
 
-def test_help_does_not_load_torch() -> None:
-    code = "import sys, msgs_cli.main; print(sorted({'torch', 'cv2', 'numba', 'pycolmap', 'numpy'} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert done.stdout.strip() == "[]"
+HELP_OF_EVERY_COMMAND = """
+import sys
+before = set(sys.modules)
+import click
+from click.testing import CliRunner
+from msgs_cli.main import main
+
+def ask(command, words):
+    result = CliRunner().invoke(main, [*words, "--help"])
+    assert result.exit_code == 0 and "Usage" in result.output, words
+    for name, below in getattr(command, "commands", {}).items():
+        ask(below, [*words, name])
+
+ask(main, [])
+loaded = {name for name in set(sys.modules) - before if name.partition(".")[0] not in sys.stdlib_module_names}
+own = ("msgs_cli", "pipelines", "formats")
+print(*(name if name.startswith(own) else name.partition(".")[0] for name in loaded))
+"""
+LIGHT = {"click", "formats", "formats.errors", "pipelines", "pipelines.run_folder_names"}
+"""All that the help may load beside the standard library and the command line's own modules."""
+
+
+def test_help_of_every_command_loads_nothing_heavy() -> None:
+    done = subprocess.run([sys.executable, "-c", HELP_OF_EVERY_COMMAND], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    loaded = set(done.stdout.split())
+    assert "msgs_cli.models" in loaded
+    assert {name for name in loaded if not name.startswith("msgs_cli")} == LIGHT
 
 
 @pytest.mark.parametrize("path", sorted(p for room in FORBIDDEN for p in (ROOT / room).rglob("*.py")), ids=str)
