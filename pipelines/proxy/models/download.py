@@ -68,7 +68,10 @@ def fetch(urls: Sequence[str], target: Path, size: int, sha256: str, progress: C
             return actual
         log.warning("%s: %s", url, reason)
         reasons.append(f"{url}: {reason}")
-    raise InputError("no mirror delivered the file:\n  " + "\n  ".join(reasons) + "\nCheck the network and try again")
+    raise InputError(
+        "no mirror delivered the file:\n  " + "\n  ".join(reasons) + "\nCheck the network and try again, or bring the "
+        "file from elsewhere: msgs-slam models pull --from FOLDER"
+    )
 
 
 def _fetch_one(url: str, part: Path, size: int, progress: Callable[[int, int], None]) -> str:

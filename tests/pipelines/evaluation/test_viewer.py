@@ -19,6 +19,7 @@ from finished import note_finished
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from formats.datasets import Sequence
 from formats.errors import InputError
 from formats.gaussian_ply import read_gaussian_ply
 from pipelines.run_folder import RunFolder
@@ -115,6 +116,11 @@ class Page:
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
+    def tap(self, x: float, y: float) -> None:
+        """With a finger."""
+        self.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
+        self.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
     def wait_for(self, seen: Callable[[NDArray[np.uint8]], bool], seconds: float = 240) -> NDArray[np.uint8]:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -162,8 +168,37 @@ def changes(page: Page, before: NDArray[np.uint8], by: float = 10) -> NDArray[np
     return after
 
 
+def until(happened: Callable[[], object]) -> None:
+    end = time.monotonic() + 120
+    while not happened():
+        assert time.monotonic() < end, "the page did not answer"
+        time.sleep(0.5)
+
+
+def measure(page: Page, viewer: Any, truth: Sequence) -> tuple[float, float]:
+    """What the tape says after a click and a tap in the first camera's view, and the true distance."""
+    client = next(iter(viewer.server.get_clients().values()))
+    width, height = page.canvas()
+    focal, camera, depth = height / 2 / np.tan(client.camera.fov / 2), truth.camera, truth.depth(0)
+    assert camera is not None
+    assert depth is not None
+    places = []
+    viewer.tape.switch.value = True
+    time.sleep(1)
+    for touch, x in ((page.click, 0.45), (page.tap, 0.56)):
+        touch(x * width, 0.55 * height)
+        ray = np.array([(x - 0.5) * width / focal, 0.05 * height / focal, 1.0])
+        u, v = int(camera.fx * ray[0] + camera.cx), int(camera.fy * ray[1] + camera.cy)
+        places.append(depth[v, u] * ray)
+        until(lambda: viewer.tape.told.content != "Click two places of the map.")
+    until(lambda: viewer.tape.result)
+    return float(viewer.tape.result.split()[0]), float(np.linalg.norm(places[1] - places[0]))
+
+
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
-def test_page_shows_the_map_and_every_control_changes_it(oracle_run: OracleRun, tmp_path: Path) -> None:
+def test_page_shows_the_map_and_every_control_changes_it(
+    oracle_run: OracleRun, truth: Sequence, tmp_path: Path
+) -> None:
     pytest.importorskip("viser")
     from pipelines.viewer import open_viewer
 
@@ -188,6 +223,9 @@ def test_page_shows_the_map_and_every_control_changes_it(oracle_run: OracleRun, 
             page.click(*where_shown(first.world_from_cam[:3, 3] * viewer.scene.scale, client.camera, page.canvas()))
             elsewhere = changes(page, depth)
             assert viewer.preview.label.startswith(first.frame.name)
+            measured, true = measure(page, viewer, truth)
+            assert 0 < abs(measured - true) < 0.1 * true
+            viewer.tape.switch.value = False
             viewer.boxes["Show Gaussians"].value = False
             bare = page.wait_for(lambda p: np.abs(p.astype(float) - elsewhere).mean() > 10)
             viewer.boxes["Mesh"].value = True

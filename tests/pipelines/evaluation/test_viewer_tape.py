@@ -107,7 +107,7 @@ def viewer(oracle_run: OracleRun) -> Iterator[Any]:
     pytest.importorskip("viser")
     from pipelines.viewer import open_viewer
 
-    opened = open_viewer(oracle_run(pixel_stride=8).root, port=0)
+    opened = open_viewer(oracle_run(pixel_stride=8, mesh=True).root, port=0)
     yield opened
     opened.stop()
 
