@@ -123,7 +123,7 @@ class Viewer:
         gui = self.server.gui
         titles = [f"{plain(s.title)}: {len(s.centers):,} Gaussians" for s in self.scenes]
         if len(titles) == 1:
-            gui.add_markdown(titles[0])
+            gui.add_markdown("**{}**: {}".format(*titles[0].rsplit(": ", 1)))
         else:
             self.pieces = gui.add_dropdown("Piece", titles)
             self.pieces.on_update(lambda _: self.choose(titles.index(self.pieces.value)))

@@ -13,7 +13,7 @@ from formats.gaussian_ply import read_gaussian_ply
 from formats.gaussians import GaussianCloud, isotropic_cloud
 from pipelines.run_folder import RunFolder
 from pipelines.types import Metres
-from pipelines.viewer_scene import ViewerScene, load_scene
+from pipelines.viewer_scene import ViewerScene, load_scenes
 from pipelines.viewer_tape import Touch, tape, tape_text, touch
 
 OracleRun = Callable[..., RunFolder]
@@ -67,7 +67,7 @@ def test_nothing_is_touched_where_nothing_is() -> None:
 
 
 def test_distances_in_the_room_are_true_within_what_is_stated(oracle_run: OracleRun, truth: Sequence) -> None:
-    scene = load_scene(oracle_run().root)
+    scene = load_scenes(oracle_run().root)[0]
     c = truth.camera
     assert c is not None
     assert truth.world_from_cam is not None
