@@ -1,23 +1,30 @@
-"""What the site is given while it is built: the page of all settings, and equations as MathML, which browsers draw
-without any script."""
+"""What the site is given while it is built: the pages of all commands and settings, and equations as MathML, which
+browsers draw without any script."""
 
 from __future__ import annotations
 
 import html
 import re
+from collections.abc import Iterator
 from dataclasses import fields
 from typing import Any
 
+import click
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 
+from msgs_cli.main import main
 from pipelines.config import Config, allowed_values, config_to_dict
 
 _MATHS = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
+_COLUMNS = 78
+"""As wide as the page."""
+
 
 def on_files(files: Files, config: Any) -> Files:
-    """Adds settings.md."""
+    """Adds commands.md and settings.md."""
+    files.append(File.generated(config, "commands.md", content=commands_page()))
     files.append(File.generated(config, "settings.md", content=settings_page()))
     return files
 
@@ -29,6 +36,20 @@ def on_page_content(content: str, **_: Any) -> str:
 
 def _mathml(found: re.Match[str]) -> str:
     return convert(html.unescape(found[2]), display="inline" if found[1] == "span" else "block")
+
+
+def commands_page() -> str:
+    """Markdown of what every command says of itself."""
+    return "# Commands\n\nThis page is made from the program.\n" + "".join(_help_of(main, "msgs-slam", None))
+
+
+def _help_of(command: click.Command, name: str, above: click.Context | None) -> Iterator[str]:
+    options = {**main.context_settings, "max_content_width": _COLUMNS, "terminal_width": _COLUMNS}
+    context = click.Context(command, info_name=name, parent=above, **options)
+    yield f"\n## {context.command_path}\n\n```text\n{command.get_help(context)}\n```\n"
+    if isinstance(command, click.Group):
+        for below in command.list_commands(context):
+            yield from _help_of(command.commands[below], below, context)
 
 
 def settings_page() -> str:

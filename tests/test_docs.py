@@ -112,7 +112,7 @@ def test_site_is_built_without_a_broken_link(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     pages = {path.stem: path.read_text(encoding="utf-8") for path in tmp_path.glob("*.html")}
-    assert {path.stem for path in SITE.glob("*.md")} | {"settings"} <= set(pages)
+    assert {path.stem for path in SITE.glob("*.md")} | {"settings", "commands"} <= set(pages)
     assert "mapping" in pages["settings"]
     for name in main.commands:
         assert f"msgs-slam {name}" in pages["commands"], name
