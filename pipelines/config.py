@@ -16,7 +16,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from formats.errors import InputError
 from formats.jsonfile import read_toml
-from pipelines.retired_settings import explain_retired
+from pipelines.earlier_versions import explain_retired
 
 
 def setting(

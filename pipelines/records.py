@@ -15,7 +15,7 @@ from formats.errors import InputError
 from formats.jsonfile import read_json_object, read_toml, write_json
 from formats.reading import parsing
 from pipelines.config import Config, config_to_dict, merge_known_settings, settings_of_stage
-from pipelines.migration import migrated_stages
+from pipelines.earlier_versions import migrated_stages
 from pipelines.run_folder_names import STAGES
 from pipelines.stored import dataclass_from_json
 

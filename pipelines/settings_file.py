@@ -11,9 +11,9 @@ from formats.errors import InputError
 from formats.jsonfile import MAX_TOML_BYTES, read_toml
 from formats.reading import opened
 from pipelines.config import Config, config_to_toml, merge_known_settings, merge_settings
+from pipelines.earlier_versions import GONE
 from pipelines.progress import log
 from pipelines.records import load_records, load_source, recorded_config
-from pipelines.retired_settings import GONE
 
 if TYPE_CHECKING:
     from pipelines.run_folder import RunFolder

@@ -27,12 +27,11 @@ PACKAGE = "msgs_slam"
 PLUMBING = frozenset(
     [
         "pipelines.config",
-        "pipelines.retired_settings",
+        "pipelines.earlier_versions",
         "pipelines.stages",
         "pipelines.progress",
         "pipelines.stopping",
         "pipelines.records",
-        "pipelines.migration",
         "pipelines.settings_file",
         "pipelines.finished_files",
         "pipelines.journal",

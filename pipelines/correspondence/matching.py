@@ -11,15 +11,10 @@ from numpy.typing import NDArray
 from pipelines.jit import kernel
 from pipelines.types import Features
 
-
-@dataclass(frozen=True)
-class MatchOptions:
-    """Descriptor angles are in radians, `max_error` in pixels."""
-
-    max_ratio: float = 0.8
-    max_angle: float = 0.7
-    max_error: float = 2.0
-    min_inliers: int = 15
+MAX_RATIO, MAX_ANGLE = 0.8, 0.7
+"""Of the angle between two descriptors that match: as a share of the next best one's (Lowe), and in radians."""
+_MAX_ERROR, _MIN_INLIERS = 2.0, 15
+"""Pixels within which a match obeys a geometry, and how many have to."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +34,9 @@ class VerifiedPair:
     proposed: int
 
 
-def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8], options: MatchOptions) -> NDArray[np.uint32]:
+def match_descriptors(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], max_ratio: float = MAX_RATIO, max_angle: float = MAX_ANGLE
+) -> NDArray[np.uint32]:
     """(M, 2) mutual nearest neighbours that pass Lowe's ratio test, sorted by the first index.
 
     The products of byte descriptors are whole numbers below 2^24, so the float matrix product is exact and the
@@ -52,7 +49,7 @@ def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8], optio
     angle = np.arccos(np.clip(score / Features.NORM**2, 0, 1))
     next_angle = np.arccos(np.clip(runner_up / Features.NORM**2, 0, 1))
     index = np.arange(len(first))
-    good = (best_back[best] == index) & (angle < options.max_angle) & (angle < options.max_ratio * next_angle)
+    good = (best_back[best] == index) & (angle < max_angle) & (angle < max_ratio * next_angle)
     return np.stack([index[good], best[good]], axis=1).astype(np.uint32)
 
 
@@ -80,20 +77,16 @@ def _two_nearest(similarity):  # type: ignore[no-untyped-def]
 
 
 def match_pair(
-    pair: tuple[int, int],
-    features: tuple[Features, Features],
-    camera: pycolmap.Camera,
-    options: MatchOptions,
-    seed: int,
+    pair: tuple[int, int], features: tuple[Features, Features], camera: pycolmap.Camera, seed: int
 ) -> VerifiedPair | None:
     """Match two keyframes and keep what one epipolar geometry or homography explains; None where nothing does.
 
     The random choices depend on the seed and the pair alone, so pairs may be verified in any order on any thread.
     """
-    matches = match_descriptors(features[0].descriptors, features[1].descriptors, options)
-    if len(matches) < options.min_inliers:
+    matches = match_descriptors(features[0].descriptors, features[1].descriptors)
+    if len(matches) < _MIN_INLIERS:
         return None
-    return verify_matches(pair, matches, (features[0].xy, features[1].xy), camera, options, seed)
+    return verify_matches(pair, matches, (features[0].xy, features[1].xy), camera, seed)
 
 
 def verify_matches(
@@ -101,15 +94,14 @@ def verify_matches(
     matches: NDArray[np.uint32],
     xy: tuple[NDArray[np.float64], NDArray[np.float64]],
     camera: pycolmap.Camera,
-    options: MatchOptions,
     seed: int,
 ) -> VerifiedPair | None:
     """Robust two-view geometry of proposed matches, or None. See `match_pair`."""
     geometry = pycolmap.estimate_two_view_geometry(
-        camera, xy[0], camera, xy[1], matches, _verification_options(options, pair_seed(seed, pair))
+        camera, xy[0], camera, xy[1], matches, _verification_options(pair_seed(seed, pair))
     )
     inliers = np.asarray(geometry.inlier_matches, dtype=np.uint32).reshape(-1, 2)
-    if len(inliers) < options.min_inliers:
+    if len(inliers) < _MIN_INLIERS:
         return None
     matrices = np.stack([_matrix(m) for m in (geometry.F, geometry.E, geometry.H)])
     return VerifiedPair(*pair, inliers, int(geometry.config), matrices, len(matches))
@@ -124,12 +116,12 @@ def _matrix(value: NDArray[np.float64] | None) -> NDArray[np.float64]:
     return np.zeros((3, 3)) if value is None else np.array(value, dtype=np.float64)
 
 
-def _verification_options(options: MatchOptions, seed: int) -> pycolmap.TwoViewGeometryOptions:
+def _verification_options(seed: int) -> pycolmap.TwoViewGeometryOptions:
     chosen = pycolmap.TwoViewGeometryOptions()
-    chosen.min_num_inliers = options.min_inliers
+    chosen.min_num_inliers = _MIN_INLIERS
     chosen.detect_watermark = False
     chosen.compute_relative_pose = True
-    chosen.ransac.max_error = options.max_error
+    chosen.ransac.max_error = _MAX_ERROR
     chosen.ransac.random_seed = seed
     chosen.ransac.num_threads = 1
     # Of the pairs of a kitchen 99.5 % of the agreeing matches are found in a fifth of the time of pycolmap's ten

@@ -17,17 +17,8 @@ _MAX_CORNERS = 600
 _MIN_TRACKS = 30
 _APART_PX = 6.0
 _LEVELS = 4
-
-
-@dataclass(frozen=True)
-class KeyframeOptions:
-    """`parallax`: median displacement, as a fraction of the image width, that makes a new keyframe.
-
-    `min_survivors`: fraction of the tracks below which one is made in any case.
-    """
-
-    parallax: float = 0.05
-    min_survivors: float = 0.5
+_MIN_SURVIVORS = 0.5
+"""With fewer of its tracks left there is a new keyframe in any case."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +36,11 @@ class KeyframeChoice:
 
 
 def choose_keyframes(
-    frames: Iterable[tuple[NDArray[np.uint8], NDArray[np.bool_] | None]], options: KeyframeOptions
+    frames: Iterable[tuple[NDArray[np.uint8], NDArray[np.bool_] | None]], parallax: float
 ) -> KeyframeChoice:
-    """Keyframes of grey frames (H, W) in order of time, each with a mask (H, W) of what is no part of the scene; the
-    first is one, and the last where it adds a view."""
+    """Keyframes of grey frames (H, W) in order of time, each with a mask (H, W) of what is no part of the scene: one
+    whenever points have moved by `parallax`, as a fraction of the width; the first, and the last where it adds a view.
+    """
     tracker = _Tracker()
     keyframes: list[int] = []
     displacement: list[float] = []
@@ -57,11 +49,11 @@ def choose_keyframes(
         gray = reduce_image(frame, _TRACKED_SIDE)
         moved, survivors = tracker.advance(gray)
         displacement.append(moved)
-        if i == 0 or moved > options.parallax or survivors < options.min_survivors:
+        if i == 0 or moved > parallax or survivors < _MIN_SURVIVORS:
             keyframes.append(i)
             tracker.restart(gray, left_out)
         count = i + 1
-    if keyframes and keyframes[-1] != count - 1 and displacement[-1] > options.parallax / 3:
+    if keyframes and keyframes[-1] != count - 1 and displacement[-1] > parallax / 3:
         keyframes.append(count - 1)
     return KeyframeChoice(keyframes, np.array(displacement, dtype=np.float64))
 

@@ -19,7 +19,7 @@ from formats.video import VideoFrame
 from pipelines.config import Config, FramesConfig
 from pipelines.correspondence.features import to_grey
 from pipelines.correspondence.snapshots import Snapshots
-from pipelines.frames.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes
+from pipelines.frames.keyframes import KeyframeChoice, choose_keyframes
 from pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
 from pipelines.frames.pick import sharpest_of_windows
 from pipelines.frames.recording import RecordingSource
@@ -173,7 +173,7 @@ def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks) -> Ke
 
     parallax = context.config.frames.parallax
     while True:
-        choice = choose_keyframes(pictures(), KeyframeOptions(parallax=parallax))
+        choice = choose_keyframes(pictures(), parallax)
         require_motion(choice.largest_displacement)
         if len(choice.keyframes) >= min(_FEW_KEYFRAMES, len(frames)) or parallax < context.config.frames.parallax / 3:
             return choice

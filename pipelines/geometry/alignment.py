@@ -49,26 +49,22 @@ class Similarity:
         return Similarity(self.scale * other.scale, self.rotation @ other.rotation, translation)
 
 
-def align_points(
-    source: NDArray, target: NDArray, with_scale: bool = True, weights: NDArray | None = None
-) -> Similarity:
+def align_points(source: NDArray, target: NDArray, with_scale: bool = True) -> Similarity:
     """The similarity (or, without scale, the rigid motion) that takes source (N, 3) to target (N, 3).
 
-    Weighted least squares in closed form (Umeyama, PAMI 1991). Raises ValueError for fewer than three points, points
+    Least squares in closed form (Umeyama, PAMI 1991). Raises ValueError for fewer than three points, points
     that are not finite, or points on one line, where the rotation is not determined.
     """
     require_shape("source", source, (None, 3))
     require_shape("target", target, (len(source), 3))
     if len(source) < 3 or not (np.isfinite(source).all() and np.isfinite(target).all()):
         raise ValueError(f"alignment needs at least three finite points, got {len(source)}")
-    w = np.ones(len(source)) if weights is None else np.asarray(weights, dtype=np.float64)
-    w = w / w.sum()
-    source_mean, target_mean = w @ source, w @ target
+    source_mean, target_mean = source.mean(0), target.mean(0)
     source_centred, target_centred = source - source_mean, target - target_mean
-    u, d, vt = np.linalg.svd((w[:, None] * target_centred).T @ source_centred)
+    u, d, vt = np.linalg.svd(target_centred.T @ source_centred / len(source))
     if d[1] <= 1e-12 * max(d[0], 1e-300):
         raise ValueError("alignment is not determined: the points lie on one line")
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * signs) @ vt
-    scale = float(d @ signs / (w @ (source_centred**2).sum(1))) if with_scale else 1.0
+    scale = float(d @ signs / (source_centred**2).sum(1).mean()) if with_scale else 1.0
     return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)

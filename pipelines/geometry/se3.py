@@ -36,11 +36,6 @@ def inverse(motion: ArrayT) -> ArrayT:
     return _on_tensors(_inverse, motion)
 
 
-def adjoint(motion: ArrayT) -> ArrayT:
-    """(..., 6, 6) Ad with `motion @ exp(x) @ inverse(motion) == exp(adjoint(motion) @ x)`."""
-    return _on_tensors(_adjoint, motion)
-
-
 def transform(motion: ArrayT, points: ArrayT) -> ArrayT:
     """(4, 4) motion applied to (..., 3) points."""
     rotation, translation = motion[:3, :3], motion[:3, 3]
@@ -144,13 +139,6 @@ def _quaternion(rotation: Tensor) -> Tensor:
 def _inverse(motion: Tensor) -> Tensor:
     transposed = motion[..., :3, :3].transpose(-1, -2)
     return _assemble(transposed, -(transposed @ motion[..., :3, 3:]).squeeze(-1))
-
-
-def _adjoint(motion: Tensor) -> Tensor:
-    rotation = motion[..., :3, :3]
-    top = torch.cat([rotation, hat(motion[..., :3, 3]) @ rotation], dim=-1)
-    bottom = torch.cat([torch.zeros_like(rotation), rotation], dim=-1)
-    return torch.cat([top, bottom], dim=-2)
 
 
 def _rotation_angle(motion: Tensor) -> Tensor:

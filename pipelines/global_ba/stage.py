@@ -80,7 +80,7 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
     if snapshot.exists():
         return load_found(snapshot)
     run, settings, seed = context.run, context.config.global_ba, context.config.run.seed
-    pictures = Pictures(run, run.load_frames(), context.config.frames)
+    pictures = Pictures(run, context.config.frames)
     views = load_keyframe_views(context, model, pictures)
     ids = model.frame_ids.tolist()
     kinds = [np.stack([pictures.descriptor(i) for i in ids])]

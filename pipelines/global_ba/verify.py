@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pipelines.config import GlobalBaConfig
-from pipelines.correspondence.matching import MatchOptions, match_descriptors
+from pipelines.correspondence.matching import match_descriptors
 from pipelines.geometry import se3
 from pipelines.geometry.camera import unproject
 from pipelines.tracking.pnp import FramePose, solve_pose
@@ -72,7 +72,7 @@ def verify_loop(
     first: KeyframeView, second: KeyframeView, intrinsics: Intrinsics, settings: GlobalBaConfig, seed: int
 ) -> Loop | None:
     """The loop, if both directions find enough inliers, the same motion and a believable scale."""
-    pairs = match_descriptors(first.features.descriptors, second.features.descriptors, MatchOptions())
+    pairs = match_descriptors(first.features.descriptors, second.features.descriptors)
     forward = _locate(first, pairs[:, 0], second, pairs[:, 1], intrinsics, settings, seed)
     backward = _locate(second, pairs[:, 1], first, pairs[:, 0], intrinsics, settings, seed)
     if forward is None or backward is None:

@@ -17,7 +17,7 @@ from formats.errors import InputError
 from pipelines.config import FramesConfig
 from pipelines.correspondence.database import write_database
 from pipelines.correspondence.features import extract_features
-from pipelines.correspondence.matching import MatchOptions, VerifiedPair, match_pair
+from pipelines.correspondence.matching import VerifiedPair, match_pair
 from pipelines.correspondence.retrieval import (
     Looks,
     describe,
@@ -188,11 +188,10 @@ class StructureFromMotion:
         return sorted({*sequential_pairs(len(features), self.config.overlap), *loops})
 
     def _pairs(self, features: Sequence[Features], proposed: Sequence[tuple[int, int]]) -> list[VerifiedPair]:
-        options = MatchOptions()
         blocks = [proposed[i : i + _PAIRS_PER_BLOCK] for i in range(0, len(proposed), _PAIRS_PER_BLOCK)]
 
         def match(pair: tuple[int, int]) -> VerifiedPair | None:
-            return match_pair(pair, (features[pair[0]], features[pair[1]]), self.camera, options, self.seed)
+            return match_pair(pair, (features[pair[0]], features[pair[1]]), self.camera, self.seed)
 
         def match_block(block: Sequence[tuple[int, int]]) -> list[VerifiedPair]:
             return [p for p in parallel_map(match, block, self.threads) if p is not None]

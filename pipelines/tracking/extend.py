@@ -11,7 +11,7 @@ from pipelines.geometry import se3
 from pipelines.geometry.camera import project, unproject
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.pnp import MIN_INLIERS, POSE_ERROR
-from pipelines.tracking.state import Sightings, TrackState
+from pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
 from pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
@@ -22,31 +22,24 @@ MIN_ANGLE = np.radians(1.5)
 """Rays that meet at a smaller angle say nothing of the depth."""
 
 
-def promote(frame_id: int, state: TrackState, pictures: Pictures, intrinsics: Intrinsics) -> int:
+def promote(frame_id: int, state: TrackState, pictures: Pictures) -> int:
     """Make a posed frame a keyframe with new points; returns how many are new."""
     earlier = [k for k in state.nearest_keyframes(frame_id, 2) if state.segment[k] == state.segment[frame_id]]
     state.keyframes = sorted({*state.keyframes, frame_id})
     added = 0
     if earlier:
-        added += _triangulate(earlier[0], frame_id, state, pictures, intrinsics)
-    return added + _from_proxy(frame_id, state, pictures, intrinsics)
+        added += _triangulate(earlier[0], frame_id, state, pictures)
+    return added + _from_proxy(frame_id, state, pictures)
 
 
-def start_segment(
-    frame_id: int,
-    cam_from_world: Array,
-    state: TrackState,
-    pictures: Pictures,
-    intrinsics: Intrinsics,
-) -> bool:
+def start_segment(frame_id: int, cam_from_world: Array, state: TrackState, pictures: Pictures) -> bool:
     """A new beginning from one frame's proxy depth; False, and nothing changed, when it has too few points for that."""
     if pictures.proxy(frame_id) is None:
         return False
     before = len(state.points)
     segment = max(state.segment.values(), default=-1) + 1
-    nothing = Sightings(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
-    state.add_frame(frame_id, cam_from_world, nothing, True, segment)
-    if _from_proxy(frame_id, state, pictures, intrinsics) >= MIN_INLIERS:
+    state.add_frame(frame_id, cam_from_world, NO_SIGHTINGS, True, segment)
+    if _from_proxy(frame_id, state, pictures) >= MIN_INLIERS:
         return True
     for table in (state.poses, state.sightings, state.segment):
         del table[frame_id]
@@ -55,12 +48,12 @@ def start_segment(
     return False
 
 
-def _from_proxy(frame_id: int, state: TrackState, pictures: Pictures, intrinsics: Intrinsics) -> int:
+def _from_proxy(frame_id: int, state: TrackState, pictures: Pictures) -> int:
     """Corners that are no points yet, at the proxy depth, scaled to agree with the points the frame sees."""
     maps = pictures.proxy(frame_id)
     if maps is None:
         return 0
-    seen = state.sightings[frame_id]
+    seen, intrinsics = state.sightings[frame_id], pictures.intrinsics
     count = max(NEW_POINTS - len(seen), 0)
     xy = corners(pictures.grey(frame_id), seen.xy, count, left_out=pictures.left_out(frame_id))
     depth, _ = sample_proxy(maps, xy, intrinsics)
@@ -70,13 +63,13 @@ def _from_proxy(frame_id: int, state: TrackState, pictures: Pictures, intrinsics
     good = depth > 0
     in_cam = unproject(xy[good], depth[good] * scale, intrinsics)
     points = se3.transform(se3.inverse(motion), in_cam)
-    _add(frame_id, None, points, xy[good], None, state, pictures)
+    _add(points, {frame_id: xy[good]}, state, pictures)
     return int(good.sum())
 
 
-def _triangulate(first: int, second: int, state: TrackState, pictures: Pictures, intrinsics: Intrinsics) -> int:
+def _triangulate(first: int, second: int, state: TrackState, pictures: Pictures) -> int:
     """Corners of the first keyframe that are no points yet, followed into the second."""
-    taken = state.sightings[first].xy
+    taken, intrinsics = state.sightings[first].xy, pictures.intrinsics
     grey = pictures.grey(first)
     xy = corners(grey, taken, NEW_POINTS, left_out=pictures.left_out(first))
     motion = state.poses[second] @ se3.inverse(state.poses[first])
@@ -87,7 +80,7 @@ def _triangulate(first: int, second: int, state: TrackState, pictures: Pictures,
     xy, there = xy[found], there[found]
     in_first, good = triangulate(xy, there, motion, intrinsics, POSE_ERROR)
     points = se3.transform(se3.inverse(state.poses[first]), in_first[good])
-    _add(first, second, points, xy[good], there[good], state, pictures)
+    _add(points, {first: xy[good], second: there[good]}, state, pictures)
     return int(good.sum())
 
 
@@ -127,20 +120,11 @@ def triangulate(
     return points, good
 
 
-def _add(
-    first: int,
-    second: int | None,
-    points: Array,
-    xy: Array,
-    xy2: Array | None,
-    state: TrackState,
-    pictures: Pictures,
-) -> None:
-    """New points with their sightings in one or two keyframes; colours from the first."""
-    image = pictures.color(first)
-    colors = image[xy[:, 1].astype(int), xy[:, 0].astype(int)]
+def _add(points: Array, seen_at: dict[int, Array], state: TrackState, pictures: Pictures) -> None:
+    """New points (Q, 3) with the pixels (Q, 2) at which keyframes see them; colours from the first of these."""
+    first, xy = next(iter(seen_at.items()))
+    colors = pictures.color(first)[xy[:, 1].astype(int), xy[:, 0].astype(int)]
     index = state.add_points(points, colors)
-    for frame_id, pixels in ((first, xy), (second, xy2)):
-        if frame_id is not None and pixels is not None:
-            extra = Sightings(index, pixels, np.full(len(index), FLOW_SD))
-            state.sightings[frame_id] = state.sightings[frame_id].joined(extra)
+    for frame_id, pixels in seen_at.items():
+        extra = Sightings(index, pixels, np.full(len(index), FLOW_SD))
+        state.sightings[frame_id] = state.sightings[frame_id].joined(extra)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +15,6 @@ from pipelines.tracking.pnp import MIN_INLIERS, FramePose, solve_pose
 from pipelines.tracking.refine import RenderWeights, compare_frame
 from pipelines.tracking.relocalise import relocalise
 from pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
-from pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
 
@@ -33,17 +30,10 @@ class FrontEnd:
     """Poses frames one after the other, in the order of their ids, into a `TrackState`."""
 
     def __init__(
-        self,
-        state: TrackState,
-        pictures: Pictures,
-        times: Mapping[int, float],
-        intrinsics: Intrinsics,
-        settings: TrackingConfig,
-        seed: int,
-        weights: RenderWeights,
+        self, state: TrackState, pictures: Pictures, settings: TrackingConfig, seed: int, weights: RenderWeights
     ) -> None:
-        self.state, self.pictures, self.times = state, pictures, times
-        self.intrinsics, self.settings, self.seed, self.weights = intrinsics, settings, seed, weights
+        self.state, self.pictures, self.settings, self.seed, self.weights = state, pictures, settings, seed, weights
+        self.times = {i: frame.timestamp for i, frame in pictures.frames.items()}
 
     def track(self, frame_id: int, may_start: bool = True) -> None:
         """Pose one frame, or note why it is lost.
@@ -56,7 +46,7 @@ class FrontEnd:
         if not self.is_trusted(seen, solved) and self.extend_before(frame_id):
             seen, solved, start = self.by_flow(frame_id)
         if not self.is_trusted(seen, solved):
-            seen, solved = relocalise(frame_id, self.state, self.pictures, self.intrinsics, self.seed)
+            seen, solved = relocalise(frame_id, self.state, self.pictures, self.seed)
             reason += f"; {len(seen)} matched in similar keyframes, {_count(solved)} agree"
         if solved is not None and self.is_trusted(seen, solved):
             segment = self.state.segment_of_point(int(seen.point[solved.inliers][0]), frame_id)
@@ -90,7 +80,7 @@ class FrontEnd:
         start = self.by_flow(frame_id)[2]
         if start is None or not keyframes:
             return False
-        found = compare_frame(frame_id, start, keyframes, self.state, self.pictures, self.intrinsics, self.weights)
+        found = compare_frame(frame_id, start, keyframes, self.state, self.pictures, self.weights)
         if found is None or not found.is_better or found.unexplained > RENDER_LOSS:
             return False
         self.state.add_frame(frame_id, found.cam_from_world, NO_SIGHTINGS, False, segment)
@@ -111,24 +101,21 @@ class FrontEnd:
             return
         share = len(self.state.sightings[frame_id]) / max(len(self.state.sightings[nearest[0]]), 1)
         if share < KEYFRAME_SHARE:
-            self._promote(frame_id)
+            promote(frame_id, self.state, self.pictures)
 
     def extend_before(self, frame_id: int) -> bool:
         """Make the posed frame next to this one a keyframe, where there is none ahead; whether that was possible."""
         near = [i for i in (frame_id - 1, frame_id + 1) if i in self.state.poses and i not in self.state.keyframes]
         if not near or self.is_inside(frame_id):
             return False
-        self._promote(near[0])
+        promote(near[0], self.state, self.pictures)
         return True
-
-    def _promote(self, frame_id: int) -> None:
-        promote(frame_id, self.state, self.pictures, self.intrinsics)
 
     def _start(self, frame_id: int, start: Array | None) -> bool:
         if not self.settings.new_segments:
             return False
         pose = np.eye(4) if start is None else start
-        return start_segment(frame_id, pose, self.state, self.pictures, self.intrinsics)
+        return start_segment(frame_id, pose, self.state, self.pictures)
 
     def correspond(self, frame_id: int, start: Array, keyframes: list[int]) -> Sightings:
         """Points of the keyframes found in the frame by KLT, searched from where `start` (4, 4) puts them."""
@@ -138,7 +125,7 @@ class FrontEnd:
             known = self.state.sightings[keyframe]
             known = known.select(~np.isin(known.point, seen.point))
             points = self.state.points[known.point]
-            guess, _ = project(points @ start[:3, :3].T + start[:3, 3], self.intrinsics)
+            guess, _ = project(points @ start[:3, :3].T + start[:3, 3], self.pictures.intrinsics)
             xy, found = follow(self.pictures.grey(keyframe), grey, known.xy, guess)
             found &= self.pictures.is_scene(frame_id, xy)
             seen = seen.joined(Sightings(known.point[found], xy[found], np.full(int(found.sum()), FLOW_SD)))
@@ -147,7 +134,7 @@ class FrontEnd:
     def solve(self, frame_id: int, seen: Sightings, start: Array | None) -> FramePose | None:
         """The pose that most of the sightings agree on."""
         points = self.state.points[seen.point]
-        return solve_pose(seen.xy, points, self.intrinsics, self.seed + frame_id, start)
+        return solve_pose(seen.xy, points, self.pictures.intrinsics, self.seed + frame_id, start)
 
     def is_trusted(self, seen: Sightings, solved: FramePose | None) -> bool:
         """Enough points agree, and not by a small minority, which is how a wrong pose looks."""

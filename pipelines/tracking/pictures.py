@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -13,7 +13,7 @@ from pipelines.config import FramesConfig
 from pipelines.correspondence.features import extract_features, to_grey
 from pipelines.correspondence.retrieval import describe
 from pipelines.run_folder import RunFolder
-from pipelines.types import Features, Frame, ProxyMaps
+from pipelines.types import Features, ProxyMaps
 
 T = TypeVar("T")
 
@@ -35,12 +35,13 @@ class _Recent(Generic[T]):
 
 
 class Pictures:
-    """Everything tracking looks up by frame id; memory does not grow with the number of frames."""
+    """Everything tracking looks up by frame id, and the camera; memory does not grow with the number of frames."""
 
-    def __init__(self, run: RunFolder, frames: Sequence[Frame], settings: FramesConfig, kept: int = 12) -> None:
+    def __init__(self, run: RunFolder, settings: FramesConfig, kept: int = 12) -> None:
         self.run, self.settings = run, settings
         self.vocabulary = run.load_vocabulary()
-        self.frames = {f.id: f for f in frames}
+        self.frames = {f.id: f for f in run.load_frames()}
+        self.intrinsics = run.load_calibration().intrinsics
         self._grey = _Recent(lambda i: to_grey(self.color(i)), kept)
         self._left_out = _Recent(lambda i: run.left_out(self.frames[i]), kept)
         self._features = _Recent(self._load_features, 4 * kept)

@@ -76,7 +76,6 @@ def compare_frame(
     keyframes: list[int],
     state: TrackState,
     pictures: Pictures,
-    intrinsics: Intrinsics,
     weights: RenderWeights,
 ) -> Comparison | None:
     """The pose near `start` (4, 4) from which the working map looks most like the frame.
@@ -84,11 +83,11 @@ def compare_frame(
     None where the keyframes have no depth, too little of the map is seen, or the search does not converge. The
     keyframes lie in one segment. The terms of depth and labels need proxies of the frame itself (`proxy.frames`).
     """
-    small = intrinsics.at_most(WORKING_SIDE)
-    drawn = seed_map(keyframes, state, pictures, intrinsics)
+    small = pictures.intrinsics.at_most(WORKING_SIDE)
+    drawn = seed_map(keyframes, state, pictures)
     if drawn is None:
         return None
-    view = view_of(frame_id, start, keyframes, state, pictures, intrinsics)
+    view = view_of(frame_id, start, keyframes, state, pictures)
     pose = torch.from_numpy(np.ascontiguousarray(start))
     before = tracking_loss(drawn, pose, small, view, weights)
     exposed = replace(view, image=((view.image - before.bias) / before.gain).clamp(0, 1))

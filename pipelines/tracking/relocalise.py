@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pipelines.correspondence.matching import MatchOptions, match_descriptors
+from pipelines.correspondence.matching import match_descriptors
 from pipelines.geometry import se3
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.pnp import MIN_INLIERS, FramePose, solve_pose
 from pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
-from pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
 
@@ -27,29 +26,18 @@ SNAP = 2.0
 """A SIFT feature within so many pixels of a keyframe's sighting stands for the same point."""
 
 
-def relocalise(
-    frame_id: int,
-    state: TrackState,
-    pictures: Pictures,
-    intrinsics: Intrinsics,
-    seed: int,
-) -> tuple[Sightings, FramePose | None]:
+def relocalise(frame_id: int, state: TrackState, pictures: Pictures, seed: int) -> tuple[Sightings, FramePose | None]:
     """Sightings from the keyframes that look most like the frame, and the pose they agree on, if any.
 
     None, too, where two places explain the frame about as well and lie apart: things that repeat, such as the doors of
     a corridor, tell nothing of which of them is seen.
     """
     groups = _candidate_groups(frame_id, state, pictures, CANDIDATES)
-    return recognise(frame_id, groups, state, pictures, intrinsics, seed)
+    return recognise(frame_id, groups, state, pictures, seed)
 
 
 def recognise(
-    frame_id: int,
-    groups: list[list[int]],
-    state: TrackState,
-    pictures: Pictures,
-    intrinsics: Intrinsics,
-    seed: int,
+    frame_id: int, groups: list[list[int]], state: TrackState, pictures: Pictures, seed: int
 ) -> tuple[Sightings, FramePose | None]:
     """What `relocalise` answers, of these groups of keyframes alone."""
     answers: list[tuple[Sightings, FramePose, int]] = []
@@ -60,7 +48,7 @@ def recognise(
             found = match_keyframe(frame_id, keyframe, state, pictures)
             seen = seen.joined(found.select(~np.isin(found.point, seen.point)))
         points = state.points[seen.point]
-        solved = solve_pose(seen.xy, points, intrinsics, seed + frame_id)
+        solved = solve_pose(seen.xy, points, pictures.intrinsics, seed + frame_id)
         if solved is not None:
             answers.append((seen, solved, state.segment[group[0]]))
         elif len(seen) > len(most):
@@ -88,7 +76,7 @@ def match_keyframe(frame_id: int, keyframe: int, state: TrackState, pictures: Pi
     if len(known) == 0:
         return NO_SIGHTINGS
     theirs, ours = pictures.features(keyframe), pictures.features(frame_id)
-    pairs = match_descriptors(theirs.descriptors, ours.descriptors, MatchOptions())
+    pairs = match_descriptors(theirs.descriptors, ours.descriptors)
     distance, nearest = cKDTree(known.xy).query(theirs.xy[pairs[:, 0]], distance_upper_bound=SNAP)
     keep = np.isfinite(distance)
     points, pairs = known.point[nearest[keep]], pairs[keep]

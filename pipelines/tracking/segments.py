@@ -15,7 +15,6 @@ from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.pnp import MIN_INLIERS
 from pipelines.tracking.relocalise import group_by_points, recognise
 from pipelines.tracking.state import Sightings, TrackState
-from pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
 
@@ -23,7 +22,7 @@ TRIES = 12
 """Keyframes of a segment that are looked for in another: the nearest in time, then those that look most like it."""
 
 
-def join_segments(state: TrackState, pictures: Pictures, intrinsics: Intrinsics, seed: int) -> int:
+def join_segments(state: TrackState, pictures: Pictures, seed: int) -> int:
     """Bring every segment that can be recognised into the largest one's world; returns how many were joined.
 
     One keyframe is not believed: two must be recognised, and say the same of how the worlds lie to each other.
@@ -34,7 +33,7 @@ def join_segments(state: TrackState, pictures: Pictures, intrinsics: Intrinsics,
         counts = Counter(state.segment.values())
         order = sorted(counts, key=lambda s: (-counts[s], s))
         for segment in order[1:]:
-            if _join(segment, order[0], state, pictures, intrinsics, seed):
+            if _join(segment, order[0], state, pictures, seed):
                 joined, again = joined + 1, True
                 break
     return joined
@@ -60,14 +59,7 @@ def split_segments(state: TrackState) -> None:
         state.segment[frame_id] = order.index(component)
 
 
-def _join(
-    segment: int,
-    main: int,
-    state: TrackState,
-    pictures: Pictures,
-    intrinsics: Intrinsics,
-    seed: int,
-) -> bool:
+def _join(segment: int, main: int, state: TrackState, pictures: Pictures, seed: int) -> bool:
     ours = [k for k in state.keyframes if state.segment[k] == segment]
     theirs = [k for k in state.keyframes if state.segment[k] == main]
     looks = np.array([[float(pictures.descriptor(a) @ pictures.descriptor(b)) for b in theirs] for a in ours])
@@ -77,7 +69,7 @@ def _join(
     for n in near + [i for i in np.argsort(-looks.max(1), kind="stable")[:TRIES].tolist() if i not in near]:
         alike = [theirs[i] for i in np.argsort(-looks[n], kind="stable")[:3]]
         alike += [k for k in sorted(theirs, key=lambda k: abs(k - ours[n]))[:2] if k not in alike]
-        found = _recognise(ours[n], alike, state, pictures, intrinsics, seed)
+        found = _recognise(ours[n], alike, state, pictures, seed)
         if found is None:
             continue
         depth = state.median_depth(ours[n])
@@ -93,16 +85,11 @@ def _join(
 
 
 def _recognise(
-    frame_id: int,
-    keyframes: list[int],
-    state: TrackState,
-    pictures: Pictures,
-    intrinsics: Intrinsics,
-    seed: int,
+    frame_id: int, keyframes: list[int], state: TrackState, pictures: Pictures, seed: int
 ) -> tuple[Similarity, Sightings] | None:
     """main_from_segment, and the main segment's points in the frame."""
     groups = group_by_points(keyframes, state)
-    seen, solved = recognise(frame_id, groups, state, pictures, intrinsics, seed)
+    seen, solved = recognise(frame_id, groups, state, pictures, seed)
     if solved is None or solved.inliers.sum() < max(MIN_INLIERS, 0.4 * len(seen)):
         return None
     seen = seen.select(solved.inliers)

@@ -27,11 +27,11 @@ SNAPSHOTS = 20
 def run(context: StageContext) -> dict[str, Any]:
     """Keyframes from structure from motion, every other frame against them, then everything adjusted together."""
     frames = context.run.load_frames()
-    intrinsics = context.run.load_calibration().intrinsics
     proxy = context.run.load_proxy_report()
     settings = without_dependent_depth(context.config.tracking, proxy)
     metric = bool(proxy.get("metric", False))
-    pictures = Pictures(context.run, frames, context.config.frames)
+    pictures = Pictures(context.run, context.config.frames)
+    intrinsics = pictures.intrinsics
 
     state = track_frames(context, frames, pictures)
     if len(state.poses) < 2:
@@ -63,9 +63,7 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
     settings, weights = context.config.tracking, RenderWeights.of(context.config.article)
     snapshot = context.snapshot / "state.npz"
     state = TrackState.load(snapshot) if snapshot.exists() else start_state(context)
-    intrinsics = context.run.load_calibration().intrinsics
-    times = {f.id: f.timestamp for f in frames}
-    front_end = FrontEnd(state, pictures, times, intrinsics, settings, context.config.run.seed, weights)
+    front_end = FrontEnd(state, pictures, settings, context.config.run.seed, weights)
     every = max(settings.snapshot_every, len(frames) // SNAPSHOTS)
     for frame in context.progress.track(frames[state.done :], "tracking", len(frames) - state.done):
         if frame.id not in state.poses:
@@ -79,7 +77,7 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
         front_end.track(frame_id, may_start=False)
     for frame_id in sorted(state.lost) if context.run.pieces("frames") else ():
         front_end.track(frame_id, may_start=False)
-    join_segments(state, pictures, intrinsics, context.config.run.seed)
+    join_segments(state, pictures, context.config.run.seed)
     return state
 
 
@@ -103,13 +101,13 @@ def start_state(context: StageContext) -> TrackState:
 
 def compare_all(context: StageContext, state: TrackState, pictures: Pictures) -> dict[str, Any]:
     """Every frame but the keyframes against Gaussians seeded around it; the new pose stays where the loss falls."""
-    intrinsics, weights = context.run.load_calibration().intrinsics, RenderWeights.of(context.config.article)
+    weights = RenderWeights.of(context.config.article)
     others = [i for i in sorted(state.poses) if i not in state.keyframes]
     better = []
     for frame_id in context.progress.track(others, "comparing", len(others)):
         segment = state.segment[frame_id]
         keyframes = [k for k in state.nearest_keyframes(frame_id, 1) if state.segment[k] == segment]
-        found = compare_frame(frame_id, state.poses[frame_id], keyframes, state, pictures, intrinsics, weights)
+        found = compare_frame(frame_id, state.poses[frame_id], keyframes, state, pictures, weights)
         if found is not None and found.is_better:
             state.poses[frame_id] = found.cam_from_world
             better.append(found.loss_after / found.loss_before)

@@ -51,22 +51,22 @@ class View:
     labels: Tensor | None
 
 
-def seed_map(keyframes: list[int], state: TrackState, pictures: Pictures, intrinsics: Intrinsics) -> WorkingMap | None:
+def seed_map(keyframes: list[int], state: TrackState, pictures: Pictures) -> WorkingMap | None:
     """Gaussians at the keyframes' proxy depths, each scaled to agree with the points it sees; None without depth."""
-    parts = [p for k in keyframes if (p := _seed_keyframe(k, state, pictures, intrinsics)) is not None]
+    parts = [p for k in keyframes if (p := _seed_keyframe(k, state, pictures)) is not None]
     if not parts:
         return None
     return WorkingMap(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
 
 
-def _seed_keyframe(
-    keyframe: int, state: TrackState, pictures: Pictures, intrinsics: Intrinsics
-) -> tuple[Tensor, ...] | None:
+def _seed_keyframe(keyframe: int, state: TrackState, pictures: Pictures) -> tuple[Tensor, ...] | None:
     maps = pictures.proxy(keyframe)
     if maps is None:
         return None
-    small, motion = intrinsics.at_most(WORKING_SIDE), state.poses[keyframe]
-    depth = _resized(maps.depth, small) * np.float32(proxy_scale(keyframe, motion, maps, state, intrinsics) or 1.0)
+    small, motion = pictures.intrinsics.at_most(WORKING_SIDE), state.poses[keyframe]
+    depth = _resized(maps.depth, small) * np.float32(
+        proxy_scale(keyframe, motion, maps, state, pictures.intrinsics) or 1.0
+    )
     grid = torch.from_numpy(seed_grid(small.height, small.width, STRIDE))
     channels = torch.from_numpy(_resized(maps.labels, small))
     colors, pose = _picture(pictures.color(keyframe), small), torch.from_numpy(np.ascontiguousarray(motion))
@@ -75,16 +75,10 @@ def _seed_keyframe(
     return seeds.means, seeds.radii, seeds.opacities, seeds.colors, _class_picture(classes)
 
 
-def view_of(
-    frame_id: int,
-    cam_from_world: Array,
-    keyframes: list[int],
-    state: TrackState,
-    pictures: Pictures,
-    camera: Intrinsics,
-) -> View:
+def view_of(frame_id: int, cam_from_world: Array, keyframes: list[int], state: TrackState, pictures: Pictures) -> View:
     """The frame, its proxy depth scaled by the points it sees or, without enough of them, as the keyframes' is."""
-    small, maps = camera.at_most(WORKING_SIDE), pictures.proxy(frame_id)
+    camera, maps = pictures.intrinsics, pictures.proxy(frame_id)
+    small = camera.at_most(WORKING_SIDE)
     image = _picture(pictures.color(frame_id), small)
     if maps is None:
         nothing = torch.zeros(small.height, small.width)

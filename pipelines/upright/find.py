@@ -12,7 +12,6 @@ from pipelines.export.depth_views import depth_view
 from pipelines.outcome import Outcome, evenly
 from pipelines.proxy.regions.structure import Gravity, find_gravity, floor_plane, name_structure
 from pipelines.proxy.regions.voxels import Voxels, gather_frame, merge, select
-from pipelines.upright.cameras import cameras_up
 from pipelines.upright.lines import up_of_lines
 
 Array = NDArray[np.float64]
@@ -34,6 +33,18 @@ class Upright:
     told_by: str
     floor: Array | None
     against: dict[str, float] = field(default_factory=dict)
+
+
+def cameras_up(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3,) unit vector across the cameras' right axes, which people hold level, on the side of their upward axes.
+
+    world_from_cam (N, 4, 4), at least one.
+    """
+    right = world_from_cam[:, :3, 0]
+    # Alone, the mean upward axis leans as the cameras look down; the little weight settles what one direction of view
+    # leaves open.
+    up = np.linalg.solve(right.T @ right / len(right) + 0.01 * np.eye(3), -world_from_cam[:, :3, 1].mean(axis=0))
+    return np.asarray(up / max(float(np.linalg.norm(up)), 1e-12))
 
 
 def find_upright(outcome: Outcome) -> Upright:

@@ -32,7 +32,7 @@ _LEAST_CONTRAST = 3.0
 
 
 @dataclass(frozen=True)
-class Upright:
+class Vertical:
     """up (3,) unit vector in the world; `lines` within a degree of it, and the `contrast` of their length there to the
     length a degree farther out, where only chance brings lines."""
 
@@ -68,7 +68,7 @@ def line_planes(picture: NDArray[np.uint8], intrinsics: Intrinsics) -> tuple[Arr
 
 def up_of_lines(
     pictures: Iterable[NDArray[np.uint8]], cam_from_world: Array, intrinsics: Intrinsics, prior: Array
-) -> Upright:
+) -> Vertical:
     """Up by the lines of pictures at poses cam_from_world (N, 4, 4), near the unit vector `prior` (3,)."""
     found = [line_planes(picture, intrinsics) for picture in pictures]
     normals = np.concatenate(
@@ -77,10 +77,10 @@ def up_of_lines(
     return common_direction(normals, np.concatenate([np.zeros(0), *(w for _, w in found)]), prior)
 
 
-def common_direction(normals: Array, lengths: Array, prior: Array) -> Upright:
+def common_direction(normals: Array, lengths: Array, prior: Array) -> Vertical:
     """The direction near `prior` (3,) that lies in the most planes (L, 3), each counted by its length (L,)."""
     if len(normals) == 0:
-        return Upright(prior, 0, 0.0)
+        return Vertical(prior, 0, 0.0)
     candidates = _around(prior)
     off = np.degrees(np.arccos(np.clip(candidates @ prior, -1, 1)))
     votes = np.exp(-0.5 * ((candidates @ normals.T) / _sine(_COARSE_SD)) ** 2) @ lengths
@@ -90,7 +90,7 @@ def common_direction(normals: Array, lengths: Array, prior: Array) -> Upright:
     away = np.degrees(np.arcsin(np.clip(np.abs(normals @ up), 0, 1)))
     inside, ring = away < _INSIDE, (away > 3 * _INSIDE) & (away < 15 * _INSIDE)
     by_chance = float(lengths[ring].sum()) / 12 + 1e-9
-    return Upright(up, int(inside.sum()), float(lengths[inside].sum()) / by_chance)
+    return Vertical(up, int(inside.sum()), float(lengths[inside].sum()) / by_chance)
 
 
 def _refined(up: Array, normals: Array, lengths: Array, sd: float) -> Array:

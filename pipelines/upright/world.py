@@ -14,8 +14,7 @@ from pipelines.geometry.alignment import Similarity
 from pipelines.outcome import Outcome
 from pipelines.run_folder import WORLD, RunFolder
 from pipelines.stored import reading
-from pipelines.upright.cameras import cameras_up
-from pipelines.upright.find import Upright
+from pipelines.upright.find import Upright, cameras_up
 from pipelines.upright.georeference import Georeference
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ import pytest
 
 from formats.errors import InputError
 from pipelines.config import Config, config_to_dict, config_to_toml, load_config
-from pipelines.retired_settings import FIXED, GONE, MOVED
+from pipelines.earlier_versions import FIXED, GONE, MOVED
 
 
 @pytest.mark.parametrize("comments", [True, False])

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pipelines.evaluation.camera_paths import orbit, resampled, smoothed
-from pipelines.upright.cameras import cameras_up
+from pipelines.upright.find import cameras_up
 from tests.world import make_world, walk
 
 

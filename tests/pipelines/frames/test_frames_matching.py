@@ -13,7 +13,7 @@ import pytest
 from pipelines.correspondence import retrieval
 from pipelines.correspondence.database import write_database
 from pipelines.correspondence.features import extract_features
-from pipelines.correspondence.matching import MatchOptions, VerifiedPair, match_descriptors, verify_matches
+from pipelines.correspondence.matching import VerifiedPair, match_descriptors, verify_matches
 from pipelines.correspondence.retrieval import (
     Looks,
     describe,
@@ -23,7 +23,7 @@ from pipelines.correspondence.retrieval import (
     sequential_pairs,
 )
 from pipelines.correspondence.snapshots import Snapshots
-from pipelines.frames.keyframes import KeyframeOptions, choose_keyframes
+from pipelines.frames.keyframes import choose_keyframes
 from pipelines.structure.consistency import epipolar_error, judge, without_misplaced
 from pipelines.structure.parallax import rotation_residual
 from pipelines.types import Features
@@ -52,7 +52,7 @@ def test_matching_finds_a_planted_permutation() -> None:
     first = _descriptors(rng, 300)
     order = rng.permutation(300)
     noisy = np.clip(first[order].astype(int) + rng.integers(-2, 3, (300, 128)), 0, 255).astype(np.uint8)
-    matches = match_descriptors(first, noisy, MatchOptions())
+    matches = match_descriptors(first, noisy)
     assert len(matches) == 300
     np.testing.assert_array_equal(order[matches[:, 1]], matches[:, 0])
 
@@ -61,20 +61,19 @@ def test_matching_equals_its_definition() -> None:
     rng = np.random.default_rng(1)
     pool = _descriptors(rng, 150)
     first, second = pool[:100], np.concatenate([pool[60:], pool[70:80]])  # with repetitions, which must be refused
-    options = MatchOptions(max_ratio=0.9, max_angle=1.2)
     angle = np.arccos(np.clip(first.astype(float) @ second.astype(float).T / 512**2, 0, 1))
     expected = []
     for i in range(100):
         j, k = np.argsort(angle[i], kind="stable")[:2]
         if angle[i, j] < 1.2 and angle[i, j] < 0.9 * angle[i, k] and np.argmin(angle[:, j]) == i:
             expected.append((i, j))
-    assert match_descriptors(first, second, options).tolist() == [list(map(int, m)) for m in expected]
+    assert match_descriptors(first, second, 0.9, 1.2).tolist() == [list(map(int, m)) for m in expected]
     assert 20 < len(expected) < 40
 
 
 def test_too_few_descriptors_match_nothing() -> None:
     few = _descriptors(np.random.default_rng(0), 1)
-    assert len(match_descriptors(few, few, MatchOptions())) == 0
+    assert len(match_descriptors(few, few)) == 0
 
 
 def test_verification_drops_outliers_and_depends_on_the_seed_and_the_pair_alone() -> None:
@@ -83,14 +82,14 @@ def test_verification_drops_outliers_and_depends_on_the_seed_and_the_pair_alone(
     matches = np.stack([np.arange(200)] * 2, axis=1).astype(np.uint32)
     wrong = rng.permutation(200)[:60]
     matches[wrong, 1] = np.roll(matches[wrong, 1], 7)
-    found = verify_matches((0, 1), matches, (first, second), CAMERA, MatchOptions(), 0)
+    found = verify_matches((0, 1), matches, (first, second), CAMERA, 0)
     assert found is not None
     assert found.proposed == 200
     assert 120 <= len(found.matches) <= 150
     right = found.matches[:, 0] == found.matches[:, 1]
     assert right.mean() > 0.95
-    verify_matches((3, 4), matches, (second, first), CAMERA, MatchOptions(), 9)
-    again = verify_matches((0, 1), matches, (first, second), CAMERA, MatchOptions(), 0)
+    verify_matches((3, 4), matches, (second, first), CAMERA, 9)
+    again = verify_matches((0, 1), matches, (first, second), CAMERA, 0)
     assert again is not None
     np.testing.assert_array_equal(again.matches, found.matches)
     np.testing.assert_array_equal(again.matrices, found.matrices)
@@ -100,7 +99,7 @@ def test_unrelated_points_are_not_verified() -> None:
     rng = np.random.default_rng(0)
     xy = rng.uniform([0, 0], [WIDTH, HEIGHT], (2, 40, 2))
     matches = np.stack([np.arange(40)] * 2, axis=1).astype(np.uint32)
-    assert verify_matches((0, 1), matches, (xy[0], xy[1]), CAMERA, MatchOptions(max_error=1.0), 0) is None
+    assert verify_matches((0, 1), matches, (xy[0], xy[1]), CAMERA, 0) is None
 
 
 def test_epipolar_error_is_pycolmaps_sampson_error() -> None:
@@ -191,13 +190,13 @@ def _sliding(step: float, count: int) -> list[tuple[np.ndarray, None]]:
 
 def test_keyframes_follow_the_displacement() -> None:
     # 4.5 px a frame, a keyframe after more than 5 % of 320 px = 16 px: each fourth frame.
-    choice = choose_keyframes(_sliding(4.5, 20), KeyframeOptions(parallax=0.05, min_survivors=0.2))
+    choice = choose_keyframes(_sliding(4.5, 20), 0.05)
     assert choice.keyframes[:4] == [0, 4, 8, 12]
     assert choice.displacement[1:5] * WIDTH == pytest.approx([4.5, 9, 13.5, 18], abs=0.5)
 
 
 def test_no_displacement_gives_no_second_keyframe() -> None:
-    choice = choose_keyframes(_sliding(0.0, 8), KeyframeOptions())
+    choice = choose_keyframes(_sliding(0.0, 8), 0.05)
     assert choice.keyframes == [0]
     assert choice.largest_displacement < 0.001
 
@@ -205,7 +204,7 @@ def test_no_displacement_gives_no_second_keyframe() -> None:
 def test_unrelated_frames_are_all_keyframes() -> None:
     rng = np.random.default_rng(0)
     frames = [(cv2.resize(rng.integers(0, 255, (30, 40), dtype=np.uint8), (WIDTH, HEIGHT)), None) for _ in range(4)]
-    assert choose_keyframes(frames, KeyframeOptions()).keyframes == [0, 1, 2, 3]
+    assert choose_keyframes(frames, 0.05).keyframes == [0, 1, 2, 3]
 
 
 def test_snapshots_come_back_as_they_were_and_are_not_computed_twice(tmp_path: Path) -> None:

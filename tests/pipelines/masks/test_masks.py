@@ -15,7 +15,7 @@ from formats.images import read_rgb, write_grey_png, write_rgb
 from pipelines.config import ArticleConfig, MappingConfig, load_config
 from pipelines.correspondence.features import extract_features
 from pipelines.correspondence.flow import corners
-from pipelines.frames.keyframes import KeyframeOptions, choose_keyframes
+from pipelines.frames.keyframes import choose_keyframes
 from pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
 from pipelines.frames.source import open_source
 from pipelines.gaussians.adam import AdamTable
@@ -109,9 +109,9 @@ def test_features_corners_and_keyframes_keep_clear() -> None:
     assert (corners(grey, np.zeros((0, 2)), 50, left_out=left_half())[:, 0] > WIDTH // 2 - 4).all()
     # Only what is masked moves: by it alone every frame would be a keyframe.
     shown = [np.where(left_half(), np.roll(grey, 9 * i, 1), grey) for i in range(4)]
-    still = choose_keyframes([(g, left_half()) for g in shown], KeyframeOptions())
+    still = choose_keyframes([(g, left_half()) for g in shown], 0.05)
     assert still.largest_displacement < 0.01
-    assert choose_keyframes([(g, ~left_half()) for g in shown], KeyframeOptions()).largest_displacement > 0.05
+    assert choose_keyframes([(g, ~left_half()) for g in shown], 0.05).largest_displacement > 0.05
 
 
 def test_proxies_of_what_is_left_out_are_unknown() -> None:

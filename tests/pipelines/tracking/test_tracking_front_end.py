@@ -8,7 +8,7 @@ import pytest
 
 from pipelines.correspondence.features import extract_features
 from pipelines.correspondence.flow import corners, follow
-from pipelines.correspondence.matching import MatchOptions, match_descriptors
+from pipelines.correspondence.matching import match_descriptors
 from pipelines.geometry import se3
 from pipelines.geometry.camera import project
 from pipelines.tracking.extend import triangulate
@@ -113,13 +113,13 @@ def test_features_match_a_turned_picture_and_not_another() -> None:
     first = texture(3, (300, 300))
     turned = np.ascontiguousarray(np.rot90(first))
     a, b, other = (extract_features(x, 400, 0.005) for x in (first, turned, texture(4, (300, 300))))
-    pairs = match_descriptors(a.descriptors, b.descriptors, MatchOptions())
+    pairs = match_descriptors(a.descriptors, b.descriptors)
     # (x, y) goes to (y, 300 - x) in a picture turned to the left.
     wanted = np.stack([a.xy[pairs[:, 0], 1], 300 - a.xy[pairs[:, 0], 0]], 1)
     close = np.linalg.norm(wanted - b.xy[pairs[:, 1]], axis=1) < 1.5
     assert len(pairs) > 100
     assert close.mean() > 0.95
-    assert len(match_descriptors(a.descriptors, other.descriptors, MatchOptions())) < 0.1 * len(pairs)
+    assert len(match_descriptors(a.descriptors, other.descriptors)) < 0.1 * len(pairs)
 
 
 def test_state_comes_back_from_disk(tmp_path: Path) -> None:

@@ -26,6 +26,8 @@ def picture() -> np.ndarray:
 class OnePicture:
     """Every frame shows the same."""
 
+    intrinsics = CAMERA
+
     def __init__(self) -> None:
         self._features = extract_features(picture(), 400, 0.005)
 
@@ -57,7 +59,7 @@ def test_a_frame_is_posed_only_where_the_answer_is_unique(places: list[np.ndarra
     state = TrackState()
     for n, place in enumerate(places):
         add_place(state, 10 + 40 * n, place)
-    seen, solved = relocalise(30, state, OnePicture(), CAMERA, 0)  # type: ignore[arg-type]
+    seen, solved = relocalise(30, state, OnePicture(), 0)  # type: ignore[arg-type]
     assert len(seen) > 100
     assert (solved is not None) == found
     if solved is not None:
