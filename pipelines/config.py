@@ -66,9 +66,6 @@ class FramesConfig:
         0.025, "a new keyframe when points have moved by this fraction of the image width", within=(0.001, 0.5)
     )
     max_features: int = setting(3000, "SIFT features of a keyframe, at most about this many", within=(50, 100_000))
-    peak_threshold: float = setting(
-        0.004, "contrast of the weakest feature; lower finds more on plain walls", within=(0.0001, 0.1)
-    )
     overlap: int = setting(
         8, "each keyframe is matched with this many after it (and a few further ones)", within=(1, 1000)
     )
@@ -171,7 +168,6 @@ class GlobalBaConfig:
     loop_gap: int = setting(8, "a loop joins keyframes at least this many apart", within=(1, 1_000_000))
     loop_candidates: int = setting(2, "candidates a keyframe", within=(1, 1000))
     loop_appearance: float = setting(0.02, "least appearance similarity of a candidate", within=(-1, 1))
-    loop_inliers: int = setting(25, "least agreeing features of a loop, in both directions", within=(4, 100_000))
     joint: str = setting("moved", "refine map and poses together", ("moved", "always", "never"))
     joint_passes: float = setting(4.0, "how often each keyframe is visited then", within=(0, 1000))
 

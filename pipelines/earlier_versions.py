@@ -24,7 +24,7 @@ MOVED = {
 """Old name → the one that decides it now."""
 
 _FIXED = {
-    "frames": "max_match_error",
+    "frames": "max_match_error peak_threshold",
     "proxy": "alpha beta gamma theta_slope theta_middle",
     "tracking": "flow_window flow_levels flow_error flow_sd feature_sd pose_error min_inliers new_points "
     "keyframe_share relocalise_candidates silhouette color_weight render_loss depth_sd grid_rows grid_columns "
@@ -36,7 +36,7 @@ _FIXED = {
     "reliability_decay region_prior",
     "global_ba": "features words loop_shared_points richness loop_similarity miou_weight appearance_weight "
     "structure_weight loop_error loop_share loop_sure_inliers loop_rotation loop_translation loop_drift "
-    "loop_angle_drift loop_scale_drift drift_px joint_px",
+    "loop_angle_drift loop_scale_drift loop_inliers drift_px joint_px",
     "export": "truncation least_weight",
 }
 FIXED = frozenset(f"{section}.{name}" for section, names in _FIXED.items() for name in names.split())

@@ -17,13 +17,20 @@ from pipelines.types import Features, require_shape
 _of_thread = threading.local()
 
 
+PEAK_THRESHOLD = 0.004
+"""Contrast of the weakest feature; lower finds more on plain walls."""
+
+
 def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """(H, W, 3) RGB -> (H, W) grey."""
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def extract_features(
-    grey: NDArray[np.uint8], count: int, threshold: float, left_out: NDArray[np.bool_] | None = None
+    grey: NDArray[np.uint8],
+    count: int,
+    left_out: NDArray[np.bool_] | None = None,
+    threshold: float = PEAK_THRESHOLD,
 ) -> Features:
     """SIFT features (Lowe 2004) of an (H, W) picture, at most about `count`, as RootSIFT (Arandjelović and Zisserman,
     CVPR 2012).

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.config import GlobalBaConfig, TrackingConfig
+from pipelines.config import TrackingConfig
 from pipelines.geometry import se3
 from pipelines.global_ba.pose_graph import Edges, optimise_pose_graph
 from pipelines.global_ba.verify import Loop
 from pipelines.tracking.adjust import LoadProxy, Report, adjust_state
+from pipelines.tracking.bundle import reprojection_errors
 from pipelines.tracking.state import Sightings, TrackState
 from pipelines.types import Intrinsics
 
@@ -38,13 +39,12 @@ def close_loops(
     load_proxy: LoadProxy,
     metric: bool,
     tracking: TrackingConfig,
-    settings: GlobalBaConfig,
 ) -> Closed:
     """Adjust `state` (changed in place) with the loops."""
     before = reprojection_error(state, intrinsics)
     original = {i: s for i, s in state.sightings.items()}
     if drifted:
-        straighten(state, loops, settings)
+        straighten(state, loops)
     add_sightings(state, loops)
     report = adjust_state(state, intrinsics, load_proxy, metric, tracking)
     after = reprojection_error(state, intrinsics, original)
@@ -57,11 +57,8 @@ def reprojection_error(
     """Median over the sightings (the state's, or those given), in pixels."""
     errors = []
     for frame_id, seen in sorted((sightings or state.sightings).items()):
-        motion = state.poses[frame_id]
-        x, y, z = (state.points[seen.point] @ motion[:3, :3].T + motion[:3, 3]).T
-        z = np.where(z > 0, z, np.nan)
-        u, v = intrinsics.fx * x / z + intrinsics.cx, intrinsics.fy * y / z + intrinsics.cy
-        errors.append(np.nan_to_num(np.hypot(u - seen.xy[:, 0], v - seen.xy[:, 1]), nan=1e3))
+        in_cam = se3.transform(state.poses[frame_id], state.points[seen.point])
+        errors.append(reprojection_errors(in_cam, seen.xy, intrinsics))
     return float(np.median(np.concatenate(errors)))
 
 
@@ -73,13 +70,13 @@ def add_sightings(state: TrackState, loops: Sequence[Loop]) -> None:
             state.sightings[frame_id] = seen.joined(extra.select(~np.isin(extra.point, seen.point)))
 
 
-def straighten(state: TrackState, loops: Sequence[Loop], settings: GlobalBaConfig) -> None:
+def straighten(state: TrackState, loops: Sequence[Loop]) -> None:
     """Spread the drift over the keyframes by a pose graph; points move with the first keyframe that sees them."""
     ids = state.keyframes
     place = {frame_id: n for n, frame_id in enumerate(ids)}
     old = np.array([state.poses[i] for i in ids])
     depth = np.array([state.median_depth(i) for i in ids])
-    edges = _edges(old, depth, loops, place, settings)
+    edges = _edges(old, depth, loops, place)
     new, scales = optimise_pose_graph(old, np.ones(len(ids)), edges)
     _move_points(state, ids, old, new, scales)
     for n, frame_id in enumerate(ids):
@@ -88,7 +85,7 @@ def straighten(state: TrackState, loops: Sequence[Loop], settings: GlobalBaConfi
         state.poses[frame_id] = rigid
 
 
-def _edges(poses: Array, depth: Array, loops: Sequence[Loop], place: dict[int, int], settings: GlobalBaConfig) -> Edges:
+def _edges(poses: Array, depth: Array, loops: Sequence[Loop], place: dict[int, int]) -> Edges:
     """Each keyframe to the next two, and the loops."""
     n = len(poses)
     chain = [(i, i + step) for step in (1, 2) for i in range(n - step)]

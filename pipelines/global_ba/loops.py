@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.tensors import load_arrays, save_arrays
-from pipelines.config import GlobalBaConfig
 from pipelines.geometry import se3
 from pipelines.global_ba.verify import ROTATION, TRANSLATION, KeyframeView, Loop, verify_loop
 from pipelines.tracking.state import Sightings
@@ -39,7 +38,6 @@ def find_loops(
     pairs: Iterable[tuple[int, int]],
     views: Sequence[KeyframeView],
     intrinsics: Intrinsics,
-    settings: GlobalBaConfig,
     seed: int,
 ) -> FoundLoops:
     """Verify candidate pairs of keyframe indices.
@@ -53,7 +51,7 @@ def find_loops(
     tried = implausible = unverified = 0
     for first, second in pairs:
         tried += 1
-        loop = verify_loop(views[first], views[second], intrinsics, settings, seed)
+        loop = verify_loop(views[first], views[second], intrinsics, seed)
         if loop is None:
             unverified += 1
         elif not is_plausible(loop, views[first], views[second], float(path[second] - path[first])):
@@ -63,7 +61,7 @@ def find_loops(
     supported = {
         pair: loop
         for pair, loop in verified.items()
-        if loop.edge.inliers >= SURE_INLIERS or _has_support(pair, loop, verified, views, intrinsics, settings, seed)
+        if loop.edge.inliers >= SURE_INLIERS or _has_support(pair, loop, verified, views, intrinsics, seed)
     }
     return FoundLoops(list(supported.values()), tried, unverified, implausible, len(verified) - len(supported))
 
@@ -98,7 +96,6 @@ def _has_support(
     verified: dict[tuple[int, int], Loop],
     views: Sequence[KeyframeView],
     intrinsics: Intrinsics,
-    settings: GlobalBaConfig,
     seed: int,
 ) -> bool:
     """Whether a neighbouring pair is verified too and puts the keyframes in the same places."""
@@ -107,7 +104,7 @@ def _has_support(
     known = [p for p in near if p in verified]
     fresh = [(first + 1, second), (first, second - 1), (first - 1, second), (first, second + 1)]
     for other in known + [p for p in fresh if p not in verified and 0 <= p[0] < p[1] < len(views)]:
-        candidate = verified.get(other) or verify_loop(views[other[0]], views[other[1]], intrinsics, settings, seed)
+        candidate = verified.get(other) or verify_loop(views[other[0]], views[other[1]], intrinsics, seed)
         if candidate is not None and _agree(loop, pair, candidate, other, views):
             return True
     return False

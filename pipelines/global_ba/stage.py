@@ -91,7 +91,7 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
     refused = {pair for pair, matches in run.load_tried().items() if matches == 0}
     pairs = loop_candidates(model, Looks(tuple(kinds)), load_summaries(run, model), refused, settings)
     tracked = context.progress.track(pairs, "loops", len(pairs))
-    found = find_loops(tracked, views, run.load_calibration().intrinsics, settings, seed)
+    found = find_loops(tracked, views, run.load_calibration().intrinsics, seed)
     save_found(snapshot, found)
     return found
 
@@ -134,7 +134,7 @@ def adjust(context: StageContext, model: SparseModel, found: FoundLoops) -> Clos
     metric = bool(report.get("metric", False))
     tracking = without_dependent_depth(config.tracking, report)
     drifted = drift > DRIFT_PX
-    closed = close_loops(state, found.loops, drifted, intrinsics, run.find_proxy, metric, tracking, config.global_ba)
+    closed = close_loops(state, found.loops, drifted, intrinsics, run.find_proxy, metric, tracking)
     if closed.error_after > 1.5 * closed.error_before + 0.05:
         context.warn(
             f"{len(found.loops)} loops were refused: with them the reprojection error of what was known before rises "

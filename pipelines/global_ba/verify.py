@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pipelines.config import GlobalBaConfig
 from pipelines.correspondence.matching import match_descriptors
 from pipelines.geometry import se3
 from pipelines.geometry.camera import unproject
@@ -21,8 +20,8 @@ Array = NDArray[np.float64]
 
 ERROR = 4.0
 """Pixels within which a feature agrees with a loop."""
-SHARE = 0.3
-"""Least share of agreeing features."""
+INLIERS, SHARE = 25, 0.3
+"""Least number and share of agreeing features, in both directions."""
 ROTATION, TRANSLATION = 2.0, 0.05
 """By how much a loop's two directions may differ: degrees, and distance in units of the median depth."""
 
@@ -68,13 +67,11 @@ def make_view(
     return KeyframeView(frame_id, cam_from_world, features, point, in_cam)
 
 
-def verify_loop(
-    first: KeyframeView, second: KeyframeView, intrinsics: Intrinsics, settings: GlobalBaConfig, seed: int
-) -> Loop | None:
+def verify_loop(first: KeyframeView, second: KeyframeView, intrinsics: Intrinsics, seed: int) -> Loop | None:
     """The loop, if both directions find enough inliers, the same motion and a believable scale."""
     pairs = match_descriptors(first.features.descriptors, second.features.descriptors)
-    forward = _locate(first, pairs[:, 0], second, pairs[:, 1], intrinsics, settings, seed)
-    backward = _locate(second, pairs[:, 1], first, pairs[:, 0], intrinsics, settings, seed)
+    forward = _locate(first, pairs[:, 0], second, pairs[:, 1], intrinsics, seed)
+    backward = _locate(second, pairs[:, 1], first, pairs[:, 0], intrinsics, seed)
     if forward is None or backward is None:
         return None
     scale = _relative_scale(first, second, pairs, forward)
@@ -108,16 +105,15 @@ def _locate(
     target: KeyframeView,
     target_index: NDArray[np.integer],
     intrinsics: Intrinsics,
-    settings: GlobalBaConfig,
     seed: int,
 ) -> FramePose | None:
     """target_from_source by PnP, its inliers over all pairs; None when too few agree or they crowd in one spot."""
     known = np.isfinite(source.in_cam[source_index, 2])
-    if known.sum() < settings.loop_inliers:
+    if known.sum() < INLIERS:
         return None
     xy = target.features.xy[target_index]
     solved = solve_pose(xy[known], source.in_cam[source_index[known]], intrinsics, seed, None, ERROR, 1.0)
-    if solved is None or solved.inliers.sum() < max(settings.loop_inliers, SHARE * known.sum()):
+    if solved is None or solved.inliers.sum() < max(INLIERS, SHARE * known.sum()):
         return None
     inliers = np.zeros(len(xy), bool)
     inliers[known] = solved.inliers

@@ -173,8 +173,7 @@ class StructureFromMotion:
 
     def _features(self, keyframe_ids: Sequence[int]) -> list[Features]:
         def extract(frame_id: int) -> Features:
-            grey, left_out = self.load_gray(frame_id), self.left_out(frame_id)
-            return extract_features(grey, self.config.max_features, self.config.peak_threshold, left_out)
+            return extract_features(self.load_gray(frame_id), self.config.max_features, self.left_out(frame_id))
 
         def stored(frame_id: int) -> Features:
             return self.snapshots.features(frame_id, lambda: extract(frame_id))

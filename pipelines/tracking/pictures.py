@@ -77,8 +77,7 @@ class Pictures:
         kept = self.run.load_features(frame_id)
         if kept is not None:
             return kept
-        count, threshold = self.settings.max_features, self.settings.peak_threshold
-        return extract_features(self.grey(frame_id), count, threshold, self.left_out(frame_id))
+        return extract_features(self.grey(frame_id), self.settings.max_features, self.left_out(frame_id))
 
     def descriptor(self, frame_id: int) -> NDArray[np.float32]:
         """How the frame looks, for retrieval."""

@@ -14,7 +14,7 @@ from pipelines.run_folder import save_features, save_matching
 
 def keep_correspondences(folder: Path, pictures: Mapping[int, np.ndarray]) -> None:
     """Features of these keyframes (RGB), their vocabulary, and that no pair of them was tried."""
-    features = {i: extract_features(to_grey(rgb), 1500, 0.005) for i, rgb in pictures.items()}
+    features = {i: extract_features(to_grey(rgb), 1500, threshold=0.005) for i, rgb in pictures.items()}
     for frame_id, found in features.items():
         save_features(folder, frame_id, found)
     save_matching(folder, learn_vocabulary(list(features.values()), 0), {})

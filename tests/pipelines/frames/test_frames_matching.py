@@ -137,7 +137,7 @@ def test_sequential_pairs_reach_every_neighbour_and_no_pair_twice() -> None:
 def test_a_revisit_is_found_by_appearance() -> None:
     poses = list(sideways(8))
     views = [render(*p) for p in [*poses, *poses[1:3]]]
-    features = [extract_features(cv2.cvtColor(v, cv2.COLOR_RGB2GRAY), 400, 0.004) for v in views]
+    features = [extract_features(cv2.cvtColor(v, cv2.COLOR_RGB2GRAY), 400) for v in views]
     vocabulary = learn_vocabulary(features, seed=0)
     descriptors = np.stack([describe(f, vocabulary) for f in features])
     np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, rtol=1e-5)
@@ -169,15 +169,15 @@ def test_retrieval_stands_frames_without_features() -> None:
 
 
 def test_features_of_a_blank_image_are_none() -> None:
-    assert len(extract_features(np.full((100, 120), 128, np.uint8), 400, 0.004)) == 0
+    assert len(extract_features(np.full((100, 120), 128, np.uint8), 400)) == 0
 
 
 def test_features_are_one_a_place_and_none_is_in_the_mask() -> None:
     grey = cv2.cvtColor(render(*next(iter(sideways(2)))), cv2.COLOR_RGB2GRAY)
-    all_of_it = extract_features(grey, 400, 0.004)
+    all_of_it = extract_features(grey, 400)
     assert len(np.unique(all_of_it.keypoints[:, :3], axis=0)) == len(all_of_it) > 100
     right = np.arange(WIDTH)[None].repeat(HEIGHT, 0) >= WIDTH // 2
-    masked = extract_features(grey, 400, 0.004, right)
+    masked = extract_features(grey, 400, right)
     assert 50 < len(masked) < len(all_of_it)
     assert masked.xy[:, 0].max() < WIDTH // 2
 

@@ -50,7 +50,7 @@ class Walk:
         return loop_candidates(self.model, looks, nothing, refused, SETTINGS)
 
     def find(self) -> FoundLoops:
-        return find_loops(self.pairs(), self.views(), CAMERA, SETTINGS, 0)
+        return find_loops(self.pairs(), self.views(), CAMERA, 0)
 
 
 def circle_poses(count: int, laps: float) -> Array:
@@ -138,7 +138,7 @@ def test_candidates_are_revisits() -> None:
 def test_verified_loop_has_the_true_motion() -> None:
     walk = make_walk(drift=0.002, scale_drift=0.003)
     views = walk.views()
-    loop = verify_loop(views[2], views[37], CAMERA, SETTINGS, 0)
+    loop = verify_loop(views[2], views[37], CAMERA, 0)
     assert loop is not None
     truth = walk.truth[37] @ se3.inverse(walk.truth[2])
     apart = se3.log(loop.edge.frame2_from_frame1 @ se3.inverse(truth))
@@ -149,7 +149,7 @@ def test_verified_loop_has_the_true_motion() -> None:
 
 def test_places_without_overlap_are_not_verified() -> None:
     views = make_walk().views()
-    assert verify_loop(views[2], views[20], CAMERA, SETTINGS, 0) is None
+    assert verify_loop(views[2], views[20], CAMERA, 0) is None
 
 
 @pytest.mark.parametrize(("drift", "growth"), [(0.0, 0.0), (0.0015, 0.001), (-0.001, -0.002)])
@@ -159,7 +159,7 @@ def test_closing_takes_the_drift_away(drift: float, growth: float) -> None:
     assert len(found.loops) >= 3
     state = TrackState.from_backbone(walk.model, 0.5)
     before = error(walk.model.cam_from_world, walk.truth)
-    closed = close_loops(state, found.loops, drift != 0, CAMERA, lambda _: None, False, TrackingConfig(), SETTINGS)
+    closed = close_loops(state, found.loops, drift != 0, CAMERA, lambda _: None, False, TrackingConfig())
     after = error(np.array([state.poses[k] for k in range(40)]), walk.truth)
     assert 0 < after < 0.004
     assert drift == 0 or before > 0.015
@@ -170,10 +170,10 @@ def test_equal_texture_on_the_far_side_is_no_loop() -> None:
     walk = make_walk(twins=True)
     views = walk.views()
     # The pair matches and verifies: appearance and local geometry cannot know better.
-    trap = verify_loop(views[2], views[20], CAMERA, SETTINGS, 0)
+    trap = verify_loop(views[2], views[20], CAMERA, 0)
     assert trap is not None
     assert trap.edge.inliers > 50
-    found = find_loops([(2, 20), (3, 21), (4, 22), (2, 37), (3, 38)], views, CAMERA, SETTINGS, 0)
+    found = find_loops([(2, 20), (3, 21), (4, 22), (2, 37), (3, 38)], views, CAMERA, 0)
     assert found.implausible == 3
     assert {(x.edge.frame1_id, x.edge.frame2_id) for x in found.loops} == {(2, 37), (3, 38)}
 
@@ -181,10 +181,10 @@ def test_equal_texture_on_the_far_side_is_no_loop() -> None:
 def test_a_weak_loop_needs_a_neighbour_that_agrees(monkeypatch: pytest.MonkeyPatch) -> None:
     walk = make_walk()
     monkeypatch.setattr(loops, "SURE_INLIERS", 10**6)
-    assert len(find_loops([(2, 37)], walk.views(), CAMERA, SETTINGS, 0).loops) == 1
+    assert len(find_loops([(2, 37)], walk.views(), CAMERA, 0).loops) == 1
     monkeypatch.setattr(loops, "ROTATION", 1e-4)
     monkeypatch.setattr(loops, "TRANSLATION", 1e-5)
-    found = find_loops([(2, 37)], walk.views(), CAMERA, SETTINGS, 0)
+    found = find_loops([(2, 37)], walk.views(), CAMERA, 0)
     assert (len(found.loops), found.unsupported) == (0, 1)
 
 

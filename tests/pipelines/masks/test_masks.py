@@ -103,7 +103,7 @@ def test_changed_masks_are_seen(pictures: Path, tmp_path: Path) -> None:
 
 def test_features_corners_and_keyframes_keep_clear() -> None:
     grey = np.asarray(cv2.cvtColor(noise(), cv2.COLOR_RGB2GRAY), np.uint8)
-    found, kept = (extract_features(grey, 500, 0.004, mask) for mask in (None, left_half()))
+    found, kept = (extract_features(grey, 500, mask) for mask in (None, left_half()))
     assert 5 < len(kept) < len(found)
     assert (kept.xy[:, 0] >= WIDTH // 2 - 1).all()
     assert (corners(grey, np.zeros((0, 2)), 50, left_out=left_half())[:, 0] > WIDTH // 2 - 4).all()

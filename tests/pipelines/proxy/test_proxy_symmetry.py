@@ -71,7 +71,7 @@ def walk(symmetric: bool, count: int = 8) -> tuple[Sequence, list[DepthEstimate]
 
 
 def features(sequence: Sequence, frame: Frame) -> Features:
-    return extract_features(to_grey(sequence.image(frame)), 1500, 0.005)
+    return extract_features(to_grey(sequence.image(frame)), 1500, threshold=0.005)
 
 
 def search(sequence: Sequence, estimates: list[DepthEstimate]) -> list[MirrorPlane]:

@@ -29,7 +29,7 @@ class OnePicture:
     intrinsics = CAMERA
 
     def __init__(self) -> None:
-        self._features = extract_features(picture(), 400, 0.005)
+        self._features = extract_features(picture(), 400, threshold=0.005)
 
     def features(self, frame_id: int) -> Any:
         return self._features
