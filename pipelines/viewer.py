@@ -105,10 +105,14 @@ class Viewer:
         if self.scene.cameras:
             world_from_cam = self.scene.cameras[0].world_from_cam
             return world_from_cam[:3, 3] * self.scene.scale, world_from_cam[:3, 2]
-        return self._outside(), np.array([0.0, 2.0, 7.0]) / np.sqrt(53)
+        outside, middle = self._outside()
+        return outside, (middle - outside) / np.linalg.norm(middle - outside)
 
-    def _outside(self) -> NDArray[np.float64]:
-        return np.asarray(np.median(self.scene.centers, axis=0) + np.array([0.0, -2.0, -7.0]), np.float64)
+    def _outside(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where to look from at a scene without cameras, and where to: in front of it and a little above."""
+        middle, up = np.median(self.scene.centers, axis=0).astype(np.float64), self.scene.up
+        ahead = np.array([0.0, 1, 0]) if abs(up[2]) > 0.5 else np.array([0.0, 0, 1])
+        return middle + 2 * up - 7 * ahead, middle
 
     def wait(self) -> None:
         """Until the process is interrupted."""
@@ -209,8 +213,7 @@ class Viewer:
                 client.camera.position = position - 0.9 * forward + 0.5 * self.scene.up
                 client.camera.look_at = position + 1.5 * forward
             return
-        client.camera.position = self._outside()
-        client.camera.look_at = np.median(self.scene.centers, axis=0)
+        client.camera.position, client.camera.look_at = self._outside()
 
     def _add_path(self) -> Any:
         if len(self.scene.path) < 2:

@@ -20,9 +20,9 @@ from pipelines.export.writers import map_cloud
 from pipelines.gaussian_map import decided_channels
 from pipelines.outcome import Outcome, evenly, labels_of_channels, load_outcome
 from pipelines.proxy.palette import class_colors
-from pipelines.run_folder import MESH, RunFolder
+from pipelines.run_folder import MESH, WORLD, RunFolder
 from pipelines.types import Frame, Metres
-from pipelines.upright.world import load_world, up_in_run
+from pipelines.upright.world import load_world, read_world, up_in_run
 
 MODES = ("colour", "classes", "depth")
 MOST_CAMERAS = 60
@@ -154,11 +154,18 @@ def _from_file(path: Path) -> ViewerScene:
         title=path.name,
         cloud=cloud,
         scale=_scale(cloud.means, np.zeros((0, 3))),
-        up=np.array([0.0, -1.0, 0.0]),
+        up=_up_of_file(path),
         labels=cloud.class_ids,
         class_names=tuple(f"class {i}" for i in range(classes)),
         class_colors=class_colors(classes),
     )
+
+
+def _up_of_file(path: Path) -> NDArray[np.float64]:
+    """z in a PLY of this program's export, as world.json beside it says; else y points down, as in most splat files."""
+    world = path.with_name(WORLD)
+    stands = path.suffix in (".ply", ".safetensors") and world.is_file() and read_world(world).axes == "up"
+    return np.array([0.0, 0, 1] if stands else [0.0, -1, 0])
 
 
 def _scale(means: NDArray, centers: NDArray) -> float:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from formats.gaussian_ply import write_gaussian_ply
 from pipelines.types import VOID
@@ -19,6 +20,8 @@ from pipelines.viewer_tape import Touch, tape, tape_text, touch
 _SETTLE_SECONDS = 0.25
 """A slider is dragged through many values; the map is sent again once it rests."""
 _RED = (220, 38, 38)
+_LIFT = 0.06
+"""Of the scene as shown, which is about five long."""
 
 
 class Selection:
@@ -112,7 +115,11 @@ class Selection:
 
 
 class Tape:
-    """Two clicks (or taps) on the map: a line with the distance and its standard deviation."""
+    """Two clicks on the map: a line with the distance and its standard deviation.
+
+    viser 1.1 takes no finger's tap on the scene for a click (a touched canvas holds its pointer from the start), so a
+    button marks what is in the middle of the view.
+    """
 
     def __init__(self, server: Any, scene: ViewerScene, selection: Selection) -> None:
         self._server, self._scene, self._selection = server, scene, selection
@@ -120,17 +127,27 @@ class Tape:
         self.result = ""
         with server.gui.add_folder("Measure"):
             self.switch = server.gui.add_checkbox("Measuring tape", False, hint="Click two places of the map")
+            self._middle = server.gui.add_button(
+                "Mark the middle", hint="Instead of a click; for fingers", visible=False
+            )
             self.told = server.gui.add_markdown("")
+        self._middle.on_click(lambda event: self.mark_middle(event.client))
         self.switch.on_update(lambda _: self._turn(bool(self.switch.value)))
 
     def click(self, event: Any) -> None:
-        """A place that the event's line of sight meets: the first end of the tape, or the second."""
-        origin = np.asarray(event.ray_origin, np.float64) / self._scene.scale
-        direction = np.asarray(event.ray_direction, np.float64)
-        camera = event.client.camera
-        pixel = float(camera.fov) / max(int(camera.image_height), 1)
+        """A place that the event's line of sight meets."""
+        self._place(np.asarray(event.ray_origin, np.float64), np.asarray(event.ray_direction, np.float64), event.client)
+
+    def mark_middle(self, client: Any) -> None:
+        """What is in the middle of the client's view."""
+        turn = Rotation.from_quat(np.asarray(client.camera.wxyz)[[1, 2, 3, 0]]).as_matrix()
+        self._place(np.asarray(client.camera.position, np.float64), turn[:, 2], client)
+
+    def _place(self, origin: NDArray[np.float64], direction: NDArray[np.float64], client: Any) -> None:
+        """The first end of the tape, or the second."""
+        pixel = float(client.camera.fov) / max(int(client.camera.image_height), 1)
         cloud = self._scene.cloud.only(self._selection.rows)
-        found = touch(cloud, origin, direction / np.linalg.norm(direction), pixel)
+        found = touch(cloud, origin / self._scene.scale, direction / np.linalg.norm(direction), pixel)
         if found is None:
             self.told.content = "Nothing is there: click on the map."
         elif self._first is None:
@@ -145,6 +162,7 @@ class Tape:
     def _turn(self, on: bool) -> None:
         self._server.scene.remove_click_callback()
         self._server.scene.remove_by_name("/tape")
+        self._middle.visible = on
         self._first, self.result, self.told.content = None, "", "Click two places of the map." if on else ""
         if on:
             self._server.scene.on_click()(self.click)
@@ -153,7 +171,8 @@ class Tape:
         length, sd = tape(first, second)
         self.result = tape_text(length, sd, self._scene.is_metric, self._scene.metres)
         self.told.content = f"**{self.result}**"
-        ends = np.stack([first.point, second.point]).astype(np.float32) * np.float32(self._scene.scale)
+        # A little towards the eye, else what it is stretched over covers it.
+        ends = np.stack([t.point * self._scene.scale - _LIFT * t.direction for t in (first, second)]).astype(np.float32)
         scene = self._server.scene
         scene.add_line_segments("/tape/line", ends[None], _RED, thickness=3.0, thickness_units="screen")
         scene.add_label("/tape/text", self.result, position=ends.mean(axis=0))

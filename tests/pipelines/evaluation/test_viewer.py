@@ -116,10 +116,10 @@ class Page:
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
-    def tap(self, x: float, y: float) -> None:
-        """With a finger."""
-        self.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
-        self.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+    def press(self, words: str) -> None:
+        """The button with these words, as a finger or a mouse would."""
+        button = f"[...document.querySelectorAll('button')].find(b => b.innerText.includes({words!r}))"
+        self.call("Runtime.evaluate", expression=f"{button}.click()")
 
     def wait_for(self, seen: Callable[[NDArray[np.uint8]], bool], seconds: float = 240) -> NDArray[np.uint8]:
         end = time.monotonic() + seconds
@@ -176,7 +176,7 @@ def until(happened: Callable[[], object]) -> None:
 
 
 def measure(page: Page, viewer: Any, truth: Sequence) -> tuple[float, float]:
-    """What the tape says after a click and a tap in the first camera's view, and the true distance."""
+    """What the tape says after a click and a press on its button in the first camera's view, and the true distance."""
     client = next(iter(viewer.server.get_clients().values()))
     width, height = page.canvas()
     focal, camera, depth = height / 2 / np.tan(client.camera.fov / 2), truth.camera, truth.depth(0)
@@ -185,12 +185,13 @@ def measure(page: Page, viewer: Any, truth: Sequence) -> tuple[float, float]:
     places = []
     viewer.tape.switch.value = True
     time.sleep(1)
-    for touch, x in ((page.click, 0.45), (page.tap, 0.56)):
-        touch(x * width, 0.55 * height)
-        ray = np.array([(x - 0.5) * width / focal, 0.05 * height / focal, 1.0])
-        u, v = int(camera.fx * ray[0] + camera.cx), int(camera.fy * ray[1] + camera.cy)
+    for x in (0.45, 0.5):
+        ray = np.array([(x - 0.5) * width / focal, 0.0, 1.0])
+        u, v = int(camera.fx * ray[0] + camera.cx), int(camera.cy)
         places.append(depth[v, u] * ray)
-        until(lambda: viewer.tape.told.content != "Click two places of the map.")
+    page.click(0.45 * width, 0.5 * height)
+    until(lambda: viewer.tape.told.content == "And the second place.")
+    page.press("Mark the middle")
     until(lambda: viewer.tape.result)
     return float(viewer.tape.result.split()[0]), float(np.linalg.norm(places[1] - places[0]))
 
