@@ -16,6 +16,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 from formats.errors import InputError
 from msgs_cli import looking
 from msgs_cli.ablating import ablate
+from msgs_cli.batch import batch
 from msgs_cli.doctor import doctor
 from msgs_cli.json_lines import JsonError
 from msgs_cli.models import models
@@ -23,6 +24,7 @@ from msgs_cli.options import (
     FOLDER,
     LOG_FORMAT,
     RUN_ARGUMENT,
+    UNTIL,
     make_progress,
     open_run,
     set_up_logging,
@@ -33,7 +35,7 @@ from msgs_cli.options import (
     verbosity_options,
 )
 from msgs_cli.text import flush_output, prepare_streams, printable, say
-from pipelines.run_folder_names import EXPORTS, STAGES
+from pipelines.run_folder_names import EXPORTS
 
 
 class FriendlyGroup(click.Group):
@@ -73,6 +75,7 @@ def main() -> None:
     msgs-slam demo                      try it on a small synthetic room (under 3 minutes)
     msgs-slam reconstruct video.mp4     the whole job; writes video.msgs/
     msgs-slam resume video.msgs         go on after a stop
+    msgs-slam batch FOLDER --out RUNS   many recordings, on one machine or many
     msgs-slam status video.msgs         what is done, what was found
     msgs-slam export video.msgs         write the export files again, or elsewhere
     msgs-slam report video.msgs         one HTML page: what was found, how good, what to film better
@@ -85,9 +88,6 @@ def main() -> None:
     msgs-slam config                    every setting with its default and meaning
     """
     prepare_streams()
-
-
-UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], help="Stop after this stage.")
 
 
 @main.command()
@@ -275,6 +275,7 @@ for command in (looking.evaluate, looking.report, looking.render, looking.view):
     main.add_command(command)
 main.add_command(models)
 main.add_command(ablate)
+main.add_command(batch)
 main.add_command(doctor)
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ import click
 
 from msgs_cli.json_lines import JsonHandler, JsonProgress
 from msgs_cli.text import PrintableFormatter, say
+from pipelines.run_folder_names import STAGES
 
 if TYPE_CHECKING:
     from pipelines.progress import Progress
@@ -24,6 +26,7 @@ FOLDER = click.Path(path_type=Path, file_okay=False)
 RUN_ARGUMENT = click.argument("run_path", metavar="RUN", type=FOLDER)
 
 
+UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], help="Stop after this stage.")
 LOG_FORMAT = "msgs_cli.log_format"
 
 
@@ -120,25 +123,43 @@ def _toml_string(text: str) -> str:
     return f'"{escaped}"'
 
 
-def set_up_logging(quiet: bool, verbose: bool) -> None:
-    """Logs go to stderr: warnings, or everything, or errors only."""
+def set_up_logging(quiet: bool, verbose: bool, as_json: bool | None = None) -> None:
+    """Logs go to stderr: warnings, or everything, or errors only; as the command line asks, or `as_json`."""
     if quiet and verbose:
         raise click.UsageError("-q and -v exclude each other")
     level = logging.ERROR if quiet else logging.INFO if verbose else logging.WARNING
-    handler: logging.Handler = JsonHandler() if _as_json() else logging.StreamHandler(sys.stderr)
-    if not _as_json():
+    as_json = _as_json() if as_json is None else as_json
+    handler: logging.Handler = JsonHandler() if as_json else logging.StreamHandler(sys.stderr)
+    if not as_json:
         handler.setFormatter(PrintableFormatter("%(levelname)s: %(message)s"))
     logging.basicConfig(level=level, handlers=[handler], force=True)
 
 
-def make_progress(quiet: bool) -> Progress:
+def make_progress(quiet: bool, as_json: bool | None = None) -> Progress:
     """Bars on stderr, or JSON lines, or nothing."""
     from msgs_cli.progress import BarProgress
     from pipelines.progress import SilentProgress
 
     if quiet:
         return SilentProgress()
-    return JsonProgress() if _as_json() else BarProgress()
+    as_json = _as_json() if as_json is None else as_json
+    return JsonProgress() if as_json else BarProgress()
+
+
+def worker_setup(quiet: bool, verbose: bool, remote: bool) -> Callable[[str], Progress]:
+    """What sets logging up in a process that works on one recording of many, and makes its progress: bars here, lines
+    from elsewhere. Can be sent there."""
+    return partial(_worker_progress, quiet, verbose, _as_json(), remote)
+
+
+def _worker_progress(quiet: bool, verbose: bool, as_json: bool, remote: bool, name: str) -> Progress:
+    from pipelines.progress import LineProgress
+
+    set_up_logging(quiet, verbose, as_json)
+    if remote and not quiet and not as_json:
+        return LineProgress(name)
+    logging.getLogger("msgs_slam").info("%s: begins", name)
+    return make_progress(quiet, as_json)
 
 
 def open_run(path: Path) -> RunFolder:

@@ -16,6 +16,10 @@ from pipelines.run_folder import RunFolder
 LOCK = ".lock"
 
 
+class RunBusyError(InputError):
+    """Another process works on the run."""
+
+
 @contextmanager
 def locked(run: RunFolder) -> Iterator[None]:
     """Hold the run's lock; the system lets go of it when the process ends, however it ends.
@@ -27,7 +31,7 @@ def locked(run: RunFolder) -> Iterator[None]:
     made = _make(run.root)
     with _open(run.root / LOCK) as stream:
         if not _take(stream) or not _still_there(stream, run.root / LOCK):
-            raise InputError(f"{run.root}: another msgs-slam process is working on this run. Wait for it to end")
+            raise RunBusyError(f"{run.root}: another msgs-slam process is working on this run. Wait for it to end")
         try:
             yield
         except InputError as error:

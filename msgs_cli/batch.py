@@ -1,0 +1,108 @@
+"""`msgs-slam batch`: a run for every recording of a folder."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from msgs_cli.options import (
+    FOLDER,
+    UNTIL,
+    set_up_logging,
+    settings_options,
+    source_options,
+    source_settings,
+    stopping_softly,
+    verbosity_options,
+    worker_setup,
+)
+from msgs_cli.text import say
+
+if TYPE_CHECKING:
+    from pipelines.engines import LocalEngine, RayEngine
+
+
+@click.command()
+@click.argument("folder", type=FOLDER)
+@click.option("--out", type=FOLDER, required=True, metavar="RUNS", help="Where the runs, batch.json and batch.md go.")
+@click.option(
+    "--engine", "engine_name", type=click.Choice(["local", "ray"]), default="local", show_default=True,
+    help="local: one recording after the other; ray: as many at once as the cluster has room for.",
+)  # fmt: skip
+@click.option("--address", default="", metavar="HOST:PORT", help="Join this Ray cluster. Default: this machine alone.")
+@click.option("--shard", default="0/1", metavar="K/N", help="Every N-th recording only, the K-th from 0 on.")
+@settings_options
+@source_options
+@UNTIL
+@verbosity_options
+def batch(
+    folder: Path,
+    out: Path,
+    engine_name: str,
+    address: str,
+    shard: str,
+    config_file: Path | None,
+    overrides: tuple[str, ...],
+    until: str,
+    quiet: bool,
+    verbose: bool,
+    **about_source: str | None,
+) -> None:
+    """Reconstruct every video, image folder and data set in FOLDER, a run each, and go on after failures.
+
+    Prints one table; the exit code is 1 where a recording failed, and RUNS/NAME.failed.txt says why. The same command
+    goes on where it was stopped. With --shard many machines share the work over one disk (SLURM arrays, Kubernetes
+    indexed jobs, AWS Batch: docs/batch.md).
+    """
+    set_up_logging(quiet, verbose)
+    if address and engine_name != "ray":
+        raise click.UsageError("--address is of --engine ray")
+    from formats.jsonfile import read_toml
+    from pipelines.batch import Shard, find_recordings, run_batch, table_rows, write_table
+    from pipelines.config import load_config
+
+    recordings = find_recordings(folder.resolve(), out.resolve())
+    mine = Shard.parse(shard).of(recordings)
+    settings = read_toml(config_file) if config_file else {}
+    texts = (*overrides, *source_settings(about_source))
+    config = load_config(config_file, texts)
+    out.mkdir(parents=True, exist_ok=True)
+    engine, cpus, more = _open_engine(engine_name, address, config.run.threads)
+    gpus = int(config.run.device == "cuda")
+    prepare = worker_setup(quiet, verbose, engine_name == "ray")
+    try:
+        with stopping_softly("The same command goes on with it."):
+            failed = run_batch(mine, engine, settings, (*texts, *more), until, prepare, cpus, gpus)
+    finally:
+        rows = table_rows(recordings)
+        write_table(out, rows)
+        if engine_name == "ray":
+            engine.close()  # type: ignore[union-attr]
+    if not quiet:
+        _print(rows)
+    if failed:
+        say(f"{len(failed)} of {len(mine)} recordings failed; {out}/NAME.failed.txt says why", err=True)
+        sys.exit(1)
+
+
+def _open_engine(name: str, address: str, threads: int) -> tuple[LocalEngine | RayEngine, int, tuple[str, ...]]:
+    """The engine, the CPUs of a recording, and the settings that follow: the same number of threads on every node, or
+    the results would differ."""
+    from pipelines.engines import LocalEngine, RayEngine
+
+    if name == "local":
+        return LocalEngine(), 1, ()
+    engine = RayEngine(address)
+    cpus = threads or engine.smallest_node
+    return engine, cpus, (f"run.threads={cpus}",)
+
+
+def _print(rows: list[dict[str, object]]) -> None:
+    from msgs_cli.tables import format_figure, format_table, terminal_width
+
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    cells = [[format_figure(row[c]) if c in row else "" for c in columns] for row in rows]
+    say(format_table(columns, cells, terminal_width()))

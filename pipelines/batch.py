@@ -1,0 +1,221 @@
+"""Many recordings: a run each, one table, going on after failures; shared between as many processes as one likes.
+
+A recording's run folder is all that is known of it, and its lock sees to it that one process at a time works on it. So
+any number of batches over the same folders may be started, killed and started again, on one machine or many.
+"""
+
+from __future__ import annotations
+
+import platform
+import traceback
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from formats.atomic import write_text
+from formats.errors import InputError
+from formats.images import list_images
+from formats.jsonfile import write_json
+from pipelines.config import Config, load_config, merge_settings
+from pipelines.engines import Call, Engine
+from pipelines.frames.recording import open_recording
+from pipelines.lock import RunBusyError
+from pipelines.progress import Progress, log
+from pipelines.reconstruct import all_stages, existing_config, reconstruct
+from pipelines.records import load_records
+from pipelines.run_folder import RunFolder
+from pipelines.run_folder_names import STAGES
+from pipelines.stage_identity import stage_identity
+
+_VIDEOS = {
+    ".3gp", ".avi", ".flv", ".insv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".sens",
+    ".ts", ".videos", ".webm", ".wmv",
+}  # fmt: skip
+DONE, FAILED, ELSEWHERE, UNFINISHED, NOT_YET = "done", "failed", "in another process", "unfinished", "not yet"
+_FIGURES = (("frames", "frames"), ("tracking", "posed"), ("tracking", "keyframes"), ("mapping", "keyframe_psnr"))
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A source and the folder of its run."""
+
+    name: str
+    source: Path
+    run: Path
+
+    @property
+    def failure_file(self) -> Path:
+        """Why it failed the last time; not there where it did not."""
+        return self.run.with_suffix(".failed.txt")
+
+
+@dataclass(frozen=True)
+class Job:
+    """What travels to wherever a recording is worked on. `settings`: of a file, by section; `prepare` sets logging up
+    there and makes the progress; `code`: identity of the stages' code here."""
+
+    recording: Recording
+    settings: Mapping[str, Any]
+    overrides: tuple[str, ...]
+    until: str
+    prepare: Callable[[str], Progress]
+    code: str
+
+    def config(self) -> Config:
+        """The settings: those that the run has already, then the file's, then the overrides."""
+        base = existing_config(RunFolder(self.recording.run)) or Config()
+        return load_config(None, self.overrides, merge_settings(base, self.settings, "the settings file"))
+
+
+@dataclass(frozen=True)
+class Shard:
+    """The recordings whose number leaves the rest `index` when divided by `count`."""
+
+    index: int = 0
+    count: int = 1
+
+    @staticmethod
+    def parse(text: str) -> Shard:
+        """From `3/16`, counted from 0. Raises InputError for anything else."""
+        index, _, count = text.partition("/")
+        if not (index.isdecimal() and count.isdecimal() and int(index) < int(count)):
+            raise InputError(f"--shard {text}: expected K/N with K from 0 to N - 1, for example 3/16")
+        return Shard(int(index), int(count))
+
+    def of(self, recordings: Sequence[Recording]) -> list[Recording]:
+        """Its own."""
+        return list(recordings[self.index :: self.count])
+
+
+def find_recordings(folder: Path, runs: Path) -> list[Recording]:
+    """The videos, image folders and data sets directly in a folder, by name. Raises InputError where there is none."""
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder. `batch` takes a folder of videos, image folders or data sets")
+    sources = [p for p in sorted(folder.iterdir()) if p.resolve() != runs.resolve() and _is_recording(p)]
+    if not sources:
+        raise InputError(f"{folder} holds no video, image folder or data set")
+    stems = [p.stem if p.is_file() else p.name for p in sources]
+    names = [stem if stems.count(stem) == 1 else p.name for stem, p in zip(stems, sources, strict=True)]
+    return [Recording(n, p, runs / f"{n}.msgs") for n, p in zip(names, sources, strict=True)]
+
+
+def _is_recording(path: Path) -> bool:
+    if path.is_file():
+        return path.suffix.lower() in _VIDEOS
+    if path.suffix == ".msgs" or path.name.startswith("."):
+        return False
+    try:
+        return open_recording(path, "auto") is not None or bool(list_images(path))
+    except InputError:
+        return False
+
+
+def run_batch(
+    recordings: Sequence[Recording],
+    engine: Engine,
+    settings: Mapping[str, Any],
+    overrides: tuple[str, ...],
+    until: str,
+    prepare: Callable[[str], Progress],
+    cpus: int = 1,
+    gpus: int = 0,
+) -> list[Recording]:
+    """Bring the runs of these recordings up to date; returns those that failed. What another process works on is left
+    to it. Raises InputError before anything slow for settings that cannot be."""
+    load_config(None, overrides, merge_settings(Config(), settings, "the settings file"))
+    code = code_identity()
+    jobs = {r.name: Job(r, settings, overrides, until, prepare, code) for r in recordings}
+    calls = [Call(name, work_on, (job,), cpus, gpus) for name, job in jobs.items()]
+    failed = []
+    for ended in engine.run(calls):
+        recording = jobs[ended.call.name].recording
+        if ended.failure:
+            write_text(recording.failure_file, ended.failure.rstrip() + "\n")
+        state = FAILED if ended.failure else ended.value
+        log.info("%s: %s", recording.name, state)
+        if state == FAILED:
+            log.error("%s: %s", recording.name, _last_line(recording.failure_file))
+            failed.append(recording)
+    return failed
+
+
+def work_on(job: Job) -> str:
+    """One recording, here: DONE, FAILED with the reason beside the run, or ELSEWHERE. May be done twice, at any time,
+    by anybody."""
+    recording, progress = job.recording, job.prepare(job.recording.name)
+    try:
+        _require_same_world(job)
+        reconstruct(recording.source, RunFolder(recording.run), job.config(), progress, job.until)
+    except RunBusyError:
+        return ELSEWHERE
+    except InputError as error:
+        write_text(recording.failure_file, f"{error}\n")
+        return FAILED
+    except Exception:
+        write_text(recording.failure_file, traceback.format_exc())
+        return FAILED
+    recording.failure_file.unlink(missing_ok=True)
+    return DONE
+
+
+def _require_same_world(job: Job) -> None:
+    """This node sees the folders, and has the program that the others have."""
+    recording, node = job.recording, platform.node()
+    for folder in (recording.source, recording.run.parent):
+        if not folder.exists():
+            raise InputError(
+                f"the node {node} does not see {folder}: sources and runs must lie on a disk that all nodes have under "
+                "the same path"
+            )
+    if job.code != (here := code_identity()):
+        raise InputError(
+            f"the node {node} has another version of the program ({here[:12]}, not {job.code[:12]}): install the same "
+            "on every node"
+        )
+
+
+def code_identity() -> str:
+    """Of what the stages compute with."""
+    return " ".join(stage_identity(stage.name, stage.file) for stage in all_stages())
+
+
+def table_rows(recordings: Iterable[Recording]) -> list[dict[str, Any]]:
+    """One row a recording, from what lies in its run folder: whoever worked on it, and whenever."""
+    return [_row(r) for r in recordings]
+
+
+def _row(recording: Recording) -> dict[str, Any]:
+    row: dict[str, Any] = {"recording": recording.name, "state": NOT_YET}
+    run = RunFolder(recording.run)
+    try:
+        records = load_records(run)
+    except InputError as error:
+        return {**row, "state": FAILED, "error": str(error).splitlines()[0]}
+    if run.root.exists():
+        row["state"] = DONE if STAGES[-1] in records else f"{UNFINISHED} ({', '.join(records) or 'nothing done'})"
+    for stage, name in _FIGURES:
+        if stage in records:
+            row[name] = records[stage].figures.get(name)
+    if records:
+        row["seconds"] = round(sum(r.seconds for r in records.values()), 1)
+        row["peak_mb"] = round(max(r.peak_memory_mb for r in records.values()))
+        row["warnings"] = sum(len(r.warnings) for r in records.values())
+    if recording.failure_file.exists():
+        row |= {"state": FAILED, "error": _last_line(recording.failure_file)}
+    return row
+
+
+def _last_line(file: Path) -> str:
+    """A traceback says last what it was; a message says all in its first line."""
+    lines = file.read_text(encoding="utf-8", errors="replace").strip().splitlines() or [""]
+    return lines[-1 if any(line.startswith("Traceback") for line in lines) else 0]
+
+
+def write_table(runs: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """batch.json and batch.md beside the runs."""
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    lines = ["| " + " | ".join(columns) + " |", "|" + " --- |" * len(columns)]
+    lines += ["| " + " | ".join(str(row.get(c, "")).replace("|", "\\|") for c in columns) + " |" for row in rows]
+    write_json(runs / "batch.json", list(rows))
+    write_text(runs / "batch.md", "\n".join(lines) + "\n")

@@ -1,0 +1,207 @@
+"""Where independent calls run: one after the other on this machine, or on the machines of a Ray cluster.
+
+Either way a call has a process of its own. What it returns comes back; a bug's traceback comes back as text; a process
+that is lost (killed, out of memory, its machine gone) costs its own call only, which is tried once more.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import socket
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any, Protocol
+
+from formats.errors import InputError
+from pipelines.progress import log
+from pipelines.stopping import Stopped, is_asked, soft_stop, stop_if_asked
+
+TRIES = 2
+_ANSWERS_WITHIN, _ENDS_WITHIN = 5.0, 20.0
+"""Seconds: for an address to answer, for cancelled calls to end by themselves."""
+
+
+@dataclass(frozen=True)
+class Call:
+    """`function`, of a module's top level, with plain `arguments`: both travel. cpus, gpus: what it takes of a node."""
+
+    name: str
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    cpus: int = 1
+    gpus: int = 0
+
+
+@dataclass(frozen=True)
+class Ended:
+    """value: what the call returned; failure: why it did not, "" where it did."""
+
+    call: Call
+    value: Any
+    failure: str = ""
+
+
+class Engine(Protocol):
+    """Runs calls and hands each out when it has ended, in any order. Raises Stopped where a signal asks for it."""
+
+    def run(self, calls: Sequence[Call]) -> Iterator[Ended]:
+        """All of them."""
+        ...
+
+
+class LocalEngine:
+    """One call after the other, each with the whole machine."""
+
+    def run(self, calls: Sequence[Call]) -> Iterator[Ended]:
+        """In order."""
+        for call in calls:
+            stop_if_asked()
+            yield _in_own_process(call)
+
+
+def _in_own_process(call: Call) -> Ended:
+    context = multiprocessing.get_context("spawn")
+    for _ in range(TRIES):
+        receiver, sender = context.Pipe(duplex=False)
+        process = context.Process(target=_child, args=(sender, call), name=call.name)
+        process.start()
+        sender.close()
+        try:
+            kind, value = _answer(process, receiver)
+        finally:
+            process.kill()
+            process.join()
+        if kind == "stopped":
+            stop_if_asked()
+            raise Stopped(value)
+        if kind != "lost":
+            return Ended(call, value) if kind == "value" else Ended(call, None, value)
+        log.warning("%s: its process was lost (%s)", call.name, reason := _how_it_ended(process.exitcode))
+    return Ended(call, None, f"its process was lost {TRIES} times: {reason}")
+
+
+def _answer(process: Any, receiver: Connection) -> tuple[str, Any]:
+    """What the child has sent; ("lost", None) where it ended without a word. A signal to stop is passed on to it."""
+    told = False
+    while True:
+        if is_asked() and not told:
+            process.terminate()
+            told = True
+        try:
+            if receiver.poll(0.2):
+                return receiver.recv()
+        except EOFError:
+            process.join()
+            return "lost", None
+
+
+def _child(sender: Connection, call: Call) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent passes on what it means
+    try:
+        with soft_stop(lambda number: None):
+            sender.send(("value", call.function(*call.arguments)))
+    except Stopped as stopped:
+        sender.send(("stopped", stopped.number))
+    except Exception:
+        sender.send(("failure", traceback.format_exc()))
+
+
+def _how_it_ended(exitcode: int | None) -> str:
+    if exitcode is not None and exitcode < 0:
+        name = signal.Signals(-exitcode).name
+        return f"ended by {name}" + (", for want of memory perhaps" if name == "SIGKILL" else "")
+    return f"exit code {exitcode}"
+
+
+class RayEngine:
+    """Tasks of a Ray cluster: of the one at `address` (host:port, or auto), else of one on this machine alone.
+
+    Raises InputError where Ray is not installed, or none answers.
+    """
+
+    def __init__(self, address: str = "") -> None:
+        self._ray = _import_ray()
+        if address not in ("", "auto"):
+            _require_answer(address)
+        try:
+            self._ray.init(address or "local", log_to_driver=True, include_dashboard=False if not address else None)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            raise InputError(
+                f"no Ray cluster could be joined at {address or 'this machine'} ({str(error)[:300]}). Start one with "
+                "`ray start --head`, with the same versions of Python and Ray on every node, or leave --address away"
+            ) from error
+
+    @property
+    def smallest_node(self) -> int:
+        """CPUs that every node has."""
+        nodes = [n["Resources"].get("CPU", 0) for n in self._ray.nodes() if n["Alive"]]
+        return max(int(min((c for c in nodes if c >= 1), default=1)), 1)
+
+    def run(self, calls: Sequence[Call]) -> Iterator[Ended]:
+        """As they end."""
+        ray = self._ray
+        task = ray.remote(_on_node)
+        options = {"max_retries": TRIES - 1, "retry_exceptions": False}
+        waiting = {
+            task.options(name=c.name, num_cpus=c.cpus, num_gpus=c.gpus, **options).remote(c.function, c.arguments): c
+            for c in calls
+        }
+        try:
+            while waiting:
+                stop_if_asked()
+                for ref in ray.wait(list(waiting), timeout=0.5)[0]:
+                    yield self._ended(ref, waiting.pop(ref))
+        finally:
+            self._cancel(list(waiting))
+
+    def _ended(self, ref: Any, call: Call) -> Ended:
+        try:
+            kind, value = self._ray.get(ref)
+        except self._ray.exceptions.RayError as error:
+            return Ended(call, None, f"its process was lost {TRIES} times: {str(error)[:500]}")
+        return Ended(call, value) if kind == "value" else Ended(call, None, value)
+
+    def _cancel(self, refs: list[Any]) -> None:
+        for force in (False, True):
+            for ref in refs:
+                self._ray.cancel(ref, force=force)
+            if refs:
+                refs = self._ray.wait(refs, num_returns=len(refs), timeout=_ENDS_WITHIN)[1]
+
+    def close(self) -> None:
+        """Leave the cluster; one that was started here ends."""
+        self._ray.shutdown()
+
+
+def _on_node(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[str, Any]:
+    try:
+        return "value", function(*arguments)
+    except Exception:
+        return "failure", f"on {socket.gethostname()}:\n{traceback.format_exc()}"
+
+
+def _import_ray() -> Any:
+    try:
+        import ray
+    except ImportError as error:
+        raise InputError("--engine ray needs Ray: pip install 'msgs-slam[cluster]', on every node") from error
+    return ray
+
+
+def _require_answer(address: str) -> None:
+    """Ray itself waits for minutes for an address where nobody is."""
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdigit():
+        raise InputError(f"--address {address}: expected HOST:PORT, as `ray start --head` prints it, or auto")
+    started = time.monotonic()
+    try:
+        socket.create_connection((host, int(port)), timeout=_ANSWERS_WITHIN).close()
+    except (OSError, OverflowError) as error:
+        raise InputError(
+            f"no Ray answers at {address} ({error}, after {time.monotonic() - started:.0f} s). Start one there with "
+            "`ray start --head`, mind the firewall, or leave --address away: then this machine works alone"
+        ) from error

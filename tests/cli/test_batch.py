@@ -1,0 +1,136 @@
+"""`msgs-slam batch`: many recordings, one table, whatever becomes of single ones."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from formats.errors import InputError
+from formats.images import write_rgb
+from msgs_cli.main import main
+from pipelines import batch
+from pipelines.batch import DONE, ELSEWHERE, FAILED, Job, Recording, Shard, find_recordings, work_on
+from pipelines.engines import Call, Ended
+from pipelines.lock import locked
+from pipelines.progress import SilentProgress
+from pipelines.run_folder import RunFolder
+from tests.pipelines.frames.conftest import QUICK, render, sideways
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short walk, a video that is none, and what is no recording at all."""
+    folder = tmp_path_factory.mktemp("recordings")
+    for i, pose in enumerate(sideways(12)):
+        write_rgb(folder / "walk" / f"{i:02d}.jpg", render(*pose))
+    (folder / "broken.mp4").write_bytes(b"no video" * 100)
+    (folder / "notes.txt").write_text("of the day")
+    (folder / "empty").mkdir()
+    return folder
+
+
+def run_batch(folder: Path, runs: Path, *more: str) -> Result:
+    settings = [part for text in QUICK for part in ("--set", text)]
+    arguments = ["batch", str(folder), "--out", str(runs), "--until", "frames", *settings, *more]
+    return CliRunner().invoke(main, arguments, catch_exceptions=False)
+
+
+def rows(runs: Path) -> dict[str, dict[str, object]]:
+    return {row["recording"]: row for row in json.loads((runs / "batch.json").read_text())}
+
+
+def test_a_failure_costs_itself_only_and_a_second_call_does_what_is_left(recordings: Path, tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    first = run_batch(recordings, runs)
+    assert first.exit_code == 1
+    assert "1 of 2 recordings failed" in first.stderr
+    found = rows(runs)
+    assert set(found) == {"broken", "walk"}
+    assert found["walk"]["state"] == "unfinished (frames)"  # as far as --until says
+    assert found["broken"]["state"] == FAILED
+    assert "broken.mp4" in str(found["broken"]["error"])
+    assert "broken.mp4" in (runs / "broken.failed.txt").read_text()
+    assert "| walk | unfinished (frames) |" in (runs / "batch.md").read_text()
+    assert not (runs / "broken.msgs").exists()
+    before = (runs / "walk.msgs" / "frames" / "frames.json").stat().st_mtime_ns
+    half = Shard.parse("1/2").of(find_recordings(recordings, runs))  # broken is of the other one
+    assert [r.name for r in half] == ["walk"]
+    assert batch.run_batch(half, Here(), {}, QUICK, "frames", _silent) == []
+    assert (runs / "walk.msgs" / "frames" / "frames.json").stat().st_mtime_ns == before
+    assert {r["recording"]: r["state"] for r in batch.table_rows(find_recordings(recordings, runs))} == {
+        "broken": FAILED, "walk": "unfinished (frames)",
+    }  # fmt: skip
+
+
+class Here:
+    """The simplest engine: no process of its own."""
+
+    def run(self, calls: Sequence[Call]) -> Iterator[Ended]:
+        return (Ended(call, call.function(*call.arguments)) for call in calls)
+
+
+def job_of(recording: Recording, **changes: object) -> Job:
+    given = {"settings": {}, "overrides": QUICK, "until": "frames", "prepare": _silent, "code": ""}
+    return Job(recording, **{**given, "code": batch.code_identity(), **changes})  # type: ignore[arg-type]
+
+
+def _silent(name: str) -> SilentProgress:
+    return SilentProgress()
+
+
+def test_what_another_process_works_on_is_left_to_it(recordings: Path, tmp_path: Path) -> None:
+    walk = find_recordings(recordings, tmp_path)[1]
+    with locked(RunFolder(walk.run)):
+        assert work_on(job_of(walk)) == ELSEWHERE
+    assert not walk.failure_file.exists()
+    walk.failure_file.write_text("of yesterday")
+    assert work_on(job_of(walk, settings={"frames": {"max_side": 200}})) == DONE
+    assert not walk.failure_file.exists()
+    assert job_of(walk).config().frames.max_side == 200  # the run's own, from now on
+
+
+def test_a_node_that_sees_no_folder_or_has_another_program_is_named(
+    recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batch.platform, "node", lambda: "node-7")
+    elsewhere = Recording("walk", tmp_path / "disk" / "walk", tmp_path / "walk.msgs")
+    assert work_on(job_of(elsewhere)) == FAILED
+    assert "the node node-7 does not see" in elsewhere.failure_file.read_text()
+    here = find_recordings(recordings, tmp_path)[1]
+    assert work_on(job_of(here, code="another")) == FAILED
+    assert "the node node-7 has another version of the program" in here.failure_file.read_text()
+
+
+def test_shards_are_disjoint_and_together_all() -> None:
+    all_of_them = [Recording(str(i), Path(), Path()) for i in range(37)]
+    parts = [Shard.parse(f"{k}/16").of(all_of_them) for k in range(16)]
+    assert sorted((r for part in parts for r in part), key=lambda r: int(r.name)) == all_of_them
+    for wrong in ("16/16", "-1/4", "3", "a/b", "0/0"):
+        with pytest.raises(InputError, match="K from 0 to N - 1"):
+            Shard.parse(wrong)
+
+
+def test_recordings_of_one_name_have_runs_of_their_own(tmp_path: Path) -> None:
+    for name in ("a.mp4", "a.mov", "b.mp4", ".hidden.mp4x"):
+        (tmp_path / name).write_bytes(b"x")
+    found = find_recordings(tmp_path, tmp_path / "runs")
+    assert [(r.name, r.run.name) for r in found] == [
+        ("a.mov", "a.mov.msgs"), ("a.mp4", "a.mp4.msgs"), ("b", "b.msgs"),
+    ]  # fmt: skip
+    with pytest.raises(InputError, match="is not a folder"):
+        find_recordings(tmp_path / "a.mp4", tmp_path)
+    (tmp_path / "none").mkdir()
+    with pytest.raises(InputError, match="holds no video"):
+        find_recordings(tmp_path / "none", tmp_path)
+
+
+def test_wrong_settings_are_refused_before_anything(recordings: Path, tmp_path: Path) -> None:
+    refused = run_batch(recordings, tmp_path / "runs", "--set", "frames.nonsense=1")
+    assert refused.exit_code == 1
+    assert "there is no setting frames.nonsense" in refused.stderr
+    assert not (tmp_path / "runs").exists()
+    assert run_batch(recordings, tmp_path / "runs", "--address", "x:1").exit_code == 2

@@ -1,0 +1,84 @@
+"""Calls here and in a Ray cluster: what comes back, what a lost process costs, how it stops."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import engine_calls
+import pytest
+
+from formats.errors import InputError
+from pipelines.engines import Call, Engine, LocalEngine, RayEngine
+from pipelines.stopping import Stopped, soft_stop
+
+needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra msgs-slam[cluster]")
+
+
+@pytest.fixture(scope="module", params=["local", pytest.param("ray", marks=needs_ray)])
+def engine(request: pytest.FixtureRequest) -> Iterator[Engine]:
+    if request.param == "local":
+        yield LocalEngine()
+        return
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join(p for p in sys.path if p))  # as an installed program is found
+        patch.setenv("RAY_memory_monitor_refresh_ms", "0")
+        cluster = RayEngine()
+        yield cluster
+        cluster.close()
+
+
+def test_what_is_returned_raised_and_lost_comes_back(engine: Engine, tmp_path: Path) -> None:
+    """Each call costs itself only; a process that is lost is tried once more."""
+    (tmp_path / "once").mkdir()
+    (tmp_path / "always").mkdir()
+    calls = [
+        Call("two", engine_calls.double, (2,)),
+        Call("raises", engine_calls.fail, (3,)),
+        Call("dies once", engine_calls.die, (str(tmp_path / "once"), 1)),
+        Call("dies", engine_calls.die, (str(tmp_path / "always"), 5)),
+        Call("four", engine_calls.double, (4,)),
+    ]
+    ended = {e.call.name: e for e in engine.run(calls)}
+    assert {n: e.value for n, e in ended.items() if not e.failure} == {"two": 4, "four": 8, "dies once": "after 1"}
+    assert "ValueError: no 3" in ended["raises"].failure
+    assert "engine_calls.py" in ended["raises"].failure
+    assert "its process was lost 2 times" in ended["dies"].failure
+    assert len(list((tmp_path / "always").iterdir())) == 2
+
+
+def test_a_signal_ends_the_calls(engine: Engine, tmp_path: Path) -> None:
+    marker = tmp_path / "begun"
+
+    def interrupt() -> None:
+        while not marker.exists():
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    started = time.monotonic()
+    with pytest.raises(Stopped), soft_stop(lambda number: None):
+        list(engine.run([Call("waits", engine_calls.wait, (str(marker),)), Call("two", engine_calls.double, (2,))]))
+    thread.join()
+    assert time.monotonic() - started < 25
+
+
+@needs_ray
+def test_an_address_without_a_cluster_is_told_of_at_once() -> None:
+    with pytest.raises(InputError, match=r"no Ray answers at 127\.0\.0\.1:1 .*\n?.*`ray start --head`"):
+        RayEngine("127.0.0.1:1")
+    with pytest.raises(InputError, match="expected HOST:PORT"):
+        RayEngine("somewhere")
+
+
+def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(InputError, match=r"pip install 'msgs-slam\[cluster\]'"):
+        RayEngine()
