@@ -2,16 +2,18 @@
 
     python tests/benchmarks/damage.py RUN OTHER_RUN --truth DATASET --work DIR [--series 2]
 
-RUN and OTHER_RUN are finished runs of small clips; of files that come in series (frames, proxy maps) `--series` of each
-are taken. A command passes when it ends with code 1, names the file and says what to type, or when it does not use the
-file: then what it writes must be the same bytes as for the whole run. `status` must name the file. At the end one file
-of each stage is damaged and `resume` must bring back the same bytes. Prints the counts; exit code 1 if any is wrong.
+RUN and OTHER_RUN are finished runs of small clips; of files that come in series (frames, proxy maps) `--series` of
+each are taken. A command passes when it ends with code 1, names the file and says what to type, or when it does not
+use the file: then what it writes, or `view` shows, must be the same bytes as for the whole run. `status` must name
+the file, and `view` may, beside a frame that is damaged. At the end one file of each stage is damaged and `resume`
+must bring back the same bytes. Prints the counts; exit code 1 if any is wrong.
 """
 
 from __future__ import annotations
 
 import argparse
 import collections
+import hashlib
 import json
 import re
 import shutil
@@ -19,13 +21,17 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import click
+import numpy as np
 from click.testing import CliRunner, Result
 
 from formats.digest import file_sha256
 from msgs_cli.main import main as msgs_slam
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
+from pipelines.viewer import Viewer
 
+PORT = 18097
 Damage = Callable[[Path, Path], None]
 
 
@@ -62,7 +68,26 @@ def commands(run: Path, truth: Path, out: Path) -> dict[str, list[str]]:
         "report": ["report", str(run), "--to", str(out / "report.html"), "-q"],
         "evaluate": ["evaluate", str(run), "--truth", str(truth), "-q"],
         "render": ["render", str(run), str(out), "--fps", "1", "-q"],
+        "view": ["view", str(run), "--port", str(PORT)],
     }
+
+
+def look_at_all(viewer: Viewer, out: Path) -> None:
+    """In place of waiting: click every camera, and write what is shown into `out`; then Ctrl-C."""
+    scene, digest = viewer.scene, hashlib.sha256()
+    shown = [scene.centers, scene.covariances, scene.opacities, scene.path, *scene.colors.values()]
+    if scene.mesh_file is not None:
+        shown.append(np.fromfile(scene.mesh_file, np.uint8))
+    for camera in scene.cameras:
+        viewer.visit(camera, None)
+        if "msgs-slam" in viewer.preview.label:
+            click.echo(viewer.preview.label)
+        shown += [camera.world_from_cam, viewer.preview.image]
+    for array in shown:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    out.mkdir(parents=True)
+    (out / "shown.txt").write_text(digest.hexdigest())
+    raise KeyboardInterrupt
 
 
 def invoke(arguments: list[str]) -> Result:
@@ -82,8 +107,10 @@ def written(out: Path, run: Path) -> dict[str, str]:
 def verdict(name: str, result: Result, file: str, same: bool) -> str:
     """refused, named, unused, or what is wrong."""
     said = result.stderr + result.stdout
+    if result.exit_code == 0 and name in ("status", "view") and Path(file).name in said:
+        return "named"
     if result.exit_code == 0 and name == "status":
-        return "named" if Path(file).name in said else "WRONG: status does not name it"
+        return "WRONG: status does not name it"
     if result.exit_code == 0:
         return "unused" if same else "WRONG: used, and nothing said"
     names = {Path(file).name, "run.toml"} if file == "manifest.json" else {Path(file).name}  # both tell of one source
@@ -127,6 +154,7 @@ def main() -> None:
     parser.add_argument("--series", type=int, default=2)
     options = parser.parse_args()
     damaged, out = options.work / "damaged.msgs", options.work / "out"
+    Viewer.wait = lambda viewer: look_at_all(viewer, out)  # type: ignore[method-assign]
     counts: collections.Counter[str] = collections.Counter()
     whole: dict[str, dict[str, str]] = {}
     files = chosen_files(options.run, options.series)

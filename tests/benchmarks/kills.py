@@ -2,12 +2,13 @@
 
     python tests/benchmarks/kills.py --kills 1000 --work DIR [--seed 0]
 
-A process that has everything imported and compiled forks one child after another; the child reconstructs, or resumes, a
-tiny clip of the synthetic room, and is killed. Half of the kills come after a random time, half inside the child's n-th
-call of os.replace, os.fsync, os.unlink, os.rmdir, os.mkdir or os.open, before or after it. When a child ends by itself,
-the stages are compared, file by file, with those of a run that nobody has killed; then a setting is changed, which
-makes a stage and what follows out of date, and it goes on. Says how many kills there were, in which stages, and what
-differed.
+A process that has everything imported and compiled forks one child after another; the child reconstructs, or resumes,
+a tiny clip of the synthetic room, and is killed. Half of the kills come after a random time, a third inside the
+child's n-th call of os.replace, os.fsync, os.unlink, os.rmdir, os.mkdir or os.open, before or after it, the others
+inside a call for run.toml or manifest.json. When a child ends by itself, the stages are compared, file by file, with
+those of a run that nobody has killed; then a setting is changed, which makes a stage and what follows out of date,
+and it goes on. Says how many kills there were, in which stages, at which calls and files, how many hit the resume of
+a resume that was killed too, and what differed. Figures of several seeds add up; each takes one core.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import collections
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import sys
@@ -38,22 +40,26 @@ from pipelines.stage_identity import stage_identity
 from tests.world import ClipOptions, iter_clip, make_world
 
 SETTINGS = (
-    "run.threads=1", "run.device=cpu", "frames.max_features=600", "proxy.stereo_side=96", "proxy.stereo_planes=24",
+    "run.threads=1", "run.device=cpu", "frames.max_features=600", "proxy.stereo_side=64", "proxy.stereo_planes=16",
     "mapping.passes=1",
-    "mapping.min_iterations=20", "mapping.max_gaussians=6000", "mapping.snapshot_every=5", "export.voxel=0.08",
+    "mapping.min_iterations=20", "mapping.max_gaussians=3000", "mapping.snapshot_every=5", "export.voxel=0.1",
 )  # fmt: skip
 CHANGES = (
-    (), ("export.spz=true",), ("global_ba.use_loops=false",), ("mapping.min_iterations=24",), ("export.mesh_side=100",),
-    ("tracking.render=never",), (),
+    (), ("export.spz=true",), ("proxy.stereo_planes=12",), ("mapping.min_iterations=24",), ("export.mesh_side=100",),
+    ("global_ba.use_loops=false",), ("tracking.render=never",), ("frames.max_features=500",),
 )  # fmt: skip
 """Settings of one round after the other, each beside SETTINGS: rounds begin at different stages."""
 CALLS = ("replace", "fsync", "unlink", "rmdir", "mkdir", "open")
-FIRST_WAIT = 0.35
+RECORDS = re.compile(r"(run|manifest)(\.tmp)?\.(toml|json)$")
+FIRST_WAIT = 0.2
+"""Seconds, on average, of a kill after a random time: a fifteenth of what the tiny clip takes."""
+Kill = tuple[str, int, bool, bool]
+"""Inside which call, its how manieth, before or after it, and whether only those for `RECORDS` count."""
 
 
 def make_clip(path: Path) -> Path:
-    """16 frames of 160 x 120."""
-    options = ClipOptions(frames=16, width=160, height=120, fps=10.0, laps=0.3)
+    """10 frames of 128 x 96, as few as structure from motion is sure of."""
+    options = ClipOptions(frames=10, width=128, height=96, fps=10.0, laps=0.2)
     return write_video(path, [f.rgb for f in iter_clip(make_world(texel=0.02), options)], options.fps)
 
 
@@ -68,27 +74,35 @@ def digests(run: RunFolder) -> dict[str, str]:
     return {str(p.relative_to(run.root)): file_sha256(p) for p in files}
 
 
-def in_child(work: Callable[[], Any], kill_call: tuple[str, int, bool] | None) -> int:
+def in_child(work: Callable[[], Any], kill: Kill | None = None, tell: int | None = None) -> int:
     """Fork; the child does the work and exits 0, or 1 with its traceback on stderr. Returns its process id."""
     child = os.fork()
     if child:
         return child
     try:
-        if kill_call is not None:
-            arm(*kill_call)
+        if kill is not None:
+            arm(*kill, tell)
         work()
         os._exit(0)
     except BaseException:
         traceback.print_exc()
+    finally:  # whatever happens: the parent's frames are not this process's to leave
         os._exit(1)
+    return 0
 
 
-def arm(name: str, count: int, before: bool) -> None:
-    """Make this process kill itself at its `count`-th call of os.`name`."""
+def arm(name: str, count: int, before: bool, records: bool, tell: int | None) -> None:
+    """Make this process kill itself at its `count`-th call of os.`name`, and write its file's name to `tell` first."""
     real, left = getattr(os, name), [count]
 
     def call(*args: Any, **kwargs: Any) -> Any:
+        path = args[-1] if name == "replace" else args[0]
+        path = os.readlink(f"/proc/self/fd/{path}") if isinstance(path, int) else os.fspath(path)
+        if records and not RECORDS.search(path):
+            return real(*args, **kwargs)
         left[0] -= 1
+        if left[0] == 0 and tell is not None:
+            os.write(tell, f"{name} {path}".encode())
         if left[0] == 0 and before:
             os.kill(os.getpid(), signal.SIGKILL)
         result = real(*args, **kwargs)
@@ -113,7 +127,7 @@ def unbroken(clip: Path, work: Path) -> list[dict[str, str]]:
     run, digests_after = RunFolder(work / "whole.msgs"), []
     shutil.rmtree(run.root, ignore_errors=True)
     for change in CHANGES:
-        child = in_child(lambda c=change: reconstruct(clip, run, settings(c), SilentProgress()), None)  # type: ignore[misc]
+        child = in_child(lambda c=change: reconstruct(clip, run, settings(c), SilentProgress()))  # type: ignore[misc]
         assert os.waitpid(child, 0)[1] == 0, "the unbroken run failed"
         digests_after.append(digests(run))
     write_json(kept, {"code": code, "digests": digests_after})
@@ -129,28 +143,58 @@ def one_round(clip: Path, run: RunFolder, config: Config, rng: random.Random, co
     def go_on() -> Any:
         return resume(RunFolder(run.root), SilentProgress(), config)
 
-    stuck = 0
+    stuck, resumed = 0, 0
+    incoming, outgoing = os.pipe()
+    os.set_blocking(incoming, False)
     while True:
-        at_call = (rng.choice(CALLS), rng.randint(1, 12 + 4 * stuck), rng.random() < 0.5)
-        kill_call = at_call if rng.random() < 0.5 else None
-        work = go_on if run.manifest_file.exists() and rng.random() < 0.7 else start
-        before = sum(p.is_file() for p in run.root.rglob("*")) if run.root.exists() else 0
-        child = in_child(work, kill_call)
-        deadline = time.monotonic() + (rng.expovariate(1 / (FIRST_WAIT * (1 + stuck))) if kill_call is None else 600)
+        kill = chosen_kill(rng, stuck)
+        resumes = run.manifest_file.exists() and rng.random() < 0.7
+        before = size_of(run)
+        child = in_child(go_on if resumes else start, kill, outgoing)
+        # Some calls come too seldom to be waited for.
+        patience = FIRST_WAIT * (1 + stuck) * (1 if kill is None else 3)
+        deadline = time.monotonic() + rng.expovariate(1 / patience)
         while (ended := os.waitpid(child, os.WNOHANG)) == (0, 0) and time.monotonic() < deadline:
             time.sleep(0.002)
         if ended == (0, 0):
             os.kill(child, signal.SIGKILL)
             ended = os.waitpid(child, 0)
-        if os.WIFSIGNALED(ended[1]):
-            counts[stage_at(run)] += 1
-            after = sum(p.is_file() for p in run.root.rglob("*")) if run.root.exists() else 0
-            stuck = 0 if after > before else stuck + 1
-            continue
-        if os.WEXITSTATUS(ended[1]) != 0:
-            counts["failed"] += 1
-            raise SystemExit(f"a child failed; the run is kept in {run.root}")
-        return
+        if not os.WIFSIGNALED(ended[1]):
+            break
+        resumed = resumed + 1 if resumes else 0
+        counts["kills"] += 1
+        counts["of a resume of a killed resume"] += resumed > 1
+        counts[f"in {stage_at(run)}"] += 1
+        counts[f"at {where(incoming)}"] += 1
+        stuck = 0 if size_of(run) > before else stuck + 1
+    os.close(incoming)
+    os.close(outgoing)
+    if os.WEXITSTATUS(ended[1]) != 0:
+        raise SystemExit(f"a child failed; the run is kept in {run.root}")
+
+
+def chosen_kill(rng: random.Random, stuck: int) -> Kill | None:
+    """None for a random time."""
+    if rng.random() < 0.5:
+        return None
+    if rng.random() < 0.3:
+        return rng.choice(("replace", "fsync", "unlink")), rng.randint(1, 4), rng.random() < 0.5, True
+    return rng.choice(CALLS), rng.randint(1, 12 + 4 * stuck), rng.random() < 0.5, False
+
+
+def size_of(run: RunFolder) -> int:
+    """How many files there are."""
+    return sum(p.is_file() for p in run.root.rglob("*")) if run.root.exists() else 0
+
+
+def where(incoming: int) -> str:
+    """The call that a child was killed in, and the record that it was for, if any."""
+    try:
+        call, _, path = os.read(incoming, 4096).decode().partition(" ")
+    except BlockingIOError:
+        return "a random time"
+    found = RECORDS.search(path)
+    return f"{call}, {found[1]}" if found else call
 
 
 def main() -> None:
@@ -164,12 +208,12 @@ def main() -> None:
     options.work.mkdir(parents=True, exist_ok=True)
     clip = options.work / "clip.avi"
     # In a child too: a process whose libraries have begun threads of their own cannot be forked any more.
-    os.waitpid(in_child(lambda: make_clip(clip), None), 0)
+    os.waitpid(in_child(lambda: make_clip(clip)), 0)
 
     whole = unbroken(clip, options.work)
     run = RunFolder(options.work / "killed.msgs")
     differing, rounds = 0, 0
-    while (killed := sum(counts.values())) < options.kills:
+    while counts["kills"] < options.kills:
         if rounds % len(CHANGES) == 0:
             shutil.rmtree(run.root, ignore_errors=True)
         expected = whole[rounds % len(CHANGES)]
@@ -181,8 +225,8 @@ def main() -> None:
             wrong = [n for n in {*found, *expected} if found.get(n) != expected.get(n)]
             print(f"round {rounds}: {len(wrong)} files differ: {sorted(wrong)[:5]}", flush=True)
             shutil.copytree(run.root, options.work / f"differs{rounds}.msgs", dirs_exist_ok=True)
-        print(json.dumps({"kills": sum(counts.values()), "rounds": rounds, "differing": differing}), flush=True)
-    print(json.dumps({"kills": killed, "rounds": rounds, "differing": differing, "by stage": counts}, indent=1))
+        print(json.dumps({"kills": counts["kills"], "rounds": rounds, "differing": differing}), flush=True)
+    print(json.dumps({"rounds": rounds, "differing": differing, **dict(sorted(counts.items()))}, indent=1))
     sys.exit(differing > 0)
 
 
