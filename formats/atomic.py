@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Protocol
 
-from formats.errors import DiskFullError, InputError
+from formats.errors import DiskFullError, InputError, RecoverableError
 
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NOT_ALLOWED = {errno.EACCES, errno.EPERM, errno.EROFS}
@@ -105,13 +105,18 @@ def _explained(error: OSError, path: Path) -> Exception:
     """The same failure in the user's words, where the user can do something about it."""
     if is_disk_full(error, path.parent):
         return DiskFullError(
-            f"disk full while writing {path.name}, {free_bytes(path.parent) / 1e6:.0f} MB are free in {path.parent}: "
+            f"disk full while writing {path.name} ({error.strerror or 'cut short'}), "
+            f"{free_bytes(path.parent) / 1e6:.0f} MB are free in {path.parent}: "
             "free some space (or point the output at another disk), then run the same command again"
         )
     if error.errno in _NOT_ALLOWED:
-        return InputError(f"cannot write {path}, {error.strerror}: choose another output folder or change its rights")
+        return RecoverableError(
+            f"cannot write {path}, {error.strerror}: choose another output folder or change its rights"
+        )
     if error.errno == errno.ENAMETOOLONG:
         return InputError(f"cannot write {path}: the name is too long for this disk: choose a shorter one")
+    if error.errno == errno.ENOENT:
+        return RecoverableError(f"cannot write {path}: {error.filename} has vanished, or cannot be made there")
     if error.errno in (errno.ENOTDIR, errno.EEXIST):
         return InputError(f"cannot write {path}, a part of that path is a file: choose another output folder")
     return error

@@ -9,5 +9,9 @@ class InputError(Exception):
     """
 
 
-class DiskFullError(InputError):
-    """The disk is full: the work done so far is kept, and can go on once there is space."""
+class RecoverableError(InputError):
+    """The work done so far is kept, and goes on once what the message names is mended: rights, a vanished source."""
+
+
+class DiskFullError(RecoverableError):
+    """The disk is full."""

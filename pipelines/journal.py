@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from formats.digest import file_sha256
-from formats.errors import InputError
+from formats.errors import RecoverableError
 from pipelines.stopping import stop_if_asked
 
 JOURNAL = ".written"
@@ -28,7 +28,8 @@ class Journal:
     def writing(self, path: Path, temporary: Path) -> None:
         """Note the file that is about to be renamed to `path`."""
         if path.is_relative_to(self.folder):
-            line = f"{file_sha256(temporary)} {path.relative_to(self.folder).as_posix()}\n"
+            # The end of line comes first: a line that a full disk has cut must not swallow the one after it.
+            line = f"\n{file_sha256(temporary)} {path.relative_to(self.folder).as_posix()}"
             with self._lock, (self.folder / JOURNAL).open("a", encoding="utf-8") as stream:
                 stream.write(line)
 
@@ -54,12 +55,14 @@ class Journal:
         return damaged
 
     def close(self, files: dict[str, tuple[int, str]]) -> None:
-        """End the journal of a stage that has left these files. Raises InputError where one is not what was written:
-        a disk that is full or failing may keep less than it said."""
+        """End the journal of a stage that has left these files.
+
+        Raises RecoverableError where one is not what was written: a full or failing disk may keep less than it said.
+        """
         known = self._known()
         torn = [name for name, (_, digest) in files.items() if digest not in known.get(name, ())]
         if torn:
-            raise InputError(
+            raise RecoverableError(
                 f"{self.folder / torn[0]} is not what was written there ({len(torn)} such files): the disk may be full "
                 f"or failing. Type `msgs-slam resume {self.folder.parent}`"
             )

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-from formats.errors import DiskFullError, InputError
+from formats.errors import InputError, RecoverableError
 from pipelines.records import load_records
 from pipelines.run_folder import RunFolder
 
@@ -24,9 +24,10 @@ class RunBusyError(InputError):
 def locked(run: RunFolder) -> Iterator[None]:
     """Hold the run's lock; the system lets go of it when the process ends, however it ends.
 
-    The folder is made where it is missing, and removed again when the block ends with an InputError before a stage is
-    done: what could not be begun leaves nothing behind. A folder that was there is never removed, nor one that
-    another process holds. Raises InputError when another process does, or when the folder cannot be written.
+    The folder is made where it is missing, and removed again when the block ends with an error before the work began,
+    or with an InputError, but for a RecoverableError, before a stage is done: what cannot be used leaves nothing
+    behind. A folder that was there is never removed, nor one that another process holds. Raises InputError when
+    another process does, or when the folder cannot be written.
     """
     made = _make(run.root)
     with _open(run.root / LOCK) as stream:
@@ -34,8 +35,10 @@ def locked(run: RunFolder) -> Iterator[None]:
             raise RunBusyError(f"{run.root}: another msgs-slam process is working on this run. Wait for it to end")
         try:
             yield
-        except InputError as error:
-            if made and not isinstance(error, DiskFullError) and not load_records(run):
+        except Exception as error:
+            unusable = isinstance(error, InputError) and not isinstance(error, RecoverableError)
+            begun = run.manifest_file.exists()
+            if made and (not begun or (unusable and not load_records(run))):
                 shutil.rmtree(run.root, ignore_errors=True)  # Windows keeps the open lock
             raise
 

@@ -8,14 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from formats.atomic import write_text
-from formats.digest import file_sha256, files_sha256
-from formats.errors import InputError
-from formats.image_times import times_file
-from formats.images import list_images
+from formats.errors import InputError, RecoverableError
 from pipelines.config import Config
 from pipelines.device import settle_device
-from pipelines.frames.recording import open_recording
-from pipelines.frames.source import LIST_SUFFIX, require_source, video_files
+from pipelines.frames.source import LIST_SUFFIX, source_digest
 from pipelines.lock import LOCK, locked
 from pipelines.progress import Progress
 from pipelines.records import StageRecord, load_records, load_source, recorded_config
@@ -91,10 +87,6 @@ def resume(
     source = Path(origin.path)
     config = _with_device(config or load_settings(run))
     with locked(run):
-        if "frames" not in load_records(run) and source_digest(source, config.run.format) != origin.digest:
-            raise InputError(
-                f"{source} has changed since {run.root} was begun. Reconstruct it into another folder: --out NEW"
-            )
         return _run(run, source, origin.digest, config, progress, until)
 
 
@@ -109,25 +101,20 @@ def require_run(run: RunFolder) -> None:
 def _run(
     run: RunFolder, source: Path, digest: str, config: Config, progress: Progress, until: str
 ) -> dict[str, StageRecord]:
+    def same_source() -> None:
+        kept = f"What is done so far is kept: bring it back, then type `msgs-slam resume {run.root}`"
+        try:
+            same = source_digest(source, config.run.format) == digest
+        except InputError as error:
+            raise RecoverableError(f"{error}. {kept}") from error
+        if not same:
+            raise RecoverableError(
+                f"{source} has changed since {run.root} was begun. {kept}. Or reconstruct what it is now into another "
+                "folder: --out NEW"
+            )
+
     _set_threads(config.run.threads or os.cpu_count() or 1)
-    return run_stages(all_stages(), run, source, digest, config, progress, until)
-
-
-def source_digest(source: Path, format: str) -> str:
-    """Identity of a source: a video's bytes; names and bytes of the pictures of a folder or data set, and their times.
-
-    What else lies in the folder does not count. Raises InputError where there is nothing to read.
-    """
-    require_source(source)
-    recording = open_recording(source, format)
-    if recording is not None and recording.image_paths:
-        head = f"{recording.format} {recording.camera}".encode() + recording.timestamps.tobytes()
-        return files_sha256(zip(recording.names, recording.image_paths, strict=True), head)
-    if source.is_file():
-        files = video_files(source)
-        return file_sha256(source) if files == (source,) else files_sha256((str(i), f) for i, f in enumerate(files))
-    images, times = list_images(source), times_file(source)
-    return files_sha256(sorted((p.name, p) for p in [*images, *([times] if times else [])]))
+    return run_stages(all_stages(), run, source, digest, config, progress, until, same_source)
 
 
 def _require_run_or_empty(run: RunFolder) -> None:

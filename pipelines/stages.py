@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from formats.atomic import is_disk_full, watched_by, write_text
-from formats.errors import DiskFullError, InputError
+from formats.errors import DiskFullError, InputError, RecoverableError
 from pipelines.config import Config, settings_of_stage
 from pipelines.device import settle_device
 from pipelines.journal import JOURNAL, Journal, empty
@@ -40,6 +40,11 @@ from pipelines.streamed import memory_room
 
 FINGERPRINT = "fingerprint"
 """File of an unfinished folder: the work it belongs to."""
+SameSource = Callable[[], None]
+
+
+def _trusted() -> None:
+    """A source that nobody asks about."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,8 @@ class StageContext:
 
     `folder` is the stage's own unfinished folder: it writes its result there, and may keep snapshots under
     `folder / "snapshot"`, which is removed when the stage ends well. What an interrupted attempt with the same
-    settings and inputs has left in `folder` is still there when the stage starts again. `stages` are all of the run.
+    settings and inputs has left in `folder` is still there when the stage starts again. `stages` are all of the run;
+    `same_source` raises RecoverableError where the source is not, or no longer, what the run was begun from.
     """
 
     run: RunFolder
@@ -58,6 +64,7 @@ class StageContext:
     progress: Progress
     warnings: list[str] = field(default_factory=list)
     stages: list[Stage] = field(default_factory=list)
+    same_source: SameSource = _trusted
 
     @property
     def snapshot(self) -> Path:
@@ -116,6 +123,7 @@ def run_stages(
     config: Config,
     progress: Progress,
     until: str = STAGES[-1],
+    same_source: SameSource = _trusted,
 ) -> dict[str, StageRecord]:
     """Bring every stage up to `until` up to date; returns their records.
 
@@ -128,7 +136,7 @@ def run_stages(
     origin = Source(str(source), source_digest)
     upstream = source_digest
     wanted = stages[: STAGES.index(until) + 1]
-    inputs = _check_inputs(wanted, source, config, records, source_digest)
+    inputs = _check_inputs(wanted, run, source, config, source_digest, same_source)
     if (before := run.manifest()) is None or before.format != FORMAT:
         write_manifest(run.manifest_file, Manifest(origin, records))
     save_settings(run, config)
@@ -139,7 +147,7 @@ def run_stages(
             if _drop(records, stage.name):
                 write_manifest(run.manifest_file, Manifest(origin, records))
             folder = run.partial(stage.name)
-            context = StageContext(run, source, config, folder, progress, stages=stages)
+            context = StageContext(run, source, config, folder, progress, stages=stages, same_source=same_source)
             record = _run_one(stage, context, fingerprint, inputs[stage.name])
             records[stage.name] = record
             write_manifest(run.manifest_file, Manifest(origin, records))
@@ -158,18 +166,19 @@ def _drop(records: dict[str, StageRecord], name: str) -> bool:
 
 
 def _check_inputs(
-    stages: list[Stage], source: Path, config: Config, records: dict[str, StageRecord], upstream: str
+    stages: list[Stage], run: RunFolder, source: Path, config: Config, upstream: str, same_source: SameSource
 ) -> dict[str, Any]:
     """What each stage reads beside the stages before it; raises InputError where one has work to do and cannot.
 
     A finished stage whose inputs are gone (files deleted, a model removed) stays as it is.
     """
-    inputs = {}
+    inputs, records = {}, load_records(run)
     settled = True
     for stage in stages:
         record = records.get(stage.name)
         if record is None or record.fingerprint != stage_fingerprint(stage, config, upstream, record.inputs):
             settled = False
+        settled = settled and not run.damaged(stage.name)
         kept = record.inputs if record is not None and settled else None
         upstream = next_upstream(upstream, record) if record else upstream
         try:
@@ -180,6 +189,8 @@ def _check_inputs(
             log.warning("%s: keeps what it was made from (%s)", stage.name, error)
             inputs[stage.name] = kept
         settled &= inputs[stage.name] == kept
+        if stage is stages[0] and not settled:
+            same_source()
         if stage.check and not settled:
             stage.check(source, config)
     return inputs
@@ -198,6 +209,10 @@ def _run_one(stage: Stage, context: StageContext, fingerprint: str, inputs: Any)
     try:
         with watched_by(journal):
             figures = stage.run(context)
+    except InputError as error:
+        if stage.name == STAGES[0] and not isinstance(error, RecoverableError):
+            context.same_source()  # if it is not, that is what is wrong
+        raise
     except OSError as error:
         if is_disk_full(error, run.root):
             raise DiskFullError(

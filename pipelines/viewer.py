@@ -195,8 +195,12 @@ class Viewer:
             if self.mode.value == "depth":
                 self.show("depth", client)
         if self.scene.run is not None:
-            self.preview.image = _reduced(self.scene.run.image(camera.frame))
-            self.preview.label = f"{plain(camera.frame.name)}, {camera.frame.timestamp:.2f} s"
+            label = f"{plain(camera.frame.name)}, {camera.frame.timestamp:.2f} s"
+            try:
+                self.preview.image = _reduced(self.scene.run.image(camera.frame))
+            except InputError as error:  # this frame alone: what else is shown was checked
+                label = plain(str(error))
+            self.preview.label = label
 
     def _move(self, client: Any, camera: ViewerCamera) -> None:
         wxyz, position = self._pose(camera)

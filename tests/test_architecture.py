@@ -1,6 +1,7 @@
 """The shape of the house: imports go one way, help is instant, nothing unsafe is loaded."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -90,6 +91,20 @@ def test_nothing_is_unpickled() -> None:
                     assert any(k.arg == "weights_only" for k in node.keywords), f"{path}:{node.lineno}"
                 if isinstance(node, ast.Call) and ast.unparse(node.func) == "np.load":
                     assert any(k.arg == "allow_pickle" for k in node.keywords), f"{path}:{node.lineno}"
+
+
+UNSAFE_IMPORTS = {"subprocess", "pty", "marshal", "shelve", "dill", "cloudpickle", "joblib", "yaml", "ctypes"}
+UNSAFE_CALLS = re.compile(r"eval|exec|compile|__import__|os\.(system|popen|exec\w+|spawn\w+|posix_spawn\w*|fork)")
+
+
+@pytest.mark.parametrize("room", FORBIDDEN)
+def test_no_other_program_and_no_text_is_run(room: str) -> None:
+    for path in (ROOT / room).rglob("*.py"):
+        assert not imported_packages(path) & UNSAFE_IMPORTS, path
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call):
+                assert not UNSAFE_CALLS.fullmatch(ast.unparse(node.func)), f"{path}:{node.lineno}"
+                assert not any(k.arg == "shell" for k in node.keywords), f"{path}:{node.lineno}"
 
 
 HELP_OF_EVERY_COMMAND = """

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -11,7 +13,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from formats.atomic import write_bytes
+from formats.atomic import free_bytes, write_bytes
 from formats.errors import DiskFullError
 from formats.jsonfile import read_json, write_json
 from formats.tensors import load_arrays, save_arrays
@@ -74,14 +76,25 @@ class Snapshots:
         return pycolmap.Reconstruction(path) if (path / "cameras.bin").exists() else None
 
     def _require_room(self) -> None:
-        """COLMAP ends the whole process where its database meets a full disk, so there must be room for it before."""
+        """COLMAP ends the whole process where its database cannot grow, so there must be room for it before.
+
+        It is taken for a moment: how much is free tells nothing of a quota, or of the largest file allowed.
+        """
         needed = _DATABASE_SHARE * sum(p.stat().st_size for p in self.folder.glob("*/*.npz")) + _LEAST_ROOM
-        free = shutil.disk_usage(self.folder).free
-        if free < needed:
+        place = self.folder / "room.tmp"
+        try:
+            with place.open("wb") as file:
+                if hasattr(os, "posix_fallocate"):
+                    os.posix_fallocate(file.fileno(), 0, needed)
+                elif free_bytes(self.folder) < needed:
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError as error:
             raise DiskFullError(
-                f"{self.folder}: structure from motion needs {needed / 1e6:.0f} MB of disk, {free / 1e6:.0f} MB are "
-                "free. Free some space, then run the same command again"
-            )
+                f"{self.folder}: structure from motion needs {needed / 1e6:.0f} MB of disk, which cannot be had "
+                f"({error.strerror}). Free some space, then run the same command again"
+            ) from error
+        finally:
+            place.unlink(missing_ok=True)
 
 
 def _pack(pairs: Sequence[VerifiedPair]) -> dict[str, NDArray]:

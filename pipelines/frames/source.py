@@ -10,8 +10,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from formats.digest import file_sha256, files_sha256
 from formats.errors import InputError
-from formats.image_times import read_image_times
+from formats.image_times import read_image_times, times_file
 from formats.images import exif_focal_px, image_size, is_depth_map, list_images, read_rgb
 from formats.reading import reaching, require_file
 from formats.textfile import read_text
@@ -206,6 +207,23 @@ def require_source(path: Path) -> None:
             next(path.iterdir(), None)
             return
     require_file(path)
+
+
+def source_digest(source: Path, format: str) -> str:
+    """Identity of a source: a video's bytes; names and bytes of the pictures of a folder or data set, and their times.
+
+    What else lies in the folder does not count. Raises InputError where there is nothing to read.
+    """
+    require_source(source)
+    recording = open_recording(source, format)
+    if recording is not None and recording.image_paths:
+        head = f"{recording.format} {recording.camera}".encode() + recording.timestamps.tobytes()
+        return files_sha256(zip(recording.names, recording.image_paths, strict=True), head)
+    if source.is_file():
+        files = video_files(source)
+        return file_sha256(source) if files == (source,) else files_sha256((str(i), f) for i, f in enumerate(files))
+    images, times = list_images(source), times_file(source)
+    return files_sha256(sorted((p.name, p) for p in [*images, *([times] if times else [])]))
 
 
 def _require_one_size(folder: Path, sizes: dict[str, tuple[int, int]], what: str) -> None:

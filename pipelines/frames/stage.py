@@ -12,7 +12,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from formats.atomic import copy_file
-from formats.errors import InputError
+from formats.errors import InputError, RecoverableError
 from formats.images import read_rgb, write_rgb
 from formats.jsonfile import read_json, write_json
 from formats.video import VideoFrame
@@ -130,6 +130,7 @@ def _pick(context: StageContext, source: AnySource) -> list[Frame]:
         name = source.name(frame_id, picture.source_index)
         frames.append(Frame(frame_id, name, timestamp, picture.source_index, score))
         _save_picked(context, source, picture, name)
+    context.same_source()
     if len(frames) < 2:
         raise InputError(f"{source.path} gives one frame only; a reconstruction needs several views of a scene")
     write_json(table, {"frames": [asdict(f) for f in frames], "warnings": context.warnings})
@@ -302,6 +303,19 @@ def _write_frames(context: StageContext, source: AnySource, frames: list[Frame],
     done = parallel_map(write, pictures, context.threads)
     for _ in context.progress.track(done, "undistorting", len(missing)):
         pass
+    _require_all(context, source, missing)
+
+
+def _require_all(context: StageContext, source: AnySource, frames: list[Frame]) -> None:
+    """The source has given all of these frames again, as they were."""
+    try:
+        context.same_source()
+    except InputError:
+        for frame in frames:
+            (context.folder / frame.name).unlink(missing_ok=True)
+        raise
+    if lost := [f.name for f in frames if not (context.folder / f.name).exists()]:
+        raise RecoverableError(f"{source.path}: {len(lost)} frames could be read before and no longer, {lost[0]} first")
 
 
 def _figures(frames: list[Frame], structure: Structure, calibration: Calibration) -> dict[str, Any]:

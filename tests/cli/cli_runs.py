@@ -1,5 +1,6 @@
 """Commands in this process, and what a tiny finished run consists of."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,3 +32,24 @@ class FinishedRun:
     video: Path
     truth: Path
     folder: Path
+
+
+def kernels() -> Path:
+    """Where compiled kernels are kept already, so that they need not be compiled again."""
+    home = os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or Path(home, "msgs-slam"))
+
+
+def elsewhere(root: Path) -> dict[str, str]:
+    """An environment whose home, temporary and working folder are new and empty, below `root`."""
+    for name in ("home", "temporary", "here"):
+        (root / name).mkdir()
+    places = {"HOME": root / "home", "XDG_CACHE_HOME": root / "home" / "cache", "TMPDIR": root / "temporary"}
+    places |= {"NUMBA_CACHE_DIR": kernels(), "MSGS_SLAM_CACHE": root / "home" / "models"}
+    paths = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")]
+    return os.environ | {k: str(v) for k, v in places.items()} | {"PYTHONPATH": os.pathsep.join(paths)}
+
+
+def files_below(*folders: Path) -> dict[str, int]:
+    """Name → time of change."""
+    return {str(p): p.stat().st_mtime_ns for f in folders for p in f.rglob("*") if p.is_file()}

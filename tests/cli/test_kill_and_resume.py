@@ -1,4 +1,7 @@
-"""SIGKILL in every stage: the run goes on, keeps what is finished, and ends with the bytes of an unbroken run."""
+"""SIGKILL in every stage: the run goes on, keeps what is finished, and ends with the bytes of an unbroken run.
+
+Nothing is written beside the run folder meanwhile, not even by what is killed.
+"""
 
 import hashlib
 import json
@@ -11,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from cli_runs import elsewhere, files_below
 
 from formats.video_writer import write_video
 from pipelines.run_folder_names import STAGES
@@ -30,9 +34,9 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_video(path, [f.rgb for f in iter_clip(make_world(texel=0.01), options)], options.fps)
 
 
-def start(*arguments: object) -> subprocess.Popen[bytes]:
+def start(environment: dict[str, str], *arguments: object) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "msgs_cli.main", *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment)
 
 
 def finish(process: subprocess.Popen[bytes]) -> None:
@@ -70,17 +74,17 @@ def finished_at(run: Path) -> dict[str, float]:
 
 def test_killed_in_every_stage_the_run_ends_as_an_unbroken_one(clip: Path, tmp_path: Path) -> None:
     options = [x for s in SETTINGS for x in ("--set", s)]
-    whole, broken = tmp_path / "whole.msgs", tmp_path / "broken.msgs"
-    finish(start("reconstruct", clip, "--out", whole, *options))
+    whole, broken, places = tmp_path / "whole.msgs", tmp_path / "broken.msgs", elsewhere(tmp_path)
+    finish(start(places, "reconstruct", clip, "--out", whole, *options))
 
     killed = []
-    process = start("reconstruct", clip, "--out", broken, *options)
+    process = start(places, "reconstruct", clip, "--out", broken, *options)
     for stage in STAGES:
         if kill_when(process, written(broken / f"{stage}.partial", 1)):
             killed.append(stage)
             before = finished_at(broken)
             assert list(before) == list(STAGES[: STAGES.index(stage)])
-        process = start("resume", broken)
+        process = start(places, "resume", broken)
     finish(process)
     after = finished_at(broken)
     assert {name: after[name] for name in before} == before, "a finished stage was done again"
@@ -88,6 +92,8 @@ def test_killed_in_every_stage_the_run_ends_as_an_unbroken_one(clip: Path, tmp_p
     assert digests(broken) == digests(whole)
 
     # A changed setting of mapping: mapping and what follows are done again, nothing before.
-    finish(start("resume", broken, "--set", "mapping.min_iterations=41"))
+    finish(start(places, "resume", broken, "--set", "mapping.min_iterations=41"))
     later = finished_at(broken)
     assert [name for name in STAGES if later[name] != after[name]] == ["mapping", "global_ba", "export"]
+    assert files_below(*(tmp_path / name for name in ("home", "temporary", "here"))) == {}
+    assert {p.name for p in tmp_path.iterdir()} == {"whole.msgs", "broken.msgs", "home", "temporary", "here"}

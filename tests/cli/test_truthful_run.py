@@ -14,9 +14,10 @@ from cli_runs import OPTIONS, FinishedRun, invoke
 
 from formats.errors import InputError
 from pipelines.config import Config
+from pipelines.frames.source import source_digest
 from pipelines.lock import locked
 from pipelines.progress import SilentProgress
-from pipelines.reconstruct import made_with, reconstruct, source_digest
+from pipelines.reconstruct import made_with, reconstruct
 from pipelines.records import load_records
 from pipelines.run_folder import RunFolder
 

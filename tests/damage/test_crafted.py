@@ -29,8 +29,7 @@ from formats.mesh import read_mesh_glb, read_mesh_ply
 from formats.tensors import load_arrays, load_safetensors, save_safetensors
 from formats.trajectory import read_matrices, read_tum
 from pipelines.frames.recording import RecordingSource
-from pipelines.frames.source import FolderSource, open_source
-from pipelines.reconstruct import source_digest
+from pipelines.frames.source import FolderSource, open_source, source_digest
 
 Read = Callable[[Path], Any]
 DEEP = 100_000

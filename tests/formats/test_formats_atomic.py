@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from formats.atomic import atomic_path, write_bytes, write_text
-from formats.errors import DiskFullError, InputError
+from formats.errors import DiskFullError, InputError, RecoverableError
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -36,7 +37,7 @@ def test_failed_block_keeps_the_old_file(tmp_path: Path) -> None:
             temporary.write_text("half of the n")
             (folder / "not there").read_text()
 
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(RecoverableError):
         write_half(tmp_path)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
@@ -100,6 +101,13 @@ def test_a_file_in_place_of_a_folder(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("I am a file")
     with pytest.raises(InputError, match="choose another output folder"):
         write_bytes(tmp_path / "out" / "a.bin", b"x")
+
+
+def test_what_vanishes_while_it_is_copied_is_named(tmp_path: Path) -> None:
+    gone = pytest.raises(RecoverableError, match=r"cannot write .*a\.bin: .*gone\.jpg has vanished")
+    with gone, atomic_path(tmp_path / "a.bin") as temporary:
+        shutil.copyfile(tmp_path / "gone.jpg", temporary)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_other_errors_stay_what_they_are(tmp_path: Path) -> None:

@@ -9,11 +9,12 @@ import pytest
 from formats.atomic import write_text
 from formats.errors import DiskFullError, InputError
 from pipelines.config import Config, MappingConfig, load_config
+from pipelines.journal import JOURNAL
 from pipelines.progress import SilentProgress
 from pipelines.records import load_records
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
-from pipelines.stages import Stage, StageContext, run_stages
+from pipelines.stages import SameSource, Stage, StageContext, run_stages
 
 
 class Recorder:
@@ -171,6 +172,45 @@ def test_file_that_the_disk_has_cut_is_not_sealed(recorder: Recorder, tmp_path: 
         bring_up_to_date(Cutting(), tmp_path / "r")
     assert list(load_records(RunFolder(tmp_path / "r"))) == ["frames"]
     assert bring_up_to_date(recorder, tmp_path / "r") == list(STAGES[1:])
+
+
+def test_line_of_the_journal_that_a_full_disk_has_cut_costs_no_other_file(recorder: Recorder, tmp_path: Path) -> None:
+    recorder.fail_in = "mapping"
+    with pytest.raises(KeyboardInterrupt):
+        bring_up_to_date(recorder, tmp_path / "r")
+    journal = RunFolder(tmp_path / "r").partial("mapping") / JOURNAL
+    with journal.open("a") as file:
+        file.write("\n0123456789abcdef")
+    recorder.fail_in = ""
+    assert bring_up_to_date(recorder, tmp_path / "r") == ["mapping", "global_ba", "export"]
+
+
+def test_nothing_is_given_up_for_a_source_that_is_another_one(recorder: Recorder, tmp_path: Path) -> None:
+    asked: list[bool] = []
+
+    def same_source() -> None:
+        asked.append(True)
+        raise InputError("the source has changed")
+
+    def bring(config: Config, source: SameSource = same_source) -> None:
+        run_stages(
+            recorder.stages(), run, Path("video.mp4"), "d", config, SilentProgress(), "export", source
+        )  # fmt: skip
+
+    run = RunFolder(tmp_path / "r")
+    run.root.mkdir()
+    bring(Config(), lambda: None)
+    bring(load_config(overrides=["mapping.hold_out=4"]))
+    assert asked == []  # frames are done: the source is not needed
+    bring(Config())
+    before = run.manifest_file.read_bytes(), run.settings_file.read_bytes()
+    with pytest.raises(InputError, match="the source has changed"):
+        bring(load_config(overrides=["frames.rate=1"]))
+    (run.stage("frames") / "result.txt").write_text("damaged")
+    with pytest.raises(InputError, match="the source has changed"):
+        bring(Config())
+    assert asked == [True, True]
+    assert (run.manifest_file.read_bytes(), run.settings_file.read_bytes()) == before
 
 
 def test_snapshot_of_other_settings_is_dropped(recorder: Recorder, tmp_path: Path) -> None:

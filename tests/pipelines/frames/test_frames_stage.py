@@ -12,10 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
-from formats.errors import InputError
+from formats.errors import DiskFullError, InputError
 from formats.images import read_rgb, write_rgb
 from formats.jsonfile import read_json
 from pipelines.config import load_config
+from pipelines.correspondence.snapshots import Snapshots
+from pipelines.frames.source import source_digest
 from pipelines.frames.stage import run
 from pipelines.geometry.alignment import align_points
 from pipelines.progress import SilentProgress
@@ -126,6 +128,68 @@ def test_a_stage_killed_again_and_again_ends_with_the_same_bytes(
     assert run(again) == finished[1]
     assert digests(again.folder) == digests(finished[0].folder)
     assert {p.name: p.stat().st_mtime_ns for p in (again.snapshot / "features").iterdir()} == extracted
+
+
+def test_structure_from_motion_is_not_begun_without_room_for_it(tmp_path: Path) -> None:
+    """Asked of the system, not of the free bytes: those tell nothing of the largest file allowed."""
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, before[1]))
+    try:
+        with pytest.raises(DiskFullError, match="needs 30 MB of disk"):
+            Snapshots(tmp_path).model("global", lambda work: pytest.fail("COLMAP was called"))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.rglob("room*"))
+
+
+class ActAt(SilentProgress):
+    """Does something when the n-th item of a bar has been handed out."""
+
+    def __init__(self, label: str, item: int, act: Callable[[], object]) -> None:
+        self._label, self._item, self._act = label, item, act
+
+    def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+        for i, item in enumerate(items):
+            if label == self._label and i == self._item:
+                self._act()
+            yield item
+
+
+def test_pictures_that_change_while_they_are_read_are_noticed(
+    finished: tuple[StageContext, dict], bent_walk: Walk, tmp_path: Path
+) -> None:
+    """One vanishes at the first reading, one is exchanged at the second: the stage says so, and keeps none of it."""
+    folder = tmp_path / "walk"
+    shutil.copytree(bent_walk.folder, folder)
+    digest = source_digest(folder, "images")
+
+    def same_source() -> None:
+        if source_digest(folder, "images") != digest:
+            raise InputError("the source has changed")
+
+    def bring(label: str, item: int, act: Callable[[], object]) -> dict:
+        context, work = finished[0], ActAt(label, item, act)
+        return run(StageContext(context.run, folder, context.config, place, work, same_source=same_source))
+
+    place = tmp_path / "frames"
+    place.mkdir()
+    picture = folder / "view_007.png"
+    with pytest.raises(InputError, match="has changed"):
+        bring("picking", 2, picture.unlink)
+    assert not (place / "snapshot" / "picked.json").exists()
+    shutil.rmtree(place)
+    shutil.copytree(bent_walk.folder, folder, dirs_exist_ok=True)
+
+    shutil.copytree(finished[0].folder, place)  # with its snapshots: all but the frames is done
+    for frame in place.glob("*.png"):
+        frame.unlink()
+    with pytest.raises(InputError, match="has changed"):
+        bring("undistorting", 0, lambda: picture.write_bytes((folder / "view_003.png").read_bytes()))
+    assert not list(place.glob("*.png"))
+    shutil.copytree(bent_walk.folder, folder, dirs_exist_ok=True)
+    assert bring("", 0, same_source) == finished[1]
+    assert digests(place) == digests(finished[0].folder)
 
 
 def test_given_intrinsics_are_kept(bent_walk: Walk, make_context: Callable[..., StageContext]) -> None:

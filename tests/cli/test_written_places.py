@@ -1,0 +1,49 @@
+"""Commands write into the run folder, the cache and the folder that was asked for, and nowhere else."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from cli_runs import FinishedRun, elsewhere, files_below
+
+ALL_OF_THEM = """
+import json, sys
+from click.testing import CliRunner
+from msgs_cli.main import main
+for arguments in json.loads(sys.argv[1]):
+    done = CliRunner().invoke(main, arguments)
+    assert done.exit_code == 0, (arguments, done.output, done.exception)
+"""
+
+
+def test_nothing_is_written_elsewhere(
+    finished_run: FinishedRun, copied_run: Callable[[str], Path], tmp_path: Path
+) -> None:
+    run, asked = copied_run("run.msgs"), tmp_path / "asked"
+    environment = elsewhere(tmp_path)
+    source = files_below(finished_run.truth, finished_run.video.parent)
+    commands: list[list[object]] = [
+        ["resume", run, "--set", "export.spz=true", "-q"],
+        ["status", run],
+        ["export", run, "--to", asked / "export", "-q"],
+        ["render", run, asked / "walk.mp4", "--fps", "2", "-q"],
+        ["report", run, "--to", asked / "report.html", "-q"],
+        ["evaluate", run, "--truth", finished_run.truth, "-q"],
+        ["config"],
+        ["models", "list"],
+    ]
+    arguments = json.dumps([[str(word) for word in command] for command in commands])
+    done = subprocess.run(
+        [sys.executable, "-c", ALL_OF_THEM, arguments],
+        cwd=tmp_path / "here", env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert files_below(*(tmp_path / name for name in ("home", "temporary", "here"))) == {}
+    assert files_below(finished_run.truth, finished_run.video.parent) == source
+    assert {p.name for p in asked.iterdir()} == {"export", "walk.mp4", "report.html"}
+    assert {p.name for p in tmp_path.iterdir()} == {"run.msgs", "asked", "home", "temporary", "here"}
+    assert {p.name for p in run.iterdir() if p.name not in {q.name for q in finished_run.folder.iterdir()}} == {
+        "evaluation"
+    }
