@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from formats.atomic import copy_file
-from formats.errors import DiskFullError, InputError
+from formats.errors import InputError, RecoverableError
 from pipelines.config import Config
 from pipelines.records import load_records
 from pipelines.run_folder import (
@@ -43,7 +43,7 @@ def make_pieces(context: StageContext) -> list[RunFolder]:
         stages = [Stage("frames", take_frames, "the frames of the piece"), *context.stages[1:]]
         try:
             run_stages(stages, piece, context.source, origin, _settings(context.config), context.progress)
-        except DiskFullError:
+        except RecoverableError:
             raise
         except InputError as error:
             context.warn(f"{name} is posed, and could not be made whole: {error}")
