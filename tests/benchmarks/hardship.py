@@ -310,7 +310,7 @@ def _frames_made_again(work: Path, run: Path, folder: Path, picture: Path) -> It
 
 def prepare(work: Path) -> None:
     """A clip with its truth, a whole run of it, and copies of it as it was before each stage."""
-    from pipelines.world import ClipOptions, make_world, write_sequence
+    from tests.world import ClipOptions, make_world, write_sequence
 
     make_clip(work / "clip.avi")
     write_sequence(work / "truth", make_world(texel=0.02), ClipOptions(frames=10, width=128, height=96, laps=0.2))
