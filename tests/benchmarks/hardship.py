@@ -290,7 +290,7 @@ def _frames_made_again(work: Path, run: Path, folder: Path, picture: Path) -> It
     before = (run / "manifest.json").read_bytes()
     whole = picture.read_bytes()
     for what, act in {"gone": folder.rename, "changed": lambda _: picture.write_bytes(whole + b"\0")}.items():
-        for name, option in {"damaged frame": [], "setting": ["--set", "frames.parallax=9"]}.items():
+        for name, option in {"damaged frame": [], "setting": ["--set", "frames.parallax=0.03"]}.items():
             frame = next((run / "frames").glob("*.png"))
             good = frame.read_bytes()
             if not option:
