@@ -12,7 +12,7 @@ is given the folder of the running stage.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from itertools import count, takewhile
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -273,7 +273,7 @@ def save_matching(folder: Path, vocabulary: Vocabulary, tried: dict[tuple[int, i
 
 def save_sparse_model(path: Path, model: SparseModel) -> None:
     """One npz."""
-    save_arrays(path, dict(model.__dict__))
+    save_arrays(path, {field.name: getattr(model, field.name) for field in fields(model)})
 
 
 def load_sparse_model(path: Path) -> SparseModel:

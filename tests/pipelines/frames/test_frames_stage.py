@@ -21,7 +21,7 @@ from pipelines.frames.source import source_digest
 from pipelines.frames.stage import run
 from pipelines.geometry.alignment import align_points
 from pipelines.progress import SilentProgress
-from pipelines.run_folder import RunFolder, load_sparse_model
+from pipelines.run_folder import BACKBONE, SPARSE, RunFolder, load_sparse_model, save_sparse
 from pipelines.stages import StageContext
 from pipelines.stored import dataclass_from_json
 from pipelines.structure import sfm
@@ -99,6 +99,15 @@ def test_points_reproject_into_the_undistorted_frames(finished: tuple[StageConte
     x, y = model.obs_xy[first].astype(int).clip(0, [rgb.shape[1] - 1, rgb.shape[0] - 1]).T
     difference = np.abs(rgb[y, x].astype(int) - model.colors[model.obs_point[first]])
     assert np.median(difference) < 20
+
+
+def test_what_was_asked_of_a_model_is_not_saved_with_it(finished: tuple[StageContext, dict], tmp_path: Path) -> None:
+    context, _ = finished
+    model = context.run.load_backbone()
+    assert model is not None
+    assert model.tree.n == model.seen.shape[0] == len(model.centers)
+    save_sparse(tmp_path, model)
+    assert (tmp_path / SPARSE).read_bytes() == (context.folder / BACKBONE).read_bytes()
 
 
 def test_frames_are_undistorted(finished: tuple[StageContext, dict], bent_walk: Walk) -> None:
