@@ -37,12 +37,12 @@ from pipelines.geometry import se3
 from pipelines.geometry.alignment import align_points
 from pipelines.global_ba.local import adjust_views
 from pipelines.mapping import schedule
-from pipelines.mapping.load import MappingInput, load_views
+from pipelines.mapping.load import MappingInput, load_view, load_views
 from pipelines.mapping.measure import mean_figures, measure_view
 from pipelines.mapping.optimise import optimise_map, scene_depth
 from pipelines.mapping.views import View
-from pipelines.outcome import load_outcome
 from pipelines.proxy.reliability import GAMMA, theta
+from pipelines.records import load_source
 from pipelines.run_folder import RunFolder
 from pipelines.types import Trajectory
 
@@ -85,11 +85,9 @@ def local_trial(run: RunFolder, truth: Path | None) -> dict[str, dict[str, float
     """Mean error of the chosen keyframes' places in cm (in thousandths of the scene's depth without truth) and degrees,
     before and after, by start."""
     trajectory, gaussian_map = run.load_trajectory("mapping"), run.load_map("mapping")
-    settings = MappingConfig(max_side=320)
-    views = load_views(run, trajectory, settings).views
-    chosen = views[::6]
-    unit = scene_depth(views)
-    true, scale = true_poses(run, trajectory, views, truth, unit)
+    chosen = keyframe_views(run, trajectory)
+    unit = scene_depth(chosen)
+    true, scale = true_poses(run, trajectory, truth, unit)
     rng = np.random.default_rng(0)
     shake = rng.normal(size=(len(chosen), 6)) / np.sqrt(3) * np.repeat([0.01 * unit, np.radians(0.3)], 3)
     out = {}
@@ -98,34 +96,43 @@ def local_trial(run: RunFolder, truth: Path | None) -> dict[str, dict[str, float
             replace(v, cam_from_world=torch.from_numpy(se3.exp(t)) @ v.cam_from_world)
             for v, t in zip(chosen, twists, strict=True)
         ]
-        found = adjust_views(start, {v.frame_id for v in chosen}, gaussian_map, settings, 20)
+        found = adjust_views(start, {v.frame_id for v in chosen}, gaussian_map, MappingConfig(), 20)
         for when, group in (("before", start), ("after", found)):
-            motions = [v.cam_from_world.numpy() @ se3.inverse(true[v.frame_id]) for v in group]
-            centres = [
-                np.linalg.norm(se3.inverse(v.cam_from_world.numpy())[:3, 3] - se3.inverse(true[v.frame_id])[:3, 3])
-                for v in group
-            ]
-            angles = [float(np.degrees(se3.rotation_angle(m))) for m in motions]
+            ours = se3.inverse(np.array([v.cam_from_world.numpy() for v in group]))
+            theirs = se3.inverse(np.array([true[v.frame_id] for v in group]))
+            away = np.linalg.norm(ours[:, :3, 3] - theirs[:, :3, 3], axis=1)
+            turned = np.degrees(se3.rotation_angle(se3.inverse(ours) @ theirs))
             out[f"{name}, {when}"] = {
-                "place": round(scale * float(np.mean(centres)), 3), "degrees": round(float(np.mean(angles)), 3)
-            }  # fmt: skip
+                "place": round(float(scale * away.mean()), 3),
+                "degrees": round(float(turned.mean()), 3),
+            }
     return out
 
 
+def keyframe_views(run: RunFolder, trajectory: Trajectory) -> list[View]:
+    """Every sixth keyframe at 320 pixels."""
+    frames = {f.id: f for f in run.load_frames()}
+    camera = run.load_calibration().intrinsics.at_most(320)
+    fields, class_ids = run.load_depth_fields("tracking"), tuple(run.load_class_ids())
+    poses = dict(zip(trajectory.frame_ids.tolist(), trajectory.cam_from_world, strict=True))
+    return [
+        load_view(run, frames[i], camera, poses[i], fields.in_world(i, run.load_proxy(i)), class_ids, "cpu")
+        for i in trajectory.frame_ids[trajectory.is_keyframe].tolist()[::6]
+    ]
+
+
 def true_poses(
-    run: RunFolder, trajectory: Trajectory, views: list[View], truth: Path | None, unit: float
+    run: RunFolder, trajectory: Trajectory, truth: Path | None, unit: float
 ) -> tuple[dict[int, NDArray[np.float64]], float]:
     """cam_from_world by frame in the run's world, and what its lengths are multiplied by."""
-    if truth is None:
-        return {v.frame_id: v.cam_from_world.numpy() for v in views}, 1000 / unit
-    outcome = load_outcome(run)
-    matched = match_truth(outcome.frames, outcome.source_is_folder, open_sequence(truth))
     ids = trajectory.frame_ids.tolist()
-    theirs = matched.world_from_cam[[outcome.frame_row(v.frame_id) for v in views]]
-    ours = np.array([trajectory.world_from_cam[ids.index(v.frame_id)] for v in views])
-    ours_from_true = align_points(theirs[:, :3, 3], ours[:, :3, 3])
-    moved = ours_from_true.apply_to_poses(se3.inverse(theirs))
-    return {v.frame_id: m for v, m in zip(views, moved, strict=True)}, 100 / ours_from_true.scale
+    if truth is None:
+        return dict(zip(ids, trajectory.cam_from_world, strict=True)), 1000 / unit
+    matched = match_truth(run.load_frames(), Path(load_source(run).path).is_dir(), open_sequence(truth))
+    rows = np.flatnonzero(trajectory.is_keyframe & matched.has_pose)
+    ours_from_true = align_points(matched.world_from_cam[rows, :3, 3], trajectory.centers[rows])
+    moved = ours_from_true.apply_to_poses(se3.inverse(matched.world_from_cam[rows]))
+    return dict(zip([ids[r] for r in rows], moved, strict=True)), 100 / ours_from_true.scale
 
 
 def stretch(run: RunFolder, count: int) -> MappingInput:
