@@ -141,16 +141,23 @@ class StructureFromMotion:
                 return pieces
             snapshots = Snapshots(self.snapshots.folder / f"piece_{number}")
             snapshots.folder.mkdir(exist_ok=True)
-            found = replace(self, camera=camera, is_fixed=True, snapshots=snapshots)._map(features, rest)
+            alone = replace(self, camera=camera, is_fixed=True, snapshots=snapshots)
+            tried = [alone._map(features, rest, ("global",))]
+            if tried[0] is None or not self._is_piece(tried[0][2]):
+                tried.append(alone._map(features, rest, ("incremental",)))
+            found = max(filter(None, tried), key=lambda f: (self._is_piece(f[2]), f[2].registered), default=None)
             if found is None or found[2].registered < self.config.least_piece:
                 return pieces
             piece = found[0]
             adjust(piece, refine_camera=False)
             report = judge(piece, rest, xy, len(features), self.config.overlap)
             left -= {i - 1 for i in piece.reg_image_ids()}
-            if len(report.parts[0]) >= self.config.least_piece and report.is_consistent:
+            if self._is_piece(report):
                 take_out(piece, [k for part in report.parts[1:] for k in part])
                 pieces.append(piece)
+
+    def _is_piece(self, report: ModelReport) -> bool:
+        return len(report.parts[0]) >= self.config.least_piece and report.is_consistent
 
     def _largest_first(
         self, found: _Adjusted, pieces: list[pycolmap.Reconstruction]

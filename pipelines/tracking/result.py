@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,43 +12,33 @@ from pipelines.tracking.state import TrackState
 from pipelines.types import Frame, SparseModel, Trajectory
 
 
-def keep_largest_segment(state: TrackState) -> None:
-    """Frames of the other segments become lost: their poses live in another world."""
-    counts = Counter(state.segment[i] for i in state.poses)
-    # The smaller number wins a tie, so that the choice does not depend on the order of a dictionary.
-    largest = min(counts, key=lambda s: (-counts[s], s))
-    for frame_id in sorted(state.poses):
-        if state.segment[frame_id] != largest:
-            state.lost.setdefault(frame_id, "tracked, but this stretch could not be joined to the rest")
-            for table in (state.poses, state.sightings, state.segment):
-                del table[frame_id]
-    state.keyframes = [k for k in state.keyframes if k in state.poses]
-
-
-def take_pieces(state: TrackState, least: int) -> list[TrackState]:
-    """The segments but the largest that have at least so many frames, largest first, each in a world of its own."""
+def split_worlds(state: TrackState, least: int) -> list[TrackState]:
+    """The segments, largest first, each in a world of its own that begins with its first posed camera; of those after
+    the first, the ones of at least so many frames. The first has the reason why a frame is in none or in another."""
     counts = Counter(state.segment.values())
-    order = sorted(counts, key=lambda s: (-counts[s], s))[1:]
-    pieces = []
-    for number, segment in enumerate((s for s in order if counts[s] >= least), 2):
-        inside = [i for i in sorted(state.poses) if state.segment[i] == segment]
-        poses, sightings = {i: state.poses[i] for i in inside}, {i: state.sightings[i] for i in inside}
-        keyframes = [k for k in state.keyframes if k in poses]
-        piece = TrackState(state.points, state.colors, poses, sightings, keyframes, segment=dict.fromkeys(inside, 0))
-        normalise(piece)
-        pieces.append(piece)
-        state.lost |= dict.fromkeys(inside, f"in piece_{number}, which nothing joins to the rest")
-    return pieces
+    # The smaller number wins a tie, so that the choice does not depend on the order of a dictionary.
+    order = sorted(counts, key=lambda s: (-counts[s], s))
+    kept = order[:1] + [s for s in order[1:] if counts[s] >= least]
+    elsewhere = {s: f"in piece_{n}, which nothing joins to the rest" for n, s in enumerate(kept[1:], 2)}
+    short = "tracked, but this stretch could not be joined to the rest"
+    apart = {i: elsewhere.get(s, short) for i, s in state.segment.items() if s != order[0]}
+    first, *pieces = (_alone(state, segment) for segment in kept)
+    return [replace(first, lost=state.lost | apart), *pieces]
 
 
-def normalise(state: TrackState) -> None:
-    """Keep one world, the first posed camera its origin."""
-    keep_largest_segment(state)
-    new_from_old = state.poses[min(state.poses)]
+def _alone(state: TrackState, segment: int) -> TrackState:
+    inside = [i for i in sorted(state.poses) if state.segment[i] == segment]
+    new_from_old = state.poses[inside[0]]
     old_from_new = se3.inverse(new_from_old)
-    state.points = state.points @ new_from_old[:3, :3].T + new_from_old[:3, 3]
-    for frame_id, cam_from_old in state.poses.items():
-        state.poses[frame_id] = cam_from_old @ old_from_new
+    return TrackState(
+        state.points @ new_from_old[:3, :3].T + new_from_old[:3, 3],
+        state.colors,
+        {i: state.poses[i] @ old_from_new for i in inside},
+        {i: state.sightings[i] for i in inside},
+        [k for k in state.keyframes if state.segment[k] == segment],
+        segment=dict.fromkeys(inside, segment),
+        rendered=[i for i in state.rendered if state.segment[i] == segment],
+    )
 
 
 def to_trajectory(state: TrackState, frames: list[Frame]) -> Trajectory:

@@ -14,7 +14,7 @@ from pipelines.tracking.adjust import Report, adjust_state, align_depths, withou
 from pipelines.tracking.front_end import FrontEnd
 from pipelines.tracking.pictures import Pictures
 from pipelines.tracking.refine import RenderWeights, compare_frame
-from pipelines.tracking.result import normalise, take_pieces, to_sparse_model, to_trajectory
+from pipelines.tracking.result import split_worlds, to_sparse_model, to_trajectory
 from pipelines.tracking.segments import join_segments, split_segments
 from pipelines.tracking.state import FEATURE_SD, TrackState
 from pipelines.types import Frame
@@ -41,9 +41,8 @@ def run(context: StageContext) -> dict[str, Any]:
         )
     report = adjust_state(state, intrinsics, pictures.proxy, metric, settings)
     compared = compare_all(context, state, pictures) if settings.render == "all" else {}
-    pieces = take_pieces(state, context.config.frames.least_piece)
+    state, *pieces = split_worlds(state, context.config.frames.least_piece)
     save_pieces(context, pieces, frames)
-    normalise(state)
 
     trajectory = to_trajectory(state, frames)
     save_trajectory(context.folder, trajectory)
@@ -54,7 +53,9 @@ def run(context: StageContext) -> dict[str, Any]:
     if "reference_relative_sd" in proxy:  # what the user's reference leaves open; depths agree far better
         figures["scale_relative_sd"] = proxy["reference_relative_sd"]
     save_figures(context.folder, "tracking", figures)
-    warn_of_losses(context, state)
+    lost = set(state.lost).difference(*(p.poses for p in pieces))
+    if lost:
+        context.warn(f"{len(lost)} frames have no pose: {stretches(lost)}")
     return figures
 
 
@@ -135,20 +136,11 @@ def describe(state: TrackState, frames: list[Frame], report: Report, metric: boo
         "posed": len(state.poses),
         "keyframes": len(state.keyframes),
         "by_rendering": len(state.rendered),
-        "segments": len(set(state.segment.values())),
         "lost": {str(i): reason for i, reason in sorted(state.lost.items())},
         "scale": "metric" if metric and world else "free",
         "scale_relative_sd": world.relative_sd if world else None,
         **report.figures,
     }
-
-
-def warn_of_losses(context: StageContext, state: TrackState) -> None:
-    """Name what is lost."""
-    if state.lost:
-        context.warn(f"{len(state.lost)} frames have no pose: {stretches(state.lost)}")
-    if len(set(state.segment.values())) > 1:
-        context.warn("the trajectory has parts that could not be joined; only the largest is kept")
 
 
 STAGE = Stage("tracking", run, "a pose for every frame, by correspondences and bundle adjustment")

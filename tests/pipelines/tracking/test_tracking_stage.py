@@ -140,7 +140,7 @@ def test_works_without_structure_from_motion(
     made = make_run(tmp_path / "run", keyframes=(), all_proxies=True)
     figures = finish(open_stage(made.run, "tracking"))
     assert figures["posed"] == 24
-    assert figures["segments"] == 1
+    assert figures["pieces"] == []
     assert 2 <= figures["keyframes"] <= 12
     assert 0 < trajectory_error(made, scale=False) < 0.02
 
@@ -151,7 +151,7 @@ def test_goes_on_where_structure_from_motion_ends(
     made = make_run(tmp_path / "run", keyframes=(8, 11, 14), all_proxies=True, backbone_scale=0.4)
     figures = finish(open_stage(made.run, "tracking"))
     assert figures["posed"] == 24
-    assert figures["segments"] == 1
+    assert figures["pieces"] == []
     assert 0 < trajectory_error(made, scale=False) < 0.02
 
 
@@ -183,7 +183,7 @@ def test_parts_of_structure_from_motion_are_joined_where_they_recognise_each_oth
     context = open_stage(made.run, "tracking")
     figures = finish(context)
     assert figures["posed"] == 24
-    assert figures["segments"] == 1
+    assert figures["pieces"] == []
     assert 0 < trajectory_error(made, scale=True) < 0.02
 
 
