@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ MAX_RATIO, MAX_ANGLE = 0.8, 0.7
 """Of the angle between two descriptors that match: as a share of the next best one's (Lowe), and in radians."""
 _MAX_ERROR, _MIN_INLIERS = 2.0, 15
 """Pixels within which a match obeys a geometry, and how many have to."""
+_FIRST_LOOK, _NEARLY = 300, 0.8
+"""Trials of the first look at a pair, and its share of the least inliers: chosen on two recordings."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,8 @@ def verify_matches(
     seed: int,
 ) -> VerifiedPair | None:
     """Robust two-view geometry of proposed matches, or None. See `match_pair`."""
+    if not _may_agree(xy[0][matches[:, 0]], xy[1][matches[:, 1]]):
+        return None
     geometry = pycolmap.estimate_two_view_geometry(
         camera, xy[0], camera, xy[1], matches, _verification_options(pair_seed(seed, pair))
     )
@@ -105,6 +110,16 @@ def verify_matches(
         return None
     matrices = np.stack([_matrix(m) for m in (geometry.F, geometry.E, geometry.H)])
     return VerifiedPair(*pair, inliers, int(geometry.config), matrices, len(matches))
+
+
+def _may_agree(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:
+    """A first look at matched pixels (M, 2), by OpenCV's USAC: whether about enough of them obey one epipolar geometry.
+
+    It takes a millisecond; of pairs with nothing in common each costs the full count of trials for three geometries.
+    Of some pairs of a walk through a house and of a kitchen it refused 100 of 130 of those, and none of 421 others.
+    """
+    _, inliers = cv2.findFundamentalMat(first, second, cv2.USAC_FAST, _MAX_ERROR, 0.99, _FIRST_LOOK)
+    return inliers is not None and int(inliers.sum()) >= _NEARLY * _MIN_INLIERS
 
 
 def pair_seed(seed: int, pair: tuple[int, int]) -> int:
