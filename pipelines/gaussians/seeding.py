@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -141,7 +142,7 @@ def _cells(values: NDArray[np.float32], side: int) -> NDArray[np.float32]:
     """(ceil(H / side), ceil(W / side)) largest value in each square."""
     height, width = values.shape
     padded = np.pad(values, ((0, -height % side), (0, -width % side)), mode="edge")
-    return padded.reshape(padded.shape[0] // side, side, padded.shape[1] // side, side).max((1, 3))
+    return reduce(np.maximum, (padded[i::side, j::side] for i in range(side) for j in range(side)))
 
 
 def _refill(out: NDArray[np.float32], cells: NDArray[np.bool_], side: int, spacing: float, middle: int | None) -> None:

@@ -11,18 +11,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from pipelines.gaussians.render.jit import kernel
-
 C1, C2 = 0.01**2, 0.03**2
 """Constants of Wang et al. 2004 for images in 0..1."""
-TAPS, _SIGMA = 11, 1.5
+TAPS = 11
+_WINDOW = cv2.getGaussianKernel(TAPS, 1.5)[:, 0]
+"""The window, along rows and along columns."""
 
 
 def ssim_map(rendered: Tensor, target: Tensor) -> Tensor:
     """(H, W, 3) local similarity of two float images in 0..1; differentiable in `rendered` alone.
 
     11-tap Gaussian window of sigma 1.5 (Wang et al., TIP 2004), zeros outside the image as the 3DGS loss has it.
-    float32 on a CPU takes compiled loops, everything else plain torch.
     """
     return _Ssim.apply(rendered, target)
 
@@ -30,8 +29,7 @@ def ssim_map(rendered: Tensor, target: Tensor) -> Tensor:
 class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor) -> Tensor:
-        fast = a.device.type == "cpu" and a.dtype == torch.float32
-        value, by_mean, by_var, by_cov = _similarity_fast(a, b) if fast else similarity(a, b)
+        value, by_mean, by_var, by_cov = similarity(a, b)
         ctx.save_for_backward(a, b, by_mean, by_var, by_cov)
         return value
 
@@ -59,60 +57,18 @@ def similarity(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return value, by_mean, by_var, by_cov
 
 
-def _similarity_fast(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """`similarity` in two passes over memory around the five blurs."""
-    first, second = (np.ascontiguousarray(x.detach().numpy()) for x in (a, b))
-    products = np.empty((3, *first.shape), np.float32)
-    _products(first.reshape(-1), second.reshape(-1), products.reshape(3, -1))
-    blurred = [_blur_array(x) for x in (first, second, *products)]
-    out = np.empty((4, *first.shape), np.float32)
-    _similarity_loop(*(x.reshape(-1) for x in blurred), out.reshape(4, -1), C1, C2)
-    value, by_mean, by_var, by_cov = torch.from_numpy(out)
-    return value, by_mean, by_var, by_cov
-
-
-@kernel
-def _products(a: NDArray, b: NDArray, out: NDArray) -> None:
-    for i in range(len(a)):
-        out[0, i] = a[i] * a[i]
-        out[1, i] = b[i] * b[i]
-        out[2, i] = a[i] * b[i]
-
-
-@kernel
-def _similarity_loop(
-    mean_a: NDArray, mean_b: NDArray, aa: NDArray, bb: NDArray, ab: NDArray, out: NDArray, c1: float, c2: float
-) -> None:
-    one, two = np.float32(1), np.float32(2)
-    k1, k2 = np.float32(c1), np.float32(c2)
-    for i in range(len(mean_a)):
-        x, y = mean_a[i], mean_b[i]
-        luminance = two * x * y + k1
-        contrast = two * (ab[i] - x * y) + k2
-        under_l = x * x + y * y + k1
-        under_c = aa[i] - x * x + bb[i] - y * y + k2
-        inverse = one / (under_l * under_c)
-        value = luminance * contrast * inverse
-        by_cov = two * luminance * inverse
-        by_var = -value / under_c
-        out[0, i] = value
-        out[1, i] = two * y * contrast * inverse - two * x * value / under_l - two * x * by_var - y * by_cov
-        out[2, i] = by_var
-        out[3, i] = by_cov
-
-
 def blur(image: Tensor) -> Tensor:
     """(H, W, C) Gaussian-weighted mean around every pixel, zeros outside the image."""
     if image.device.type == "cpu" and image.dtype in (torch.float32, torch.float64):
         # OpenCV's separable filter is about ten times torch's depthwise convolution on a CPU.
-        return torch.from_numpy(_blur_array(np.ascontiguousarray(image.detach().numpy())))
-    taps = torch.as_tensor(cv2.getGaussianKernel(TAPS, _SIGMA), dtype=image.dtype, device=image.device).flatten()
+        return torch.from_numpy(blur_array(np.ascontiguousarray(image.detach().numpy())))
+    taps = torch.as_tensor(_WINDOW, dtype=image.dtype, device=image.device)
     planes = image.permute(2, 0, 1)[:, None]
     planes = functional.conv2d(planes, taps[None, None, :, None], padding=(TAPS // 2, 0))
     planes = functional.conv2d(planes, taps[None, None, None, :], padding=(0, TAPS // 2))
     return planes[:, 0].permute(1, 2, 0)
 
 
-def _blur_array(image: NDArray) -> NDArray:
-    taps = cv2.getGaussianKernel(TAPS, _SIGMA)
-    return cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_CONSTANT).reshape(image.shape)
+def blur_array(image: NDArray, out: NDArray | None = None) -> NDArray:
+    """The same of an array, into `out` where it is given."""
+    return cv2.sepFilter2D(image, -1, _WINDOW, _WINDOW, out, borderType=cv2.BORDER_CONSTANT).reshape(image.shape)

@@ -6,24 +6,11 @@ import torch
 from torch import Tensor
 
 from pipelines.gaussians.entropy import weighted_entropy
-from pipelines.gaussians.ssim import ssim_map
 
-SSIM_WEIGHT = 0.2
-"""Share of 1 - SSIM in eq. (20)."""
 NU = 1.2
 """ν of eq. (18)."""
 SIZE_LIMIT = 0.03
 """Radius above which a Gaussian is too large, in units of the scene's median depth."""
-
-
-def image_loss(rendered: Tensor, target: Tensor) -> Tensor:
-    """MSGS-SLAM eq. (20): (1 - w) |I - C| + w (1 - SSIM), mean over (H, W, channels) images in 0..1.
-
-    The article prints ω = 0.2 before the absolute difference; the weights of 3DGS, which has the same formula, are the
-    other way round, and so are the ones here.
-    """
-    difference = (rendered - target).abs().mean()
-    return (1 - SSIM_WEIGHT) * difference + SSIM_WEIGHT * (1 - ssim_map(rendered, target).mean())
 
 
 def depth_weight(reliability: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from pipelines.mapping.article.boundary_clip import clip_beside_boundary
 from pipelines.mapping.article.edge_term import edge_loss
 from pipelines.mapping.article.label_image import label_image_loss
 from pipelines.mapping.article.mirrors import label_symmetry_loss, symmetry_loss
-from pipelines.mapping.state import expose
+from pipelines.mapping.photo_loss import photo_loss
 from pipelines.mapping.views import View
 
 SILHOUETTE_WEIGHT = 0.05
@@ -45,9 +45,7 @@ class Objective:
             clip_beside_boundary(rendering.features, view.channels, article.boundary_clip)
         # split, not slices: the gradient of each slice would be a whole image of zeros around it.
         shown, logits = rendering.features.split([3, rendering.features.shape[-1] - 3], dim=-1)
-        colors = expose(shown, table)
-        beside = colors.detach()  # what is no part of the scene looks as the map does, and asks for nothing
-        loss = losses.image_loss(view.of_scene(colors, beside), view.of_scene(view.colors, beside))
+        loss = photo_loss(shown, table.values["log_gain"], table.values["offset"], view.image, view.scene)
         loss = loss + SILHOUETTE_WEIGHT * losses.silhouette_loss(view.of_scene(rendering.silhouette, 1.0))
         loss = loss + losses.size_loss(log_radii, self.unit)
         if s.depth_weight > 0 and s.use_proxy_depth:

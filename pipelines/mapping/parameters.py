@@ -38,10 +38,6 @@ class MapParameters:
     def __len__(self) -> int:
         return len(self.anchor_frame_ids)
 
-    def features(self, with_classes: bool = True) -> Tensor:
-        """(M, 3 + C) colours and class logits, or (M, 3) colours alone."""
-        return torch.cat([self["colors"], self["class_logits"]], dim=1) if with_classes else self["colors"]
-
     def keep(self, rows: Tensor) -> None:
         """Keep only the given rows everywhere."""
         self.table.keep(rows)

@@ -29,9 +29,12 @@ def with_region_prior(
     out, out_trust = inverse.copy(), np.where(depth > 0, trust, 0).astype(np.float32)
     trust = out_trust.copy()
     for channel in np.unique(channels[channels != VOID]):
-        count, regions = cv2.connectedComponents((channels == channel).astype(np.uint8), connectivity=4)
-        for region in range(1, count):
-            rows, columns = np.nonzero(regions == region)
+        mask = (channels == channel).astype(np.uint8)
+        _, regions, boxes, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
+        for region in 1 + np.flatnonzero(boxes[1:, cv2.CC_STAT_AREA] >= _MIN_REGION):
+            left, top, width, height = boxes[region, : cv2.CC_STAT_AREA]
+            rows, columns = np.nonzero(regions[top : top + height, left : left + width] == region)
+            rows, columns = rows + top, columns + left
             weak = trust[rows, columns] <= low
             reliable = ~weak & (inverse[rows, columns] > 0)
             if not weak.any() or reliable.sum() < _MIN_REGION:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipelines.gaussian_map import GaussianMap
-from pipelines.gaussians.render import render
+from pipelines.gaussians.render import blending_weights, render
 from pipelines.gaussians.render.rendering import project_map
 from pipelines.types import Intrinsics
 
@@ -38,21 +38,20 @@ class Blame:
         return Blame(torch.where(worse, other.error, self.error), torch.where(worse, other.footprint, self.footprint))
 
 
+@torch.no_grad()
 def blame(
     gaussian_map: GaussianMap, cam_from_world: Tensor, intrinsics: Intrinsics, error_of: Callable[[Tensor], Tensor]
 ) -> Blame:
     """What each Gaussian answers for in one view: the errors of the pixels, weighed by its part in them, summed.
 
-    `error_of`: (H, W, 3) colours of the map to (H, W) errors. The sum is the gradient of a feature that nothing else
-    depends on (Rota Bulò, Porzi and Kontschieder, "Revising Densification in Gaussian Splatting", ECCV 2024).
+    `error_of`: (H, W, 3) colours of the map to (H, W) errors (the error of Rota Bulò, Porzi and Kontschieder, "Revising
+    Densification in Gaussian Splatting", ECCV 2024).
     """
     m = gaussian_map
-    probe = torch.zeros(len(m), 1, device=m.means.device, requires_grad=True)
-    shown = render(m.means, m.radii, m.opacities, torch.cat([m.colors, probe], 1), cam_from_world, intrinsics).features
-    colors, probed = shown.split([3, 1], dim=-1)
-    (error,) = torch.autograd.grad((probed[..., 0] * error_of(colors.detach())).sum(), probe)
+    shown = render(m.means, m.radii, m.opacities, m.colors, cam_from_world, intrinsics).features
+    weights = blending_weights(m.means, m.radii, m.opacities, cam_from_world, intrinsics, counts=error_of(shown))
     _, _, footprint, _ = project_map(m.means, m.radii, cam_from_world, intrinsics)
-    return Blame(error[:, 0], footprint)
+    return Blame(weights.total, footprint)
 
 
 def split(gaussian_map: GaussianMap, rows: Tensor) -> GaussianMap:

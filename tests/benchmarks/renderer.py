@@ -40,6 +40,7 @@ from pipelines.gaussians.render.compositing import choose_backend
 from pipelines.gaussians.render.rendering import project_map
 from pipelines.geometry import se3
 from pipelines.mapping import losses
+from pipelines.mapping.photo_loss import photo_loss
 
 ROWS = [(320, 240, 50_000, 8), (320, 240, 200_000, 8), (640, 480, 200_000, 8), (640, 480, 200_000, 40)]
 WANTED = [8.2, 8.8, 12.3, 7.9]
@@ -169,7 +170,8 @@ class Iteration:
         self.optimizer = torch.optim.Adam(self.parameters, lr=1e-4, fused=True)
         with torch.no_grad():
             seen = self.draw(torch.eye(4, dtype=torch.float64))
-        self.image, self.depth = seen.features[..., :3].clone(), seen.depth
+        self.image, self.depth = (255 * seen.features[..., :3]).to(torch.uint8), seen.depth
+        self.exposure = torch.zeros(2, 3, device=device)
         self.labels = seen.features[..., 3:].argmax(-1).to(torch.uint8)
         self.weight = torch.ones_like(self.depth)
 
@@ -181,7 +183,7 @@ class Iteration:
     def step(self) -> None:
         self.optimizer.zero_grad()
         seen = self.draw(POSE)
-        loss = losses.image_loss(seen.features[..., :3], self.image)
+        loss = photo_loss(seen.features[..., :3], *self.exposure, self.image)
         loss = loss + losses.depth_loss(seen.depth, self.depth, self.weight, 1.0)
         loss = loss + losses.label_loss(seen.features[..., 3:], self.labels, self.weight)
         loss.backward()

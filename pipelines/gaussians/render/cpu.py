@@ -12,10 +12,10 @@ from torch import Tensor
 from pipelines.gaussians.render.cpu_backward import backward_band
 from pipelines.gaussians.render.cpu_bands import split_into_bands
 from pipelines.gaussians.render.cpu_forward import forward_band
-from pipelines.gaussians.render.cpu_inspect import inspect
+from pipelines.gaussians.render.cpu_inspect import in_view, inspect
 from pipelines.gaussians.render.threads import for_each
 
-__all__ = ["composite", "inspect"]
+__all__ = ["composite", "in_view", "inspect"]
 
 F32 = np.float32
 
@@ -44,8 +44,9 @@ class _Composite(torch.autograd.Function):
         width, height, proxy_depth, kappa, near = arguments[6:]
         # The type of the guide, not its value, chooses the depth chain: who uses only one compiles only one.
         guide = None if proxy_depth is None or kappa == 0 else (_array(proxy_depth), F32(kappa))
-        vectors = channel_vectors(values.shape[1])
-        bands = split_into_bands(tuple(projected), values, 16 * len(vectors), width, height, near)
+        vectors = None if guide is None and values.shape[1] == 3 else channel_vectors(values.shape[1])
+        channels = 3 if vectors is None else 16 * len(vectors)
+        bands = split_into_bands(tuple(projected), values, channels, width, height, near)
         features, planes = np.empty((height, width, values.shape[1]), F32), np.empty((3, height, width), F32)
         for_each(lambda b: forward_band(vectors, b, *bands.prepared[b], guide, features, planes), len(bands))
         outputs = (torch.from_numpy(features), *torch.from_numpy(planes).unbind(0))
@@ -79,7 +80,7 @@ class _Composite(torch.autograd.Function):
 
 
 def channel_vectors(channels: int) -> tuple[int, ...]:
-    """A tuple with one 0 per sixteen channels: its type tells the kernels how many vectors a pixel has."""
+    """See `cpu_forward.Vectors`."""
     return (0,) * max(1, (channels + 15) // 16)
 
 

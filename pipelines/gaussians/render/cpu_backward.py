@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.gaussians.render import rules
+from pipelines.gaussians.render.boxes import gradients_of_box
 from pipelines.gaussians.render.cpu_bands import (
     BAND_ROWS,
     RECORD,
@@ -18,17 +19,17 @@ from pipelines.gaussians.render.cpu_bands import (
     first_pixel,
     last_pixel,
 )
-from pipelines.gaussians.render.cpu_forward import CHECK_EVERY, PIXELS, Guide, clear, is_opaque
+from pipelines.gaussians.render.cpu_forward import CHECK_EVERY, PIXELS, Guide, Vectors, channels_of, clear, is_opaque
 from pipelines.gaussians.render.jit import inner, kernel
 from pipelines.gaussians.render.lanes import (
+    add_totals,
     at_most,
     counting,
     exp,
-    gradients_of_box,
     load,
+    reciprocal,
     splat,
     store,
-    total,
     where,
 )
 
@@ -49,7 +50,7 @@ _TINY = F32(1e-30)
 def open_tile(
     state: NDArray[np.float32],
     image: NDArray[np.float32],
-    channels: int,
+    vectors: Vectors,
     left: int,
     top: int,
     columns: int,
@@ -62,7 +63,7 @@ def open_tile(
 ) -> None:
     """Loads the gradients of the pixels of a tile and everything that will be blended into them."""
     clear(state)
-    used = features.shape[2]
+    used, channels = features.shape[2], channels_of(vectors)
     for y in range(rows):
         for x in range(columns):
             pixel, row, column = TILE * y + x, top + y, left + x
@@ -70,7 +71,7 @@ def open_tile(
             behind = d_seen * planes[2, row, column]
             gradients, values = d_features[row, column], features[row, column]
             for c in range(used):
-                image[pixel * channels + c] = gradients[c]
+                image[PIXELS * c + pixel if vectors is None else pixel * channels + c] = gradients[c]
                 behind += gradients[c] * values[c]
             state[LIGHT + pixel] = _ONE
             state[D_DEPTH + pixel] = d_depth
@@ -129,11 +130,52 @@ def pull_rows(
         behind = load(state, BEHIND + row) - weight * q
         store(state, BEHIND + row, behind)
         store(state, LIGHT + row, light - weight)
-        d_alpha = light * q - behind / (_ONE - alpha)
+        d_alpha = light * q - behind * reciprocal(_ONE - alpha)
         m = where(alpha < splat(_ALPHA_MAX), d_alpha * alpha)
         pull, pull_y, pull_y2 = pull + m, pull_y + m * dy, pull_y2 + m * (dy * dy)
         d_z = d_z + weight * d_depth
     return pull, pull_y, pull_y2, d_z
+
+
+@inner
+def pull_painted_rows(
+    state: NDArray[np.float32],
+    image: NDArray[np.float32],
+    features: NDArray[np.float32],
+    at: int,
+    falloff_y: NDArray[np.float32],
+    falloff_x: object,
+    dx2: object,
+    z: np.float32,
+    y_center: np.float32,
+    reach2: np.float32,
+    first: int,
+    last: int,
+) -> tuple[object, object, object, object, object, object, object]:
+    """`weigh_rows` and `pull_rows` in one, where the gradients of three features lie in the planes of `image`; also the
+    sums, column by column, of the gradients of the Gaussian's features, those from `at` on."""
+    red, green, blue = features[at], features[at + 1], features[at + 2]
+    pull, pull_y, pull_y2, d_z = splat(_ZERO), splat(_ZERO), splat(_ZERO), splat(_ZERO)
+    d_red, d_green, d_blue = splat(_ZERO), splat(_ZERO), splat(_ZERO)
+    for y in range(first, last + 1):
+        row = TILE * y
+        dy = F32(y) + _HALF - y_center
+        light = load(state, LIGHT + row)
+        alpha = at_most(falloff_x * falloff_y[y], _ALPHA_MAX)
+        alpha = where((dx2 <= splat(reach2 - dy * dy)) & (light >= _LIGHT_MIN), alpha)
+        weight = alpha * light
+        d_depth, by_red = load(state, D_DEPTH + row), load(image, row)
+        by_green, by_blue = load(image, PIXELS + row), load(image, 2 * PIXELS + row)
+        q = by_red * red + by_green * green + by_blue * blue + d_depth * z + load(state, D_SEEN + row)
+        behind = load(state, BEHIND + row) - weight * q
+        store(state, BEHIND + row, behind)
+        store(state, LIGHT + row, light - weight)
+        d_alpha = light * q - behind * reciprocal(_ONE - alpha)
+        m = where(alpha < splat(_ALPHA_MAX), d_alpha * alpha)
+        pull, pull_y, pull_y2 = pull + m, pull_y + m * dy, pull_y2 + m * (dy * dy)
+        d_z = d_z + weight * d_depth
+        d_red, d_green, d_blue = d_red + weight * by_red, d_green + weight * by_green, d_blue + weight * by_blue
+    return pull, pull_y, pull_y2, d_z, d_red, d_green, d_blue
 
 
 @inner
@@ -171,7 +213,7 @@ def pull_rows_by_proxy(
 
 @kernel
 def backward_band(
-    vectors: tuple[int, ...],
+    vectors: Vectors,
     band: int,
     own: NDArray[np.int32],
     first: NDArray[np.int32],
@@ -195,9 +237,9 @@ def backward_band(
     features and planes are the images of the forward pass, d_image and d_planes their gradients.
     """
     height, width, used = features.shape
-    channels = 16 * len(vectors)
+    channels = channels_of(vectors)
     d_padded = np.zeros(len(padded), np.float32)
-    d_records = np.zeros(5 * len(own), np.float32)
+    d_records = np.zeros(8 * len(own), np.float32)
     band_top = band * BAND_ROWS
     across = (width + TILE - 1) // TILE
     image = np.zeros(PIXELS * channels, np.float32)
@@ -208,7 +250,7 @@ def backward_band(
         left, top = TILE * (tile % across), band_top + TILE * (tile // across)
         columns, rows = min(TILE, width - left), min(TILE, height - top)
         open_tile(
-            state, image, channels, left, top, columns, rows, guide,
+            state, image, vectors, left, top, columns, rows, guide,
             features, planes, d_image, d_planes,
         )  # fmt: skip
         for k in range(tile_starts[tile], tile_starts[tile + 1]):
@@ -219,41 +261,54 @@ def backward_band(
             y0, y1 = first_pixel(v_tile - r), last_pixel(v_tile + r, rows)
             if x1 < x0 or y1 < y0:
                 continue
-            precision = _ONE / (records[at + 2] * records[at + 2])
+            sharpness = -_HALF / (records[at + 2] * records[at + 2])
             dx = counting(_HALF - u_tile)
             dy = counting(_HALF - v_tile)
             dx2 = dx * dx
-            falloff_x = exp(dx2 * (-_HALF * precision))
-            store(falloff_y, 0, exp(dy * dy * (-_HALF * precision)) * records[at + 4])
-            weigh_rows(state, decisive, falloff_y, falloff_x, dx2, v_tile, r * r, y0, y1)
-            quads = (x1 - x0 + 4) // 4
-            corner = TILE * y0 + min(x0, TILE - 4 * quads)  # four at a time, without leaving the tile
-            gradients_of_box(
-                image, corner * channels, padded, i * channels, d_padded, i * channels,
-                state, WEIGHT + corner, state, PRODUCT + corner, y1 - y0 + 1, quads, vectors,
-            )  # fmt: skip
-            depth = records[at + 3]
-            if guide is None:
-                pull, pull_y, pull_y2, d_z = pull_rows(state, depth, v_tile, y0, y1)
+            falloff_x = exp(dx2 * sharpness)
+            store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
+            depth, unused = records[at + 3], splat(_ZERO)
+            if vectors is None:
+                pull, pull_y, pull_y2, d_z, d_red, d_green, d_blue = pull_painted_rows(
+                    state, image, padded, i * channels, falloff_y, falloff_x, dx2, depth, v_tile, r * r, y0, y1
+                )
+                add_totals(d_records, 8 * i + 4, pull, d_red, d_green, d_blue)
             else:
-                pull, pull_y, pull_y2, d_z = pull_rows_by_proxy(state, depth, v_tile, y0, y1)
-            d_records[5 * i + 0] += total(pull * dx) * precision
-            d_records[5 * i + 1] += total(pull_y) * precision
-            d_records[5 * i + 2] += total(pull * dx2 + pull_y2) * precision / records[at + 2]
-            d_records[5 * i + 3] += total(d_z)
-            d_records[5 * i + 4] += total(pull) / records[at + 4]
+                weigh_rows(state, decisive, falloff_y, falloff_x, dx2, v_tile, r * r, y0, y1)
+                quads = (x1 - x0 + 4) // 4
+                corner = TILE * y0 + min(x0, TILE - 4 * quads)  # four at a time, without leaving the tile
+                gradients_of_box(
+                    image, corner * channels, padded, i * channels, d_padded, i * channels,
+                    state, WEIGHT + corner, state, PRODUCT + corner, y1 - y0 + 1, quads, vectors,
+                )  # fmt: skip
+                if guide is None:
+                    pull, pull_y, pull_y2, d_z = pull_rows(state, depth, v_tile, y0, y1)
+                else:
+                    pull, pull_y, pull_y2, d_z = pull_rows_by_proxy(state, depth, v_tile, y0, y1)
+                add_totals(d_records, 8 * i + 4, pull, unused, unused, unused)
+            add_totals(d_records, 8 * i, pull * dx, pull_y, pull * dx2 + pull_y2, d_z)
             if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, decisive):
                 break
     for k in range(len(own)):
-        i = own[k]
+        i, at = own[k], 8 * k
+        sigma_px, opacity = records[RECORD * k + 2], records[RECORD * k + 4]
+        precision = _ONE / (sigma_px * sigma_px)
+        d_records[at] *= precision
+        d_records[at + 1] *= precision
+        d_records[at + 2] *= precision / sigma_px
+        d_records[at + 4] /= opacity
+        if vectors is None:
+            values, value_at = d_records, at + 5
+        else:
+            values, value_at = d_padded, k * channels
         if slots[i + 1] > slots[i]:
             row = shared[slots[i] + band - first[i]]
             for j in range(5):
-                row[j] = d_records[5 * k + j]
+                row[j] = d_records[at + j]
             for c in range(used):
-                row[5 + c] = d_padded[k * channels + c]
+                row[5 + c] = values[value_at + c]
         else:
             for j in range(5):
-                d_geometry[j, i] = d_records[5 * k + j]
+                d_geometry[j, i] = d_records[at + j]
             for c in range(used):
-                d_features[i, c] = d_padded[k * channels + c]
+                d_features[i, c] = values[value_at + c]

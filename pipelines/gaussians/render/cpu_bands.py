@@ -76,50 +76,59 @@ def split_into_bands(
     near: float,
 ) -> Bands:
     """Everything about the Gaussians u, v, sigma_px, z, opacity (M,) and features (M, C) that bands need to know."""
-    reach = reach_of(projected, width, height, F32(near))
-    first, starts, entries, slots = bin_gaussians(projected[1], reach, height)
+    reach, first, starts, entries, slots = bin_gaussians(*projected, width, height, F32(near))
     bands = Bands(first, starts, entries, slots, [None] * (len(starts) - 1))  # type: ignore[list-item]
 
     def prepare(band: int) -> None:
         top = band * BAND_ROWS
         own = bands.own(band)
         own[:] = near_to_far(own, projected[3])
-        records, padded = gather_band(own, projected, reach, features, channels)
+        records, padded = gather_band(own, *projected, reach, features, channels)
         bands.prepared[band] = (records, padded, *list_tiles(records, top, width, min(BAND_ROWS, height - top)))
 
     for_each(prepare, len(bands))
     return bands
 
 
-def reach_of(
-    projected: tuple[NDArray[np.float32], ...], width: int, height: int, near: np.float32
-) -> NDArray[np.float32]:
-    """How far from its centre a Gaussian is seen, in pixels (M,); 0 where it is not seen at all."""
-    u, v, sigma_px, z, opacity = projected
-    contrast = np.maximum(opacity, _ALPHA_MIN) / _ALPHA_MIN
-    reach = sigma_px * np.sqrt(np.minimum(_CUT2, _TWO * np.log(contrast)))
-    seen = (z > near) & (reach > 0)
-    for center, size in ((u, width), (v, height)):
-        seen &= (center + reach >= _HALF) & (center - reach <= F32(size - 0.5))
-    return np.where(seen, reach, _ZERO)
-
-
+@kernel
 def bin_gaussians(
-    v: NDArray[np.float32], reach: NDArray[np.float32], height: int
-) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
-    """The first four fields of `Bands`, entries in the order of their indices."""
-    bands = (height + BAND_ROWS - 1) // BAND_ROWS
-    # Bands of the pixel rows from ceil(v - reach - 1/2) to floor(v + reach - 1/2). Unseen ones may be anywhere.
-    top, bottom = (np.clip(edge - _HALF, _ZERO, F32(height - 1)) for edge in (v - reach, v + reach))
-    first, last = (row.astype(np.int32) // BAND_ROWS for row in (np.ceil(top), bottom))
-    spans = np.where(reach > 0, np.maximum(last - first + 1, 0), 0)
-    several = np.where(spans > 1, spans, 0)
-    slots = np.concatenate([[0], np.cumsum(several)])
-    index = np.repeat(np.arange(len(v), dtype=np.int32), spans)
-    step = np.arange(len(index)) - np.repeat(np.cumsum(spans) - spans, spans)
-    band = (first[index] + step).astype(np.uint16)
-    order = np.argsort(band, kind="stable")  # of 16-bit numbers a radix sort
-    return first, np.searchsorted(band[order], np.arange(bands + 1)), index[order], slots
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    sigma_px: NDArray[np.float32],
+    z: NDArray[np.float32],
+    opacity: NDArray[np.float32],
+    width: int,
+    height: int,
+    near: np.float32,
+) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
+    """How far from its centre each Gaussian is seen, in pixels (M,), 0 where it is not seen at all; and the first four
+    fields of `Bands`, entries in the order of their indices."""
+    count, bands = len(u), (height + BAND_ROWS - 1) // BAND_ROWS
+    reach, first, last = np.zeros(count, np.float32), np.zeros(count, np.int32), np.zeros(count, np.int32)
+    slots, starts = np.zeros(count + 1, np.int64), np.zeros(bands + 2, np.int64)
+    right, bottom = F32(width) - _HALF, F32(height) - _HALF
+    for i in range(count):
+        spans = 0
+        if z[i] > near and opacity[i] > _ALPHA_MIN:
+            r = sigma_px[i] * np.sqrt(min(_CUT2, _TWO * np.log(opacity[i] / _ALPHA_MIN)))
+            if r > 0 and u[i] + r >= _HALF and u[i] - r <= right and v[i] + r >= _HALF and v[i] - r <= bottom:
+                top, low = first_pixel(v[i] - r), last_pixel(v[i] + r, height)
+                if low >= top:  # else it lies between two rows of pixels
+                    reach[i] = r
+                    first[i], last[i] = top // BAND_ROWS, low // BAND_ROWS
+                    spans = last[i] - first[i] + 1
+                    for band in range(first[i], last[i] + 1):
+                        starts[band + 2] += 1
+        slots[i + 1] = slots[i] + (spans if spans > 1 else 0)
+    for band in range(bands):
+        starts[band + 2] += starts[band + 1]
+    entries = np.empty(starts[bands + 1], np.int32)
+    for i in range(count):
+        if reach[i] > 0:
+            for band in range(first[i], last[i] + 1):
+                entries[starts[band + 1]] = i
+                starts[band + 1] += 1
+    return reach, first, starts[: bands + 1], entries, slots
 
 
 def near_to_far(entries: NDArray[np.int32], z: NDArray[np.float32]) -> NDArray[np.int32]:
@@ -133,18 +142,28 @@ def near_to_far(entries: NDArray[np.int32], z: NDArray[np.float32]) -> NDArray[n
     return keys.astype(np.uint32).view(np.int32)
 
 
+@kernel
 def gather_band(
     entries: NDArray[np.int32],
-    projected: tuple[NDArray[np.float32], ...],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    sigma_px: NDArray[np.float32],
+    z: NDArray[np.float32],
+    opacity: NDArray[np.float32],
     reach: NDArray[np.float32],
     features: NDArray[np.float32],
     channels: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The band's Gaussians side by side: records (n * RECORD,) and features padded with 0 to (n * channels,)."""
-    records = np.stack([numbers.take(entries) for numbers in (*projected, reach)], axis=1)
-    padded = np.zeros((len(entries), channels), F32)
-    padded[:, : features.shape[1]] = features.take(entries, axis=0)
-    return records.ravel(), padded.ravel()
+    records = np.empty(len(entries) * RECORD, np.float32)
+    padded = np.zeros(len(entries) * channels, np.float32)
+    for k in range(len(entries)):
+        i, at = entries[k], k * RECORD
+        records[at], records[at + 1], records[at + 2] = u[i], v[i], sigma_px[i]
+        records[at + 3], records[at + 4], records[at + 5] = z[i], opacity[i], reach[i]
+        for c in range(features.shape[1]):
+            padded[k * channels + c] = features[i, c]
+    return records, padded
 
 
 @kernel

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.gaussians.render import rules
+from pipelines.gaussians.render.boxes import add_to_box
 from pipelines.gaussians.render.cpu_bands import (
     BAND_ROWS,
     RECORD,
@@ -21,7 +22,6 @@ from pipelines.gaussians.render.cpu_bands import (
 )
 from pipelines.gaussians.render.jit import inner, kernel
 from pipelines.gaussians.render.lanes import (
-    add_to_box,
     any_of,
     at_most,
     counting,
@@ -41,11 +41,24 @@ depth chain, the proxy depth and the κ of the pixel (0 where the proxy is unkno
 PLANES = 6
 Guide: TypeAlias = tuple[NDArray[np.float32], np.float32] | None
 """The proxy depth (H, W), 0 where unknown, and κ of eq. (7); None for κ = 0, where both chains are one."""
+Vectors: TypeAlias = tuple[int, ...] | None
+"""A tuple with one 0 per sixteen channels of a pixel, which lie side by side: its type tells the kernels how many
+vectors a pixel has. None for three channels without a guide, which lie in planes as the rest of a tile's state does:
+one vector is sixteen pixels of a channel instead of a pixel's sixteen channels, at two thirds of the time."""
 CHECK_EVERY = 32  # Gaussians between two looks at whether the whole tile is opaque
 
 _ALPHA_MAX, _LIGHT_MIN = F32(rules.ALPHA_MAX), F32(rules.TRANSMITTANCE_MIN)
 _HALF, _ZERO, _ONE = F32(0.5), F32(0), F32(1)
 _TINY = F32(1e-30)
+
+
+@inner
+def channels_of(vectors: Vectors) -> int:
+    """Numbers that a tile keeps of a pixel's features, and a band of a Gaussian's."""
+    if vectors is None:
+        return 3
+    else:
+        return 16 * len(vectors)
 
 
 @inner
@@ -146,9 +159,27 @@ def blend_rows_by_proxy(
         store(state, DEPTH_LIGHT + row, depth_light - depth_weight * agreement)
 
 
+@inner
+def paint_rows(
+    image: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    features: NDArray[np.float32],
+    at: int,
+    first: int,
+    last: int,
+) -> None:
+    """Three features, those from `at` on, into the three planes of a tile's image, sixteen pixels at once."""
+    red, green, blue = features[at], features[at + 1], features[at + 2]
+    for row in range(TILE * first, TILE * last + TILE, TILE):
+        weight = load(weights, row)
+        store(image, row, load(image, row) + weight * red)
+        store(image, PIXELS + row, load(image, PIXELS + row) + weight * green)
+        store(image, 2 * PIXELS + row, load(image, 2 * PIXELS + row) + weight * blue)
+
+
 @kernel
 def forward_band(
-    vectors: tuple[int, ...],
+    vectors: Vectors,
     band: int,
     records: NDArray[np.float32],
     padded: NDArray[np.float32],
@@ -160,7 +191,7 @@ def forward_band(
 ) -> None:
     """Fills the band's rows of the feature image (H, W, C) and of depth sum, depth silhouette, silhouette (3, H, W)."""
     height, width, used = out_features.shape
-    channels = 16 * len(vectors)
+    channels = channels_of(vectors)
     band_top = band * BAND_ROWS
     across = (width + TILE - 1) // TILE
     image = np.empty(PIXELS * channels, np.float32)
@@ -191,10 +222,13 @@ def forward_band(
                 blend_rows(state, weights, falloff_y, falloff_x, dx2, v_tile, r * r, depth, y0, y1)
             else:
                 blend_rows_by_proxy(state, weights, falloff_y, falloff_x, dx2, v_tile, r * r, depth, y0, y1)
-            corner = TILE * y0 + x0
-            add_to_box(
-                image, corner * channels, padded, i * channels, weights, corner, y1 - y0 + 1, x1 - x0 + 1, vectors
-            )
+            if vectors is None:
+                paint_rows(image, weights, padded, i * channels, y0, y1)
+            else:
+                corner = TILE * y0 + x0
+                add_to_box(
+                    image, corner * channels, padded, i * channels, weights, corner, y1 - y0 + 1, x1 - x0 + 1, vectors
+                )
             if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, decisive):
                 break
         for y in range(rows):
@@ -202,7 +236,7 @@ def forward_band(
                 pixel = TILE * y + x
                 row = out_features[top + y, left + x]
                 for c in range(used):
-                    row[c] = image[pixel * channels + c]
+                    row[c] = image[PIXELS * c + pixel if vectors is None else pixel * channels + c]
                 seen = _ONE - state[LIGHT + pixel]
                 out_planes[0, top + y, left + x] = state[DEPTH_SUM + pixel]
                 out_planes[1, top + y, left + x] = seen if guide is None else state[DEPTH_SILHOUETTE + pixel]

@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pipelines.gaussians.render import rules
 from pipelines.gaussians.render.cpu_bands import (
     BAND_ROWS,
     RECORD,
@@ -28,22 +29,26 @@ from pipelines.gaussians.render.cpu_forward import (
 from pipelines.gaussians.render.jit import kernel
 from pipelines.gaussians.render.lanes import counting, exp, largest, largest_of, load, splat, store, total, where
 from pipelines.gaussians.render.threads import for_each
+from pipelines.types import Intrinsics
 
 F32 = np.float32
 _HALF, _ZERO = F32(0.5), F32(0)
 
 
 def inspect(
-    u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, width: int, height: int, near: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Median depth (H, W), and summed and largest blending weight of each Gaussian, (M,) each; float32 CPU tensors."""
+    u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, width: int, height: int, near: float,
+    counts: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Median depth (H, W), and summed and largest blending weight of each Gaussian, (M,) each; float32 CPU tensors. In
+    the sums a pixel counts as counts (H, W) says, as 1 where None."""
     projected = tuple(tensor.detach().contiguous().numpy() for tensor in (u, v, sigma_px, z, opacity))
     no_features = np.zeros((len(u), 0), F32)
     bands = split_into_bands(projected, no_features, 0, width, height, near)
     median = np.empty((height, width), F32)
+    counted = np.ones((height, width), F32) if counts is None else counts.contiguous().numpy()
     sums, most = np.zeros(len(u), F32), np.zeros(len(u), F32)
     shared = np.empty((int(bands.slots[-1]), 2), F32)
-    results = (median, sums, most, shared)
+    results = (counted, median, sums, most, shared)
     places = (bands.first, bands.slots)
     for_each(lambda b: inspect_band(b, bands.own(b), *places, *bands.prepared[b], *results), len(bands))
     if len(straddling := bands.straddling):
@@ -51,6 +56,35 @@ def inspect(
         sums[straddling] = np.add.reduceat(shared[:, 0], starts)
         most[straddling] = np.maximum.reduceat(shared[:, 1], starts)
     return torch.from_numpy(median), torch.from_numpy(sums), torch.from_numpy(most)
+
+
+def in_view(means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float) -> Tensor:
+    """(n,) indices of the Gaussians whose square reaches the image, a pixel to spare; float32 CPU tensors."""
+    k = intrinsics
+    camera = np.array([k.fx, k.fy, k.cx, k.cy, (k.fx * k.fy) ** 0.5, k.width, k.height, near], F32)
+    arrays = (x.contiguous().numpy() for x in (means, radii, cam_from_world))
+    return torch.from_numpy(list_in_view(*arrays, camera))
+
+
+@kernel
+def list_in_view(
+    means: NDArray[np.float32], radii: NDArray[np.float32], pose: NDArray[np.float32], camera: NDArray[np.float32]
+) -> NDArray[np.int64]:
+    """See `in_view`; camera: fx, fy, cx, cy, their common focal length, width, height, near."""
+    fx, fy, cx, cy, focal, width, height, near = camera
+    out, count = np.empty(len(means), np.int64), 0
+    for i in range(len(means)):
+        x, y, z = means[i]
+        depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+        if depth > near:
+            # All lengths times the depth: nothing is divided.
+            reach = F32(rules.CUT_SIGMAS) * focal * radii[i] + depth
+            u = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) + cx * depth
+            v = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) + cy * depth
+            if u > -reach and v > -reach and u < width * depth + reach and v < height * depth + reach:
+                out[count] = i
+                count += 1
+    return out[:count].copy()
 
 
 @kernel
@@ -63,6 +97,7 @@ def inspect_band(
     padded: NDArray[np.float32],
     tile_starts: NDArray[np.int64],
     members: NDArray[np.int32],
+    counted: NDArray[np.float32],
     median: NDArray[np.float32],
     sums: NDArray[np.float32],
     most: NDArray[np.float32],
@@ -75,11 +110,16 @@ def inspect_band(
     across = (width + TILE - 1) // TILE
     state, weights = np.empty(PIXELS * PLANES, np.float32), np.zeros(PIXELS, np.float32)
     falloff_y, medians = np.empty(TILE, np.float32), np.empty(PIXELS, np.float32)
+    count = np.empty(PIXELS, np.float32)
     for tile in range(len(tile_starts) - 1):
         left, top = TILE * (tile % across), band_top + TILE * (tile // across)
         columns, rows = min(TILE, width - left), min(TILE, height - top)
         open_tile(state, None, left, top, columns, rows)
         clear(medians)
+        clear(count)
+        for y in range(rows):
+            for x in range(columns):
+                count[TILE * y + x] = counted[top + y, left + x]
         for k in range(tile_starts[tile], tile_starts[tile + 1]):
             i = members[k]
             at = RECORD * i
@@ -96,7 +136,7 @@ def inspect_band(
             summed, top_weight = splat(_ZERO), splat(_ZERO)
             for y in range(y0, y1 + 1):
                 weight, light = load(weights, TILE * y), load(state, LIGHT + TILE * y)
-                summed, top_weight = summed + weight, largest(top_weight, weight)
+                summed, top_weight = summed + weight * load(count, TILE * y), largest(top_weight, weight)
                 found = load(medians, TILE * y)
                 here = (light < splat(_HALF)) & (weight > splat(_ZERO)) & (found <= splat(_ZERO))
                 store(medians, TILE * y, found + where(here, splat(depth)))

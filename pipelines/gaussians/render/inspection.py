@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from pipelines.gaussians.render.compositing import choose_backend, require_finite
@@ -13,7 +14,8 @@ from pipelines.types import Intrinsics
 
 @dataclass(frozen=True)
 class BlendingWeights:
-    """Of every Gaussian, over all pixels of an image: its summed and its largest blending weight, (M,) each."""
+    """Of every Gaussian, over all pixels of an image: its summed (weighed by what the pixels count) and its largest
+    blending weight, (M,) each."""
 
     total: Tensor
     largest: Tensor
@@ -41,10 +43,21 @@ def blending_weights(
     intrinsics: Intrinsics,
     near: float = NEAR,
     backend: str | None = None,
+    counts: Tensor | None = None,
 ) -> BlendingWeights:
     """What each of the M Gaussians contributes to the image of a camera: 0 where it is not seen at all. No gradients;
-    arguments as in `render`."""
-    return BlendingWeights(*_inspect(means, radii, opacities, cam_from_world, intrinsics, near, backend)[1:])
+    `counts` (H, W): what a pixel's weights count in the sums, None for 1; the others as in `render`."""
+    return BlendingWeights(*_inspect(means, radii, opacities, cam_from_world, intrinsics, near, backend, counts)[1:])
+
+
+@torch.no_grad()
+def in_view(means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float = NEAR) -> Tensor:
+    """(n,) indices of the Gaussians that the camera may see: no others take part in its image or get a gradient."""
+    for name, tensor in (("means", means), ("radii", radii), ("cam_from_world", cam_from_world)):
+        require_finite(name, tensor)
+    module = choose_backend(None, means)
+    seen: Tensor = module.in_view(means.detach(), radii.detach(), cam_from_world.to(means), intrinsics, near)
+    return seen
 
 
 def _inspect(
@@ -55,9 +68,11 @@ def _inspect(
     intrinsics: Intrinsics,
     near: float,
     backend: str | None,
+    counts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     require_finite("opacities", opacities)
     projected = project_map(means.detach(), radii.detach(), cam_from_world.detach(), intrinsics, near=near)
     module = choose_backend(backend, means)
-    median, total, largest = module.inspect(*projected, opacities.detach(), intrinsics.width, intrinsics.height, near)
+    size = (intrinsics.width, intrinsics.height)
+    median, total, largest = module.inspect(*projected, opacities.detach(), *size, near, counts)
     return median, total, largest

@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 
 from pipelines.gaussians.render.rules import ALPHA_MAX, ALPHA_MIN, CUT_SIGMAS, TRANSMITTANCE_MIN
+from pipelines.geometry.camera import project_gaussians
+from pipelines.types import Intrinsics
 
 
 @dataclass(frozen=True)
@@ -68,9 +70,11 @@ def composite(
 
 
 def inspect(
-    u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, width: int, height: int, near: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Median depth (H, W), and summed and largest blending weight of each Gaussian, (M,) each."""
+    u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, width: int, height: int, near: float,
+    counts: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Median depth (H, W), and summed and largest blending weight of each Gaussian, (M,) each; in the sums a pixel
+    counts as counts (H, W) says."""
     u, v, sigma_px, z, opacity = (x.detach() for x in (u, v, sigma_px, z, opacity))
     pairs = list_pairs(u, v, sigma_px, z, opacity, width, height, near)
     alpha, depth = pair_opacities(pairs, u, v, sigma_px, z, opacity, width)
@@ -78,9 +82,19 @@ def inspect(
     weights = torch.where(before >= TRANSMITTANCE_MIN, alpha * before, 0.0)
     crossing = (before >= 0.5) & (before - weights < 0.5)
     median = z.new_zeros(height * width).index_add(0, pairs.pixel[crossing], depth[crossing])
-    sums = torch.zeros_like(z).index_add(0, pairs.gaussian, weights)
+    counted = weights if counts is None else weights * counts.reshape(-1)[pairs.pixel]
+    sums = torch.zeros_like(z).index_add(0, pairs.gaussian, counted)
     most = torch.zeros_like(z).scatter_reduce(0, pairs.gaussian, weights, "amax")
     return median.view(height, width), sums, most
+
+
+def in_view(means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float) -> Tensor:
+    """(n,) indices of the Gaussians whose square reaches the image, a pixel to spare."""
+    points = means @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
+    u, v, sigma_px, z = project_gaussians(points, radii, intrinsics, near)
+    reach = CUT_SIGMAS * sigma_px + 1
+    seen = (z > near) & (u > -reach) & (u < intrinsics.width + reach) & (v > -reach) & (v < intrinsics.height + reach)
+    return torch.nonzero(seen)[:, 0]
 
 
 def list_pairs(

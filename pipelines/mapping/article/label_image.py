@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from pipelines.gaussians.ssim import ssim_map
-from pipelines.mapping.losses import SSIM_WEIGHT
+from pipelines.mapping.photo_loss import SSIM_WEIGHT
 from pipelines.types import VOID
 
 

@@ -6,10 +6,11 @@ import torch
 from skimage.metrics import structural_similarity
 
 from pipelines.gaussians.entropy import plain_entropy, weighted_entropy
-from pipelines.gaussians.ssim import similarity, ssim_map
+from pipelines.gaussians.ssim import ssim_map
 from pipelines.mapping import losses
 from pipelines.mapping.article.edge_term import edge_loss
 from pipelines.mapping.article.label_image import label_image_loss
+from pipelines.mapping.photo_loss import photo_loss, plain_photo_loss
 from pipelines.types import VOID
 
 
@@ -35,31 +36,35 @@ def test_ssim_agrees_with_scikit_image_inside() -> None:
     assert np.abs(ssim_map(a, b).numpy() - truth)[inside].max() < 1e-9
 
 
-def test_compiled_ssim_equals_the_plain_one() -> None:
-    a, b = pictures()
-    fast = a.clone().requires_grad_()
-    plain = a.double().requires_grad_()
-    value, truth = ssim_map(fast, b), ssim_map(plain, b.double())
-    weight = torch.rand_like(truth)
-    (value * weight.float()).sum().backward()
-    (truth * weight).sum().backward()
-    assert (value - truth).abs().max() < 2e-5
-    assert fast.grad is not None
-    assert plain.grad is not None
-    assert 0 < (fast.grad - plain.grad).norm() / plain.grad.norm() < 1e-4
-    assert (similarity(a, b)[0] - value).abs().max() < 2e-5
-
-
 def test_ssim_gradient() -> None:
     a, b = pictures(torch.float64, (7, 8))
     assert torch.autograd.gradcheck(lambda x: ssim_map(x, b), (a.requires_grad_(),))
 
 
-def test_image_loss_weighs_its_two_parts() -> None:
+def test_photo_loss_weighs_its_two_parts() -> None:
     a, b = pictures()
-    expected = 0.8 * (a - b).abs().mean() + 0.2 * (1 - ssim_map(a, b).mean())
-    assert torch.isclose(losses.image_loss(a, b), expected)
-    assert losses.image_loss(a, a) < 1e-6
+    photo, nothing = (255 * b).to(torch.uint8), torch.zeros(3)
+    expected = 0.8 * (a - photo / 255).abs().mean() + 0.2 * (1 - ssim_map(a, photo / 255).mean())
+    assert torch.isclose(photo_loss(a, nothing, nothing, photo), expected)
+    assert photo_loss(photo / 255, nothing, nothing, photo) < 1e-6
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_compiled_photo_loss_is_the_plain_one(masked: bool) -> None:
+    """Value and gradients; the colours may be some of more features, and the last band of rows may be short."""
+    features, photo = torch.cat(pictures(), -1), (255 * pictures()[1]).to(torch.uint8)
+    scene = torch.rand(photo.shape[:2], generator=torch.Generator().manual_seed(1)) > 0.3 if masked else None
+    exposure = [torch.tensor([0.1, -0.2, 0.05]), torch.tensor([0.01, 0.02, -0.1])]
+    found = []
+    for loss, kind in ((photo_loss, torch.float32), (plain_photo_loss, torch.float64)):
+        values = [x.to(kind).requires_grad_() for x in (features, *exposure)]
+        value = loss(values[0][..., :3], *values[1:], photo, scene)
+        found.append([value, *torch.autograd.grad(3 * value, values)])
+    for mine, theirs in zip(*found, strict=True):
+        assert theirs.abs().max() > 0
+        assert (mine - theirs).abs().max() < 1e-5 * theirs.abs().max()
+    if scene is not None:
+        assert found[0][1][~scene].abs().max() == 0
 
 
 def test_depth_loss_has_no_unit_and_ignores_unknown_depth() -> None:

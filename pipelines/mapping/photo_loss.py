@@ -1,0 +1,208 @@
+"""The picture that the map shows against the photo, MSGS-SLAM eq. (20): value and gradient in three compiled passes
+around the window's blurs, where autograd would make thirty passes over memory."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pipelines.gaussians.render.jit import inner, kernel
+from pipelines.gaussians.render.lanes import counting, load, splat, store, total, where
+from pipelines.gaussians.render.threads import for_each
+from pipelines.gaussians.ssim import C1, C2, blur_array, ssim_map
+
+SSIM_WEIGHT = 0.2
+"""Share of 1 - SSIM in eq. (20)."""
+_ROWS = 16
+_ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
+_C1, _C2, _SHARE = np.float32(C1), np.float32(C2), np.float32(SSIM_WEIGHT)
+
+
+def photo_loss(shown: Tensor, log_gain: Tensor, offset: Tensor, photo: Tensor, scene: Tensor | None = None) -> Tensor:
+    """(1 - w) |C - I| + w (1 - SSIM), mean over the picture, with C = shown * exp(log_gain) + offset.
+
+    shown (H, W, 3) 0..1, log_gain and offset (3,), photo (H, W, 3) uint8; differentiable in the first three. Where
+    scene (H, W) is False the photo is no part of the scene: there it looks as the map does, and asks for nothing.
+    The article prints ω = 0.2 before the absolute difference; the weights of 3DGS, which has the same formula, are the
+    other way round, and so are the ones here. float32 on a CPU takes compiled loops, everything else plain torch.
+    """
+    if shown.device.type == "cpu" and shown.dtype == torch.float32:
+        return _PhotoLoss.apply(shown, log_gain, offset, photo, scene)
+    return plain_photo_loss(shown, log_gain, offset, photo, scene)
+
+
+def plain_photo_loss(shown: Tensor, log_gain: Tensor, offset: Tensor, photo: Tensor, scene: Tensor | None) -> Tensor:
+    """The same by torch's own functions."""
+    colors, target = shown * torch.exp(log_gain) + offset, photo.to(shown.dtype) / 255
+    if scene is not None:
+        beside = colors.detach()
+        colors, target = (torch.where(scene[..., None], x, beside) for x in (colors, target))
+    difference = (colors - target).abs().mean()
+    return (1 - SSIM_WEIGHT) * difference + SSIM_WEIGHT * (1 - ssim_map(colors, target).mean())
+
+
+@lru_cache(maxsize=2)
+def _room(planes: int, size: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Two times `planes` of `size` numbers to work in: fresh pages would take as long as the work does."""
+    return np.zeros((planes, size), np.float32), np.zeros((planes, size), np.float32)
+
+
+class _PhotoLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, shown: Tensor, log_gain: Tensor, offset: Tensor, photo: Tensor, scene: Tensor | None
+    ) -> Tensor:
+        # Rendered colours may be a slice of more features: the loops take them as they lie.
+        picture, target = shown.detach().numpy(), photo.numpy()
+        mask = None if scene is None else scene.numpy()
+        exposure = np.stack([np.exp(log_gain.detach().numpy()), offset.detach().numpy()]).astype(np.float32)
+        height, width = target.shape[:2]
+        bands, shape = -(-height // _ROWS), target.shape
+        planes, moments = _room(5, bands * _ROWS * width * 3)
+        sums = np.zeros((bands, 8))
+
+        def blur(first: int) -> None:
+            for k in range(first, 5):
+                pictures = (x[: target.size].reshape(target.shape) for x in (planes[k], moments[k - first]))
+                blur_array(*pictures)
+
+        def rows(band: int) -> slice:
+            return slice(band * _ROWS, min((band + 1) * _ROWS, height))
+
+        def of_scene(band: int) -> NDArray[np.bool_] | None:
+            return None if mask is None else mask[rows(band)]
+
+        def work(kernel_: Any, *arrays: NDArray) -> None:
+            for_each(
+                lambda b: kernel_(
+                    picture[rows(b)], target[rows(b)], of_scene(b), exposure, b * _ROWS * width * 3, planes, *arrays,
+                    sums[b],
+                ),
+                bands,
+            )  # fmt: skip
+
+        work(_expose)
+        blur(0)
+        for_each(lambda b: _similarity(b, _ROWS * width * 3, target.size, moments, planes, sums[b]), bands)
+        gradient = np.empty(shape, np.float32)
+        blur(2)
+        work(_differentiate, moments, gradient)
+        difference, likeness, *by_exposure = sums.sum(0) / target.size
+        ctx.save_for_backward(torch.from_numpy(gradient), torch.tensor(by_exposure, dtype=torch.float32))
+        loss = (1 - SSIM_WEIGHT) * difference + SSIM_WEIGHT * (1 - likeness)
+        return torch.tensor(loss, dtype=torch.float32)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        gradient, by_exposure = ctx.saved_tensors
+        by_gain, by_offset = (by_exposure * grads[0]).split(3)
+        return gradient * grads[0], by_gain, by_offset, None, None
+
+
+@kernel
+def _expose(
+    shown: NDArray[np.float32],
+    photo: NDArray[np.uint8],
+    scene: NDArray[np.bool_] | None,
+    exposure: NDArray[np.float32],
+    start: int,
+    planes: NDArray[np.float32],
+    sums: NDArray[np.float64],
+) -> None:
+    """A band's colours a, photo b and products aa, bb and ab, into the planes from `start` on; the summed |a - b|."""
+    height, width, _ = shown.shape
+    scale, i = np.float32(1 / 255), start
+    for y in range(height):
+        row = np.float32(0)
+        for x in range(width):
+            for c in range(3):
+                a = shown[y, x, c] * exposure[0, c] + exposure[1, c]
+                b = np.float32(photo[y, x, c]) * scale
+                if scene is not None:
+                    b = b if scene[y, x] else a
+                planes[0, i], planes[1, i] = a, b
+                planes[2, i], planes[3, i], planes[4, i] = a * a, b * b, a * b
+                row += abs(a - b)
+                i += 1
+        sums[0] += row
+
+
+@kernel
+def _similarity(
+    band: int, length: int, count: int, moments: NDArray[np.float32], planes: NDArray[np.float32],
+    sums: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """The derivatives of a band's similarity by mean, variance and covariance, into planes 2 to 4, and its sum.
+
+    As `pipelines.gaussians.ssim.similarity`, with one division.
+    """
+    size = planes.shape[1]
+    flat, out = moments.reshape(-1), planes.reshape(-1)
+    for i in range(band * length, band * length + length, 16):
+        x, y = load(flat, i), load(flat, size + i)
+        xx, yy, xy = x * x, y * y, x * y
+        luminance, contrast = xy * _TWO + _C1, (load(flat, 4 * size + i) - xy) * _TWO + _C2
+        under_l, under_c = xx + yy + _C1, load(flat, 2 * size + i) - xx + load(flat, 3 * size + i) - yy + _C2
+        inverse = _ONE / (under_l * under_c)
+        value = luminance * contrast * inverse
+        by_cov = luminance * inverse * _TWO
+        by_var = splat(_ZERO) - value * inverse * under_l
+        by_mean = y * contrast * inverse * _TWO - x * value * inverse * under_c * _TWO - x * by_var * _TWO - y * by_cov
+        store(out, 2 * size + i, by_mean)
+        store(out, 3 * size + i, by_var)
+        store(out, 4 * size + i, by_cov)
+        # The last band may reach over the end of the picture.
+        sums[1] += total(where(counting(np.float32(i - count)) < splat(_ZERO), value))
+
+
+@kernel
+def _differentiate(
+    shown: NDArray[np.float32],
+    photo: NDArray[np.uint8],
+    scene: NDArray[np.bool_] | None,
+    exposure: NDArray[np.float32],
+    start: int,
+    planes: NDArray[np.float32],
+    blurred: NDArray[np.float32],
+    gradient: NDArray[np.float32],
+    sums: NDArray[np.float64],
+) -> None:
+    """A band's gradient by what was shown, and n times that by log gains and offsets."""
+    height, width, _ = shown.shape
+    size, flat, blurs = planes.shape[1], planes.reshape(-1), blurred.reshape(-1)
+    each, first = np.float32(1 / gradient.size), start // (3 * width)
+    red_gain, green_gain, blue_gain = exposure[0, 0], exposure[0, 1], exposure[0, 2]
+    for y in range(height):
+        d_red, d_green, d_blue, o_red, o_green, o_blue = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+        for x in range(width):
+            if scene is not None and not scene[y, x]:
+                for c in range(3):
+                    gradient[first + y, x, c] = _ZERO
+                continue
+            i = start + 3 * (y * width + x)
+            red, green = _gradient_at(flat, blurs, i, size), _gradient_at(flat, blurs, i + 1, size)
+            blue = _gradient_at(flat, blurs, i + 2, size)
+            o_red, o_green, o_blue = o_red + red, o_green + green, o_blue + blue
+            red, green, blue = red * red_gain, green * green_gain, blue * blue_gain
+            row, out = shown[y, x], gradient[first + y, x]
+            d_red, d_green, d_blue = d_red + red * row[0], d_green + green * row[1], d_blue + blue * row[2]
+            out[0], out[1], out[2] = red * each, green * each, blue * each
+        for c, value in enumerate((d_red, d_green, d_blue, o_red, o_green, o_blue)):
+            sums[2 + c] += value
+
+
+@inner
+def _gradient_at(planes: NDArray[np.float32], blurred: NDArray[np.float32], i: int, size: int) -> np.float32:
+    """n times the gradient of the loss by one number of the exposed colours.
+
+    The window is symmetric and the border zero, so the blur is its own adjoint.
+    """
+    a, b = planes[i], planes[size + i]
+    likeness = blurred[i] + _TWO * a * blurred[size + i] + b * blurred[2 * size + i]
+    sign = np.float32(a > b) - np.float32(a < b)
+    return (_ONE - _SHARE) * sign - _SHARE * likeness
