@@ -65,7 +65,7 @@ class FrameMasks:
 
     def _search(self, finder: PeopleFinder, frames: Sequence[Frame], progress: Progress) -> None:
         todo = [f for f in frames if load_left_out(self._folder, f) is None]
-        for frame in progress.track(todo, "people", len(todo)):
+        for frame in progress.track(todo, "people", len(todo)) if todo else ():
             save_left_out(self._folder, frame, finder.left_out(read_rgb(self._picked / frame.name)))
 
     def _shows_people(self, frame: Frame) -> bool:
