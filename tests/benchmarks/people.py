@@ -9,7 +9,7 @@ A case that is done in DIR is not done again. With --poses nothing is mapped, an
 without, is coarse: for the whole walk of 150 frames.
 
 A ghost is what stands in her way and nowhere near a true surface: before what a frame in which she hides it shows, and
-farther than 10 cm from every surface of the 150 true depth maps. What of that the clean run has too, within 10 cm, is
+farther than 30 cm from every surface of the 150 true depth maps. What of that the clean run has too, within 10 cm, is
 no trace of her.
 """
 
@@ -52,8 +52,10 @@ CASES = ("clean", "networks", "masks", "nothing")
 TURN = 22
 """Frames (of 10 a second) in which she walks to and fro once."""
 TALL = 440
-APART = 0.1
-"""Metres from every true surface at which something is none of it: several times the error of the map's depth."""
+APART, BESIDE = 0.3, 0.1
+"""Metres from every true surface at which something is none of it, and from another point to be the same. Of the solid
+Gaussians of a clean map of 24 frames 614 are farther than 10 cm from every true surface, 59 than 15, 10 than 20, 0 than
+30: far walls without parallax."""
 COARSE = ["proxy.stereo_side=160", "proxy.stereo_planes=16", "proxy.max_side=160"]
 
 
@@ -211,7 +213,7 @@ def ghosts(points: NDArray[np.float64], clip: Clip, surface: cKDTree) -> NDArray
 
 def beyond(points: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
     """The points that have none of the others within 10 cm."""
-    return points if len(others) == 0 else points[cKDTree(others).query(points)[0] > APART]
+    return points if len(others) == 0 else points[cKDTree(others).query(points)[0] > BESIDE]
 
 
 def read_vertices(run: RunFolder) -> NDArray[np.float64]:
