@@ -33,10 +33,10 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-import cv2
 import numpy as np
-from hard_sequences import HARD, write_hard
+from hard_sequences import HARD, write_hard, write_noisy_depth
 from numpy.typing import NDArray
+from parted_sequences import LONG, PARTED, kitchen_two_row, write_parted
 
 DATA = ROOT.parent / "shared" / "data"
 PLAIN = ("run.format=images",)
@@ -96,6 +96,7 @@ def cases(work: Path) -> dict[str, Case]:
     replica, white, phone = DATA / "replica_office0", DATA / "whiteroom", DATA / "phone_desk"
     office, room = by_number(rows_of(replica / "traj_derived_c2w.txt"), 10), by_number(rows_of(white / "traj.txt"))
     known = "frames.intrinsics=300,300,300,170"
+    long = rows_of(DATA / "kitchen_long" / "world_from_camera_16.txt")
     files = f'proxy.depth="files:{white / "proxy_depth"}"'
     return {
         "kitchen_video": Case(DATA / "videos/kitchen_640x480_30fps.mp4", (), kitchen_truth),
@@ -108,6 +109,12 @@ def cases(work: Path) -> dict[str, Case]:
         "whiteroom_files": Case(white / "rgb", (*PLAIN, files), room),
         "corridor": Case(work / "corridor" / "rgb", (*PLAIN, *COARSE), written_truth(work / "corridor" / "traj.txt")),
         "bedroom": Case(DATA / "videos/bedroom_848x364_58fps.mp4", (), lambda *_: None),
+        "house_portrait": Case(DATA / "videos/house_portrait_540x960_30fps.mp4", (), lambda *_: None),
+        "kitchen_long": Case(DATA / LONG, (), by_number(long)),
+        "kitchen_7scenes": Case(work / "kitchen_7scenes", (), by_number(long)),
+        "kitchen_two": Case(work / "kitchen_two" / "both.videos", (), lambda _, index: long[kitchen_two_row(index)]),
+        "whiteroom_halves": Case(work / "whiteroom_halves" / "rgb", PLAIN, room),
+        "whiteroom_apart": Case(work / "whiteroom_apart" / "rgb", PLAIN, room),
         **{
             name: Case(work / name / "rgb", (*PLAIN, *COARSE), written_truth(work / name / "traj.txt")) for name in HARD
         },
@@ -122,6 +129,8 @@ def prepare(name: str, case: Case, work: Path) -> Path:
         return write_walk(work / "corridor", "corridor", frames=150, laps=1.08)
     if name in HARD:
         return write_hard(name, work / name, DATA)
+    if name in PARTED:
+        return write_parted(name, work / name, DATA)
     if case.glob == "*" and not case.last:
         return case.source
     folder = work / f"{name}_pictures"
@@ -144,18 +153,6 @@ def write_walk(folder: Path, layout: str, frames: int, laps: float) -> Path:
     return folder / "rgb"
 
 
-def write_noisy_depth(source: Path, target: Path) -> None:
-    """Each depth times its own factor (3 %) and a smooth field (6 %): what a good network does wrong."""
-    target.mkdir(exist_ok=True)
-    rng = np.random.default_rng(0)
-    for path in sorted(source.glob("*.png")):
-        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float64)
-        field = rng.normal(size=(7, 9)).astype(np.float32)
-        field = cv2.resize(field, depth.shape[::-1], interpolation=cv2.INTER_CUBIC)
-        depth *= np.exp(rng.normal() * 0.03) * (1 + 0.06 * field / field.std())
-        cv2.imwrite(str(target / path.name), np.clip(np.round(depth), 0, 65535).astype(np.uint16))
-
-
 def measure_ours(name: str, work: Path, settings: Sequence[str], until: str) -> dict[str, Any]:
     """Run the stages and compare the trajectory with the truth."""
     from pipelines.config import load_config
@@ -168,11 +165,13 @@ def measure_ours(name: str, work: Path, settings: Sequence[str], until: str) -> 
     with adjustment_timed() as adjusting:
         records, seconds = run_stages_timed(source, run, config, until)
     trajectory, frames = run.load_trajectory(until), run.load_frames()
+    pieces = {piece: run.load_trajectory("tracking", piece) for piece in run.pieces("tracking")}
     originals = original_names(source, frames)
     truth = [case.truth(n, f.source_index) for n, f in zip(originals, frames, strict=True)]
     metric = bool(run.load_proxy_report().get("metric", False))
     return {
         **errors(trajectory.cam_from_world, trajectory.is_posed, truth, metric),
+        "pieces": {name: errors(t.cam_from_world, t.is_posed, truth, False) for name, t in pieces.items()},
         "cpu_seconds": {stage: round(spent["cpu"], 1) for stage, spent in seconds.items()},
         "clock_seconds": {stage: round(spent["clock"], 1) for stage, spent in seconds.items()},
         "adjustment_cpu_seconds": round(sum(adjusting), 1),
@@ -376,6 +375,8 @@ def print_row(name: str, method: str, row: dict[str, Any]) -> None:
         str(len(row["warnings"])) if "warnings" in row else "-",
     ]
     print(f"{name:18} {method:12}" + "".join(f"{c:>11}" for c in cells), flush=True)
+    for piece, found in row.get("pieces", {}).items():
+        print(f"{'':31} {piece}: {found['posed']} frames, {found.get('sim3_cm', '-')} cm")
     for warning in row.get("warnings", []):
         print(f"{'':31} {warning}", flush=True)
 
