@@ -10,8 +10,7 @@ from formats.atomic import write_text
 from formats.errors import InputError
 from formats.jsonfile import MAX_TOML_BYTES, read_toml
 from formats.reading import opened
-from pipelines.config import Config, config_to_toml, merge_known_settings, merge_settings
-from pipelines.earlier_versions import GONE
+from pipelines.config import Config, config_to_toml, merge_known_settings
 from pipelines.progress import log
 from pipelines.records import load_records, load_source, recorded_config
 
@@ -40,19 +39,14 @@ def load_settings(run: RunFolder) -> Config:
     with opened(run.settings_file, MAX_TOML_BYTES, any_content=True) as file:
         text = file.read().decode("utf-8", errors="replace")
     mark = _MARK.match(text)
-    if mark is None and _is_of_first_format(run):
-        return _first_format(read_toml(run.settings_file), run)
-    if mark is None or mark[1] != _check(run, text[mark.end() :]):
+    as_written = mark[1] == _check(run, text[mark.end() :]) if mark else _is_of_first_format(run)
+    if not as_written:
         raise InputError(
             f"{run.settings_file} is not as the program left it: damaged, or edited by hand. Delete it and type "
             f"`msgs-slam resume {run.root}`: what the finished stages were made with is kept in manifest.json. "
             "(Settings are changed with --set SECTION.KEY=VALUE, or with --config FILE, which may be a copy of it)"
         )
-    values = read_toml(run.settings_file)
-    for key in GONE:  # the program has written it, when it was one
-        section, _, name = key.partition(".")
-        values.get(section, {}).pop(name, None)
-    return merge_settings(Config(), values, where=str(run.settings_file))
+    return _known(read_toml(run.settings_file), run)
 
 
 def _check(run: RunFolder, text: str) -> str:
@@ -64,12 +58,12 @@ def _is_of_first_format(run: RunFolder) -> bool:
     return manifest is not None and manifest.format == 1
 
 
-def _first_format(values: dict[str, Any], run: RunFolder) -> Config:
-    """Of 0.1.0: settings that are no more, or whose value is none any longer, are told of and left out."""
+def _known(values: dict[str, Any], run: RunFolder) -> Config:
+    """Settings of an earlier version that are no more, or whose value is none any longer, are told of and left out."""
     config, dropped = merge_known_settings(Config(), values)
     if dropped:
         log.warning(
-            "%s is of version 0.1.0: %d settings in it are none any more (%s, ...)",
-            run.settings_file, len(dropped), ", ".join(dropped[:3]),
+            "%s is of an earlier version: %d settings in it are none any more (%s%s)",
+            run.settings_file, len(dropped), ", ".join(dropped[:3]), ", ..." if len(dropped) > 3 else "",
         )  # fmt: skip
     return config

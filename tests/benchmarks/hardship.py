@@ -62,8 +62,9 @@ def command(*arguments: object, before: Act | None = None, powerless: bool = Fal
     incoming, outgoing = os.pipe()  # what is said goes where no limit of files holds
 
     def act() -> None:
-        for number in (1, 2):
+        for number, name in ((1, "stdout"), (2, "stderr")):
             os.dup2(outgoing, number)
+            setattr(sys, name, open(number, "w", closefd=False))  # noqa: SIM115 (until the child ends)
         if powerless:
             ctypes.CDLL(None).capset(struct.pack("Ii", CAPABILITIES_3, 0), bytes(24))
         if before is not None:

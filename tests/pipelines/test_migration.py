@@ -3,11 +3,13 @@
 import json
 import logging
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from formats.errors import InputError
+from pipelines.config import ExportConfig, config_to_toml
 from pipelines.records import FORMAT, load_records, load_source, recorded_config, write_manifest
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
@@ -66,3 +68,22 @@ def test_its_damage_is_refused(run: RunFolder) -> None:
         run.manifest_file.write_text(json.dumps(spoilt))
         with pytest.raises(InputError, match="msgs-slam reconstruct"):
             load_source(RunFolder(run.root))
+
+
+def test_a_setting_that_is_no_more_does_not_stop_a_run_of_this_format(
+    run: RunFolder, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a version would leave it that still had one: with its checksum."""
+    config, manifest = replace(load_settings(run), export=ExportConfig(voxel=0.05)), run.manifest()
+    assert manifest is not None
+    write_manifest(run.manifest_file, manifest)
+    text = config_to_toml(config).replace("[frames]\n", "[frames]\npeak_threshold = 0.01\n")
+    monkeypatch.setattr("pipelines.settings_file.config_to_toml", lambda _: text)
+    save_settings(run, config)
+    assert load_settings(RunFolder(run.root)) == config
+    assert "1 settings in it are none any more (frames.peak_threshold)" in caplog.text
+    run.settings_file.write_text(
+        run.settings_file.read_text().replace("peak_threshold = 0.01", "peak_threshold = 0.02")
+    )
+    with pytest.raises(InputError, match="not as the program left it"):
+        load_settings(RunFolder(run.root))
