@@ -52,7 +52,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     Raises DiskFullError when the disk is full, InputError when the folder cannot be written.
     """
     path = Path(path)
-    temporary = path.with_name(_temporary_name(path))
+    temporary = temporary_of(path)
     try:
         if path.exists() and not path.is_file():  # renaming would take the place of a device
             raise InputError(f"{path} is a folder, a device or a pipe: name a file that may be written")
@@ -72,11 +72,12 @@ def atomic_path(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-def _temporary_name(path: Path) -> str:
+def temporary_of(path: Path) -> Path:
+    """Where `atomic_path` writes first: what a killed process may leave."""
     name = f".{path.stem}.tmp{path.suffix}"
-    if len(os.fsencode(name)) <= _LONGEST_NAME:
-        return name
-    return f".{hashlib.sha256(os.fsencode(path.name)).hexdigest()}.tmp{path.suffix}"
+    if len(os.fsencode(name)) > _LONGEST_NAME:
+        name = f".{hashlib.sha256(os.fsencode(path.name)).hexdigest()}.tmp{path.suffix}"
+    return path.with_name(name)
 
 
 def write_bytes(path: Path, data: bytes | bytearray | memoryview) -> None:

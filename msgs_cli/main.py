@@ -145,13 +145,14 @@ def resume(
     """Go on with RUN where it stopped. Finished stages are kept unless one of their settings is changed."""
     set_up_logging(quiet, verbose)
     from pipelines.config import load_config
-    from pipelines.reconstruct import existing_config, require_run
+    from pipelines.reconstruct import require_run
     from pipelines.reconstruct import resume as run_resume
     from pipelines.run_folder import RunFolder
+    from pipelines.settings_file import load_settings
 
     run = RunFolder(run_path)
     require_run(run)
-    config = load_config(config_file, overrides, base=existing_config(run))
+    config = load_config(config_file, overrides, base=load_settings(run))
     with stopping_softly(f"Go on with: msgs-slam resume {run.root}"):
         records = run_resume(run, make_progress(quiet), config, until)
     if not quiet:

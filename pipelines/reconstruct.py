@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from formats.atomic import write_text
+from formats.atomic import temporary_of, write_text
 from formats.errors import InputError, RecoverableError
 from pipelines.config import Config
 from pipelines.device import settle_device
@@ -51,8 +51,10 @@ def one_source(sources: Sequence[Path], run: RunFolder) -> Path:
 
 
 def existing_config(run: RunFolder) -> Config | None:
-    """The settings of run.toml, with which the run goes on, or None where there is no run."""
-    return load_settings(run) if run.manifest_file.exists() else None
+    """The settings of run.toml, with which the run goes on, or None where there are none: no run, or one that was
+    stopped before they were written."""
+    begun = run.manifest_file.exists() and (run.settings_file.exists() or load_records(run))
+    return load_settings(run) if begun else None
 
 
 def made_with(run: RunFolder) -> Config:
@@ -121,7 +123,8 @@ def _require_run_or_empty(run: RunFolder) -> None:
     """Nothing is written, not even a lock, into a folder that holds something else."""
     if not run.root.is_dir() or run.manifest_file.exists():
         return
-    if any(p.name != LOCK for p in run.root.iterdir()):
+    begun = {LOCK, temporary_of(run.manifest_file).name}  # all that there is when the first file is being written
+    if any(p.name not in begun for p in run.root.iterdir()):
         raise InputError(f"{run.root} exists and is not a run folder. Choose another with --out FOLDER")
 
 

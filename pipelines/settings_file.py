@@ -31,11 +31,18 @@ def save_settings(run: RunFolder, config: Config) -> None:
 def load_settings(run: RunFolder) -> Config:
     """The settings with which the run goes on. Raises InputError for a file that is not as the program left it.
 
-    Where it is gone, what the finished stages were made with is taken, and defaults for the others.
+    Where it is gone, what the finished stages were made with is taken, and defaults for the others; InputError where
+    none is finished.
     """
     if not run.settings_file.exists():
+        if not (records := load_records(run)):
+            raise InputError(
+                f"{run.root} was stopped before its settings were written, or {run.settings_file.name} is gone, and "
+                f"nothing is finished: type `msgs-slam reconstruct {load_source(run).path} --out {run.root}` with the "
+                "options it had"
+            )
         log.warning("%s is gone: stages that are not done get default settings", run.settings_file)
-        return recorded_config(load_records(run), Config())
+        return recorded_config(records, Config())
     with opened(run.settings_file, MAX_TOML_BYTES, any_content=True) as file:
         text = file.read().decode("utf-8", errors="replace")
     mark = _MARK.match(text)

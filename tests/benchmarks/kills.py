@@ -25,6 +25,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from pipelines.progress import SilentProgress
 from pipelines.reconstruct import all_stages, reconstruct, resume
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
+from pipelines.settings_file import load_settings
 from pipelines.stage_identity import stage_identity
 from tests.world import ClipOptions, iter_clip, make_world
 
@@ -134,43 +136,68 @@ def unbroken(clip: Path, work: Path) -> list[dict[str, str]]:
     return digests_after
 
 
-def one_round(clip: Path, run: RunFolder, config: Config, rng: random.Random, counts: collections.Counter[str]) -> None:
-    """Kill until a child ends by itself. Waits grow while nothing gets done, so that every piece of work fits."""
+@dataclass
+class Killer:
+    """Starts children on one run and kills them; counts the kills."""
 
-    def start() -> Any:
-        return reconstruct(clip, RunFolder(run.root), config, SilentProgress())
+    clip: Path
+    run: RunFolder
+    rng: random.Random
+    counts: collections.Counter[str] = field(default_factory=collections.Counter)
 
-    def go_on() -> Any:
-        return resume(RunFolder(run.root), SilentProgress(), config)
-
-    stuck, resumed = 0, 0
-    incoming, outgoing = os.pipe()
-    os.set_blocking(incoming, False)
-    while True:
-        kill = chosen_kill(rng, stuck)
-        resumes = run.manifest_file.exists() and rng.random() < 0.7
-        before = size_of(run)
-        child = in_child(go_on if resumes else start, kill, outgoing)
-        # Some calls come too seldom to be waited for.
-        patience = FIRST_WAIT * (1 + stuck) * (1 if kill is None else 3)
-        deadline = time.monotonic() + rng.expovariate(1 / patience)
+    def attempt(self, work: Callable[[], Any], kill: Kill | None, patience: float) -> bool:
+        """Whether the child was killed; else it has ended well, or the benchmark ends."""
+        incoming, outgoing = os.pipe()
+        child = in_child(work, kill, outgoing)
+        os.close(outgoing)
+        deadline = time.monotonic() + self.rng.expovariate(1 / patience)
         while (ended := os.waitpid(child, os.WNOHANG)) == (0, 0) and time.monotonic() < deadline:
             time.sleep(0.002)
         if ended == (0, 0):
             os.kill(child, signal.SIGKILL)
             ended = os.waitpid(child, 0)
-        if not os.WIFSIGNALED(ended[1]):
-            break
-        resumed = resumed + 1 if resumes else 0
-        counts["kills"] += 1
-        counts["of a resume of a killed resume"] += resumed > 1
-        counts[f"in {stage_at(run)}"] += 1
-        counts[f"at {where(incoming)}"] += 1
-        stuck = 0 if size_of(run) > before else stuck + 1
-    os.close(incoming)
-    os.close(outgoing)
-    if os.WEXITSTATUS(ended[1]) != 0:
-        raise SystemExit(f"a child failed; the run is kept in {run.root}")
+        with os.fdopen(incoming) as stream:
+            place = where(stream.read())
+        if os.WIFSIGNALED(ended[1]):
+            self.counts["kills"] += 1
+            self.counts[f"in {stage_at(self.run)}"] += 1
+            self.counts[f"at {place}"] += 1
+            return True
+        if os.WEXITSTATUS(ended[1]) != 0:
+            raise SystemExit(f"a child failed; the run is kept in {self.run.root}")
+        return False
+
+    def start(self, config: Config) -> Any:
+        """As `msgs-slam reconstruct`."""
+        return reconstruct(self.clip, RunFolder(self.run.root), config, SilentProgress())
+
+    def go_on(self, config: Config) -> Any:
+        """As `msgs-slam resume`: from the settings in run.toml, where they are those of this round."""
+        run = RunFolder(self.run.root)
+        own = run.settings_file.exists() and load_settings(run) == config
+        return resume(run, SilentProgress(), None if own else config)
+
+    def first_moments(self, config: Config) -> None:
+        """A new run is killed while its first records are written; the same command goes on."""
+        for number in range(1, 7):
+            for call in ("replace", "fsync", "unlink"):
+                shutil.rmtree(self.run.root, ignore_errors=True)
+                self.attempt(lambda: self.start(config), (call, number, self.rng.random() < 0.5, True), 60)
+                self.attempt(lambda: self.start(config), None, FIRST_WAIT)
+
+    def one_round(self, config: Config) -> None:
+        """Kill until a child ends by itself. Waits grow while nothing gets done, so that every piece of work fits."""
+        stuck, resumed, killed = 0, 0, True
+        while killed:
+            kill = chosen_kill(self.rng, stuck)
+            resumes = self.run.manifest_file.exists() and self.rng.random() < 0.7
+            before = size_of(self.run)
+            # Some calls come too seldom to be waited for.
+            patience = FIRST_WAIT * (1 + stuck) * (1 if kill is None else 3)
+            killed = self.attempt(lambda r=resumes: self.go_on(config) if r else self.start(config), kill, patience)  # type: ignore[misc]
+            resumed = resumed + 1 if resumes else 0
+            self.counts["of a resume of a killed resume"] += killed and resumed > 1
+            stuck = 0 if size_of(self.run) > before else stuck + 1
 
 
 def chosen_kill(rng: random.Random, stuck: int) -> Kill | None:
@@ -187,14 +214,11 @@ def size_of(run: RunFolder) -> int:
     return sum(p.is_file() for p in run.root.rglob("*")) if run.root.exists() else 0
 
 
-def where(incoming: int) -> str:
+def where(told: str) -> str:
     """The call that a child was killed in, and the record that it was for, if any."""
-    try:
-        call, _, path = os.read(incoming, 4096).decode().partition(" ")
-    except BlockingIOError:
-        return "a random time"
+    call, _, path = told.partition(" ")
     found = RECORDS.search(path)
-    return f"{call}, {found[1]}" if found else call
+    return f"{call}, {found[1]}" if found else call or "a random time"
 
 
 def main() -> None:
@@ -204,7 +228,6 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    rng, counts = random.Random(options.seed), collections.Counter[str]()
     options.work.mkdir(parents=True, exist_ok=True)
     clip = options.work / "clip.avi"
     # In a child too: a process whose libraries have begun threads of their own cannot be forked any more.
@@ -212,12 +235,13 @@ def main() -> None:
 
     whole = unbroken(clip, options.work)
     run = RunFolder(options.work / "killed.msgs")
-    differing, rounds = 0, 0
+    killer = Killer(clip, run, random.Random(options.seed))
+    counts, differing, rounds = killer.counts, 0, 0
     while counts["kills"] < options.kills:
+        config, expected = settings(CHANGES[rounds % len(CHANGES)]), whole[rounds % len(CHANGES)]
         if rounds % len(CHANGES) == 0:
-            shutil.rmtree(run.root, ignore_errors=True)
-        expected = whole[rounds % len(CHANGES)]
-        one_round(clip, run, settings(CHANGES[rounds % len(CHANGES)]), rng, counts)
+            killer.first_moments(config)
+        killer.one_round(config)
         rounds += 1
         found = digests(run)
         if found != expected:

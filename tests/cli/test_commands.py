@@ -7,8 +7,10 @@ import click
 import pytest
 from click.testing import CliRunner, Result
 
+from formats.atomic import temporary_of
 from msgs_cli.main import main
 from pipelines.config import Config
+from pipelines.reconstruct import existing_config
 from pipelines.records import Manifest, Source, write_manifest
 from pipelines.run_folder import RunFolder
 from pipelines.settings_file import save_settings
@@ -114,6 +116,25 @@ def test_run_of_another_source_is_not_touched(tmp_path: Path) -> None:
     assert "another source" in message
     assert "--out" in message
     assert (out / "manifest.json").read_bytes() == manifest
+
+
+def test_what_was_stopped_in_its_first_moments_is_begun_again(tmp_path: Path) -> None:
+    """Between the lock, the manifest and run.toml: with default settings nobody would have asked for."""
+    run = run_of(tmp_path / "run")
+    run.settings_file.unlink()
+    for command in ("resume", "status"):
+        result = invoke(command, run.root)
+        assert result.exit_code == 1
+        assert f"msgs-slam reconstruct other.mp4 --out {run.root}" in result.stderr
+    assert existing_config(run) is None
+    half = temporary_of(run.manifest_file)
+    run.manifest_file.rename(half)
+    source = tmp_path / "video.mp4"
+    source.write_text("x")
+    assert "video.mp4" in refused(source, run.root)  # as a video, not because of the folder
+    assert half.exists()
+    (run.root / "diary.txt").write_text("mine")
+    assert "not a run folder" in refused(source, run.root)
 
 
 def emptied(run: RunFolder) -> None:
