@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -9,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.atomic import atomic_path, free_bytes
+from formats.atomic import atomic_path, free_bytes, is_disk_full
 from formats.errors import DiskFullError, InputError
 
 CODECS = {".mp4": "mp4v", ".avi": "FFV1", ".mkv": "FFV1"}
@@ -64,5 +66,7 @@ def _require_all(temporary: Path, path: Path, written: int) -> None:
 def _open_writer(path: Path, codec: str, fps: float, size: tuple[int, int]) -> cv2.VideoWriter:
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), fps, size)
     if not writer.isOpened():
+        if is_disk_full(OSError(), path.parent):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         raise InputError(f"{path}: this OpenCV cannot write {codec} video; install opencv-python-headless from PyPI")
     return writer
