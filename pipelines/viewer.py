@@ -180,7 +180,7 @@ class Viewer:
             f"/cameras/{number:05d}", camera.fov, camera.aspect, scale=_FRUSTUM, color=(37, 99, 235),
             thickness=1.5, thickness_units="screen", wxyz=wxyz, position=position,
         )  # fmt: skip
-        handle.on_click(lambda event: self.visit(camera, event.client))
+        handle.on_click(lambda event: None if self.tape.switch.value else self.visit(camera, event.client))
         return handle
 
     def _pose(self, camera: ViewerCamera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
