@@ -9,6 +9,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,7 @@ from pipelines.stage_identity import stage_identity
 from pipelines.stopping import stop_if_asked
 from pipelines.streamed import memory_room
 
+_PROCESS = Path("/proc/self")
 FINGERPRINT = "fingerprint"
 """File of an unfinished folder: the work it belongs to."""
 SameSource = Callable[[], None]
@@ -206,6 +208,7 @@ def _run_one(stage: Stage, context: StageContext, fingerprint: str, inputs: Any)
     run, folder = context.run, context.folder
     journal = _open_partial(folder, fingerprint)
     started = time.monotonic()
+    forget_peak()
     try:
         with watched_by(journal):
             figures = stage.run(context)
@@ -271,8 +274,18 @@ def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) 
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def forget_peak() -> None:
+    """From now on `peak_memory_mb` is what comes, where the system can do that (Linux)."""
+    with suppress(OSError):
+        (_PROCESS / "clear_refs").write_text("5", encoding="ascii")
+
+
 def peak_memory_mb() -> float:
-    """Largest resident memory of this process so far, in MB; 0 where the system does not tell (Windows)."""
+    """Largest resident memory of this process since `forget_peak`, in MB; since it began where the system has no such
+    thing, 0 where it tells nothing (Windows)."""
+    with suppress(OSError, ValueError, StopIteration):
+        lines = (_PROCESS / "status").read_text(encoding="ascii").splitlines()
+        return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) / 1024
     try:
         import resource
     except ImportError:

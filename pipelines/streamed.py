@@ -6,6 +6,7 @@ import os
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from threading import RLock
 from typing import Generic, TypeVar, overload
 
 T = TypeVar("T")
@@ -17,13 +18,15 @@ _CONTAINER = Path("/sys/fs/cgroup")
 class Streamed(Sequence[T], Generic[T]):
     """The values of `make` for 0 to `count` - 1, those used last kept while they need at most `room` bytes together.
 
-    `make` gives the same value whenever it is called with the same number, so that nobody sees what is kept.
+    `make` gives the same value whenever it is called with the same number, so that nobody sees what is kept. May be
+    asked from several threads.
     """
 
     def __init__(self, count: int, make: Callable[[int], T], size_of: Callable[[T], int], room: float) -> None:
         self._count, self._make, self._size_of, self._room = count, make, size_of, room
         self._kept: OrderedDict[int, T] = OrderedDict()
         self._used = 0
+        self._lock = RLock()
 
     def __len__(self) -> int:
         return self._count
@@ -36,13 +39,19 @@ class Streamed(Sequence[T], Generic[T]):
         if isinstance(index, slice):
             return [self[i] for i in range(self._count)[index]]
         key = range(self._count)[index]  # raises IndexError, counts from the end
-        if key not in self._kept:
-            value = self._kept[key] = self._make(key)
+        with self._lock:
+            if key not in self._kept:
+                self.keep(key, self._make(key))
+            self._kept.move_to_end(key)
+            return self._kept[key]
+
+    def keep(self, index: int, value: T) -> None:
+        """Take a value that is at hand, the one that `make` would make."""
+        with self._lock:
+            self._kept[index] = value
             self._used += self._size_of(value)
             while self._used > self._room and len(self._kept) > 1:
                 self._used -= self._size_of(self._kept.popitem(last=False)[1])
-        self._kept.move_to_end(key)
-        return self._kept[key]
 
     def changed(self, function: Callable[[int, T], T]) -> Streamed[T]:
         """The same with `function` of number and value applied; takes over what is kept here, and the room."""

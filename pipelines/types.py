@@ -52,6 +52,11 @@ class Features:
         require_shape("keypoints", self.keypoints, (None, 4))
         require_shape("descriptors", self.descriptors, (len(self.keypoints), 128))
 
+    @property
+    def nbytes(self) -> int:
+        """Memory they take."""
+        return self.keypoints.nbytes + self.descriptors.nbytes
+
     def __len__(self) -> int:
         return len(self.keypoints)
 

@@ -203,6 +203,7 @@ def _structure(
         progress=context.progress,
         threads=context.threads,
         seed=context.config.run.seed,
+        memory=context.memory_room,
     ).run(keyframes)
     warn_of_structure(context, structure, [frames[k].id for k in keyframes])
     return structure

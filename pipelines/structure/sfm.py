@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -28,6 +29,7 @@ from pipelines.correspondence.retrieval import (
 )
 from pipelines.correspondence.snapshots import Snapshots
 from pipelines.progress import Progress
+from pipelines.streamed import Streamed
 from pipelines.structure.adjust import adjust
 from pipelines.structure.consistency import ModelReport, judge, without_misplaced
 from pipelines.structure.lens import set_lens
@@ -37,6 +39,8 @@ from pipelines.structure.seams import cut, take_out
 from pipelines.types import Features, Vocabulary
 
 _PAIRS_PER_BLOCK = 64
+_FEATURES_SHARE = 0.25
+"""Of the memory that there is: what has no room there is read again from the snapshot."""
 _MIN_KEYFRAMES = 3
 _MIN_POINTS = 30
 LENS_HELD = "global-lens-held"
@@ -60,7 +64,7 @@ class Structure:
     report: ModelReport
     mapper: str
     focal_sd: float
-    features: list[Features]
+    features: Sequence[Features]
     vocabulary: Vocabulary
     tried: list[tuple[int, int]]
     pairs: list[VerifiedPair]
@@ -90,6 +94,7 @@ class StructureFromMotion:
     progress: Progress
     threads: int
     seed: int
+    memory: float = math.inf
 
     def run(self, keyframe_ids: Sequence[int]) -> Structure:
         """Raises InputError when the keyframes have no parallax or too little in common."""
@@ -178,7 +183,7 @@ class StructureFromMotion:
                     adjust(other, refine_camera=False)
         return replace(found, model=largest), others
 
-    def _features(self, keyframe_ids: Sequence[int]) -> list[Features]:
+    def _features(self, keyframe_ids: Sequence[int]) -> Streamed[Features]:
         def extract(frame_id: int) -> Features:
             return extract_features(self.load_gray(frame_id), self.config.max_features, self.left_out(frame_id))
 
@@ -186,7 +191,11 @@ class StructureFromMotion:
             return self.snapshots.features(frame_id, lambda: extract(frame_id))
 
         found = parallel_map(stored, keyframe_ids, self.threads)
-        return list(self.progress.track(found, "features", len(keyframe_ids)))
+        room = _FEATURES_SHARE * self.memory
+        features = Streamed(len(keyframe_ids), lambda k: stored(keyframe_ids[k]), lambda f: f.nbytes, room)
+        for k, value in enumerate(self.progress.track(found, "features", len(keyframe_ids))):
+            features.keep(k, value)
+        return features
 
     def _proposed(self, features: Sequence[Features], vocabulary: Vocabulary) -> list[tuple[int, int]]:
         looks = Looks((np.stack([describe(f, vocabulary) for f in features]),))

@@ -14,9 +14,9 @@ from cli_runs import FinishedRun, invoke
 
 from formats.errors import DiskFullError, InputError
 from formats.video_writer import write_video
-from pipelines import lock, records
+from pipelines import lock, records, stages
 from pipelines.run_folder import RunFolder
-from pipelines.stages import peak_memory_mb
+from pipelines.stages import forget_peak, peak_memory_mb
 from pipelines.stopping import Stopped, is_asked, soft_stop, stop_if_asked
 
 COMMAND = [sys.executable, "-m", "msgs_cli.main"]
@@ -128,7 +128,9 @@ def test_video_that_the_disk_has_cut_is_refused(tmp_path: Path, monkeypatch: pyt
 def test_windows_has_neither_resource_nor_flock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("resource", "fcntl", "msvcrt"):
         monkeypatch.setitem(sys.modules, name, None)  # importing it fails
+    monkeypatch.setattr(stages, "_PROCESS", tmp_path / "none")
     assert peak_memory_mb() == 0.0
+    forget_peak()
     with lock.locked(RunFolder(tmp_path / "a")):
         assert (tmp_path / "a").exists()
 

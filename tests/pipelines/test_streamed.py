@@ -1,10 +1,13 @@
 """What does not fit into memory is made again, and nobody sees the difference."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipelines import streamed
+from pipelines.stages import forget_peak, peak_memory_mb
 from pipelines.streamed import Streamed, machine_memory, memory_room
 
 
@@ -45,6 +48,28 @@ def test_a_change_takes_over_what_is_kept() -> None:
     assert [changed[i] for i in (3, 2)] == ["3!!!", "2!!"]
     assert made == [0, 1, 2, 3]
     assert list(changed) == ["0", "1!", "2!!", "3!!!"]
+
+
+def test_what_is_at_hand_is_taken_and_threads_get_what_they_ask_for() -> None:
+    made: list[int] = []
+    values = Streamed(40, lambda i: made.append(i) or str(i), len, room=6)
+    for i in range(40):
+        values.keep(i, str(i))
+    assert (values[39], values[38]) == ("39", "38")
+    assert made == []
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(values.__getitem__, [i % 40 for i in range(400)])) == [str(i % 40) for i in range(400)]
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux forgets a peak")
+def test_the_peak_of_memory_is_that_of_a_stage() -> None:
+    before = peak_memory_mb()
+    block = np.ones(40_000_000)
+    with_block = peak_memory_mb()
+    del block
+    forget_peak()
+    assert with_block > before + 200 or with_block > peak_memory_mb() + 200
+    assert peak_memory_mb() < with_block - 200
 
 
 def test_room_is_half_of_the_machine_or_container(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
