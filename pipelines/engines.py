@@ -7,8 +7,10 @@ that is lost (killed, out of memory, its machine gone) costs its own call only, 
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 import socket
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -101,6 +103,7 @@ def _answer(process: Any, receiver: Connection) -> tuple[str, Any]:
 
 def _child(sender: Connection, call: Call) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent passes on what it means
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         with soft_stop(lambda number: None):
             sender.send(("value", call.function(*call.arguments)))
@@ -108,6 +111,13 @@ def _child(sender: Connection, call: Call) -> None:
         sender.send(("stopped", stopped.number))
     except Exception:
         sender.send(("failure", traceback.format_exc()))
+
+
+def _end_with_parent() -> None:
+    """A parent that is killed passes nothing on."""
+    if (parent := multiprocessing.parent_process()) is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _how_it_ended(exitcode: int | None) -> str:

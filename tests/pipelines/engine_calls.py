@@ -27,7 +27,7 @@ def wait(marker: str) -> None:
     """Until stopped."""
     from pipelines.stopping import stop_if_asked
 
-    Path(marker).touch()
+    Path(marker).write_text(str(os.getpid()))
     for _ in range(600):
         stop_if_asked()
         time.sleep(0.05)

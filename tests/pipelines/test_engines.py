@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -68,6 +69,30 @@ def test_a_signal_ends_the_calls(engine: Engine, tmp_path: Path) -> None:
         list(engine.run([Call("waits", engine_calls.wait, (str(marker),)), Call("two", engine_calls.double, (2,))]))
     thread.join()
     assert time.monotonic() - started < 25
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kills as Unix does")
+def test_a_killed_parent_leaves_no_process_behind(tmp_path: Path) -> None:
+    marker = tmp_path / "begun"
+    code = (
+        "import engine_calls\nfrom pipelines.engines import Call, LocalEngine\n"
+        f"list(LocalEngine().run([Call('waits', engine_calls.wait, ({str(marker)!r},))]))\n"
+    )
+    paths = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    parent = subprocess.Popen([sys.executable, "-c", code], env=paths, stderr=subprocess.DEVNULL)
+    while not marker.exists() or not marker.read_text():
+        assert parent.poll() is None
+        time.sleep(0.05)
+    child = int(marker.read_text())
+    parent.kill()
+    parent.wait()
+    for _ in range(400):
+        try:
+            os.kill(child, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.05)
+    pytest.fail("the child still works")
 
 
 @needs_ray
