@@ -112,6 +112,8 @@ class _Mode(TorchFunctionMode):
             args = tuple(PretendTensor(torch.tensor(x, dtype=of)) if isinstance(x, _NUMBER) else x for x in args)
         device = kwargs.get("device")
         if device is not None and torch.device(device).type == DEVICE and not _has_pretender(args):
+            if function is torch.empty:  # torch's own rules for "meta" make the zeros of a backward pass by it
+                function = torch.zeros
             return PretendTensor(function(*args, **{**kwargs, "device": "cpu"}))
         return function(*args, **kwargs)
 

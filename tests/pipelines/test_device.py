@@ -94,6 +94,15 @@ def test_it_is_viewed_from_there(run: RunFolder) -> None:
     assert len(load_scenes(run.root)[0].centers) > 100
 
 
+def test_gradients_there_are_those_of_the_cpu() -> None:
+    values = torch.randn(500, generator=torch.Generator().manual_seed(0))
+    found = []
+    for leaf in (values.clone().requires_grad_(), values.to(DEVICE).requires_grad_()):
+        loss = (leaf - 0.5).clamp(min=0).square().mean() + torch.where(leaf > 0, leaf.exp(), 0.0).sum()
+        found.append(torch.autograd.grad(loss, leaf)[0].cpu())
+    assert torch.equal(*found)
+
+
 def test_a_misplaced_copy_to_the_cpu_is_found(
     world_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
