@@ -29,7 +29,7 @@ def load_scale_spreads(run: RunFolder) -> tuple[list[float], float]:
 
 def load_metres(run: RunFolder) -> Metres | None:
     """How long the world's unit is, as the export found it; None where it did not, or has not run."""
-    if not (run.stage("export") / SCALE).exists():  # exports are the user's: files may be gone
+    if not run.has("export", SCALE):
         return None
     if (row := read_json(run.file("export", SCALE))) is None:
         return None

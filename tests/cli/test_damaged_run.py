@@ -21,6 +21,7 @@ USED_BY = {
     "global_ba/map.safetensors": "ply",
     "global_ba/trajectory.npz": "tum",
     "global_ba/sparse.npz": "colmap",
+    "export/scale.json": "tum",
 }
 
 
