@@ -2,38 +2,40 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from finished import note_finished
 
 from formats.datasets import open_sequence
-from pipelines.config import Config, ExportConfig, GlobalBaConfig, MappingConfig
+from pipelines.config import Config, ExportConfig, GlobalBaConfig, MappingConfig, ProxyConfig
 from pipelines.evaluation.evaluate import evaluate_run
-from pipelines.export import stage as export_stage
 from pipelines.export.stage import export_run
-from pipelines.global_ba import stage as global_ba_stage
 from pipelines.global_ba.move_map import move_map
 from pipelines.mapping import growth
 from pipelines.mapping import stage as mapping_stage
 from pipelines.progress import SilentProgress
+from pipelines.reconstruct import all_stages
 from pipelines.render_run import render_run
 from pipelines.run_folder import RunFolder
-from pipelines.stages import Stage, StageContext
+from pipelines.run_folder_names import STAGES
+from pipelines.stages import StageContext, run_stages
+from pipelines.tracking.pictures import Pictures
+from pipelines.tracking.refine import RenderWeights, compare_frame
+from pipelines.tracking.state import FEATURE_SD, TrackState
 from pipelines.viewer_scene import load_scenes
 from tests.pipelines.mapping.small_run import make_run
 from tests.pretend_device import DEVICE, PretendTensor, WrongDeviceError, pretended
 
 CONFIG = Config(
+    proxy=ProxyConfig(max_side=96, stereo_side=80, stereo_planes=24),
     mapping=MappingConfig(passes=2.0, min_iterations=0, max_side=40, hold_out=4),
     global_ba=GlobalBaConfig(use_loops=False, joint="always", joint_passes=1.0),
     export=ExportConfig(voxel=0.05, mesh_side=40),
 )
-_BEFORE = ("frames", "proxy", "tracking")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -42,25 +44,27 @@ def device() -> Iterator[None]:
         yield
 
 
-def finish(stage: Stage, run: RunFolder, done: tuple[str, ...], config: Config = CONFIG) -> dict:
-    folder = run.stage(stage.name)
-    folder.mkdir(exist_ok=True)
-    figures = stage.run(StageContext(run, run.root, config, folder, SilentProgress()))
-    note_finished(run, (*_BEFORE, *done, stage.name), config)
-    return figures
-
-
 @pytest.fixture(scope="module")
 def run(device: None, tmp_path_factory: pytest.TempPathFactory, world_sequence: Path) -> RunFolder:
-    """Mapped on the pretended device, refined and exported there."""
-    made = make_run(tmp_path_factory.mktemp("device") / "run", world_sequence, every=4)
-    mapped = finish(mapping_stage.STAGE, made, ())
-    refined = finish(global_ba_stage.STAGE, made, ("mapping",))
-    finish(export_stage.STAGE, made, ("mapping", "global_ba"))
-    assert mapped["keyframe_psnr"] > 15
-    assert mapped["held_out_psnr"] > 10
-    assert refined["joint"] in ("kept", "thrown away")
+    """All six stages, of the walk's beginning, where `auto` chooses the pretended device."""
+    source, made = tmp_path_factory.mktemp("source"), RunFolder(tmp_path_factory.mktemp("device"))
+    (source / "rgb").mkdir()
+    for name in ("intrinsics.json", "timestamps.txt", *(f"rgb/{i:06d}.png" for i in range(14))):
+        shutil.copyfile(world_sequence / name, source / name)
+    records = run_stages(all_stages(), made, source, "made", CONFIG, SilentProgress())
+    assert list(records) == list(STAGES)
+    assert records["tracking"].figures["posed"] == 14
+    assert records["mapping"].figures["keyframe_psnr"] > 15
+    assert records["mapping"].figures["held_out_psnr"] > 10
+    assert records["global_ba"].figures["joint"] in ("kept", "thrown away")
     return made
+
+
+def test_a_frame_is_compared_with_gaussians_there(run: RunFolder) -> None:
+    state = TrackState.from_backbone(run.load_sparse("tracking"), FEATURE_SD)
+    found = compare_frame(5, state.poses[5], [4, 6], state, Pictures(run, CONFIG.frames), RenderWeights())
+    assert found is not None
+    assert found.unexplained < 0.5
 
 
 def test_a_map_can_be_moved_there(run: RunFolder) -> None:
@@ -110,5 +114,6 @@ def test_a_misplaced_copy_to_the_cpu_is_found(
     right = growth.Growth._spacing
     monkeypatch.setattr(growth.Growth, "_spacing", lambda self, view: right(self, view).cpu())
     made = make_run(tmp_path / "run", world_sequence, every=8)
+    made.partial("mapping").mkdir()
     with pytest.raises(WrongDeviceError, match="of the CPU meets"):
-        finish(mapping_stage.STAGE, made, (), replace(CONFIG, mapping=MappingConfig(max_side=40)))
+        mapping_stage.run(StageContext(made, made.root, CONFIG, made.partial("mapping"), SilentProgress()))
