@@ -5,6 +5,7 @@ import io
 import itertools
 import json
 import os
+import re
 import resource
 import socket
 import struct
@@ -152,6 +153,16 @@ def test_a_camera_for_another_shape_is_refused_and_a_resized_one_fits(tmp_path: 
         path.write_text(json.dumps(camera | change))
         with pytest.raises(InputError):
             RecordingSource(open_sequence(tmp_path)).known_camera()
+
+
+def test_a_card_must_name_the_output(tmp_path: Path) -> None:
+    DOORS["card"].make(tmp_path)
+    card = tmp_path / DOORS["card"].entry
+    text = re.sub(r'^output = ".*"$', 'output = ""', card.read_text(), flags=re.MULTILINE)
+    assert text != card.read_text()
+    card.write_text(text)
+    with pytest.raises(InputError, match="it has no output ''"):
+        DOORS["card"].read(card)
 
 
 # sources ------------------------------------------------------------------------------------------------------------

@@ -36,7 +36,7 @@ class Network:
         inputs, outputs = self._runtime.inputs, self._runtime.outputs
         if set(inputs) != set(filter(None, (card.input, card.tokens))):
             raise InputError(f"{card.model}: its inputs are {', '.join(inputs)}; the card says {card.input}")
-        for name in wanted:
+        for name in {**dict.fromkeys(wanted), card.output: None}:
             if name not in outputs:
                 raise InputError(
                     f"{card.model}: it has no output {name!r}, only {', '.join(outputs)}. Correct the card"

@@ -36,8 +36,8 @@ class TfliteRuntime:
         with parsing(path, "TFLite network that LiteRT can load", "download it again"):
             self._interpreter = Interpreter(model_content=_ending_at(path, content, outputs), num_threads=threads)
             self._interpreter.allocate_tensors()
-        self._in = {d["name"]: d for d in self._interpreter.get_input_details()}
-        self._out = {d["name"]: d for d in self._interpreter.get_output_details()}
+            self._in = {d["name"]: d for d in self._interpreter.get_input_details()}
+            self._out = {d["name"]: d for d in self._interpreter.get_output_details()}
         self.inputs = {k: Port(_channels_first(d["shape"]), np.float32) for k, d in self._in.items()}
         self.outputs = {k: Port(_channels_first(d["shape"]), d["dtype"]) for k, d in self._out.items()}
         self.metadata: dict[str, str] = {}
