@@ -157,12 +157,12 @@ def test_a_camera_for_another_shape_is_refused_and_a_resized_one_fits(tmp_path: 
 
 def test_a_card_must_name_the_output(tmp_path: Path) -> None:
     DOORS["card"].make(tmp_path)
-    card = tmp_path / DOORS["card"].entry
+    card = tmp_path / "card.toml"
     text = re.sub(r'^output = ".*"$', 'output = ""', card.read_text(), flags=re.MULTILINE)
     assert text != card.read_text()
     card.write_text(text)
     with pytest.raises(InputError, match="it has no output ''"):
-        DOORS["card"].read(card)
+        DOORS["card"].read(tmp_path / DOORS["card"].entry)
 
 
 # sources ------------------------------------------------------------------------------------------------------------
