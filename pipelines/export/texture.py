@@ -1,4 +1,4 @@
-"""A texture painted from photographs: each texel the mean of the few keyframes that see its place best."""
+"""A texture painted from photographs: each texel a mean of the keyframes that see its place, the best above all."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from pipelines.types import Intrinsics
 
 AGREES = 0.03
 """Relative difference up to which the depth of a view confirms that it sees a place."""
-BEST_VIEWS = 6
-POWER = 4.0
-"""A view counts with this power of its pixels a length on the surface, times how sharp it is."""
+POWER = 2.0
+"""A view counts with this power of its pixels a length on the surface, times how sharp it is. The mean of many views
+lies nearer to each of them than that of the best: on kitchen 24.4 dB instead of 23.5 with six views and 4."""
 _FEATHER = 0.04
 """Weights fade over this part of the picture's width beside its rim and beside steps of the depth."""
 _BAND = 64
@@ -48,7 +48,7 @@ def texels_wanted(vertices: NDArray[np.float32], faces: NDArray[np.int32], shots
 def paint_texture(atlas: Atlas, shots: Sequence[Shot], progress: Progress) -> NDArray[np.uint8]:
     """(height, width, 3) RGB; what no view sees has its vertices' colours, what no face covers those beside it."""
     vertices, faces = atlas.mesh.vertices, atlas.mesh.faces
-    weights = best_views(vertices, vertex_normals(vertices, faces), shots)[:, atlas.corner_vertex]
+    weights = view_weights(vertices, vertex_normals(vertices, faces), shots)[:, atlas.corner_vertex]
     owner = owners(atlas)
     total = np.zeros((atlas.height, atlas.width, 4), np.float32)
     for shot, weight in zip(progress.track(shots, "texture", len(shots)), weights, strict=True):
@@ -69,10 +69,10 @@ def vertex_normals(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> N
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
 
 
-def best_views(
+def view_weights(
     vertices: NDArray[np.float32], normals: NDArray[np.float64], shots: Sequence[Shot]
 ) -> NDArray[np.float32]:
-    """(N, V) how much each shot counts at each vertex: 0 for all but the `BEST_VIEWS` best, 1 the best of all."""
+    """(N, V) how much each shot counts at each vertex: 0 where it does not see it, 1 for the best of all."""
     weights = np.zeros((len(shots), len(vertices)), np.float32)
     for n, shot in enumerate(shots):
         density, place = _density(vertices, normals, shot)
@@ -80,11 +80,7 @@ def best_views(
         weights[n, seen] = (shot.sharpness * density[seen]) ** POWER * _feather(shot.depth_view)[
             place[seen, 1], place[seen, 0]
         ]
-    weights /= np.maximum(weights.max(0), np.finfo(np.float32).tiny)
-    if len(shots) > BEST_VIEWS:
-        least = np.partition(weights, len(shots) - BEST_VIEWS, axis=0)[len(shots) - BEST_VIEWS]
-        weights[weights < least] = 0
-    return weights
+    return weights / np.maximum(weights.max(0), np.finfo(np.float32).tiny)
 
 
 def _density(
