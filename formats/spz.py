@@ -1,24 +1,31 @@
-"""SPZ, Niantic's compressed splat file: 20 bytes a Gaussian before gzip."""
+"""SPZ, Niantic's compressed splat file: 20 bytes a Gaussian before compression.
+
+Version 4 is a plain header, a table and a Zstandard stream for each attribute; versions 2 and 3 are one gzip stream.
+Layout by the README of github.com/nianticlabs/spz; version 2 keeps rotations in three bytes, the others in four.
+"""
 
 from __future__ import annotations
 
 import gzip
 import io
 import struct
+from io import BufferedReader
 from pathlib import Path
 
 import numpy as np
+import zstandard
 from numpy.typing import NDArray
 
 from formats.atomic import write_bytes
 from formats.errors import InputError
 from formats.gaussians import GaussianCloud, unit_quaternions
-from formats.reading import parsing, require_file
+from formats.reading import opened, parsing, require_file
 
 _MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")
-_WRITTEN_VERSION = 2
-_REST_BYTES = {0: 0, 1: 9, 2: 24, 3: 45}
+_HEADER_4 = struct.Struct("<4sIIBBBBI12x")
+_MOST_STREAMS = 16
+_MOST_DEGREE = 4
 _LEAST_BYTES = 19
 _MOST_FRACTION_BITS = 24
 _LEAST_LIMIT, _HIGHEST_RATIO = 32 << 20, 30
@@ -29,70 +36,95 @@ _SH_C0 = 0.28209479177387814
 _FLIP = np.array([1, -1, -1], dtype=np.float32)
 
 
-def write_spz(path: Path, cloud: GaussianCloud) -> None:
-    """Write a cloud as SPZ version 2 without view-dependent colour; classes are not kept.
+def write_spz(path: Path, cloud: GaussianCloud, version: int = 4) -> None:
+    """Write a cloud as SPZ version 4 (or 3, for older readers) without view-dependent colour; classes are not kept.
 
     Positions are fixed point of 24 bits with as many fraction bits as the scene's extent leaves (at most 16), scales
-    steps of 1/16 in the logarithm, opacity, colour and rotation 8 bits. The same cloud gives the same bytes. Raises
-    ValueError where a position is not finite or beyond 4 million, InputError when the disk refuses.
+    steps of 1/16 in the logarithm, opacity and colour 8 bits, rotations 10 bits a component. The same cloud gives the
+    same bytes. Raises ValueError where a position is not finite or beyond 4 million, InputError when the disk refuses.
     """
     extent = float(np.abs(cloud.means).max(initial=0))
     if not np.isfinite(cloud.means).all() or extent >= 2**22:
         raise ValueError(f"write_spz: positions must be finite and below 4 million, got {extent:g}")
     fraction_bits = max(0, min(16, 21 - int(np.floor(np.log2(max(extent, 1e-9))))))
-    header = _HEADER.pack(_MAGIC, _WRITTEN_VERSION, len(cloud), 0, fraction_bits, 0, 0)
     opacity = 1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))
-    dc = (cloud.colors - 0.5) / _SH_C0
-    quat_xyzw = cloud.quat_wxyz[:, [1, 2, 3, 0]] * np.append(_FLIP, 1)
-    quat_xyzw = quat_xyzw * np.where(quat_xyzw[:, 3:] < 0, -1, 1)
-    parts = [
-        _fixed24(cloud.means * _FLIP, fraction_bits),
-        _byte(opacity * 255),
-        _byte(dc * (_COLOR_SCALE * 255) + 0.5 * 255),
-        _byte((cloud.log_scales + 10) * 16),
-        _byte(quat_xyzw[:, :3] * 127.5 + 127.5),
+    streams = [
+        _fixed24(cloud.means * _FLIP, fraction_bits).tobytes(),
+        _byte(opacity * 255).tobytes(),
+        _byte((cloud.colors - 0.5) / _SH_C0 * (_COLOR_SCALE * 255) + 0.5 * 255).tobytes(),
+        _byte((cloud.log_scales + 10) * 16).tobytes(),
+        _packed_rotations(cloud.quat_wxyz[:, [1, 2, 3, 0]] * np.append(_FLIP, 1)).tobytes(),
     ]
+    write_bytes(path, (_container_4 if version == 4 else _container_3)(streams, len(cloud), fraction_bits))
+
+
+def _container_4(streams: list[bytes], count: int, fraction_bits: int) -> bytes:
+    packed = [zstandard.ZstdCompressor(level=12).compress(stream) for stream in streams]
+    header = _HEADER_4.pack(_MAGIC, 4, count, 0, fraction_bits, 0, len(streams), _HEADER_4.size)
+    table = [struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True)]
+    return b"".join([header, *table, *packed])
+
+
+def _container_3(streams: list[bytes], count: int, fraction_bits: int) -> bytes:
     buffer = io.BytesIO()
     # mtime 0: the clock must not get into the file
     with gzip.GzipFile(fileobj=buffer, mode="wb", mtime=0) as file:
-        file.write(header + b"".join(part.tobytes() for part in parts))
-    write_bytes(path, buffer.getvalue())
+        file.write(_HEADER.pack(_MAGIC, 3, count, 0, fraction_bits, 0, 0) + b"".join(streams))
+    return buffer.getvalue()
 
 
 def read_spz(path: Path) -> GaussianCloud:
-    """The Gaussians of an SPZ file of version 2 or 3; view-dependent colour is dropped.
+    """The Gaussians of an SPZ file of version 2, 3 or 4; view-dependent colour is dropped.
 
     Raises InputError for another version, for a damaged file, and for one that would unpack to far more than it is.
     """
-    size = require_file(path)
-    with parsing(path, "SPZ file"), gzip.open(path, "rb") as file:
-        return _read_stream(file, path, max(_LEAST_LIMIT, size * _HIGHEST_RATIO))
+    most = max(_LEAST_LIMIT, require_file(path) * _HIGHEST_RATIO)
+    with opened(path) as plain, parsing(path, "SPZ file"):
+        if plain.peek(4)[:4] == _MAGIC:
+            return _read_version_4(plain, path, most)
+        with gzip.open(plain, "rb") as file:
+            magic, version, count, degree, fraction_bits, _, _ = _HEADER.unpack(file.read(_HEADER.size))
+            _require_sane(path, magic == _MAGIC and version in (2, 3), count, degree, fraction_bits, most)
+            streams = [_fields(file, count, width) for width in (9, 1, 3, 3, 3 if version == 2 else 4)]
+    return _unpacked(streams, degree, fraction_bits)
 
 
-def _read_stream(file: gzip.GzipFile, path: Path, most: int) -> GaussianCloud:
-    magic, version, count, degree, fraction_bits, _, _ = _HEADER.unpack(file.read(_HEADER.size))
-    if magic != _MAGIC or version not in (2, 3) or degree not in _REST_BYTES:
-        raise InputError(f"{path} is no SPZ file of version 2 or 3: export it with another program's default settings")
+def _read_version_4(file: BufferedReader, path: Path, most: int) -> GaussianCloud:
+    _, version, count, degree, fraction_bits, _, number, table = _HEADER_4.unpack(file.read(_HEADER_4.size))
+    _require_sane(path, version == 4 and 5 <= number <= _MOST_STREAMS, count, degree, fraction_bits, most)
+    file.seek(table)
+    sizes = [struct.unpack("<QQ", file.read(16))[0] for _ in range(number)]
+    streams = []
+    for packed, width in zip(sizes, (9, 1, 3, 3, 4), strict=False):
+        data = io.BytesIO(file.read(min(packed, most)))
+        with zstandard.ZstdDecompressor().stream_reader(data) as stream:
+            streams.append(_fields(stream, count, width))
+    return _unpacked(streams, degree, fraction_bits)
+
+
+def _require_sane(path: Path, known: bool, count: int, degree: int, fraction_bits: int, most: int) -> None:
+    if not known or degree > _MOST_DEGREE:
+        raise InputError(f"{path} is no SPZ file of version 2 to 4: export it with another program's default settings")
     if count * _LEAST_BYTES > most or fraction_bits > _MOST_FRACTION_BITS:
         raise InputError(f"{path} promises {count} Gaussians, more than it can hold: it is damaged")
-    positions = _fields(file, count, 9)
-    opacity = _fields(file, count, 1)[:, 0] / 255.0
-    colors = (_fields(file, count, 3) / 255.0 - 0.5) / _COLOR_SCALE
-    log_scales = _fields(file, count, 3) / 16.0 - 10
-    rotations = _fields(file, count, 3 if version == 2 else 4)
-    quat_xyzw = _first_three(rotations) if version == 2 else _smallest_three(rotations)
-    inside = opacity.clip(1e-4, 1 - 1e-4)
+
+
+def _unpacked(streams: list[NDArray[np.uint8]], degree: int, fraction_bits: int) -> GaussianCloud:
+    """Positions, opacities, colours, scales, rotations as bytes (M, 9), (M, 1), (M, 3), (M, 3), (M, 3 or 4)."""
+    positions, opacities, colors, scales, rotations = streams
+    quat_xyzw = _first_three(rotations) if rotations.shape[1] == 3 else _smallest_three(rotations)
+    inside = (opacities[:, 0] / 255.0).clip(1e-4, 1 - 1e-4)
     return GaussianCloud(
         means=_from_fixed24(positions, fraction_bits) * _FLIP,
-        log_scales=log_scales.astype(np.float32),
+        log_scales=(scales / 16.0 - 10).astype(np.float32),
         quat_wxyz=unit_quaternions((quat_xyzw * np.append(_FLIP, 1))[:, [3, 0, 1, 2]]),
         opacity_logits=np.log(inside / (1 - inside)).astype(np.float32),
-        colors=(colors * _SH_C0 + 0.5).astype(np.float32),
+        colors=((colors / 255.0 - 0.5) / _COLOR_SCALE * _SH_C0 + 0.5).astype(np.float32),
         dropped_sh_degree=degree,
     )
 
 
-def _fields(file: gzip.GzipFile, count: int, width: int) -> NDArray[np.uint8]:
+def _fields(file: gzip.GzipFile | zstandard.ZstdDecompressionReader, count: int, width: int) -> NDArray[np.uint8]:
     data = file.read(count * width)
     if len(data) != count * width:
         raise EOFError("it ends before its Gaussians do")
@@ -120,6 +152,19 @@ def _first_three(data: NDArray[np.uint8]) -> NDArray[np.float64]:
     xyz = data / 127.5 - 1
     w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(axis=1, keepdims=True)))
     return np.concatenate([xyz, w], axis=1)
+
+
+def _packed_rotations(quat_xyzw: NDArray) -> NDArray[np.uint32]:
+    """(M,) of (M, 4), as `_smallest_three` reads them: the largest component is made positive and left out."""
+    largest = np.abs(quat_xyzw).argmax(axis=1)
+    sign = np.where(np.take_along_axis(quat_xyzw, largest[:, None], 1) < 0, -1, 1)
+    quat = quat_xyzw * sign / np.maximum(np.linalg.norm(quat_xyzw, axis=1, keepdims=True), 1e-12)
+    packed = largest.astype(np.uint32)
+    for i in range(4):
+        magnitude = np.round(np.abs(quat[:, i]) / np.sqrt(0.5) * 511).clip(0, 511).astype(np.uint32)
+        bits = magnitude | np.where(quat[:, i] < 0, np.uint32(512), np.uint32(0))
+        packed = np.where(largest == i, packed, packed << np.uint32(10) | bits).astype("<u4")
+    return packed
 
 
 def _smallest_three(data: NDArray[np.uint8]) -> NDArray[np.float64]:

@@ -197,6 +197,7 @@ class ExportConfig:
         ("auto", "free"),
     )
     spz: bool = setting(False, "write the map as point_cloud.spz too")
+    spz_version: int = setting(4, "version of that file; 3 for older readers", within=(3, 4))
     splat_glb: bool = setting(False, "write the map as point_cloud.glb too (glTF, KHR_gaussian_splatting)")
     sh_rest: bool = setting(False, "the splat PLYs hold f_rest_0 to 44 too, all zero, for readers that insist on them")
     texture: bool = setting(False, "write a lighter mesh with a texture of photographs too: mesh_textured.*")

@@ -168,7 +168,7 @@ def _check(source: Path, config: Config) -> None:
 def write_all_but_mesh(outcome: Outcome, world: World, settings: ExportConfig, folder: Path) -> list[Path]:
     """COLMAP model, PLYs, trajectory, notes; SPZ and GLB where the settings want them. `outcome` stands in `world`."""
     paths = write_colmap(outcome, folder) + write_ply(outcome, settings.sh_rest, folder)
-    paths += write_spz_file(outcome, world, folder) if settings.spz else []
+    paths += write_spz_file(outcome, world, settings.spz_version, folder) if settings.spz else []
     paths += write_glb_file(outcome, world, folder) if settings.splat_glb else []
     return paths + write_trajectory(outcome, folder) + write_notes(outcome, world, folder)
 
@@ -205,7 +205,7 @@ def export_run(
     writers: dict[str, Callable[[], list[Path]]] = {
         "colmap": lambda: write_colmap(outcome, folder),
         "ply": lambda: write_ply(outcome, settings.sh_rest, folder),
-        "spz": lambda: write_spz_file(outcome, world, folder),
+        "spz": lambda: write_spz_file(outcome, world, settings.spz_version, folder),
         "glb": lambda: write_glb_file(outcome, world, folder),
         "mesh": lambda: mesh("mesh"),
         "texture": lambda: mesh("texture"),

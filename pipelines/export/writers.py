@@ -85,12 +85,12 @@ def write_ply(outcome: Outcome, sh_rest: bool, folder: Path) -> list[Path]:
     return paths
 
 
-def write_spz_file(outcome: Outcome, world: World, folder: Path) -> list[Path]:
+def write_spz_file(outcome: Outcome, world: World, version: int, folder: Path) -> list[Path]:
     """The map's colours in a tenth of the space of the PLY, without classes: the format has no room for them.
 
     SPZ says which way is up, so the scene stands upright in its viewers.
     """
-    write_spz(folder / "point_cloud.spz", _turned(map_cloud(outcome), world))
+    write_spz(folder / "point_cloud.spz", _turned(map_cloud(outcome), world), version)
     return [folder / "point_cloud.spz"]
 
 
