@@ -46,7 +46,10 @@ def one_source(sources: Sequence[Path], run: RunFolder) -> Path:
     path = run.root.with_suffix(LIST_SUFFIX)
     if any("\n" in str(source) for source in sources):
         raise InputError("a video's name holds a line break: rename it")
-    write_text(path, "".join(f"{source.resolve()}\n" for source in sources))
+    text = "".join(f"{source.resolve()}\n" for source in sources)
+    if path.exists() and (not path.is_file() or path.read_bytes() != text.encode()):
+        raise InputError(f"{path} is there and is not the list of these videos. Choose another folder with --out FOLDER")
+    write_text(path, text)
     return path
 
 

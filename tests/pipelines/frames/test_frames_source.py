@@ -180,6 +180,8 @@ def test_videos_of_one_place_are_one_source(tmp_path: Path) -> None:
     digest = source_digest(tmp_path / "both.videos", "auto")
     (tmp_path / "both.videos").write_text("b.avi\na.avi\n")
     assert source_digest(tmp_path / "both.videos", "auto") != digest
+    with pytest.raises(InputError, match=r"both\.videos is there and is not the list of these videos"):
+        one_source(paths, run)
     write_video(tmp_path / "b.avi", [np.zeros((48, 80, 3), np.uint8)] * 2, 10.0)
     with pytest.raises(InputError, match=r"videos of .*both.videos differ in size: .*b\.avi is 80x48, .*a\.avi"):
         open_source(tmp_path / "both.videos")
