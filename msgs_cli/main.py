@@ -176,7 +176,8 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
     say(f"{run.root}: made from {found.source}\n")
     say(status_table(found.stages, verbose))
     records = {s.name: s.record for s in found.stages if s.record}
-    for line in scale_lines(run.root, records):
+    whole = {s.name: s.record for s in found.stages if s.record and not s.damaged}
+    for line in scale_lines(run.root, whole):
         say(line)
     for line in [*(f"warning: {w}" for w in found.warnings), *warning_lines(records)]:
         say(line)

@@ -143,7 +143,7 @@ class MappingConfig:
         or_zero=True,
     )
     seed_stride: int = setting(2, "pixels between two new Gaussians where the map has a hole", within=(1, 64))
-    passes: float = setting(9.0, "how often each keyframe is visited once all are seeded", within=(0, 1000))
+    passes: float = setting(10.0, "how often each keyframe is visited once all are seeded", within=(0, 1000))
     min_iterations: int = setting(400, "at least this many such visits in all", within=(0, 10_000_000))
     snapshot_every: int = setting(150, "steps between two snapshots", within=(1, 1_000_000))
     max_gaussians: int = setting(1000000, "the map stops growing at this many", within=(100, 50_000_000))
@@ -201,7 +201,6 @@ class ExportConfig:
     splat_glb: bool = setting(False, "write the map as point_cloud.glb too (glTF, KHR_gaussian_splatting)")
     sh_rest: bool = setting(False, "the splat PLYs hold f_rest_0 to 44 too, all zero, for readers that insist on them")
     texture: bool = setting(False, "write a lighter mesh with a texture of photographs too: mesh_textured.*")
-    texture_side: int = setting(4096, "its texture has at most this many pixels a side", within=(64, 16384))
     least_piece: float = setting(
         0.01, "connected pieces smaller than this share of the largest one are removed", within=(0, 1)
     )

@@ -48,7 +48,9 @@ def one_source(sources: Sequence[Path], run: RunFolder) -> Path:
         raise InputError("a video's name holds a line break: rename it")
     text = "".join(f"{source.resolve()}\n" for source in sources)
     if path.exists() and (not path.is_file() or path.read_bytes() != text.encode()):
-        raise InputError(f"{path} is there and is not the list of these videos. Choose another folder with --out FOLDER")
+        raise InputError(
+            f"{path} is there and is not the list of these videos. Choose another folder with --out FOLDER"
+        )
     write_text(path, text)
     return path
 

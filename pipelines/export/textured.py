@@ -21,6 +21,9 @@ from pipelines.outcome import Outcome
 from pipelines.progress import Progress
 from pipelines.types import Frame, SemanticMesh
 
+TEXTURE_SIDE = 4096
+"""A texture has at most this many pixels a side: what viewers on the web and phones take."""
+
 
 def make_textured(
     outcome: Outcome, mesh: SemanticMesh, views: Sequence[DepthView], settings: ExportConfig, progress: Progress
@@ -28,7 +31,7 @@ def make_textured(
     """A tenth of the mesh's vertices, and a picture of its surface from the keyframes that `views` are of."""
     shots = _shots(outcome, views, settings)
     light = simplified(mesh)
-    atlas = unwrapped(light, texels_wanted(light.vertices, light.faces, shots), settings.texture_side)
+    atlas = unwrapped(light, texels_wanted(light.vertices, light.faces, shots), TEXTURE_SIDE)
     texture = paint_texture(atlas, shots, progress)
     uv = (atlas.corners / (atlas.width, atlas.height)).astype(np.float32)
     return TexturedMesh(light.vertices, light.labels, atlas.corner_vertex, uv, atlas.corner_faces, texture)

@@ -151,7 +151,7 @@ class MapOptimiser:
         p = self.state.parameters
         arguments = (p["means"], torch.exp(p["log_radii"]), torch.sigmoid(p["opacity_logits"]))
         largest = torch.zeros(len(p), device=p["means"].device)
-        for index, view in enumerate(self.halves):
+        for index, view in enumerate(self.views):
             pose = self.state.cam_from_world(index, view)
             largest = torch.maximum(largest, blending_weights(*arguments, pose, view.intrinsics).largest)
         return largest

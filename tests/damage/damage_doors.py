@@ -452,6 +452,7 @@ DOORS: dict[str, Door] = {
     "Gaussian PLY": Door(lambda f: write_gaussian_ply(f / "a.ply", _cloud(), ("a", "b")), gaussians, "a.ply", weight=2),
     "viewer's scene": Door(lambda f: write_gaussian_ply(f / "a.ply", _cloud()), viewer_scene, "a.ply"),
     "SPZ": Door(lambda f: write_spz(f / "a.spz", _cloud()), gaussians, "a.spz"),
+    "SPZ, version 3": Door(lambda f: write_spz(f / "a.spz", _cloud(), version=3), gaussians, "a.spz"),
     ".splat": Door(make_splat, gaussians, "a.splat"),
     "compact map": Door(lambda f: write_compact(f / "a.safetensors", _cloud()), gaussians, "a.safetensors", JSON_HEAD),
     "Gaussian GLB": Door(

@@ -106,8 +106,9 @@ def _places(value: Any) -> Any:
 
 
 def in_gzip(data: bytes, rng: Random) -> bytes:
-    """Damage under the compression, where its checksum does not see it."""
-    return in_bytes(data, rng) if rng.random() < 0.4 else gzip.compress(in_bytes(gzip.decompress(data), rng), mtime=0)
+    """Damage under the compression, where its checksum does not see it; anywhere in what is not compressed so."""
+    outside = data[:2] != b"\x1f\x8b" or rng.random() < 0.4
+    return in_bytes(data, rng) if outside else gzip.compress(in_bytes(gzip.decompress(data), rng), mtime=0)
 
 
 def in_zip(data: bytes, rng: Random) -> bytes:

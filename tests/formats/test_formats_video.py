@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import time
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -244,16 +245,18 @@ def hdr_signal(srgb: np.ndarray, transfer: str) -> np.ndarray:
 
 def write_hdr(path: Path, pictures: list[np.ndarray], transfer: str) -> None:
     """10 bit HEVC that says its transfer function, pictures as uint16 RGB."""
-    options = {"crf": "4", "preset": "ultrafast", "x265-params": "log-level=none:pools=1:frame-threads=1"}
+    options = {"crf": "4", "preset": "ultrafast", "x265-params": "log-level=none:pools=1:frame-threads=1:bframes=0"}
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx265", rate=10, options=options)
         stream.width, stream.height, stream.pix_fmt = pictures[0].shape[1], pictures[0].shape[0], "yuv420p10le"
         context = stream.codec_context
         context.color_trc, context.color_primaries = {"PQ": 16, "HLG": 18}[transfer], 9
         context.colorspace, context.color_range = 9, 1
-        for picture in pictures:
+        for time, picture in enumerate(pictures):
             frame = av.VideoFrame.from_ndarray(picture, format="rgb48le")
-            container.mux(stream.encode(frame.reformat(format="yuv420p10le", dst_colorspace=9, dst_color_range=1)))
+            frame = frame.reformat(format="yuv420p10le", dst_colorspace=9, dst_color_range=1)
+            frame.pts, frame.time_base = time, Fraction(1, 10)
+            container.mux(stream.encode(frame))
         container.mux(stream.encode())
 
 

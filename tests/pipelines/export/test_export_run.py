@@ -17,6 +17,7 @@ from formats.errors import InputError
 from formats.gaussian_glb import read_gaussian_glb
 from formats.spz import read_spz
 from pipelines.config import ExportConfig
+from pipelines.export import textured
 from pipelines.export.stage import export_run
 from pipelines.geometry.camera import project
 from pipelines.outcome import Outcome, load_outcome
@@ -25,7 +26,7 @@ from pipelines.run_folder_names import EXPORTS
 from pipelines.upright.world import read_world
 
 OracleRun = Callable[..., RunFolder]
-SETTINGS = ExportConfig(spz=True, splat_glb=True, texture=True, texture_side=512, voxel=0.03)
+SETTINGS = ExportConfig(spz=True, splat_glb=True, texture=True, voxel=0.03)
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,9 @@ def run(oracle_run: OracleRun) -> RunFolder:
 @pytest.fixture(scope="module")
 def folder(run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("exported")
-    paths = export_run(run, folder, settings=SETTINGS)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(textured, "TEXTURE_SIDE", 512)
+        paths = export_run(run, folder, settings=SETTINGS)
     assert all(p.exists() for p in paths)
     return folder
 
