@@ -180,7 +180,7 @@ def test_joint_refinement_is_kept_only_where_it_helps_and_survives_interruption(
     assert figures["joint"] in ("kept", "thrown away")
     assert (figures["joint"] == "kept") == (figures["joint_psnr_after"] >= figures["joint_psnr_before"])
     context = open_stage(broken.run, "global_ba", config)
-    keyframes = int(broken.run.load_trajectory("tracking").is_keyframe.sum())  # a snapshot comes once a pass at most
+    keyframes = int(broken.run.load_trajectory("mapping").is_keyframe.sum())  # a snapshot comes once a pass at most
     with pytest.raises(KeyboardInterrupt):
         STAGE.run(
             StageContext(context.run, context.source, config, context.folder, BreakOff("refining", keyframes + 3))
