@@ -29,7 +29,7 @@ def locked(run: RunFolder) -> Iterator[None]:
     behind. A folder that was there is never removed, nor one that another process holds. Raises InputError when
     another process does, or when the folder cannot be written.
     """
-    made = _make(run.root)
+    made = make_folder(run.root)
     with _open(run.root / LOCK) as stream:
         if not _take(stream) or not _still_there(stream, run.root / LOCK):
             raise RunBusyError(f"{run.root}: another msgs-slam process is working on this run. Wait for it to end")
@@ -43,8 +43,8 @@ def locked(run: RunFolder) -> Iterator[None]:
             raise
 
 
-def _make(root: Path) -> bool:
-    """Whether the folder was not there."""
+def make_folder(root: Path) -> bool:
+    """Make a run's folder; whether it was not there. Raises InputError where it cannot be made."""
     try:
         root.parent.mkdir(parents=True, exist_ok=True)
         root.mkdir()

@@ -9,16 +9,20 @@ from pathlib import Path
 
 from formats.atomic import temporary_of, write_text
 from formats.errors import InputError, RecoverableError
+from formats.video import probe_video
 from pipelines.config import Config
 from pipelines.device import settle_device
 from pipelines.frames.source import LIST_SUFFIX, source_digest
-from pipelines.lock import LOCK, locked
+from pipelines.lock import LOCK, locked, make_folder
 from pipelines.progress import Progress
 from pipelines.records import StageRecord, load_records, load_source, recorded_config
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
 from pipelines.settings_file import load_settings
 from pipelines.stages import Stage, run_stages
+
+SOURCE_LIST = f"source{LIST_SUFFIX}"
+"""The videos of a run of several."""
 
 
 def all_stages() -> list[Stage]:
@@ -40,18 +44,27 @@ def default_run_folder(source: Path) -> RunFolder:
 
 
 def one_source(sources: Sequence[Path], run: RunFolder) -> Path:
-    """The source itself, or for several videos of one place a list of them, written beside the run."""
+    """The source itself, or for several videos of one place a list of them, kept in the run folder.
+
+    Raises InputError for what is no video and for a folder that holds something else, before anything is written.
+    """
     if len(sources) == 1:
         return sources[0]
-    path = run.root.with_suffix(LIST_SUFFIX)
     if any("\n" in str(source) for source in sources):
         raise InputError("a video's name holds a line break: rename it")
-    text = "".join(f"{source.resolve()}\n" for source in sources)
-    if path.exists() and (not path.is_file() or path.read_bytes() != text.encode()):
+    _require_run_or_empty(run)
+    path, text = run.root / SOURCE_LIST, "".join(f"{source.resolve()}\n" for source in sources)
+    same = path.is_file() and path.read_bytes() == text.encode()
+    if run.manifest_file.exists() and not same:
         raise InputError(
-            f"{path} is there and is not the list of these videos. Choose another folder with --out FOLDER"
+            f"{run.root} is the run of another source ({load_source(run).path}), not of these videos. "
+            "Choose another folder with --out FOLDER, or delete it"
         )
-    write_text(path, text)
+    for source in sources:
+        probe_video(source)
+    if not same:
+        make_folder(run.root)
+        write_text(path, text)
     return path
 
 
@@ -128,7 +141,11 @@ def _require_run_or_empty(run: RunFolder) -> None:
     """Nothing is written, not even a lock, into a folder that holds something else."""
     if not run.root.is_dir() or run.manifest_file.exists():
         return
-    begun = {LOCK, temporary_of(run.manifest_file).name}  # all that there is when the first file is being written
+    begun = {
+        LOCK,
+        SOURCE_LIST,
+        temporary_of(run.manifest_file).name,
+    }  # all that there is when the first file is being written
     if any(p.name not in begun for p in run.root.iterdir()):
         raise InputError(f"{run.root} exists and is not a run folder. Choose another with --out FOLDER")
 

@@ -177,14 +177,27 @@ def test_videos_of_one_place_are_one_source(tmp_path: Path) -> None:
     np.testing.assert_allclose(gaps[[0, 1, 3]], 0.1, atol=1e-6)
     assert gaps[2] > 5
     assert [f.source_index for f in source.read({1, 4})] == [1, 4]
-    digest = source_digest(tmp_path / "both.videos", "auto")
+    assert {p.name for p in tmp_path.iterdir()} == {"a.avi", "b.avi", "both.msgs"}
+    digest = source_digest(run.root / "source.videos", "auto")
     (tmp_path / "both.videos").write_text("b.avi\na.avi\n")
     assert source_digest(tmp_path / "both.videos", "auto") != digest
-    with pytest.raises(InputError, match=r"both\.videos is there and is not the list of these videos"):
-        one_source(paths, run)
     write_video(tmp_path / "b.avi", [np.zeros((48, 80, 3), np.uint8)] * 2, 10.0)
     with pytest.raises(InputError, match=r"videos of .*both.videos differ in size: .*b\.avi is 80x48, .*a\.avi"):
         open_source(tmp_path / "both.videos")
     (tmp_path / "both.videos").write_text("both.videos\n")
     with pytest.raises(InputError, match="names no videos"):
         open_source(tmp_path / "both.videos")
+
+
+def test_a_list_of_videos_never_enters_what_is_not_their_run(tmp_path: Path) -> None:
+    pictures = [np.zeros((48, 64, 3), np.uint8)] * 2
+    paths = [write_video(tmp_path / f"{name}.avi", pictures, 10.0) for name in "ab"]
+    run = RunFolder(tmp_path / "both.msgs")
+    with pytest.raises(InputError):
+        one_source([paths[0], tmp_path], run)
+    assert not run.root.exists()
+    run.root.mkdir()
+    (run.root / "letter.txt").write_text("mine")
+    with pytest.raises(InputError, match="not a run folder"):
+        one_source(paths, run)
+    assert [p.name for p in run.root.iterdir()] == ["letter.txt"]
