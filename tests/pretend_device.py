@@ -134,13 +134,6 @@ class PretendBackend:
         return _Composite.apply(rest, *values)
 
     @staticmethod
-    def in_view(*arguments: Any) -> torch.Tensor:
-        """As a backend's."""
-        return PretendTensor(
-            cpu.in_view(*(_taken(x).inner.contiguous() if isinstance(x, torch.Tensor) else x for x in arguments))
-        )
-
-    @staticmethod
     def inspect(*arguments: Any) -> tuple[torch.Tensor, ...]:
         """As a backend's."""
         return tuple(

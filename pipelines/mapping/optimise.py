@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial, reduce
 from pathlib import Path
 
@@ -16,8 +16,7 @@ from pipelines.gaussians.adam import AdamTable, gradients_of
 from pipelines.gaussians.render import Rendering, blending_weights, render
 from pipelines.mapping.growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
 from pipelines.mapping.objective import Objective
-from pipelines.mapping.parameters import KEYS
-from pipelines.mapping.schedule import RATE_DECAY, Schedule, Seeding, Step
+from pipelines.mapping.schedule import Schedule, Seeding, Step
 from pipelines.mapping.splitting import Blame, blame
 from pipelines.mapping.state import Exposures, OptimisedMap, OptimiserState, expose
 from pipelines.mapping.views import View, halved
@@ -25,7 +24,6 @@ from pipelines.progress import Progress, SilentProgress
 from pipelines.stopping import is_asked
 from pipelines.streamed import Streamed
 
-COLOR_KEYS = KEYS[:-1]
 MAP_RATES = {"means": 3e-4, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2, "class_logits": 6e-2}
 """Learning rates of Adam, of positions in units of the scene's median depth."""
 HALVES_ROOM = 250e6
@@ -67,7 +65,6 @@ def optimise_map(
         state.iteration = iteration + 1
         if snapshot is not None and (state.iteration % every == 0 or is_asked()):
             state.save(snapshot)
-    optimiser.settle()
     optimiser.growth.prune()
     return state.result(views, schedule.total)
 
@@ -98,14 +95,11 @@ class MapOptimiser:
         if len(parameters) == 0:
             return
         with_labels = self.objective.uses_labels(step.iteration)
-        rates, rows = self._map_rates(step.rate), self._rows()
-        shares = self._shares(rows)
         with_classes = with_labels or (step.grow and self.article.class_growth)
-        values = parameters.table.take(rows, rates, shares, KEYS if with_classes else COLOR_KEYS)
-        rendering = self.draw(view, table, values)
-        loss = self.objective.of(view, table, rendering, values["log_radii"], with_labels) * step.weight
-        of_map, of_view = gradients_of(loss, (values, table.values))
-        parameters.table.step(of_map, rates, shares, rows)
+        rendering = self.draw(view, table, with_classes)
+        loss = self.objective.of(view, table, rendering, parameters["log_radii"], with_labels) * step.weight
+        of_map, of_view = gradients_of(loss, (parameters.table, table))
+        parameters.table.step(of_map, self._map_rates(step.rate), self._shares())
         table.step(of_view, self._view_rates(step))
         if step.grow:
             self.growth.grow(step.view, Rendering(*(x.detach() for x in vars(rendering).values())))
@@ -114,21 +108,11 @@ class MapOptimiser:
         if step.prune:
             self.growth.prune(self._blending_weights)
 
-    def settle(self) -> None:
-        """Every Gaussian where it would be if it had taken part in all steps."""
-        every = self._rows()
-        self.state.parameters.table.take(every, self._map_rates(RATE_DECAY), self._shares(every))
-
     @torch.no_grad()
     def _seed(self, index: int, what: Seeding) -> None:
         known = len(self.state.parameters) > 0
         view, table = self.views[index], self.state.view_tables[index]
-        values = {k: self.state.parameters[k] for k in COLOR_KEYS}
-        self.growth.seed(index, what, self.draw(view, table, values) if known else None)
-
-    def _rows(self) -> Tensor:
-        """(M,) every Gaussian: with those alone that the view may show, the whole of replica loses 0.17 dB."""
-        return torch.arange(len(self.state.parameters), device=self.state.parameters.trust.device)
+        self.growth.seed(index, what, self.draw(view, table, with_classes=False) if known else None)
 
     def _blame(self) -> Blame:
         """What each Gaussian answers for in the view where that is most."""
@@ -155,14 +139,14 @@ class MapOptimiser:
             largest = torch.maximum(largest, blending_weights(*arguments, pose, view.intrinsics).largest)
         return largest
 
-    def draw(self, view: View, table: AdamTable, values: Mapping[str, Tensor]) -> Rendering:
-        """Gaussians of raw parameters as the view's camera sees them now, with class logits where they have any."""
-        kappa, colors = self.article.kappa, values["colors"]
+    def draw(self, view: View, table: AdamTable, with_classes: bool) -> Rendering:
+        """The map as the view's camera sees it now, with the classes' logits behind the colours or without."""
+        p, kappa = self.state.parameters, self.article.kappa
         return render(
-            values["means"],
-            torch.exp(values["log_radii"]),
-            torch.sigmoid(values["opacity_logits"]),
-            torch.cat([colors, values["class_logits"]], dim=1) if "class_logits" in values else colors,
+            p["means"],
+            torch.exp(p["log_radii"]),
+            torch.sigmoid(p["opacity_logits"]),
+            torch.cat([p["colors"], p["class_logits"]], dim=1) if with_classes else p["colors"],
             view.cam_from_world,
             view.intrinsics,
             proxy_depth=view.depth if kappa > 0 else None,
@@ -170,13 +154,13 @@ class MapOptimiser:
             twist=table.values["twist"] if self.settings.refine_poses else None,
         )
 
-    def _shares(self, rows: Tensor) -> Tensor:
-        """(n,) step sizes by confidence class (MSGS-SLAM 3.4).
+    def _shares(self) -> Tensor:
+        """(M,) step sizes by confidence class (MSGS-SLAM 3.4).
 
         The article has small steps where depth is unreliable. Measured, the contrary helps: what stands in the wrong
         place has farther to go, and colours have to lead it there.
         """
-        trust = self.state.parameters.trust[rows]
+        trust = self.state.parameters.trust
         shares = torch.where(trust > LOW_RELIABILITY, math.sqrt(LOW_TRUST_STEP), LOW_TRUST_STEP)
         return torch.where(trust > HIGH_RELIABILITY, 1.0, shares)
 

@@ -5,7 +5,7 @@
 """
 
 from pipelines.gaussians.render.compositing import Composite, composite
-from pipelines.gaussians.render.inspection import BlendingWeights, blending_weights, in_view, median_depth
+from pipelines.gaussians.render.inspection import BlendingWeights, blending_weights, median_depth
 from pipelines.gaussians.render.rendering import Rendering, render
 from pipelines.gaussians.render.threads import get_threads, set_threads
 from pipelines.gaussians.render.tracking import PoseFit, track_gn
@@ -18,7 +18,6 @@ __all__ = [
     "blending_weights",
     "composite",
     "get_threads",
-    "in_view",
     "median_depth",
     "render",
     "set_threads",

@@ -12,10 +12,10 @@ from torch import Tensor
 from pipelines.gaussians.render.cpu_backward import backward_band
 from pipelines.gaussians.render.cpu_bands import split_into_bands
 from pipelines.gaussians.render.cpu_forward import forward_band
-from pipelines.gaussians.render.cpu_inspect import in_view, inspect
+from pipelines.gaussians.render.cpu_inspect import inspect
 from pipelines.gaussians.render.threads import for_each
 
-__all__ = ["composite", "in_view", "inspect"]
+__all__ = ["composite", "inspect"]
 
 F32 = np.float32
 

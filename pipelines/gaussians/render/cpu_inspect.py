@@ -7,7 +7,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.gaussians.render import rules
 from pipelines.gaussians.render.cpu_bands import (
     BAND_ROWS,
     RECORD,
@@ -29,7 +28,6 @@ from pipelines.gaussians.render.cpu_forward import (
 from pipelines.gaussians.render.jit import kernel
 from pipelines.gaussians.render.lanes import counting, exp, largest, largest_of, load, splat, store, total, where
 from pipelines.gaussians.render.threads import for_each
-from pipelines.types import Intrinsics
 
 F32 = np.float32
 _HALF, _ZERO = F32(0.5), F32(0)
@@ -56,35 +54,6 @@ def inspect(
         sums[straddling] = np.add.reduceat(shared[:, 0], starts)
         most[straddling] = np.maximum.reduceat(shared[:, 1], starts)
     return torch.from_numpy(median), torch.from_numpy(sums), torch.from_numpy(most)
-
-
-def in_view(means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float) -> Tensor:
-    """(n,) indices of the Gaussians whose square reaches the image, a pixel to spare; float32 CPU tensors."""
-    k = intrinsics
-    camera = np.array([k.fx, k.fy, k.cx, k.cy, (k.fx * k.fy) ** 0.5, k.width, k.height, near], F32)
-    arrays = (x.contiguous().numpy() for x in (means, radii, cam_from_world))
-    return torch.from_numpy(list_in_view(*arrays, camera))
-
-
-@kernel
-def list_in_view(
-    means: NDArray[np.float32], radii: NDArray[np.float32], pose: NDArray[np.float32], camera: NDArray[np.float32]
-) -> NDArray[np.int64]:
-    """See `in_view`; camera: fx, fy, cx, cy, their common focal length, width, height, near."""
-    fx, fy, cx, cy, focal, width, height, near = camera
-    out, count = np.empty(len(means), np.int64), 0
-    for i in range(len(means)):
-        x, y, z = means[i]
-        depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-        if depth > near:
-            # All lengths times the depth: nothing is divided.
-            reach = F32(rules.CUT_SIGMAS) * focal * radii[i] + depth
-            u = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) + cx * depth
-            v = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) + cy * depth
-            if u > -reach and v > -reach and u < width * depth + reach and v < height * depth + reach:
-                out[count] = i
-                count += 1
-    return out[:count].copy()
 
 
 @kernel

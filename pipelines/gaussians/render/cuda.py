@@ -12,9 +12,9 @@ from torch import Tensor
 
 from pipelines.gaussians.render import rules
 from pipelines.gaussians.render.cuda_kernels import backward_tile, forward_tile
-from pipelines.gaussians.render.reference import in_view, inspect
+from pipelines.gaussians.render.reference import inspect
 
-__all__ = ["composite", "in_view", "inspect"]
+__all__ = ["composite", "inspect"]
 
 TILE, STEP = 16, 16
 

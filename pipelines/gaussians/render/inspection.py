@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from pipelines.gaussians.render.compositing import choose_backend, require_finite
@@ -48,16 +47,6 @@ def blending_weights(
     """What each of the M Gaussians contributes to the image of a camera: 0 where it is not seen at all. No gradients;
     `counts` (H, W): what a pixel's weights count in the sums, None for 1; the others as in `render`."""
     return BlendingWeights(*_inspect(means, radii, opacities, cam_from_world, intrinsics, near, backend, counts)[1:])
-
-
-@torch.no_grad()
-def in_view(means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float = NEAR) -> Tensor:
-    """(n,) indices of the Gaussians that the camera may see: no others take part in its image or get a gradient."""
-    for name, tensor in (("means", means), ("radii", radii), ("cam_from_world", cam_from_world)):
-        require_finite(name, tensor)
-    module = choose_backend(None, means)
-    seen: Tensor = module.in_view(means.detach(), radii.detach(), cam_from_world.to(means), intrinsics, near)
-    return seen
 
 
 def _inspect(

@@ -13,8 +13,6 @@ import torch
 from torch import Tensor
 
 from pipelines.gaussians.render.rules import ALPHA_MAX, ALPHA_MIN, CUT_SIGMAS, TRANSMITTANCE_MIN
-from pipelines.geometry.camera import project_gaussians
-from pipelines.types import Intrinsics
 
 
 @dataclass(frozen=True)
@@ -86,15 +84,6 @@ def inspect(
     sums = torch.zeros_like(z).index_add(0, pairs.gaussian, counted)
     most = torch.zeros_like(z).scatter_reduce(0, pairs.gaussian, weights, "amax")
     return median.view(height, width), sums, most
-
-
-def in_view(means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float) -> Tensor:
-    """(n,) indices of the Gaussians whose square reaches the image, a pixel to spare."""
-    points = means @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
-    u, v, sigma_px, z = project_gaussians(points, radii, intrinsics, near)
-    reach = CUT_SIGMAS * sigma_px + 1
-    seen = (z > near) & (u > -reach) & (u < intrinsics.width + reach) & (v > -reach) & (v < intrinsics.height + reach)
-    return torch.nonzero(seen)[:, 0]
 
 
 def list_pairs(
