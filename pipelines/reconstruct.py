@@ -12,17 +12,14 @@ from formats.errors import InputError, RecoverableError
 from formats.video import probe_video
 from pipelines.config import Config
 from pipelines.device import settle_device
-from pipelines.frames.source import LIST_SUFFIX, source_digest
+from pipelines.frames.source import source_digest
 from pipelines.lock import LOCK, locked, make_folder
 from pipelines.progress import Progress
 from pipelines.records import StageRecord, load_records, load_source, recorded_config
 from pipelines.run_folder import RunFolder
-from pipelines.run_folder_names import STAGES
+from pipelines.run_folder_names import SOURCE_LIST, STAGES
 from pipelines.settings_file import load_settings
 from pipelines.stages import Stage, run_stages
-
-SOURCE_LIST = f"source{LIST_SUFFIX}"
-"""The videos of a run of several."""
 
 
 def all_stages() -> list[Stage]:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ from formats.jsonfile import read_json_object, read_toml, write_json
 from formats.reading import parsing
 from pipelines.config import Config, config_to_dict, merge_known_settings, settings_of_stage
 from pipelines.earlier_versions import migrated_stages
-from pipelines.run_folder_names import STAGES
+from pipelines.run_folder_names import SOURCE_LIST, STAGES
 from pipelines.stored import dataclass_from_json
 
 if TYPE_CHECKING:
@@ -136,7 +136,10 @@ def load_records(run: RunFolder) -> dict[str, StageRecord]:
 
 def load_source(run: RunFolder) -> Source:
     """What the run was made from. Raises InputError for a folder that is no run."""
-    return read_manifest(run.manifest_file).source
+    source = read_manifest(run.manifest_file).source
+    inside = run.root / SOURCE_LIST
+    # The list of several videos lies in the run, wherever that has been moved to.
+    return replace(source, path=str(inside)) if Path(source.path).name == SOURCE_LIST and inside.is_file() else source
 
 
 def recorded_config(records: Mapping[str, StageRecord], config: Config) -> Config:

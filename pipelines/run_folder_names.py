@@ -2,3 +2,5 @@
 
 STAGES = ("frames", "proxy", "tracking", "mapping", "global_ba", "export")
 EXPORTS = ("colmap", "ply", "spz", "glb", "mesh", "texture", "tum")
+SOURCE_LIST = "source.videos"
+"""The videos of a run of several, in its folder."""

@@ -16,6 +16,7 @@ from formats.video_writer import write_video
 from pipelines.frames.source import FolderSource, VideoSource, open_source
 from pipelines.frames.stage import run
 from pipelines.reconstruct import one_source, source_digest
+from pipelines.records import Manifest, Source, load_source, write_manifest
 from pipelines.run_folder import RunFolder
 from pipelines.stages import StageContext
 
@@ -179,6 +180,9 @@ def test_videos_of_one_place_are_one_source(tmp_path: Path) -> None:
     assert [f.source_index for f in source.read({1, 4})] == [1, 4]
     assert {p.name for p in tmp_path.iterdir()} == {"a.avi", "b.avi", "both.msgs"}
     digest = source_digest(run.root / "source.videos", "auto")
+    write_manifest(run.manifest_file, Manifest(Source(str(run.root / "source.videos"), digest), {}))
+    moved = RunFolder(run.root.rename(tmp_path / "moved.msgs"))
+    assert load_source(moved).path == str(moved.root / "source.videos")
     (tmp_path / "both.videos").write_text("b.avi\na.avi\n")
     assert source_digest(tmp_path / "both.videos", "auto") != digest
     write_video(tmp_path / "b.avi", [np.zeros((48, 80, 3), np.uint8)] * 2, 10.0)
