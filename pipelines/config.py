@@ -146,7 +146,13 @@ class MappingConfig:
     passes: float = setting(10.0, "how often each keyframe is visited once all are seeded", within=(0, 1000))
     min_iterations: int = setting(400, "at least this many such visits in all", within=(0, 10_000_000))
     snapshot_every: int = setting(150, "steps between two snapshots", within=(1, 1_000_000))
-    max_gaussians: int = setting(1000000, "the map stops growing at this many", within=(100, 50_000_000))
+    max_gaussians: int = setting(
+        1000000, "the map, or each submap, stops growing at this many", within=(100, 50_000_000)
+    )
+    submap: int = setting(
+        0, "more keyframes are mapped in overlapping parts of about this many, joined at the end; 0 = never",
+        within=(4, 1_000_000), or_zero=True,
+    )  # fmt: skip
     depth_weight: float = setting(4.8, "λ_D of eq. (18); 0 = no depth loss", within=(0, 1000))
     use_proxy_depth: bool = setting(True, "false: the proxies only seed the map, no loss and no condition uses them")
     label_weight: float = setting(0.1, "λ_S of eq. (18); 0 = no semantic loss", within=(0, 1000))

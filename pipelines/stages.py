@@ -8,11 +8,11 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from formats.atomic import is_disk_full, watched_by, write_text
 from formats.errors import DiskFullError, InputError, RecoverableError
@@ -39,6 +39,8 @@ from pipelines.stage_identity import stage_identity
 from pipelines.stopping import stop_if_asked
 from pipelines.streamed import memory_room
 
+T = TypeVar("T")
+R = TypeVar("R")
 _PROCESS = Path("/proc/self")
 FINGERPRINT = "fingerprint"
 """File of an unfinished folder: the work it belongs to."""
@@ -89,6 +91,11 @@ class StageContext:
     def device(self) -> str:
         """ "cpu" or "cuda"."""
         return settle_device(self.config.run.device)
+
+    def each(self, work: Callable[[T, Progress], R], tasks: Sequence[T]) -> list[R]:
+        """What `work`, a function of a module's top level, returns of every task, in their order: here, one after the
+        other."""
+        return [work(task, self.progress) for task in tasks]
 
     def warn(self, message: str) -> None:
         """A degraded result: logged now, counted and kept for the report."""

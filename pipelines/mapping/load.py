@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,12 +40,13 @@ def load_views(
     device: torch.device | str = "cpu",
     fields: DepthFields | None = None,
     memory: float = math.inf,
+    class_ids: tuple[int, ...] | None = None,
 ) -> MappingInput:
     """The keyframes of `trajectory` with images and proxies, in order.
 
     Of `memory`, bytes, a quarter is for views; what has no room there is read again when
     it is visited. Depths are in the unit of the world by `fields`, those of tracking unless others are given; what
-    other views see through is unknown.
+    other views see through is unknown. Without `class_ids` the channels are the classes that occur.
     """
     frames = {f.id: f for f in run.load_frames()}
     full = run.load_calibration().intrinsics
@@ -53,14 +54,14 @@ def load_views(
     fields = fields or run.load_depth_fields("tracking")
     symmetry = run.load_symmetry() if article and article.symmetry_weight > 0 else {}
     kept, measured = split_frames(trajectory, settings.hold_out)
-    class_ids = occurring_classes(run.load_proxy(i).labels for i in kept if run.has_proxy(i))
+    channels = mapped_classes(run, kept) if class_ids is None else class_ids
     poses = dict(zip(trajectory.frame_ids.tolist(), trajectory.cam_from_world, strict=True))
 
     def load(frame_id: int) -> View:
         frame = frames[frame_id]
         maps = run.find_proxy(frame_id)
         scaled = None if maps is None else fields.in_world(frame_id, maps)
-        view = load_view(run, frame, intrinsics, poses[frame_id], scaled, class_ids, device)
+        view = load_view(run, frame, intrinsics, poses[frame_id], scaled, channels, device)
         if frame_id not in symmetry:
             return view
         field = torch.from_numpy(fields.scales(frame_id, *view.depth.shape)).to(device)
@@ -70,7 +71,12 @@ def load_views(
         return Streamed(len(ids), lambda n: load(ids[n]), lambda v: v.nbytes, room)
 
     views = without_contradicted_depth(streamed(kept, VIEWS_SHARE * memory))
-    return MappingInput(views, streamed(measured, VIEWS_SHARE * memory / 8), class_ids)
+    return MappingInput(views, streamed(measured, VIEWS_SHARE * memory / 8), channels)
+
+
+def mapped_classes(run: RunFolder, frame_ids: Iterable[int]) -> tuple[int, ...]:
+    """The label of each class channel of a map of these keyframes."""
+    return occurring_classes(run.load_proxy(i).labels for i in frame_ids if run.has_proxy(i))
 
 
 def without_contradicted_depth(views: Streamed[View]) -> Streamed[View]:

@@ -68,6 +68,7 @@ class Schedule:
     visits: int
     overlap: csr_matrix
     reliability: NDArray[np.float64]
+    first_rate: float = 1.0
 
     @staticmethod
     def plan(
@@ -77,9 +78,10 @@ class Schedule:
         seeding: bool,
         passes: float | None,
         keyframe_miou: float = 0.0,
+        first_rate: float = 1.0,
     ) -> Schedule:
         """The schedule for these views; `passes` overrides that of the settings, which also have a least count;
-        `keyframe_miou` is T_sem of eq. (12), 0 leaves it away."""
+        `keyframe_miou` is T_sem of eq. (12), 0 leaves it away; `first_rate`: learning rates of the first visit."""
         visits = round(passes * len(views)) if passes is not None else round(settings.passes * len(views))
         if passes is None:
             visits = max(visits, settings.min_iterations)
@@ -88,7 +90,7 @@ class Schedule:
         overlap = overlaps(v.posed_depth() for v in views)
         if keyframe_miou > 0:
             overlap = overlap.multiply(label_likeness(views) < keyframe_miou).tocsr()
-        return Schedule(seed, len(views), steps, visits, overlap, reliability)
+        return Schedule(seed, len(views), steps, visits, overlap, reliability, first_rate)
 
     @property
     def total(self) -> int:
@@ -152,7 +154,7 @@ class Schedule:
             iteration=iteration,
             view=view,
             weight=float(weights[view] / weights.mean()),
-            rate=RATE_DECAY**share,
+            rate=self.first_rate * (RATE_DECAY / self.first_rate) ** share,
             coarse=coarse,
             seed=Seeding.NOTHING,
             grow=grows,

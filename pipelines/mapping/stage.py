@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from formats.errors import InputError
-from pipelines.mapping.load import MappingInput, load_views
+from pipelines.mapping.divided import Mapped, map_divided
+from pipelines.mapping.load import load_views, split_frames
 from pipelines.mapping.measure import ViewFigures, mean_figures, measure_view
 from pipelines.mapping.optimise import OptimisedMap, optimise_map
 from pipelines.mapping.poses import interpolate_rows, move_trajectory
+from pipelines.mapping.submaps import submap_count
 from pipelines.mapping.views import View
 from pipelines.run_folder import save_exposure, save_figures, save_map, save_trajectory
 from pipelines.stages import Stage, StageContext
@@ -19,59 +21,68 @@ from pipelines.types import Trajectory
 
 
 def run(context: StageContext) -> dict[str, Any]:
-    """Views, depth that agrees between them, the optimised map; poses and exposures refined with it."""
-    settings, seed = context.config.mapping, context.config.run.seed
+    """The optimised map, made whole or submap by submap; poses and exposures refined with it."""
     trajectory = context.run.load_trajectory("tracking")
-    article, memory = context.config.article, context.memory_room
-    given = load_views(context.run, trajectory, settings, article, context.device, memory=memory)
-    _require_views(given, context)
-
-    views = given.views
-    result = optimise_map(
-        views, len(given.class_ids), settings, seed,
-        progress=context.progress, snapshot=context.snapshot / "state.safetensors", article=context.config.article,
-    )  # fmt: skip
-
-    keyframe_ids = np.array([v.frame_id for v in views])
-    moved = move_trajectory(trajectory, keyframe_ids, result.cam_from_world)
+    kept, _ = split_frames(trajectory, context.config.mapping.hold_out)
+    _require_views(context, kept)
+    divided = submap_count(len(kept), context.config.mapping.submap) > 1
+    mapped = (map_divided if divided else map_whole)(context, trajectory)
+    result, ids = mapped.result, mapped.keyframe_ids
     save_map(context.folder, result.gaussian_map)
-    save_trajectory(context.folder, moved)
-    save_exposure(context.folder, keyframe_ids, result.log_gains, result.offsets)
-    figures = _figures(context, given, result, moved)
-    save_figures(context.folder, "mapping", {**figures, "class_ids": list(given.class_ids)})
+    save_trajectory(context.folder, mapped.moved)
+    save_exposure(context.folder, ids, result.log_gains, result.offsets)
+    figures = _figures(mapped)
+    submaps = [{"own": s.own.tolist(), "border": s.border.tolist()} for s in mapped.submaps]
+    save_figures(context.folder, "mapping", {**figures, "class_ids": list(mapped.class_ids), "submaps": submaps})
     return figures
 
 
-def _require_views(given: MappingInput, context: StageContext) -> None:
-    if not given.views:
-        raise InputError(
-            f"{context.run.root}: no keyframe is left to map (mapping.hold_out = {context.config.mapping.hold_out}). "
-            "Hold out fewer frames: --set mapping.hold_out=0"
-        )
-    without = sum(not bool((v.depth > 0).any()) for v in given.views)
-    if without == len(given.views):
-        raise InputError(
-            f"{context.run.root}: none of the {without} keyframes has a depth, so nothing can be mapped. Look at the "
-            "warnings of the proxy stage, or give depth with --depth files:FOLDER"
-        )
-    if without:
-        context.warn(f"{without} of {len(given.views)} keyframes have no proxy depth; they count by their colours only")
-
-
-def _figures(context: StageContext, given: MappingInput, result: OptimisedMap, moved: Trajectory) -> dict[str, Any]:
-    """Key figures over keyframes and held-out frames."""
+def map_whole(context: StageContext, trajectory: Trajectory) -> Mapped:
+    """Views, depth that agrees between them, one map."""
+    settings, seed, article = context.config.mapping, context.config.run.seed, context.config.article
+    given = load_views(context.run, trajectory, settings, article, context.device, memory=context.memory_room)
     views = given.views
+    result = optimise_map(
+        views, len(given.class_ids), settings, seed,
+        progress=context.progress, snapshot=context.snapshot / "state.safetensors", article=article,
+    )  # fmt: skip
+    ids = np.array([v.frame_id for v in views])
+    moved = move_trajectory(trajectory, ids, result.cam_from_world)
     rows = zip(views, result.cam_from_world, result.log_gains, result.offsets, strict=True)
     keyframes = [
         measure_view(result.gaussian_map, *row) for row in context.progress.track(rows, "measuring", len(views))
     ]
+    held_out = _measure_held_out(given.held_out, views, result, moved)
+    return Mapped(result, ids, given.class_ids, moved, keyframes, held_out)
+
+
+def _require_views(context: StageContext, kept: Sequence[int]) -> None:
+    run = context.run
+    if not kept:
+        raise InputError(
+            f"{run.root}: no keyframe is left to map (mapping.hold_out = {context.config.mapping.hold_out}). "
+            "Hold out fewer frames: --set mapping.hold_out=0"
+        )
+    without = sum(not (run.has_proxy(i) and bool((run.load_proxy(i).depth > 0).any())) for i in kept)
+    if without == len(kept):
+        raise InputError(
+            f"{run.root}: none of the {without} keyframes has a depth, so nothing can be mapped. Look at the "
+            "warnings of the proxy stage, or give depth with --depth files:FOLDER"
+        )
+    if without:
+        context.warn(f"{without} of {len(kept)} keyframes have no proxy depth; they count by their colours only")
+
+
+def _figures(mapped: Mapped) -> dict[str, Any]:
+    """Key figures over keyframes and held-out frames."""
     return {
-        "keyframes": len(views),
-        "gaussians": len(result.gaussian_map),
-        "iterations": result.iterations,
-        "classes": len(given.class_ids),
-        **mean_figures(keyframes, "keyframe"),
-        **mean_figures(_measure_held_out(given.held_out, views, result, moved), "held_out"),
+        "keyframes": len(mapped.keyframe_ids),
+        "gaussians": len(mapped.result.gaussian_map),
+        "submaps": max(len(mapped.submaps), 1),
+        "iterations": mapped.result.iterations,
+        "classes": len(mapped.class_ids),
+        **mean_figures(mapped.keyframes, "keyframe"),
+        **mean_figures(mapped.held_out, "held_out"),
     }
 
 

@@ -1,0 +1,135 @@
+"""The map of a long recording, made submap by submap and joined: at any time no more than one of them is in work."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.depth.fields import DepthFields
+from pipelines.depth.posed import PosedDepth, overlaps
+from pipelines.mapping.load import mapped_classes, split_frames
+from pipelines.mapping.measure import ViewFigures
+from pipelines.mapping.poses import interpolate_rows, move_trajectory
+from pipelines.mapping.state import OptimisedMap
+from pipelines.mapping.submap_tasks import (
+    REFINED,
+    SubmapTask,
+    in_order,
+    join_submap,
+    make_submap,
+    measure_submap,
+    refine_submap,
+    together,
+)
+from pipelines.mapping.submaps import Submap, divide
+from pipelines.run_folder import RunFolder
+from pipelines.stages import StageContext
+from pipelines.types import Trajectory
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """A map with what was made beside it: poses and exposures of the keyframes keyframe_ids (N,), label of each
+    channel, all frames moved with them, the figures of keyframes and of frames held out, and the submaps (none of a map
+    made whole)."""
+
+    result: OptimisedMap
+    keyframe_ids: NDArray[np.int64]
+    class_ids: tuple[int, ...]
+    moved: Trajectory
+    keyframes: Sequence[ViewFigures]
+    held_out: Sequence[ViewFigures]
+    submaps: Sequence[Submap] = ()
+
+
+def map_divided(context: StageContext, trajectory: Trajectory) -> Mapped:
+    """Every submap made, then all joined, refined and measured: each kind of work once the one before is all done."""
+    run, settings = context.run, context.config.mapping
+    kept, _ = split_frames(trajectory, settings.hold_out)
+    fields = run.load_depth_fields("tracking")
+    submaps = divide(np.array(kept), overlaps(_depths(run, trajectory, fields, kept)), settings.submap)
+    tasks = submap_tasks(context, submaps, trajectory, fields, mapped_classes(run, kept))
+    for work in (make_submap, join_submap, refine_submap):
+        context.each(work, tasks)
+    result, ids = _all_together(tasks)
+    moved = move_trajectory(trajectory, ids, result.cam_from_world)
+    keyframes, held_out = measure(context, tasks, moved, ids, result)
+    return Mapped(result, ids, tasks[0].class_ids, moved, keyframes, held_out, submaps)
+
+
+def submap_tasks(
+    context: StageContext,
+    submaps: Sequence[Submap],
+    trajectory: Trajectory,
+    fields: DepthFields,
+    class_ids: tuple[int, ...],
+) -> list[SubmapTask]:
+    """One for each submap, of its own and bordering keyframes."""
+    files, camera = context.snapshot / "submaps", context.run.load_calibration().intrinsics
+    return [
+        SubmapTask(
+            context.run, context.config, files, number, submap, rows_of(trajectory, submap.views),
+            _only(fields, submap.views), class_ids, camera,
+        )
+        for number, submap in enumerate(submaps)
+    ]  # fmt: skip
+
+
+def _depths(
+    run: RunFolder, trajectory: Trajectory, fields: DepthFields, frame_ids: Sequence[int]
+) -> Iterator[PosedDepth]:
+    """The keyframes with their proxy depths, one at a time."""
+    camera = run.load_calibration().intrinsics
+    poses = dict(zip(trajectory.frame_ids.tolist(), trajectory.cam_from_world, strict=True))
+    for i in frame_ids:
+        if (maps := run.find_proxy(i)) is None:
+            nothing = np.zeros((camera.height, camera.width), np.float32)
+            yield PosedDepth(camera, poses[i], nothing, nothing)
+        else:
+            height, width = maps.depth.shape
+            depth = fields.in_world(i, maps).depth
+            yield PosedDepth(camera.resized(width, height), poses[i], depth, maps.confidence)
+
+
+def rows_of(trajectory: Trajectory, frame_ids: NDArray[np.int64]) -> Trajectory:
+    """The same with these frames alone."""
+    rows = np.flatnonzero(np.isin(trajectory.frame_ids, frame_ids))
+    t, reasons = trajectory, tuple(trajectory.lost_reasons[r] for r in rows)
+    return Trajectory(t.frame_ids[rows], t.timestamps[rows], t.cam_from_world[rows], t.is_keyframe[rows], reasons)
+
+
+def _only(fields: DepthFields, frame_ids: NDArray[np.int64]) -> DepthFields:
+    wanted = {i: field for i in frame_ids.tolist() if (field := fields.of_frame.get(i)) is not None}
+    return DepthFields(wanted) if wanted else fields  # one without any field means another thing
+
+
+def _all_together(tasks: Sequence[SubmapTask]) -> tuple[OptimisedMap, NDArray[np.int64]]:
+    """The whole map with all keyframes in order, and their ids."""
+    results = [task.load(REFINED, task.number) for task in tasks]
+    ids, poses, (gains, offsets) = in_order(results)
+    steps = sum(int(r.steps.sum()) for r in results)
+    return OptimisedMap(together([r.gaussian_map for r in results]), poses, gains, offsets, steps), ids
+
+
+def measure(
+    context: StageContext, tasks: Sequence[SubmapTask], moved: Trajectory, ids: NDArray[np.int64], result: OptimisedMap
+) -> tuple[list[ViewFigures], list[ViewFigures]]:
+    """Figures of the keyframes, in order, and of the frames held out, each measured with the submap of the keyframe
+    before it."""
+    times = moved.timestamps[np.isin(moved.frame_ids, ids)]
+    _, held = split_frames(moved, context.config.mapping.hold_out)
+    before = ids[np.clip(np.searchsorted(ids, held) - 1, 0, None)]
+    measuring = []
+    for task in tasks:
+        wanted = np.append(task.submap.own, np.array(held, np.int64)[np.isin(before, task.submap.own)])
+        part = rows_of(moved, wanted)
+        gains, offsets = (interpolate_rows(part.timestamps, times, a) for a in (result.log_gains, result.offsets))
+        fields = _only(context.run.load_depth_fields("tracking"), wanted)
+        measuring.append(replace(task, trajectory=part, exposure=(gains, offsets), fields=fields))
+    found = context.each(measure_submap, measuring)
+    ranked = np.argsort(np.concatenate([task.submap.own for task in tasks]))
+    keyframes = [figures for own, _ in found for figures in own]
+    return [keyframes[r] for r in ranked], [figures for _, others in found for figures in others]

@@ -1,0 +1,229 @@
+"""The work on one submap as tasks: made from its own frames, joined with what lies beside it, refined, measured.
+
+A task reads the run and files of the tasks before it, and leaves one file, whole or not at all. Where that is there it
+does nothing. So tasks of one kind may run in any order, on any machine that sees the run, and twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from formats.tensors import load_tensors, save_tensors
+from pipelines.config import Config
+from pipelines.depth.fields import DepthFields
+from pipelines.depth.posed import PosedDepth
+from pipelines.device import settle_device
+from pipelines.gaussian_map import GaussianMap
+from pipelines.gaussians.render import blending_weights, median_depth
+from pipelines.mapping.load import MappingInput, load_views
+from pipelines.mapping.measure import ViewFigures, measure_view
+from pipelines.mapping.optimise import optimise_map
+from pipelines.mapping.state import Exposures, OptimisedMap
+from pipelines.mapping.submaps import Submap, nearest_seeing
+from pipelines.mapping.views import View
+from pipelines.progress import Progress
+from pipelines.run_folder import RunFolder
+from pipelines.streamed import memory_room
+from pipelines.types import Intrinsics, Trajectory
+
+MADE, JOINED, REFINED = "made", "joined", "refined"
+_ARRAYS = ("frame_ids", "cam_from_world", "log_gains", "offsets", "depths", "steps")
+REFINING_PASSES, REFINING_RATE = 2.0, 0.1
+"""Visits of each view once the maps are joined, and the learning rates of the first of them."""
+_DEPTH_SIDE = 160
+"""Pixels on the long side of the depths by which Gaussians are given to views."""
+
+
+@dataclass(frozen=True)
+class SubmapTask:
+    """What it takes to work on submap `number`: `trajectory` holds its views (to measure it: its own keyframes, and
+    what is held out), `exposure` theirs, `fields` brings their depths into the world, `files` is the folder of all
+    submaps' results; `passes` and `first_rate` of the refinement."""
+
+    run: RunFolder
+    config: Config
+    files: Path
+    number: int
+    submap: Submap
+    trajectory: Trajectory
+    fields: DepthFields
+    class_ids: tuple[int, ...]
+    camera: Intrinsics
+    exposure: Exposures | None = None
+    passes: float = REFINING_PASSES
+    first_rate: float = REFINING_RATE
+
+    @property
+    def device(self) -> str:
+        """ "cpu" or "cuda"."""
+        return settle_device(self.config.run.device)
+
+    def file(self, kind: str, number: int | None = None) -> Path:
+        """Of a result of this submap, or of another one."""
+        return self.files / f"{kind}_{self.number if number is None else number:04d}.safetensors"
+
+    def load(self, kind: str, number: int) -> SubmapResult:
+        """A result of any submap."""
+        tensors = load_tensors(self.file(kind, number))
+        arrays = {name: tensors.pop(name).numpy() for name in _ARRAYS}
+        return SubmapResult(GaussianMap(**{n: t.to(self.device) for n, t in tensors.items()}), **arrays)
+
+    def save(self, kind: str, result: SubmapResult) -> None:
+        """One file; the snapshot of the work on it goes."""
+        arrays = {name: torch.from_numpy(np.ascontiguousarray(getattr(result, name))) for name in _ARRAYS}
+        save_tensors(self.file(kind), {**vars(result.gaussian_map), **arrays})
+        self.file(f"{kind}_state").unlink(missing_ok=True)
+
+    def views(self, trajectory: Trajectory, hold_out: int = 0) -> MappingInput:
+        """The keyframes of a trajectory, and its frames held out."""
+        settings = replace(self.config.mapping, hold_out=hold_out)
+        memory = memory_room(self.config.run.memory_mb)
+        return load_views(
+            self.run, trajectory, settings, self.config.article, self.device, self.fields, memory, self.class_ids
+        )
+
+
+@dataclass(frozen=True)
+class SubmapResult:
+    """A map with its own keyframes: frame_ids (N,), cam_from_world (N, 4, 4), log_gains and offsets (N, 3), and depths
+    (N, h, w) that it shows in them (0 where it shows none) as long as they are needed; steps (1,) of its making."""
+
+    gaussian_map: GaussianMap
+    frame_ids: NDArray[np.int64]
+    cam_from_world: NDArray[np.float64]
+    log_gains: NDArray[np.float32]
+    offsets: NDArray[np.float32]
+    depths: NDArray[np.float32]
+    steps: NDArray[np.int64]
+
+
+def make_submap(task: SubmapTask, progress: Progress) -> None:
+    """The map of its own and the bordering keyframes."""
+    if not task.file(MADE).exists():
+        given = task.views(task.trajectory)
+        result = _result(task, _optimise(task, given, progress, MADE), given.views)
+        task.save(MADE, replace(result, depths=_depths(result, task.camera)))
+
+
+def join_submap(task: SubmapTask, progress: Progress) -> None:
+    """The Gaussians that no submap beside it shows from nearer, each anchored at the view that sees it from nearest."""
+    if task.file(JOINED).exists():
+        return
+    all_results = [task.load(MADE, n) for n in (task.number, *task.submap.beside)]
+    views, ids = _posed(all_results, task.camera), np.concatenate([r.frame_ids for r in all_results])
+    own = all_results[0]
+    m = own.gaussian_map
+    best = nearest_seeing(m.means.cpu().double().numpy(), progress.track(views, "joining", len(views)))
+    anchors = np.where(best >= 0, ids[best], m.anchor_frame_ids.cpu().numpy())
+    task.save(JOINED, replace(own, gaussian_map=_belonging(m, anchors, task.submap), depths=own.depths[:0]))
+
+
+def refine_submap(task: SubmapTask, progress: Progress) -> None:
+    """Its views visited again with the Gaussians beside it that they show; what belongs to it is kept."""
+    if task.file(REFINED).exists():
+        return
+    own, *around = (task.load(JOINED, n) for n in (task.number, *task.submap.beside))
+    ids, poses, (gains, offsets) = in_order([own, *around])
+    rows = np.searchsorted(ids, task.trajectory.frame_ids)
+    given = task.views(replace(task.trajectory, cam_from_world=poses[rows]))
+    initial = together([own.gaussian_map, *(_shown(r.gaussian_map, given.views) for r in around)])
+    refined = _optimise(task, given, progress, REFINED, initial, (gains[rows], offsets[rows]))
+    result = _result(task, refined, given.views)
+    anchors = result.gaussian_map.anchor_frame_ids.cpu().numpy()
+    task.save(REFINED, replace(result, gaussian_map=_belonging(result.gaussian_map, anchors, task.submap)))
+
+
+def in_order(results: Sequence[SubmapResult]) -> tuple[NDArray[np.int64], NDArray[np.float64], Exposures]:
+    """Ids, poses and exposures of all their keyframes, by id."""
+    ids = np.concatenate([r.frame_ids for r in results])
+    order = np.argsort(ids)
+    gains, offsets = np.concatenate([r.log_gains for r in results]), np.concatenate([r.offsets for r in results])
+    return ids[order], np.concatenate([r.cam_from_world for r in results])[order], (gains[order], offsets[order])
+
+
+def measure_submap(task: SubmapTask, progress: Progress) -> tuple[list[ViewFigures], list[ViewFigures]]:
+    """Figures of its own keyframes and of the frames held out among those of its trajectory, where that puts them."""
+    maps = [task.load(REFINED, n).gaussian_map for n in (task.number, *task.submap.beside)]
+    given = task.views(task.trajectory, task.config.mapping.hold_out)
+    rows = {int(i): row for row, i in enumerate(task.trajectory.frame_ids)}
+    whole = together(maps)
+    log_gains, offsets = task.exposure or _no_exposure(len(rows))
+
+    def figures(view: View) -> ViewFigures:
+        row = rows[view.frame_id]
+        return measure_view(whole, view, task.trajectory.cam_from_world[row], log_gains[row], offsets[row])
+
+    measured = [figures(v) for v in progress.track(given.views, "measuring", len(given.views))]
+    return measured, [figures(v) for v in given.held_out]
+
+
+def _no_exposure(count: int) -> Exposures:
+    return np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
+
+
+def _optimise(
+    task: SubmapTask, given: MappingInput, progress: Progress, kind: str,
+    initial: GaussianMap | None = None, exposure: Exposures | None = None,
+) -> OptimisedMap:  # fmt: skip
+    """From a snapshot where there is one, which goes when the result is written."""
+    settings, seed = replace(task.config.mapping, hold_out=0), task.config.run.seed
+    passes, rate = (None, 1.0) if initial is None else (task.passes, task.first_rate)
+    return optimise_map(
+        given.views, len(task.class_ids), settings, seed, initial, passes,
+        progress=progress, snapshot=task.file(f"{kind}_state"), label=f"submap {task.number + 1}, {kind}",
+        exposure=exposure, article=task.config.article, first_rate=rate,
+    )  # fmt: skip
+
+
+def _result(task: SubmapTask, optimised: OptimisedMap, views: Sequence[View]) -> SubmapResult:
+    """What is the submap's own of a map of more; no depths yet."""
+    ids, made = np.array([v.frame_id for v in views]), optimised
+    own = np.isin(ids, task.submap.own)
+    poses, gains, offsets = made.cam_from_world[own], made.log_gains[own], made.offsets[own]
+    no_depths, steps = np.zeros((0, 1, 1), np.float32), np.array([made.iterations])
+    return SubmapResult(made.gaussian_map, ids[own], poses, gains, offsets, no_depths, steps)
+
+
+@torch.no_grad()
+def _depths(result: SubmapResult, intrinsics: Intrinsics) -> NDArray[np.float32]:
+    """(N, h, w) what the map shows in each of the keyframes."""
+    m, camera = result.gaussian_map, intrinsics.at_most(_DEPTH_SIDE)
+    poses = (torch.as_tensor(p, device=m.means.device) for p in result.cam_from_world)
+    return np.stack([median_depth(m.means, m.radii, m.opacities, p, camera).cpu().numpy() for p in poses])
+
+
+def _posed(results: Iterable[SubmapResult], full: Intrinsics) -> list[PosedDepth]:
+    """Every keyframe with the depth that its own map shows there."""
+    camera = full.at_most(_DEPTH_SIDE)
+    return [
+        PosedDepth(camera, pose, depth, np.ones_like(depth))
+        for result in results
+        for pose, depth in zip(result.cam_from_world, result.depths, strict=True)
+    ]
+
+
+def _belonging(gaussian_map: GaussianMap, anchors: NDArray[np.int64], submap: Submap) -> GaussianMap:
+    """The Gaussians that are anchored (M,) at the submap's own keyframes."""
+    kept = torch.from_numpy(np.isin(anchors, submap.own)).to(gaussian_map.means.device)
+    anchored = replace(gaussian_map, anchor_frame_ids=torch.from_numpy(anchors).to(gaussian_map.means.device))
+    return GaussianMap(**{name: tensor[kept] for name, tensor in vars(anchored).items()})
+
+
+def _shown(gaussian_map: GaussianMap, views: Iterable[View]) -> GaussianMap:
+    """The Gaussians that stand in some pixel of these views."""
+    m = gaussian_map
+    seen = torch.zeros(len(m), dtype=torch.bool, device=m.means.device)
+    for view in views:
+        seen |= blending_weights(m.means, m.radii, m.opacities, view.cam_from_world, view.intrinsics).largest > 0
+    return GaussianMap(**{name: tensor[seen] for name, tensor in vars(m).items()})
+
+
+def together(maps: Sequence[GaussianMap]) -> GaussianMap:
+    """One map of all."""
+    return GaussianMap(**{name: torch.cat([getattr(m, name) for m in maps]) for name in vars(maps[0])})

@@ -1,0 +1,132 @@
+"""Submaps: the keyframes of a long recording divided by what they see, and who keeps which Gaussian of their maps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import ArpackNoConvergence, eigsh
+
+from pipelines.depth.posed import PosedDepth
+
+BORDER = 16
+"""Keyframes of other submaps that a submap is made with beside its own."""
+_SLACK, _UNEVEN = 0.3, 0.5
+"""A cut may lie this share of a submap away from where all become even; there it has to share this much less."""
+_IN_ORDER = 1e-3
+"""Overlap that keyframes beside each other in time have at least: what shows nothing known belongs to somewhere."""
+_SHARES = 0.05
+"""Submaps lie beside each other where a keyframe of one has in its picture this much of what one of the other shows."""
+_SEEN_THROUGH = 0.05
+"""Relative: a view does not tell about what lies farther behind its surface."""
+
+Ids = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Submap:
+    """Frame ids of keyframes, sorted: `own`, which no other submap has, and `border`, the others that share most with
+    them; `beside`: numbers of the submaps that see some of the same."""
+
+    own: Ids
+    border: Ids
+    beside: tuple[int, ...] = ()
+
+    @property
+    def views(self) -> Ids:
+        """All that it is made from, sorted."""
+        return np.union1d(self.own, self.border)
+
+
+def divide(frame_ids: Ids, overlap: sparse.csr_matrix, size: int) -> list[Submap]:
+    """Submaps of about `size` of the keyframes (N,), by their overlaps η (N, N); one of all where they are few, or size
+    is 0.
+
+    Halved again and again along the second eigenvector of the normalised covisibility (Shi and Malik, "Normalized Cuts
+    and Image Segmentation", 2000), each time where least is shared near the middle: what sees the same place stays
+    together, however often the walk comes back to it.
+    """
+    count = overlap.shape[0]
+    chain = sparse.diags([np.full(max(count - 1, 0), _IN_ORDER)], [1], (count, count))
+    shared = (overlap + overlap.T + chain + chain.T).tocsr()
+    shared.setdiag(0)
+    parts = _halve(shared, np.arange(count), submap_count(count, size))
+    of = np.zeros(count, np.int64)
+    for number, part in enumerate(parts):
+        of[part] = number
+    return [_with_border(frame_ids, shared, of, number) for number in range(len(parts))]
+
+
+def submap_count(keyframes: int, size: int) -> int:
+    """How many submaps so many keyframes are divided into."""
+    return max(1, round(keyframes / size)) if size else 1
+
+
+def _halve(shared: sparse.csr_matrix, rows: Ids, parts: int) -> list[Ids]:
+    if parts == 1:
+        return [rows]
+    inside = shared[rows][:, rows]
+    order = _along(inside)
+    even, slack = len(rows) * (parts // 2) / parts, max(_SLACK * len(rows) / parts, 1.0)
+    cuts = np.arange(max(int(even - slack), 1), min(int(even + slack) + 1, len(rows)))
+    price = 1 + _UNEVEN * ((cuts - even) / slack) ** 2
+    cut = int(cuts[(_crossing(inside, order)[cuts] * price).argmin()])
+    sides = np.sort(rows[order[:cut]]), np.sort(rows[order[cut:]])
+    halves = _halve(shared, sides[0], parts // 2) + _halve(shared, sides[1], parts - parts // 2)
+    return sorted(halves, key=lambda part: int(part[0]))
+
+
+def _along(shared: sparse.csr_matrix) -> Ids:
+    """(n,) the rows in the order of the second eigenvector; in their own where none is found."""
+    root = np.sqrt(np.asarray(shared.sum(1)).reshape(-1))
+    scale = sparse.diags(1 / np.maximum(root, 1e-12))
+    start = root * np.linspace(-1, 1, len(root))
+    try:
+        _, vectors = eigsh(scale @ shared @ scale, k=2, which="LA", v0=start, tol=1e-4)
+    except (ArpackNoConvergence, TypeError):  # TypeError: of too few rows
+        return np.arange(len(root))
+    along = vectors[:, 0] / np.maximum(root, 1e-12)
+    along = along if along @ np.linspace(-1, 1, len(along)) >= 0 else -along
+    return np.argsort(along, kind="stable")
+
+
+def _crossing(shared: sparse.csr_matrix, order: Ids) -> NDArray[np.float64]:
+    """(n + 1,) what is shared by the first k rows of `order` and the others."""
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    pairs = shared.tocoo()
+    first, last = place[pairs.row], place[pairs.col]
+    forward = first < last
+    ends = np.bincount(first[forward] + 1, pairs.data[forward], len(order) + 1)
+    ends -= np.bincount(last[forward] + 1, pairs.data[forward], len(order) + 2)[: len(order) + 1]
+    return np.cumsum(ends)
+
+
+def _with_border(frame_ids: Ids, shared: sparse.csr_matrix, of: Ids, number: int) -> Submap:
+    own = np.flatnonzero(of == number)
+    rows = shared[own]
+    with_each = np.asarray(rows.sum(0)).reshape(-1)
+    with_each[own] = 0
+    ranked = np.argsort(-with_each, kind="stable")[:BORDER]
+    border = np.sort(ranked[with_each[ranked] > 2 * _IN_ORDER])
+    beside = np.union1d(of[rows.indices[rows.data > _SHARES]], of[border])
+    return Submap(frame_ids[own], frame_ids[border], tuple(int(n) for n in beside if n != number))
+
+
+def nearest_seeing(points: NDArray[np.float64], views: Iterable[PosedDepth]) -> Ids:
+    """(M,) for each of the points (M, 3) the number of the view that sees it, or through where it is, from nearest
+    (measured along the view's axis); -1 where none does.
+
+    It depends on the place alone: copies of a surface in two maps belong to the same view.
+    """
+    best, nearest = np.full(len(points), -1), np.full(len(points), np.inf)
+    for number, view in enumerate(views):
+        xy, z, inside = view.seen(points)
+        rows = np.flatnonzero(inside & (z < nearest))
+        place = xy[rows].astype(int)
+        rows = rows[z[rows] < (1 + _SEEN_THROUGH) * view.depth[place[:, 1], place[:, 0]]]
+        best[rows], nearest[rows] = number, z[rows]
+    return best

@@ -1,0 +1,152 @@
+"""A map made in parts is as good as one made whole, and the same however often its making is broken off."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from pipelines.config import Config, MappingConfig, RunConfig
+from pipelines.depth.posed import PosedDepth
+from pipelines.geometry import se3
+from pipelines.mapping import stage as mapping_stage
+from pipelines.mapping import submaps
+from pipelines.mapping.submaps import BORDER, divide, nearest_seeing
+from pipelines.progress import SilentProgress
+from pipelines.run_folder import RunFolder
+from pipelines.stages import StageContext
+from pipelines.types import Intrinsics
+
+CONFIG = Config(
+    run=RunConfig(device="cpu"),
+    mapping=MappingConfig(passes=2.0, min_iterations=0, max_side=48, hold_out=8, submap=5),
+)
+
+
+def chain(count: int, reach: int) -> sparse.csr_matrix:
+    """Overlaps of a walk on which keyframes up to `reach` apart see the same."""
+    apart = np.abs(np.arange(count)[:, None] - np.arange(count))
+    return sparse.csr_matrix(np.clip(1 - apart / reach, 0, 1))
+
+
+def test_a_walk_is_cut_where_it_shares_least() -> None:
+    overlap = chain(200, 20).tolil()
+    for i in range(90, 97):  # a door between 93 and 94
+        for j in range(60, 130):
+            if (i < 94) != (j < 94):
+                overlap[i, j] = overlap[j, i] = 0.05
+    first, second = divide(np.arange(200) + 1000, overlap.tocsr(), 100)
+    assert first.own.tolist() == list(range(1000, 1094))
+    assert second.own.tolist() == list(range(1094, 1200))
+    assert first.beside == (1,)
+    assert second.beside == (0,)
+    assert len(first.border) == BORDER
+    assert set(first.border) <= set(second.own)
+
+
+def test_what_is_seen_again_stays_together() -> None:
+    """Forth and back: the keyframe at time t stands where that at 199 - t stood."""
+    place = np.minimum(np.arange(200), 199 - np.arange(200))
+    overlap = sparse.csr_matrix(np.clip(1 - np.abs(place[:, None] - place) / 10, 0, 1))
+    parts = divide(np.arange(200), overlap, 50)
+    assert len(parts) == 4
+    assert sorted(np.concatenate([p.own for p in parts])) == list(range(200))
+    for part in parts:
+        assert 30 <= len(part.own) <= 70
+        assert np.ptp(place[part.own]) < 50
+        assert set(199 - part.own) == set(part.own)
+
+
+def test_few_keyframes_are_not_divided() -> None:
+    for size in (0, 100, 30):
+        (whole,) = divide(np.arange(40), chain(40, 5), size)
+        assert len(whole.own) == 40
+        assert len(whole.border) == 0
+        assert whole.beside == ()
+
+
+def test_the_nearest_view_that_sees_a_place_has_it() -> None:
+    camera = Intrinsics(40, 30, 30.0, 30.0, 20.0, 15.0)
+
+    def view(z: float, depth: float) -> PosedDepth:
+        shown = np.full((30, 40), depth, np.float32)
+        return PosedDepth(camera, se3.inverse(np.array(se3.exp(np.array([0, 0, z, 0, 0, 0.0])))), shown, shown)
+
+    far, near, beside_wall = view(0, 4.0), view(2, 2.0), view(3, 0.3)
+    on_wall, behind, outside, before = [0, 0, 4.0], [0, 0, 4.5], [9, 0, 4.0], [0, 0, 1.0]
+    points = np.array([on_wall, behind, outside, before], float)
+    assert nearest_seeing(points, [far, near, beside_wall]).tolist() == [1, -1, -1, 0]
+
+
+class Killed(Exception):
+    """As a killed process would end."""
+
+
+class KillAfter(SilentProgress):
+    """Ends after so many steps of whatever is tracked."""
+
+    def __init__(self, steps: int) -> None:
+        self.left = steps
+
+    def track(self, items, label, total=None):  # type: ignore[no-untyped-def]
+        for item in items:
+            yield item
+            self.left -= 1
+            if self.left == 0:
+                raise Killed
+
+
+class BackwardsAndTwice(StageContext):
+    """Whoever does the tasks."""
+
+    def each(self, work, tasks):  # type: ignore[no-untyped-def]
+        for task in reversed(tasks):
+            super().each(work, [task])
+        return super().each(work, tasks)
+
+
+def mapped(
+    run: RunFolder,
+    folder: Path,
+    config: Config = CONFIG,
+    progress: SilentProgress | None = None,
+    kind: type[StageContext] = StageContext,
+) -> dict:
+    folder.mkdir(exist_ok=True)
+    return mapping_stage.run(kind(run, run.root, config, folder, progress or SilentProgress()))
+
+
+@pytest.fixture(scope="module")
+def divided(small_run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, dict]]:
+    folder = tmp_path_factory.mktemp("divided") / "mapping"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(submaps, "BORDER", 4)
+        yield folder, mapped(small_run, folder)
+
+
+def test_parts_show_what_the_whole_shows(small_run: RunFolder, divided: tuple[Path, dict], tmp_path: Path) -> None:
+    whole = mapped(small_run, tmp_path / "whole", replace(CONFIG, mapping=replace(CONFIG.mapping, submap=0)))
+    figures = divided[1]
+    assert figures["submaps"] == 3
+    assert whole["submaps"] == 1
+    assert figures["keyframes"] == whole["keyframes"] == 14
+    assert figures["keyframe_psnr"] > whole["keyframe_psnr"] - 0.5
+    assert figures["held_out_psnr"] > whole["held_out_psnr"] - 0.5
+    assert 0.7 < figures["gaussians"] / whole["gaussians"] < 1.4  # copies of the same surface are not kept
+
+
+def test_broken_off_anywhere_it_ends_with_the_same_bytes(
+    small_run: RunFolder, divided: tuple[Path, dict], tmp_path: Path
+) -> None:
+    config = replace(CONFIG, mapping=replace(CONFIG.mapping, snapshot_every=20))
+    steps = divided[1]["iterations"]
+    for number, after in enumerate((int(0.4 * steps), int(2.6 * steps))):
+        folder = tmp_path / str(number)
+        with pytest.raises(Killed):
+            mapped(small_run, folder, config, KillAfter(after))
+        figures = mapped(small_run, folder, config, kind=BackwardsAndTwice)
+        assert figures == divided[1]
+        for name in ("map.safetensors", "trajectory.npz", "exposure.npz", "mapping.json"):
+            assert (folder / name).read_bytes() == (divided[0] / name).read_bytes()
