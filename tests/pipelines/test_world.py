@@ -99,6 +99,23 @@ def test_walk_is_smooth_closed_and_never_turns_on_the_spot(layout: str, world: W
     assert (turns / steps).max() < 2.5
 
 
+def test_the_stairwell_has_bars_of_few_pixels_before_other_things_and_its_floor_mirrors() -> None:
+    stairs = make_world("stairwell", texel=0.03)
+    pose = walk(stairs, np.array([0.2]))[0]
+    color, depth, solid = render_view(stairs, OPTIONS, pose)
+    names = np.array(stairs.class_names)[stairs.labels[solid]]
+    bars = (names == "bar").astype(np.uint8)
+    gaps = (cv2.morphologyEx(bars, cv2.MORPH_CLOSE, np.ones((1, 9), np.uint8)) > 0) & (bars == 0)
+    assert 0.04 < bars.mean() < 0.25
+    assert cv2.erode(bars, np.ones((5, 5), np.uint8)).mean() < 0.1 * bars.mean()
+    beside = cv2.dilate(depth * bars, np.ones((1, 17), np.uint8))
+    assert (depth > 1.1 * beside)[gaps].mean() > 0.6
+    dull, same, _ = render_view(replace(stairs, gloss=0.0), OPTIONS, pose)
+    assert (same == depth).all()
+    assert (color == dull)[names != "floor"].all()
+    assert np.abs(color - dull)[names == "floor"].mean() > 0.01
+
+
 def test_the_building_goes_on_without_a_hole_and_without_the_whole_of_it() -> None:
     """Every ray ends at a surface, and a place looks the same from whatever module it is built."""
     path = building.Walk(400).poses(np.arange(0, 400, 0.2))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -50,7 +50,10 @@ class Scene:
 
 @dataclass(frozen=True)
 class World:
-    """A scene with exact truth. labels (S,) uint8: class of every solid, an index into class_names."""
+    """A scene with exact truth. labels (S,) uint8: class of every solid, an index into class_names.
+
+    gloss: the share of the light from above that a floor at z = 0 mirrors, of what falls straight onto it.
+    """
 
     layout: str
     solids: SolidArrays
@@ -58,6 +61,13 @@ class World:
     labels: NDArray[np.uint8]
     class_names: tuple[str, ...]
     class_colors: tuple[tuple[int, int, int], ...]
+    gloss: float = 0.0
+
+    def without(self, name: str) -> World:
+        """The world less the solids of one class."""
+        kept = self.labels != self.class_names.index(name)
+        arrays = {f.name: getattr(self.solids, f.name)[kept] for f in fields(self.solids)}
+        return replace(self, solids=SolidArrays(**arrays), labels=self.labels[kept])
 
 
 def build_world(layout: str, scene: Scene, seed: int, texel: float) -> World:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -15,11 +15,13 @@ from tests.world.cast import render_rays
 from tests.world.corridor import ring_corridor
 from tests.world.paths import corridor_walk, room_walk
 from tests.world.room import furnished_room
+from tests.world.stairwell import GLOSS, stairwell, stairwell_walk
 
-LAYOUTS = {"room": furnished_room, "corridor": ring_corridor}
+LAYOUTS = {"room": furnished_room, "corridor": ring_corridor, "stairwell": stairwell}
 _WALKS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
     "room": room_walk,
     "corridor": corridor_walk,
+    "stairwell": stairwell_walk,
 }
 
 
@@ -65,13 +67,15 @@ class WorldFrame:
 
 
 def make_world(layout: str = "room", seed: int = 0, texel: float = 0.005, blank_walls: bool = False) -> World:
-    """A synthetic world with exact truth: "room" (furnished, one table to walk round) or "corridor" (repeats itself).
+    """A synthetic world with exact truth: "room" (furnished, one table to walk round), "corridor" (repeats itself) or
+    "stairwell" (thin bars before other things, over a polished floor).
 
     texel: metres per texture pixel on walls. The same arguments give the same bytes.
     """
     if layout not in LAYOUTS:
         raise ValueError(f"layout is one of {', '.join(LAYOUTS)}; got {layout!r}")
-    return build_world(layout, LAYOUTS[layout](blank_walls), seed, texel)
+    world = build_world(layout, LAYOUTS[layout](blank_walls), seed, texel)
+    return replace(world, gloss=GLOSS) if layout == "stairwell" else world
 
 
 def walk(world: World, steps: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -98,6 +102,22 @@ def render_view(
     world: World, options: ClipOptions, world_from_cam: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
     """color (H, W, 3) linear light, depth (H, W) z, solid (H, W) index or -1, as seen from one pose."""
+    color, depth, solid_at = _cast(world, options, world_from_cam)
+    floor = np.append(world.labels == world.class_names.index("floor"), False)[solid_at]
+    if world.gloss > 0 and floor.any():
+        # The mirror image is what a camera on the other side of the floor would see if there were none.
+        upside_down = np.diag([1.0, 1.0, -1.0, 1.0])
+        seen, _, _ = _cast(world.without("floor"), options, upside_down @ world_from_cam)
+        rays = np.concatenate([_rays(options)[0], np.ones((*depth.shape, 1))], -1)
+        steepness = -(rays @ world_from_cam[2, :3]) / np.linalg.norm(rays, axis=-1)
+        share = world.gloss + (1 - world.gloss) * (1 - np.clip(steepness, 0, 1)) ** 5  # Schlick's
+        color = np.where(floor[..., None], color + share[..., None].astype(np.float32) * (seen - color), color)
+    return color, depth, solid_at
+
+
+def _cast(
+    world: World, options: ClipOptions, world_from_cam: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
     h, w = options.height, options.width
     color, depth = np.zeros((h, w, 3), np.float32), np.zeros((h, w), np.float32)
     solid_at = np.empty((h, w), np.int32)
