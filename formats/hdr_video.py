@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from formats.spherical import read_moov
+
 _TRANSFERS = {16: "PQ", 18: "HLG"}  # ITU-T H.273, table 3
-_MOST_OF_MOOV = 64 << 20
 _KNEE = 0.75
 """Up to this part of diffuse white light stays as it is; all that is brighter shares the rest."""
 _709_FROM_2020 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]])
@@ -22,20 +22,7 @@ _FINE = 1 << 14
 
 def hdr_transfer(path: Path) -> str:
     """ "HLG" or "PQ" where an MP4 or MOV says so in its colr box; "" for all else."""
-    with open(path, "rb") as file:
-        while len(head := file.read(8)) == 8:
-            size, kind = struct.unpack(">I4s", head)
-            if kind == b"moov":
-                return _told(file.read(min(size, _MOST_OF_MOOV)))
-            if size == 1:
-                size = int.from_bytes(file.read(8), "big") - 8
-            if size < 8:
-                break
-            file.seek(size - 8, 1)
-    return ""
-
-
-def _told(moov: bytes) -> str:
+    moov = read_moov(path)
     place = moov.find(b"colrnclx")
     return _TRANSFERS.get(int.from_bytes(moov[place + 10 : place + 12], "big"), "") if place >= 0 else ""
 

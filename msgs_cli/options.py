@@ -82,6 +82,11 @@ _SOURCE_OPTIONS = {
         "The camera, in pixels of the source (first pixel's centre at 0.5, 0.5). Default: the data set's, EXIF, else "
         "self-calibrated.",
     ),
+    "camera": (
+        "frames.camera", "auto|perspective|equirectangular|fisheye",
+        "Kind of camera: equirectangular for whole 360° panoramas, fisheye for a lens given by --intrinsics (k1 to k4 "
+        "of OpenCV's fisheye). Default: auto, what the source says of itself.",
+    ),
     "masks": (
         "frames.masks", "FOLDER",
         "What is no part of the scene: NAME.png for a picture NAME, or the frame's number in the video; black is left "

@@ -8,7 +8,7 @@ missing.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -108,13 +108,16 @@ def require_rigid(name: str, motions: NDArray) -> None:
 
 
 def dataclass_from_json(cls: type[T], value: Any) -> T:
-    """A dataclass of plain fields from its `asdict` after JSON. Raises ValueError for other keys or types."""
+    """A dataclass of plain fields from its `asdict` after JSON; what has a default may be missing. Raises ValueError
+    for other keys or types."""
     types = get_type_hints(cls)
-    names = [f.name for f in fields(cls)]  # type: ignore[arg-type]
-    if not isinstance(value, dict) or set(value) != set(names):
+    defaults = {f.name: f.default for f in fields(cls)}  # type: ignore[arg-type]
+    names = list(defaults)
+    needed = {name for name, default in defaults.items() if default is MISSING}
+    if not isinstance(value, dict) or not needed <= set(value) <= set(names):
         found = sorted(map(str, value)) if isinstance(value, dict) else type(value).__name__
         raise ValueError(f"{cls.__name__}: expected {', '.join(names)}, got {found}")
-    return cls(**{name: _field(types[name], value[name], f"{cls.__name__}.{name}") for name in names})
+    return cls(**{name: _field(types[name], value[name], f"{cls.__name__}.{name}") for name in value})
 
 
 def _field(wanted: Any, value: Any, name: str) -> Any:

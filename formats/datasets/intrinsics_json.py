@@ -9,13 +9,15 @@ from formats.errors import InputError
 from formats.jsonfile import number, optional_number, read_json_object
 
 _DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3")
+_FISHEYE_NAMES = ("k1", "k2", "k3", "k4")
 
 
 def read_intrinsics_json(path: Path, *, integer_centres: bool) -> tuple[Camera, float | None]:
     """The camera, and raw depth units per metre where the file says so.
 
     Understands w/width, h/height, fx, fy, cx, cy, distortion (a list, or k1, k2, p1, p2, k3) and depth_scale/scale,
-    at the top or under "camera". A key pixel_centre that begins with "integer" or "half" says which number the first
+    at the top or under "camera"; beside a model or camera_model with FISHEYE in its name, k1 to k4 are the fisheye's. A
+    key pixel_centre that begins with "integer" or "half" says which number the first
     pixel's centre has; `integer_centres` is for files without that key.
     """
     top = read_json_object(path)
@@ -24,6 +26,7 @@ def read_intrinsics_json(path: Path, *, integer_centres: bool) -> tuple[Camera, 
     if not said.startswith(("integer", "half")):
         raise InputError(f"{path}: pixel_centre is {said!r}, expected it to begin with 'integer' or 'half'")
     shift = 0.5 if said.startswith("integer") else 0.0
+    fisheye = "FISHEYE" in str(table.get("camera_model", table.get("model", ""))).upper()
     camera = Camera(
         int(number(table, path, "w", "width")),
         int(number(table, path, "h", "height")),
@@ -31,7 +34,8 @@ def read_intrinsics_json(path: Path, *, integer_centres: bool) -> tuple[Camera, 
         number(table, path, "fy"),
         number(table, path, "cx") + shift,
         number(table, path, "cy") + shift,
-        _distortion(table, path),
+        _distortion(table, path, _FISHEYE_NAMES if fisheye else _DISTORTION_NAMES),
+        fisheye,
     )
     scale = optional_number(table, path, "depth_scale", "scale")
     if scale is not None and not scale > 0:
@@ -39,11 +43,11 @@ def read_intrinsics_json(path: Path, *, integer_centres: bool) -> tuple[Camera, 
     return camera, scale
 
 
-def _distortion(table: dict, path: Path) -> tuple[float, ...]:
+def _distortion(table: dict, path: Path, names: tuple[str, ...]) -> tuple[float, ...]:
     values = table.get("distortion")
     if values is None:
-        named = tuple(optional_number(table, path, name) or 0.0 for name in _DISTORTION_NAMES)
-        return named if named[4] else named[:4]
+        named = tuple(optional_number(table, path, name) or 0.0 for name in names)
+        return named if any(named[4:]) else named[:4]
     if not isinstance(values, list) or not 0 < len(values) <= 5 or not all(isinstance(v, int | float) for v in values):
         raise InputError(f"{path}: distortion is {str(values)[:80]}, expected up to five numbers k1, k2, p1, p2, k3")
     return tuple(float(v) for v in values) + (0.0,) * (4 - len(values))

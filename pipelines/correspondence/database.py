@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from pipelines.correspondence.matching import VerifiedPair
 from pipelines.types import Features
@@ -17,29 +19,40 @@ def write_database(
     names: Sequence[str],
     features: Iterable[Features],
     pairs: Iterable[VerifiedPair],
+    cam_from_rig: NDArray[np.float64],
 ) -> None:
-    """Image i (counted from 0) gets the id i + 1; all images share camera 1. An older file is replaced."""
+    """Image i (counted from 0) gets the id i + 1. An older file is replaced.
+
+    cam_from_rig (C, 3, 3): the images are those of the first of C directions, then those of the next and so on, each
+    direction a camera of its own, counted from 1. The images i, i + N / C and so on share a frame of COLMAP.
+    """
     path.unlink(missing_ok=True)
+    stations = len(names) // len(cam_from_rig)
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-        camera_id = database.write_camera(camera)
-        rig = pycolmap.Rig()
-        rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id))
-        rig_id = database.write_rig(rig)
-        for name, feature in zip(names, features, strict=True):
-            _write_image(database, name, feature, camera_id, rig_id)
+        rig, cameras = _write_rig(database, camera, cam_from_rig)
+        frames = [pycolmap.Frame(rig_id=rig) for _ in range(stations)]
+        for i, (name, feature) in enumerate(zip(names, features, strict=True)):
+            image = pycolmap.Image(name=name, camera_id=cameras[i // stations])
+            image.image_id = database.write_image(image)
+            frames[i % stations].add_data_id(image.data_id)
+            database.write_keypoints(image.image_id, feature.keypoints)
+        for station, frame in enumerate(frames, 1):
+            assert database.write_frame(frame) == station, "frames and the first images are numbered alike"
         for pair in pairs:
             _write_pair(database, pair)
 
 
-def _write_image(database: pycolmap.Database, name: str, features: Features, camera_id: int, rig_id: int) -> None:
-    image = pycolmap.Image(name=name, camera_id=camera_id)
-    image.image_id = database.write_image(image)
-    frame = pycolmap.Frame()
-    frame.rig_id = rig_id
-    frame.add_data_id(image.data_id)
-    frame_id = database.write_frame(frame)
-    assert frame_id == image.image_id, "frames and images are numbered alike"
-    database.write_keypoints(image.image_id, features.keypoints)
+def _write_rig(
+    database: pycolmap.Database, camera: pycolmap.Camera, cam_from_rig: NDArray[np.float64]
+) -> tuple[int, list[int]]:
+    cameras = [database.write_camera(camera)]
+    rig = pycolmap.Rig()
+    rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, cameras[0]))
+    for rotation in cam_from_rig[1:]:
+        cameras.append(database.write_camera(pycolmap.Camera(camera.todict() | {"camera_id": len(cameras) + 1})))
+        turned = pycolmap.Rigid3d(np.column_stack([rotation, np.zeros(3)]))
+        rig.add_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, cameras[-1]), turned)
+    return database.write_rig(rig), cameras
 
 
 def _write_pair(database: pycolmap.Database, pair: VerifiedPair) -> None:

@@ -111,7 +111,14 @@ def loop_pairs(
     return sorted(pairs)
 
 
-def far_apart(count: int, gap: int) -> Callable[[slice], NDArray[np.bool_]]:
-    """Rows of (N, N): which of `count` frames lie at least `gap` places apart."""
+def far_apart(count: int, gap: int, places: int = 0) -> Callable[[slice], NDArray[np.bool_]]:
+    """Rows of (N, N): which of `count` frames lie at least `gap` places apart; of those that look in another direction,
+    each direction with `places` frames, which stand at another place."""
     index = np.arange(count)
-    return lambda part: np.abs(index[part, None] - index) >= gap
+    places = places or count
+
+    def rows(part: slice) -> NDArray[np.bool_]:
+        apart = np.abs(index[part, None] % places - index % places)
+        return np.where(index[part, None] // places == index // places, apart >= gap, apart > 0)
+
+    return rows

@@ -19,6 +19,7 @@ from formats.nerfstudio import write_transforms
 from formats.spz import write_spz
 from formats.trajectory import write_tum
 from pipelines.export.readme import lengths, readme
+from pipelines.geometry.rig import rig_of
 from pipelines.metres.files import save_metres
 from pipelines.outcome import Outcome
 from pipelines.run_folder import save_classes
@@ -116,9 +117,11 @@ def _by_class(cloud: GaussianCloud, outcome: Outcome) -> GaussianCloud:
 
 
 def write_trajectory(outcome: Outcome, folder: Path) -> list[Path]:
-    """The poses of all posed frames."""
+    """The poses of all posed frames, of panoramas those of their middle."""
     t, note = outcome.trajectory, lengths(outcome.metres, outcome.metric)
-    write_tum(folder / "trajectory.txt", t.timestamps[t.is_posed], t.world_from_cam[t.is_posed], note)
+    posed = np.flatnonzero(t.is_posed)
+    posed = posed[t.frame_ids[posed] < rig_of(outcome.calibration.directions, len(outcome.frames)).stations]
+    write_tum(folder / "trajectory.txt", t.timestamps[posed], t.world_from_cam[posed], note)
     return [folder / "trajectory.txt"]
 
 

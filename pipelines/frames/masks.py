@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from formats.images import read_rgb
 from pipelines.config import Config
+from pipelines.frames.faces import Faces
 from pipelines.frames.source import Source, open_source
+from pipelines.geometry.rig import ONE_CAMERA, Rig
 from pipelines.masks.files import MaskFiles, open_masks
 from pipelines.masks.people import PeopleCards, PeopleFinder, people_cards
 from pipelines.progress import Progress
@@ -46,10 +48,14 @@ class FrameMasks:
     `folder` keeps what was found; `picked` names the picture of a frame.
     """
 
-    def __init__(self, config: Config, source: Source, folder: Path, picked: Path, threads: int) -> None:
+    def __init__(
+        self, config: Config, source: Source, folder: Path, picked: Path, threads: int,
+        faces: Faces | None = None, rig: Rig = ONE_CAMERA,
+    ) -> None:  # fmt: skip
         self._files = open_masks(Path(config.frames.masks), source) if config.frames.masks else MaskFiles({})
         self._cards = _cards(config)
         self._folder, self._picked, self._threads = folder, picked, threads
+        self._faces, self._rig = faces, rig
 
     def find_people(self, frames: Sequence[Frame], keyframes: Sequence[int], progress: Progress) -> None:
         """Look for people in the keyframes, and in every frame up to the next keyframe on either side of one that shows
@@ -74,7 +80,10 @@ class FrameMasks:
 
     def left_out(self, frame: Frame, width: int, height: int) -> NDArray[np.bool_] | None:
         """(height, width) of a picked frame; None where all of it is scene."""
-        given = self._files.left_out(frame.source_index, width, height)
+        size = (width, height) if self._faces is None else self._faces.size
+        given = self._files.left_out(frame.source_index, *size)
+        if given is not None and self._faces is not None:
+            given = self._faces.cut_mask(given, frame.id // self._rig.stations)
         people = load_left_out(self._folder, frame)
         parts = [p for p in (given, people) if p is not None]
         both = np.logical_or.reduce(parts) if parts else None

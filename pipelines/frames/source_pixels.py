@@ -36,6 +36,8 @@ def _distorted_camera(calibration: Calibration) -> Camera:
     """The lens before undistortion, which may have enlarged the picture to fill the frame."""
     k, zoom = calibration.intrinsics, 1.0
     for _ in range(6):
-        camera = Camera(k.width, k.height, k.fx / zoom, k.fy / zoom, k.cx, k.cy, calibration.distortion)
+        camera = Camera(
+            k.width, k.height, k.fx / zoom, k.fy / zoom, k.cx, k.cy, calibration.distortion, calibration.fisheye
+        )
         zoom = make_lens(to_pycolmap(camera)).pinhole.fx / camera.fx
     return camera

@@ -12,6 +12,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from formats.atomic import copy_file
+from formats.datasets.camera import Camera
 from formats.errors import InputError, RecoverableError
 from formats.images import read_rgb, write_rgb
 from formats.jsonfile import read_json, write_json
@@ -19,12 +20,14 @@ from formats.video import VideoFrame
 from pipelines.config import Config, FramesConfig
 from pipelines.correspondence.features import to_grey
 from pipelines.correspondence.snapshots import Snapshots
+from pipelines.frames.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
 from pipelines.frames.keyframes import KeyframeChoice, choose_keyframes
 from pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
 from pipelines.frames.pick import sharpest_of_windows
 from pipelines.frames.recording import RecordingSource
 from pipelines.frames.sharpness import reduce_image, reduced_size
 from pipelines.frames.source import FolderSource, VideoSource, open_source
+from pipelines.geometry.rig import Rig, rig_of
 from pipelines.run_folder import (
     save_backbone,
     save_calibration,
@@ -53,39 +56,47 @@ AnySource = VideoSource | FolderSource | RecordingSource
 def run(context: StageContext) -> dict[str, Any]:
     """See `StageContext`; raises InputError for a source that cannot be used."""
     source = open_source(context.source, context.config.run.format)
-    camera, origin = known_camera(context, source)
+    faces = find_faces(source, context.config.frames)
+    if faces is None and looks_like_panoramas(source, context.config.frames):
+        context.warn(
+            "the pictures are twice as wide as high, as 360° panoramas are: of such, say --camera equirectangular"
+        )
+    camera, origin = known_camera(context, source, faces)
     _require_several(source)
-    frames = _pick(context, source)
+    frames = _pick(context, source, faces)
+    rig = rig_of(1 if faces is None else len(faces), len(frames))
     masks = FrameMasks(
-        context.config, source, context.snapshot / "people", context.snapshot / "picked", context.threads
+        context.config, source, context.snapshot / "people", context.snapshot / "picked", context.threads, faces, rig
     )
-    keyframes = _keyframes(context, frames, masks)
+    keyframes = _keyframes(context, frames, masks, rig)
     masks.find_people(frames, keyframes, context.progress)
-    structure = _structure(context, camera, origin == "given", frames, keyframes, masks)
+    structure = _structure(context, camera, origin == "given", frames, keyframes, masks, rig)
     lens = make_lens(structure.model.cameras[1])
-    calibration = _calibration(context, lens, origin, structure.focal_sd)
+    calibration = _calibration(context, lens, origin, structure.focal_sd, faces)
     _write_backbone(context, structure, keyframes, lens, frames)
     _write_correspondences(context, structure, keyframes, lens)
     _write_frames(context, source, frames, lens)
     masked = masks.write(context.folder / "masks", frames, lens)
     save_calibration(context.folder, calibration)
     save_frames(context.folder, frames)
-    return _figures(frames, structure, calibration) | masked
+    panoramas = {"panoramas": rig.stations} if len(rig) > 1 else {}
+    return _figures(frames, structure, calibration) | panoramas | masked
 
 
-def known_camera(context: StageContext, source: AnySource) -> tuple[pycolmap.Camera, str]:
+def known_camera(context: StageContext, source: AnySource, faces: Faces | None) -> tuple[pycolmap.Camera, str]:
     """The camera of the reduced frames as far as it is known before, and where from."""
     config = context.config.frames
+    if faces is not None:
+        pinhole = Camera(**asdict(faces.pinhole))
+        return to_pycolmap(pinhole), "given"
     width, height = reduced_size(source.width, source.height, config.max_side)
     if config.intrinsics:
         given = read_intrinsics(config.intrinsics, source.width, source.height)
         return to_pycolmap(given.resized(width, height)), "given"
     known = source.known_camera() if isinstance(source, RecordingSource) else None
-    if known is not None and not known.fisheye and not known.is_nominal:
+    if known is not None and not known.is_nominal and not known.fisheye:
         return to_pycolmap(known.resized(width, height)), "given"
     if known is not None:
-        if known.fisheye:
-            context.warn("the data set's lens is a fisheye: its focal length is a start only, the frames calibrate it")
         return unknown_camera(width, height, known.fx * width / source.width, is_prior=True), "self-calibrated"
     exif = source.exif_focal()
     if exif is not None:
@@ -98,8 +109,23 @@ def check(source: Path, config: Config) -> None:
     opened = open_source(source, config.run.format)
     _require_several(opened)
     check_masks(source, config)
-    if config.frames.intrinsics:
+    faces = find_faces(opened, config.frames)
+    if faces is None and config.frames.intrinsics:
         read_intrinsics(config.frames.intrinsics, opened.width, opened.height)
+    if faces is not None and len(faces) > 1:
+        _check_panoramas(config)
+
+
+def _check_panoramas(config: Config) -> None:
+    """What knows pixels of the source's own pictures does not know its panoramas."""
+    files = [p for p in (config.proxy.depth, config.proxy.semantics) if p.startswith("files")]
+    reference = config.proxy.scale_ref.strip()
+    if files or (reference and not reference.startswith("height")):
+        what = f"{files[0]!r}" if files else f"--scale-ref {reference}"
+        raise InputError(
+            f"{what} cannot be used with panoramas: leave it away; --scale-ref height=METRES, the camera over the "
+            "floor, makes metres"
+        )
 
 
 def _require_several(source: AnySource) -> None:
@@ -110,7 +136,7 @@ def _require_several(source: AnySource) -> None:
 # picking --------------------------------------------------------------------------------------------------------
 
 
-def _pick(context: StageContext, source: AnySource) -> list[Frame]:
+def _pick(context: StageContext, source: AnySource, faces: Faces | None) -> list[Frame]:
     table = context.snapshot / "picked.json"
     if table.exists():
         stored = read_json(table)
@@ -129,19 +155,31 @@ def _pick(context: StageContext, source: AnySource) -> list[Frame]:
         timestamp = picture.timestamp if source.has_times else _untimed(config, frame_id)
         name = source.name(frame_id, picture.source_index)
         frames.append(Frame(frame_id, name, timestamp, picture.source_index, score))
-        _save_picked(context, source, picture, name)
+        _save_picked(context, source, picture, name, faces)
     context.same_source()
     if len(frames) < 2:
         raise InputError(f"{source.path} gives one frame only; a reconstruction needs several views of a scene")
+    if faces is not None:
+        frames = _of_all_directions(frames, faces)
     write_json(table, {"frames": [asdict(f) for f in frames], "warnings": context.warnings})
     return frames
+
+
+def _of_all_directions(frames: list[Frame], faces: Faces) -> list[Frame]:
+    """Direction by direction, as `Rig` counts."""
+    named = [(c, f, faces.names(f.name)[c]) for c in range(len(faces)) for f in frames]
+    return [replace(f, id=c * len(frames) + f.id, name=name) for c, f, name in named]
 
 
 def _untimed(config: FramesConfig, frame_id: int) -> float:
     return frame_id / (config.rate if config.rate > 0 else 1.0)
 
 
-def _save_picked(context: StageContext, source: AnySource, picture: VideoFrame, name: str) -> None:
+def _save_picked(context: StageContext, source: AnySource, picture: VideoFrame, name: str, faces: Faces | None) -> None:
+    if faces is not None:
+        for face, rgb in zip(faces.names(name), faces.cut(picture.rgb), strict=True):
+            write_rgb(_picked(context, face), rgb)
+        return
     path = _picked(context, name)
     reduced = reduce_image(picture.rgb, context.config.frames.max_side)
     original = source.original(picture.source_index) if reduced is picture.rgb else None
@@ -158,25 +196,38 @@ def _picked(context: StageContext, name: str) -> Path:
 # keyframes and structure ----------------------------------------------------------------------------------------
 
 
-def _keyframes(context: StageContext, frames: list[Frame], masks: FrameMasks) -> list[int]:
-    """Ids of keyframes by parallax; of a short walk closer ones, so that there are enough for a reconstruction."""
+def _keyframes(context: StageContext, frames: list[Frame], masks: FrameMasks, rig: Rig) -> list[int]:
+    """Ids of keyframes by parallax; of a short walk closer ones, so that there are enough for a reconstruction. Of
+    panoramas all sides are keyframes."""
     table = context.snapshot / "keyframes.json"
     if not table.exists():
-        write_json(table, _choose(context, frames, masks).keyframes)
+        write_json(table, rig.frames_of(_choose(context, frames, masks, rig).keyframes))
     return read_json(table)
 
 
-def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks) -> KeyframeChoice:
+def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks, rig: Rig) -> KeyframeChoice:
+    """Places by what is seen of them: of panoramas the level sides, two by two in one picture."""
+    across = 2 if len(rig) > 1 else 1
+    places = frames[: rig.stations]
+
+    def picture(frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+        gray = _gray(context, frame)
+        return gray, masks.left_out(frame, gray.shape[1], gray.shape[0])
+
     def pictures() -> Iterator[tuple[NDArray[np.uint8], NDArray[np.bool_] | None]]:
-        for frame in context.progress.track(frames, "keyframes", len(frames)):
-            gray = _gray(context, frame)
-            yield gray, masks.left_out(frame, gray.shape[1], gray.shape[0])
+        for frame in context.progress.track(places, "keyframes", len(places)):
+            if across == 1:
+                yield picture(frame)
+                continue
+            sides = [picture(frames[i]) for i in rig.frames_of([frame.id])]
+            hidden = [np.zeros(gray.shape, np.bool_) if mask is None else mask for gray, mask in sides]
+            yield level_mosaic([gray for gray, _ in sides]), level_mosaic(hidden)
 
     parallax = context.config.frames.parallax
     while True:
-        choice = choose_keyframes(pictures(), parallax)
-        require_motion(choice.largest_displacement)
-        if len(choice.keyframes) >= min(_FEW_KEYFRAMES, len(frames)) or parallax < context.config.frames.parallax / 3:
+        choice = choose_keyframes(pictures(), parallax / across)
+        require_motion(choice.largest_displacement * across)
+        if len(choice.keyframes) >= min(_FEW_KEYFRAMES, len(places)) or parallax < context.config.frames.parallax / 3:
             return choice
         parallax /= 2
 
@@ -192,6 +243,7 @@ def _structure(
     frames: list[Frame],
     keyframes: list[int],
     masks: FrameMasks,
+    rig: Rig,
 ) -> Structure:
     structure = StructureFromMotion(
         config=context.config.frames,
@@ -204,6 +256,7 @@ def _structure(
         threads=context.threads,
         seed=context.config.run.seed,
         memory=context.memory_room,
+        cam_from_rig=rig.cam_from_rig,
     ).run(keyframes)
     warn_of_structure(context, structure, [frames[k].id for k in keyframes])
     return structure
@@ -249,14 +302,17 @@ def warn_of_structure(context: StageContext, structure: Structure, ids: list[int
         )
 
 
-def _calibration(context: StageContext, lens: Lens, origin: str, focal_sd: float) -> Calibration:
+def _calibration(context: StageContext, lens: Lens, origin: str, focal_sd: float, faces: Faces | None) -> Calibration:
     focal_sd *= lens.pinhole.fx / lens.camera.focal_length_x
     if focal_sd > _UNSURE_FOCAL * lens.pinhole.fx:
         context.warn(
             f"the focal length is unsure: {lens.pinhole.fx:.0f} ± {focal_sd:.0f} px. If you know them, "
             "give the intrinsics with --intrinsics"
         )
-    return Calibration(lens.pinhole, origin, focal_sd, distortion_of(lens.camera))
+    if faces is None:
+        return Calibration(lens.pinhole, origin, focal_sd, distortion_of(lens.camera))
+    removed = (0.0,) * 4 if faces.fisheye is None else faces.fisheye.distortion
+    return Calibration(lens.pinhole, origin, focal_sd, removed, faces.fisheye is not None, len(faces))
 
 
 # results --------------------------------------------------------------------------------------------------------

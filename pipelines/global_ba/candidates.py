@@ -17,6 +17,7 @@ SHARED_POINTS = 15
 """Keyframes with this many points in common need no loop."""
 RICH = 0.9
 """Keyframes of a richness above this propose loops by semantics, eq. (21)."""
+PER_KEYFRAME = 2
 SIMILAR = 0.6
 """T_loop of eq. (23) on the similarity of eq. (24)."""
 WEIGHTS = (0.4, 0.3, 0.3)
@@ -48,7 +49,7 @@ def loop_candidates(
     def unrelated(part: slice) -> NDArray[np.bool_]:
         return apart(part) & (shared[part].toarray() < SHARED_POINTS)
 
-    alike = loop_pairs(looks, unrelated, settings.loop_candidates, settings.loop_appearance)
+    alike = loop_pairs(looks, unrelated, PER_KEYFRAME, settings.loop_appearance)
     by_labels = _semantic_candidates(unrelated, looks, summaries, settings) if settings.use_semantics else set()
     return sorted(pair for pair in {*alike, *by_labels} if (ids[pair[0]], ids[pair[1]]) not in refused)
 
@@ -65,7 +66,7 @@ def _semantic_candidates(
         others = np.flatnonzero(unrelated(row)[0]).tolist()
         appearance = looks.rows(row)[0, others]
         scores = similarity(summaries[i], [summaries[j] for j in others], appearance, WEIGHTS, SIMILAR)
-        for k in np.argsort(-scores, kind="stable")[: settings.loop_candidates]:
+        for k in np.argsort(-scores, kind="stable")[:PER_KEYFRAME]:
             if scores[k] > SIMILAR:
                 out.add((min(i, others[k]), max(i, others[k])))
     return out

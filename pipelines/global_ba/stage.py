@@ -57,7 +57,9 @@ def run(context: StageContext) -> dict[str, Any]:
     fields = context.run.load_depth_fields("tracking")
     settings = context.config.global_ba
 
-    found = search(context, model) if settings.use_loops else FoundLoops([], 0, 0, 0, 0)
+    # Loops of panoramas are those that structure from motion closes: the pose graph knows no places.
+    is_rig = context.run.load_calibration().directions > 1
+    found = search(context, model) if settings.use_loops and not is_rig else FoundLoops([], 0, 0, 0, 0)
     closed = adjust(context, model, found)
     moved_px = 0.0
     if closed is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,9 @@ from pipelines.types import Trajectory
 
 def run(context: StageContext) -> dict[str, Any]:
     """The optimised map, made whole or submap by submap; poses and exposures refined with it."""
+    if context.run.load_calibration().directions > 1:  # six sides of one place stay one camera
+        mapping = replace(context.config.mapping, refine_poses=False)
+        context = replace(context, config=replace(context.config, mapping=mapping))
     trajectory = context.run.load_trajectory("tracking")
     kept, _ = split_frames(trajectory, context.config.mapping.hold_out)
     _require_views(context, kept)

@@ -52,7 +52,7 @@ def solve(model: pycolmap.Reconstruction, images: Sequence[int], refine_camera: 
     """Robust adjustment of these images, in place; deterministic."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_extra_params = refine_camera
-    options.print_summary = False
+    options.refine_sensor_from_rig = options.print_summary = False
     options.min_track_length = 2
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = _CAUCHY_PX

@@ -17,6 +17,7 @@ _PARAMETERS = {
     "SIMPLE_RADIAL": "f cx cy k1",
     "RADIAL": "f cx cy k1 k2",
     "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
 }
 
 
@@ -70,12 +71,13 @@ def _from_colmap(row: list[str], path: Path) -> Camera:
         raise InputError(f"{path}: a {model} camera has width, height and {len(names)} parameters: check its line")
     named = dict(zip(names, numbers[2:], strict=True))
     focal = named.get("f", 0.0)
-    distortion = tuple(named.get(name, 0.0) for name in ("k1", "k2", "p1", "p2"))
+    fisheye = model == "OPENCV_FISHEYE"
+    distortion = tuple(named.get(name, 0.0) for name in (("k1 k2 k3 k4" if fisheye else "k1 k2 p1 p2").split()))
     if not all(1 <= side <= 1e6 for side in numbers[:2]):
         raise InputError(f"{path}: a camera of {numbers[0]:g}x{numbers[1]:g} pixels: check its line")
     return Camera(
         int(numbers[0]), int(numbers[1]), named.get("fx", focal), named.get("fy", focal), named["cx"], named["cy"],
-        distortion,
+        distortion, fisheye,
     )  # fmt: skip
 
 

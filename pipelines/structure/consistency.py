@@ -78,11 +78,12 @@ def judge(
 ) -> ModelReport:
     """Report on a model; `pairs` are indices i of keyframes whose image id is i + 1, `xy` their features' pixels.
 
-    `reach`: keyframes at most so many places apart are neighbours.
+    total: places where the camera stood; keyframes i, i + total and so on are views from one place in several
+    directions, and the report is about places. `reach`: places at most so many apart are neighbours.
     """
-    checks = check_pairs(model, pairs, xy)
+    checks = check_pairs(model, pairs, xy, total)
     matches, agreeing = sum(c.matches for c in checks), sum(c.agreeing for c in checks)
-    placed, tracks = sorted(i - 1 for i in model.reg_image_ids()), tracks_of(model)
+    placed, tracks = sorted({(i - 1) % total for i in model.reg_image_ids()}), tracks_of(model, total)
     seams = find_seams(placed, checks, tracks, reach)
     parts = find_parts(placed, seams, tracks)
     return ModelReport(
@@ -93,19 +94,23 @@ def judge(
 
 
 def without_misplaced(
-    model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], xy: Sequence[NDArray[np.float64]], reach: int
+    model: pycolmap.Reconstruction,
+    pairs: Sequence[VerifiedPair],
+    xy: Sequence[NDArray[np.float64]],
+    total: int,
+    reach: int,
 ) -> pycolmap.Reconstruction:
     """The model, keyframes that their neighbours contradict taken out of it in place; arguments as of `judge`."""
-    misplaced = find_misplaced(check_pairs(model, pairs, xy), reach)
-    if 0 < len(misplaced) <= _MOST_MISPLACED * model.num_reg_images():  # of more, who knows which are right
+    misplaced = find_misplaced(check_pairs(model, pairs, xy, total), reach)
+    if 0 < len(misplaced) <= _MOST_MISPLACED * model.num_reg_frames():  # of more, who knows which are right
         take_out(model, misplaced)
     return model
 
 
 def check_pairs(
-    model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], xy: Sequence[NDArray[np.float64]]
+    model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], xy: Sequence[NDArray[np.float64]], total: int
 ) -> list[PairCheck]:
-    """How far the matches of each pair of placed keyframes agree with their poses."""
+    """How far the matches of each pair of placed keyframes agree with their poses; by place, see `judge`."""
     camera = model.cameras[1]
     rays = {i - 1: np.asarray(camera.cam_from_img(xy[i - 1])) for i in model.reg_image_ids()}
     poses = {i: model.images[i + 1].cam_from_world().matrix() for i in rays}
@@ -118,7 +123,8 @@ def check_pairs(
             poses[pair.first], poses[pair.second],
             rays[pair.first][pair.matches[:, 0]], rays[pair.second][pair.matches[:, 1]],
         )  # fmt: skip
-        checks.append(PairCheck(pair.first, pair.second, len(error), int((error * focal < _AGREE_PX).sum())))
+        first, second = sorted((pair.first % total, pair.second % total))
+        checks.append(PairCheck(first, second, len(error), int((error * focal < _AGREE_PX).sum())))
     return checks
 
 

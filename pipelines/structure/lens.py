@@ -16,10 +16,14 @@ _BORDER_POINTS = 65
 
 
 def to_pycolmap(camera: Camera) -> pycolmap.Camera:
-    """A fixed camera with known intrinsics: OPENCV with distortion, FULL_OPENCV with a third radial one, or PINHOLE."""
+    """A fixed camera with known intrinsics: OPENCV with distortion, FULL_OPENCV with a third radial one, PINHOLE, or
+    OPENCV_FISHEYE."""
     params = [camera.fx, camera.fy, camera.cx, camera.cy]
     model = "PINHOLE"
-    if any(camera.distortion[4:]):
+    if camera.fisheye:
+        model = "OPENCV_FISHEYE"
+        params += (*camera.distortion, 0.0, 0.0, 0.0, 0.0)[:4]
+    elif any(camera.distortion[4:]):
         model = "FULL_OPENCV"
         params += [*camera.distortion, 0.0, 0.0, 0.0]
     elif any(camera.distortion):
@@ -79,15 +83,15 @@ class Lens:
 
     def undistort_image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """(H, W, 3) of the source as the pinhole sees it."""
-        x, y = self._maps()
+        x, y = self.maps()
         return cv2.remap(rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.uint8, copy=False)
 
     def undistort_mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """(H, W) of the source as the pinhole sees it."""
-        x, y = self._maps()
+        x, y = self.maps()
         return cv2.remap(mask.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) > 0
 
-    def _maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         columns, rows = np.meshgrid(np.arange(self.pinhole.width) + 0.5, np.arange(self.pinhole.height) + 0.5)
         source = _distort(self.camera, self.pinhole, np.stack([columns.ravel(), rows.ravel()], axis=1))
         # OpenCV counts pixel centres from (0, 0).

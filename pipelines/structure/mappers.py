@@ -37,6 +37,7 @@ def map_globally(
     # Half the time, on two recordings the same poses: the longest tracks hold the views together as well as all do,
     # and the last adjustment has all of them again.
     mapper.bundle_adjustment.refine_extra_params = refine_camera and bend_lens
+    mapper.refine_sensor_from_rig = mapper.bundle_adjustment.refine_sensor_from_rig = False
     mapper.track_required_tracks_per_view, mapper.ba_num_iterations = 300, 2
     return _largest(pycolmap.global_mapping(database, work, work, options))
 
@@ -49,6 +50,7 @@ def map_incrementally(database: Path, work: Path, refine_camera: bool, seed: int
         part.random_seed = seed
     options.extract_colors = False
     options.min_model_size = 3
+    options.ba_refine_sensor_from_rig = False
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = refine_camera
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = refine_camera
     return _largest(pycolmap.incremental_mapping(database, work, work, options))

@@ -122,7 +122,8 @@ def find_misplaced(checks: Iterable[PairCheck], reach: int) -> list[int]:
 
 
 def take_out(model: pycolmap.Reconstruction, keyframes: Iterable[int]) -> None:
-    """Remove keyframes and their observations from the model, in place; image i + 1 is keyframe i."""
+    """Remove keyframes and their observations from the model, in place, all that was seen from their places; image
+    i + 1 is keyframe i."""
     for k in keyframes:
         model.deregister_frame(model.images[k + 1].frame_id)
     model.tear_down()  # the covariance of an adjustment wants a pose of every image there is
@@ -149,18 +150,18 @@ def find_parts(placed: Sequence[int], seams: Iterable[Seam], tracks: Iterable[Se
     return sorted(parts.values(), key=lambda p: (-len(p), p[0]))
 
 
-def tracks_of(model: pycolmap.Reconstruction) -> list[list[int]]:
-    """For every point the keyframes that see it, sorted; image i + 1 is keyframe i."""
-    return [sorted({e.image_id - 1 for e in p.track.elements}) for p in model.points3D.values()]
+def tracks_of(model: pycolmap.Reconstruction, total: int) -> list[list[int]]:
+    """For every point the places it is seen from, sorted; image i + 1 is keyframe i, at place i % total."""
+    return [sorted({(e.image_id - 1) % total for e in p.track.elements}) for p in model.points3D.values()]
 
 
-def cut(model: pycolmap.Reconstruction, parts: Sequence[Sequence[int]]) -> None:
-    """Take the observations away by which a point is seen from more than one part, in place; the larger part keeps
-    it."""
+def cut(model: pycolmap.Reconstruction, parts: Sequence[Sequence[int]], total: int) -> None:
+    """Take the observations away by which a point is seen from more than one part of the places, in place; the larger
+    part keeps it."""
     part = {k: n for n, members in enumerate(parts) for k in members}
     for point_id in sorted(model.point3D_ids()):
         elements = model.points3D[point_id].track.elements
-        owners = [part[e.image_id - 1] for e in elements]
+        owners = [part[(e.image_id - 1) % total] for e in elements]
         keeper = min(set(owners), key=lambda o: (-owners.count(o), o))
         stray = [(e.image_id, e.point2D_idx) for e, o in zip(elements, owners, strict=True) if o != keeper]
         for image_id, index in stray:

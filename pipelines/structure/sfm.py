@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -28,6 +28,7 @@ from pipelines.correspondence.retrieval import (
     sequential_pairs,
 )
 from pipelines.correspondence.snapshots import Snapshots
+from pipelines.geometry.rig import ONE_CAMERA
 from pipelines.progress import Progress
 from pipelines.streamed import Streamed
 from pipelines.structure.adjust import adjust
@@ -53,7 +54,7 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Structure:
-    """An adjusted reconstruction (image i + 1 is keyframe i, camera 1 is the only one) and how good it is.
+    """An adjusted reconstruction (image i + 1 is keyframe i, all cameras are as camera 1) and how good it is.
 
     No point is seen from two of the report's parts: nothing tells how these lie to each other. `tried` are the pairs
     of keyframes that were matched, `pairs` those of them that obey one geometry. `pieces` are further models, in the
@@ -83,7 +84,7 @@ class _Adjusted:
 class StructureFromMotion:
     """`load_gray(frame_id)` gives an (H, W) uint8 frame, `left_out(frame_id)` what of it is no part of the scene
     (H, W), None where all of it is; `camera` is what is known of the camera before, and `is_fixed` says that it is
-    known exactly."""
+    known exactly. cam_from_rig (C, 3, 3): the keyframes come direction by direction, as `Rig` counts frames."""
 
     config: FramesConfig
     camera: pycolmap.Camera
@@ -95,6 +96,7 @@ class StructureFromMotion:
     threads: int
     seed: int
     memory: float = math.inf
+    cam_from_rig: NDArray[np.float64] = field(default_factory=lambda: ONE_CAMERA.cam_from_rig)
 
     def run(self, keyframe_ids: Sequence[int]) -> Structure:
         """Raises InputError when the keyframes have no parallax or too little in common."""
@@ -117,9 +119,12 @@ class StructureFromMotion:
             if again is not None and again.focal_sd < found.focal_sd and again.score >= _AS_GOOD * found.score:
                 found = again
         found, pieces = self._largest_first(found, self._pieces(features, pairs, found.model))
-        report = judge(found.model, pairs, xy, len(features), self.config.overlap)
-        cut(found.model, report.parts)
+        report = judge(found.model, pairs, xy, self._places(features), self.config.overlap)
+        cut(found.model, report.parts, report.total)
         return Structure(found.model, report, found.mapper, found.focal_sd, features, vocabulary, tried, pairs, pieces)
+
+    def _places(self, features: Sequence[Features]) -> int:
+        return len(features) // len(self.cam_from_rig)
 
     def _adjusted(
         self, features: Sequence[Features], pairs: Sequence[VerifiedPair], mappers: Sequence[str]
@@ -155,7 +160,7 @@ class StructureFromMotion:
                 return pieces
             piece = found[0]
             adjust(piece, refine_camera=False)
-            report = judge(piece, rest, xy, len(features), self.config.overlap)
+            report = judge(piece, rest, xy, self._places(features), self.config.overlap)
             left -= {i - 1 for i in piece.reg_image_ids()}
             if self._is_piece(report):
                 take_out(piece, [k for part in report.parts[1:] for k in part])
@@ -198,9 +203,13 @@ class StructureFromMotion:
         return features
 
     def _proposed(self, features: Sequence[Features], vocabulary: Vocabulary) -> list[tuple[int, int]]:
-        looks = Looks((np.stack([describe(f, vocabulary) for f in features]),))
-        loops = loop_pairs(looks, far_apart(len(features), self.config.overlap + 1), self.config.loop_candidates)
-        return sorted({*sequential_pairs(len(features), self.config.overlap), *loops})
+        looks, places = Looks((np.stack([describe(f, vocabulary) for f in features]),)), self._places(features)
+        loops = loop_pairs(
+            looks, far_apart(len(features), self.config.overlap + 1, places), self.config.loop_candidates
+        )
+        following = sequential_pairs(places, self.config.overlap)
+        firsts = range(0, len(features), places)
+        return sorted({*((n + i, n + j) for n in firsts for i, j in following), *loops})
 
     def _pairs(self, features: Sequence[Features], proposed: Sequence[tuple[int, int]]) -> list[VerifiedPair]:
         blocks = [proposed[i : i + _PAIRS_PER_BLOCK] for i in range(0, len(proposed), _PAIRS_PER_BLOCK)]
@@ -232,11 +241,11 @@ class StructureFromMotion:
             model = self.snapshots.model(name, lambda work, n=name: self._run_mapper(n, work, features, pairs))  # type: ignore[misc]
             if model is None:
                 continue
-            model = without_misplaced(model, pairs, xy, self.config.overlap)
-            report = judge(model, pairs, xy, len(features), self.config.overlap)
+            model = without_misplaced(model, pairs, xy, self._places(features), self.config.overlap)
+            report = judge(model, pairs, xy, self._places(features), self.config.overlap)
             if best is None or report.score > best[2].score:
                 best = model, name, report
-        if best is None or best[2].registered < min(_MIN_KEYFRAMES, len(features)) or best[2].points < _MIN_POINTS:
+        if best is None or best[2].registered < min(_MIN_KEYFRAMES, best[2].total) or best[2].points < _MIN_POINTS:
             return None
         return best
 
@@ -244,7 +253,8 @@ class StructureFromMotion:
         self, name: str, work: Path, features: Sequence[Features], pairs: Sequence[VerifiedPair]
     ) -> pycolmap.Reconstruction | None:
         database = work / "database.db"
-        write_database(database, self.camera, [f"{i:06d}" for i in range(len(features))], features, pairs)
+        names = [f"{i:06d}" for i in range(len(features))]
+        write_database(database, self.camera, names, features, pairs, self.cam_from_rig)
         if not self.camera.has_prior_focal_length:
             calibrate_focal(database, self.seed)
         if name == "incremental":

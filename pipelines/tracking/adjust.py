@@ -15,6 +15,7 @@ from pipelines.depth.align import align_keyframes
 from pipelines.depth.fields import DepthFields
 from pipelines.depth.scales import COARSE, WorldScale
 from pipelines.tracking.bundle import Bundle, adjust_bundle, adjust_pose
+from pipelines.tracking.places import settle_places
 from pipelines.tracking.state import TrackState
 from pipelines.types import Intrinsics, ProxyMaps, SparseModel, rows_by
 
@@ -75,7 +76,7 @@ def adjust_state(
     for round_number in range(ROUNDS):
         bundle = set_scale(bundle, ties, intrinsics)
         tied = with_depths(bundle, ties, intrinsics, settings)
-        result = adjust_bundle(tied, intrinsics, ITERATIONS)
+        result = adjust_bundle(tied, intrinsics, ITERATIONS, ids=np.array(frame_ids), rig=state.rig)
         initial = result.initial_cost if initial is None else initial
         bundle = result.bundle
         if round_number < ROUNDS - 1:
@@ -86,6 +87,7 @@ def adjust_state(
     seen = np.isfinite(errors)  # not so of points that the last round has left behind a camera
     write_back(state, bundle, frame_ids)
     follow_others(state, intrinsics, set(frame_ids), ties.factor)
+    settle_places(state)
     figures = {
         "adjusted_frames": len(frame_ids),
         "points": len(np.unique(bundle.obs_point)),

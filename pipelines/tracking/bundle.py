@@ -17,7 +17,9 @@ from scipy.sparse import bsr_matrix
 from scipy.sparse.linalg import splu
 
 from pipelines.geometry import se3
+from pipelines.geometry.rig import ONE_CAMERA, Rig
 from pipelines.tracking import bundle_kernels as kernels
+from pipelines.tracking.places import tie_cameras
 from pipelines.types import Intrinsics, require_shape
 
 Array = NDArray[np.float64]
@@ -91,13 +93,18 @@ def adjust_bundle(
     width: float = 2.0,
     fixed: NDArray[np.bool_] | None = None,
     tolerance: float = 1e-5,
+    ids: NDArray[np.int64] | None = None,
+    rig: Rig = ONE_CAMERA,
 ) -> Adjusted:
     """Minimise reprojection and depth errors, each under Cauchy's loss of `width` standard deviations.
 
     `fixed` (N,) bool: cameras that do not move. The free motion of the whole is left to the damping, so poses stay near
-    where they were. Stops when a step lowers the cost by less than `tolerance`, relatively.
+    where they were. `ids` (N,): the cameras' frames, of which those at one place of the `rig` move together. Stops when
+    a step lowers the cost by less than `tolerance`, relatively.
     """
-    problem = _Problem(bundle, intrinsics, width, fixed)
+    problem = _Problem(
+        bundle, intrinsics, width, fixed, np.arange(len(bundle.cam_from_world)) if ids is None else ids, rig
+    )
     motions, points = bundle.cam_from_world.copy(), bundle.points.copy()
     cost = initial = problem.cost(motions, points)
     damping, done = 1e-4, 0
@@ -126,7 +133,10 @@ def adjust_bundle(
 class _Problem:
     """The arrays of a bundle in the order the kernels want: by point, then by camera."""
 
-    def __init__(self, bundle: Bundle, intrinsics: Intrinsics, width: float, fixed: NDArray[np.bool_] | None) -> None:
+    def __init__(
+        self, bundle: Bundle, intrinsics: Intrinsics, width: float, fixed: NDArray[np.bool_] | None,
+        ids: NDArray[np.int64], rig: Rig,
+    ) -> None:  # fmt: skip
         order = np.lexsort((bundle.obs_cam, bundle.obs_point))
         b = bundle.select(order)
         known = b.obs_depth > 0
@@ -140,6 +150,7 @@ class _Problem:
         self.numbers, _ = kernels.number_blocks(self.starts, self.obs_cam, len(b.cam_from_world))
         self.pairs = np.argwhere(self.numbers >= 0)
         self.dense_cameras = DENSE_CAMERAS
+        self.ids, self.rig = ids, rig
 
     def cost(self, motions: Array, points: Array) -> float:
         return float(kernels.total_cost(motions, points, *self.data))
@@ -158,14 +169,20 @@ class _Problem:
             blocks[np.diag(self.numbers), i, i] += damping * diagonal[:, i] + 1e-9
         inverse = kernels.invert_points(point_block, damping)
         kernels.eliminate_points(self.starts, self.obs_cam, mixed, inverse, point_right, self.numbers, blocks, right)
-        step = np.zeros(6 * n)
-        free = np.repeat(self.free, 6)
+        pairs, moving, turns, place = self.pairs, self.free, None, np.arange(n)
+        if len(self.rig) > 1:
+            blocks, pairs, right, place, turns = tie_cameras(blocks, pairs, right, self.ids, self.rig)
+            moving = np.bincount(place, ~self.free) == 0
+        step = np.zeros(6 * len(moving))
+        free = np.repeat(moving, 6)
         if free.any():
-            solved = solve_blocks(blocks, self.pairs, n, right, free, self.dense_cameras)
+            solved = solve_blocks(blocks, pairs, len(moving), right, free, self.dense_cameras)
             if solved is None:
                 return None
             step[free] = solved
-        cam_step = step.reshape(n, 6)
+        cam_step = step.reshape(-1, 6)[place]
+        if turns is not None:
+            cam_step = np.einsum("nij,nj->ni", turns, cam_step)
         shift = kernels.point_steps(self.obs_cam, self.obs_point, mixed, inverse, point_right, cam_step)
         return cam_step, shift
 

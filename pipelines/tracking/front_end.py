@@ -57,7 +57,9 @@ class FrontEnd:
 
     def by_flow(self, frame_id: int) -> tuple[Sightings, FramePose | None, Array | None]:
         """Sightings, the pose they agree on, and the predicted one, in the segment of the frames before."""
-        near = {i: self.state.poses[i] for i in range(frame_id - REACH, frame_id + REACH) if i in self.state.poses}
+        camera = frame_id // self.state.rig.stations
+        reach = [i for i in range(frame_id - REACH, frame_id + REACH) if i // self.state.rig.stations == camera]
+        near = {i: self.state.poses[i] for i in reach if i in self.state.poses}
         if not near:
             return NO_SIGHTINGS, None, None
         closest = min(near, key=lambda i: (abs(i - frame_id), i))

@@ -38,6 +38,7 @@ def _alone(state: TrackState, segment: int) -> TrackState:
         [k for k in state.keyframes if state.segment[k] == segment],
         segment=dict.fromkeys(inside, segment),
         rendered=[i for i in state.rendered if state.segment[i] == segment],
+        rig=state.rig,
     )
 
 

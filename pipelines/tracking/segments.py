@@ -47,9 +47,13 @@ def split_segments(state: TrackState) -> None:
         for table in (state.poses, state.sightings, state.segment):
             del table[frame_id]
     rows = [state.sightings[k].point for k in state.keyframes]
+    # Places hold views together as points do.
+    rows = [
+        np.append(r, len(state.points) + k % state.rig.stations) for r, k in zip(rows, state.keyframes, strict=True)
+    ]
     keyframe = np.repeat(np.arange(len(rows)), [len(r) for r in rows])
     point = np.concatenate([np.zeros(0, np.int64), *rows])
-    size = len(rows) + len(state.points)
+    size = len(rows) + int(point.max(initial=0)) + 1
     seen = coo_matrix((np.ones(len(point), np.int8), (keyframe, len(rows) + point)), (size, size))
     _, label = connected_components(seen, directed=False)
     of_keyframe = label[: len(rows)].tolist()

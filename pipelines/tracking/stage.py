@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from formats.errors import InputError
+from pipelines.geometry.rig import Rig, rig_of
 from pipelines.run_folder import RunFolder, save_depth_fields, save_figures, save_sparse, save_trajectory
 from pipelines.stages import Stage, StageContext
 from pipelines.stopping import is_asked
 from pipelines.tracking.adjust import Report, adjust_state, align_depths, without_dependent_depth
 from pipelines.tracking.front_end import FrontEnd
 from pipelines.tracking.pictures import Pictures
+from pipelines.tracking.places import settle_places
 from pipelines.tracking.refine import RenderWeights, compare_frame
 from pipelines.tracking.result import split_worlds, to_sparse_model, to_trajectory
 from pipelines.tracking.segments import join_segments, split_segments
@@ -63,7 +66,10 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
     """Every frame visited once; goes on from the last snapshot."""
     settings, weights = context.config.tracking, RenderWeights.of(context.config.article)
     snapshot = context.snapshot / "state.npz"
-    state = TrackState.load(snapshot) if snapshot.exists() else start_state(context)
+    rig = rig_of(context.run.load_calibration().directions, len(frames))
+    if len(rig) > 1:  # what one direction does not show, the others do
+        settings = replace(settings, new_segments=False, render="never")
+    state = TrackState.load(snapshot, rig) if snapshot.exists() else start_state(context, rig)
     front_end = FrontEnd(state, pictures, settings, context.config.run.seed, weights)
     every = max(settings.snapshot_every, len(frames) // SNAPSHOTS)
     for frame in context.progress.track(frames[state.done :], "tracking", len(frames) - state.done):
@@ -72,6 +78,7 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
         state.done += 1
         if state.done % every == 0 or is_asked():
             state.save(snapshot)
+    settle_places(state)
     add_pieces(state, context.run, context.config.frames.least_piece)
     # Frames before the first keyframe could not be followed from anywhere; now there are neighbours behind them.
     for frame_id in sorted(state.lost, reverse=True):
@@ -79,6 +86,7 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
     for frame_id in sorted(state.lost) if context.run.pieces("frames") else ():
         front_end.track(frame_id, may_start=False)
     join_segments(state, pictures, context.config.run.seed)
+    settle_places(state)
     return state
 
 
@@ -90,12 +98,12 @@ def add_pieces(state: TrackState, run: RunFolder, least: int) -> None:
             state.add_segment(model)
 
 
-def start_state(context: StageContext) -> TrackState:
+def start_state(context: StageContext, rig: Rig) -> TrackState:
     """The backbone, its parts as segments, or nothing yet."""
     backbone = context.run.load_backbone()
     if backbone is None:
-        return TrackState()
-    state = TrackState.from_backbone(backbone, FEATURE_SD)
+        return TrackState(rig=rig)
+    state = TrackState.from_backbone(backbone, FEATURE_SD, rig)
     split_segments(state)
     return state
 

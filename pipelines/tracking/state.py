@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.tensors import load_arrays, save_arrays
+from pipelines.geometry.rig import ONE_CAMERA, Rig
 from pipelines.types import SparseModel
 
 Array = NDArray[np.float64]
@@ -51,7 +52,8 @@ class TrackState:
     """points (P, 3) in the world, colors (P, 3); per frame id its pose cam_from_world, its sightings or why it is lost.
 
     `segment` numbers connected stretches: poses of different segments cannot be compared. `rendered` are the
-    frames that only rendering could pose; `done` counts the frames that have been visited.
+    frames that only rendering could pose; `done` counts the frames that have been visited; `rig` says which frames were
+    taken at one place.
     """
 
     points: Array = field(default_factory=lambda: np.zeros((0, 3)))
@@ -63,11 +65,12 @@ class TrackState:
     segment: dict[int, int] = field(default_factory=dict)
     rendered: list[int] = field(default_factory=list)
     done: int = 0
+    rig: Rig = ONE_CAMERA
 
     @staticmethod
-    def from_backbone(model: SparseModel, sd: float) -> TrackState:
+    def from_backbone(model: SparseModel, sd: float, rig: Rig = ONE_CAMERA) -> TrackState:
         """The keyframes and points of structure from motion as segment 0."""
-        state = TrackState(model.points_in_world.copy(), model.colors.copy())
+        state = TrackState(model.points_in_world.copy(), model.colors.copy(), rig=rig)
         for k, frame_id in enumerate(int(i) for i in model.frame_ids):
             mine = model.observations_of(k)
             seen = Sightings(model.obs_point[mine].astype(np.int64), model.obs_xy[mine], np.full(len(mine), sd))
@@ -144,7 +147,7 @@ class TrackState:
         save_arrays(path, arrays)
 
     @staticmethod
-    def load(path: Path) -> TrackState:
+    def load(path: Path, rig: Rig = ONE_CAMERA) -> TrackState:
         """Inverse of `save`."""
         a = load_arrays(path)
         ends = np.cumsum(a["counts"])
@@ -163,4 +166,5 @@ class TrackState:
             dict(zip(ids, (int(s) for s in a["segment"]), strict=True)),
             [int(i) for i in a["rendered"]],
             int(a["done"]),
+            rig,
         )

@@ -68,7 +68,7 @@ def test_wrong_text_is_refused(text: str, what: str) -> None:
     ("content", "what"),
     [
         ("1 PINHOLE 480 640 525 526 240 320\n", "another shape"),
-        ("1 OPENCV_FISHEYE 640 480 525 526 320 240 0 0 0 0\n", "not supported"),
+        ("1 RAD_TAN_THIN_PRISM_FISHEYE 640 480 525 526 320 240 0 0 0 0\n", "not supported"),
         ("1 PINHOLE 640 480 525 526 320\n", "4 parameters"),
         ("hello world\n", "holds no camera"),
         ("1 2 3 4 5 6 7 8 9\n", "no calibration matrix"),

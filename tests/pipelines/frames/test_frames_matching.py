@@ -24,6 +24,7 @@ from pipelines.correspondence.retrieval import (
 )
 from pipelines.correspondence.snapshots import Snapshots
 from pipelines.frames.keyframes import choose_keyframes
+from pipelines.geometry.rig import ONE_CAMERA
 from pipelines.structure.consistency import epipolar_error, judge, without_misplaced
 from pipelines.structure.parallax import rotation_residual
 from pipelines.types import Features
@@ -268,12 +269,12 @@ def test_a_folded_model_is_recognised() -> None:
 def test_one_misplaced_view_is_taken_out_and_half_of_them_are_not() -> None:
     for turned, left in (([4], 9), (range(5, 10), 10), ([], 10)):
         model, pairs, xy = _known_model(0.5, turned)
-        model = without_misplaced(model, pairs, xy, reach=3)
+        model = without_misplaced(model, pairs, xy, total=10, reach=3)
         assert model.num_reg_images() == left
         assert judge(model, pairs, xy, total=10, reach=3).is_sound == (len(turned) == 0)
     # The nine that are left agree; the tenth is missed.
     model, pairs, xy = _known_model(0.5, [4])
-    report = judge(without_misplaced(model, pairs, xy, reach=3), pairs, xy, total=10, reach=3)
+    report = judge(without_misplaced(model, pairs, xy, total=10, reach=3), pairs, xy, total=10, reach=3)
     assert report.pairs_agreeing > 0.99
     assert (report.registered, report.contradicted) == (9, [])
 
@@ -284,7 +285,7 @@ def test_pycolmap_reads_the_database(tmp_path: Path) -> None:
     matches = np.stack([np.arange(15), np.arange(15)[::-1]], axis=1).astype(np.uint32)
     pair = VerifiedPair(0, 2, matches, 3, np.stack([rng.random((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))]), 18)
     for _ in range(2):  # the second replaces the first
-        write_database(tmp_path / "a.db", CAMERA, ["x", "y", "z"], features, [pair])
+        write_database(tmp_path / "a.db", CAMERA, ["x", "y", "z"], features, [pair], ONE_CAMERA.cam_from_rig)
     with pycolmap.Database.open(tmp_path / "a.db") as database:
         assert [i.name for i in database.read_all_images()] == ["x", "y", "z"]
         assert database.num_verified_image_pairs() == 1

@@ -92,7 +92,7 @@ def test_what_is_taken_out_leaves_no_observation(made_model: pycolmap.Reconstruc
     before = len(made_model.points3D)
     take_out(made_model, [4, 7])
     assert sorted(made_model.reg_image_ids()) == [1, 2, 3, 4, 6, 7, 9, 10]
-    tracks = tracks_of(made_model)
+    tracks = tracks_of(made_model, 10)
     assert 50 < len(tracks) <= before
     assert not any({4, 7} & set(t) for t in tracks)
     focal = made_model.cameras[1].focal_length
@@ -127,18 +127,18 @@ def made_model() -> pycolmap.Reconstruction:
 
 def test_after_the_cut_no_point_is_seen_from_two_parts(made_model: pycolmap.Reconstruction) -> None:
     parts = [[0, 1, 2, 3, 4, 5], [6, 7, 8, 9]]
-    assert any(min(t) < 6 <= max(t) for t in tracks_of(made_model))
-    cut(made_model, parts)
-    tracks = tracks_of(made_model)
+    assert any(min(t) < 6 <= max(t) for t in tracks_of(made_model, 10))
+    cut(made_model, parts, 10)
+    tracks = tracks_of(made_model, 10)
     assert len(tracks) > 50
     assert all(max(t) < 6 or min(t) >= 6 for t in tracks)
     assert np.bincount([t[0] >= 6 for t in tracks])[0] > 50
 
 
 def test_a_whole_model_is_not_touched(made_model: pycolmap.Reconstruction) -> None:
-    before = tracks_of(made_model)
-    cut(made_model, [list(range(10))])
-    assert tracks_of(made_model) == before
+    before = tracks_of(made_model, 10)
+    cut(made_model, [list(range(10))], 10)
+    assert tracks_of(made_model, 10) == before
 
 
 def _seam(before: int, points: int = 50, agreement: float = 0.9) -> Seam:

@@ -1,0 +1,58 @@
+"""A camera that looks in several directions at once: each panorama is the six sides of a cube about its centre."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.types import require_shape
+
+Array = NDArray[np.float64]
+
+LEVEL = 4
+"""The first so many sides look to the horizon."""
+_AHEAD = np.array([[0, 0, 1], [1, 0, 0], [0, 0, -1], [-1, 0, 0], [0, -1, 0], [0, 1, 0]], np.float64)
+_DOWN = np.array([[0, 1, 0]] * LEVEL + [[0, 0, 1], [0, 0, -1]], np.float64)
+CUBE = np.stack([np.cross(_DOWN, _AHEAD), _DOWN, _AHEAD], axis=1)
+"""(6, 3, 3) side_from_rig: front, right, back, left, up, down; the rig's axes are those of its front."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Cameras of one kind that look from one point: at each of `stations` places camera c takes frame
+    c * stations + place, so that the frames of one camera follow each other.
+
+    cam_from_rig (C, 3, 3): how each is turned. Of a single camera every frame is a place.
+    """
+
+    stations: int
+    cam_from_rig: Array
+
+    def __post_init__(self) -> None:
+        require_shape("cam_from_rig", self.cam_from_rig, (None, 3, 3))
+
+    def __len__(self) -> int:
+        return len(self.cam_from_rig)
+
+    def frames_of(self, stations: Iterable[int]) -> list[int]:
+        """What all cameras took at these places, camera by camera."""
+        return [c * self.stations + s for c in range(len(self)) for s in stations]
+
+    @property
+    def motions(self) -> Array:
+        """(C, 4, 4) cam_from_rig."""
+        out = np.tile(np.eye(4), (len(self), 1, 1))
+        out[:, :3, :3] = self.cam_from_rig
+        return out
+
+
+ONE_CAMERA = Rig(1 << 62, np.eye(3)[None])
+"""Whatever the number of a frame, it is a place of its own."""
+
+
+def rig_of(directions: int, frames: int) -> Rig:
+    """Of so many frames in all, by a camera that looks in 1 or 6 directions."""
+    return Rig(frames // len(CUBE), CUBE) if directions == len(CUBE) else ONE_CAMERA
