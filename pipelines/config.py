@@ -210,9 +210,6 @@ class ExportConfig:
     splat_glb: bool = setting(False, "write the map as point_cloud.glb too (glTF, KHR_gaussian_splatting)")
     sh_rest: bool = setting(False, "the splat PLYs hold f_rest_0 to 44 too, all zero, for readers that insist on them")
     texture: bool = setting(False, "write a lighter mesh with a texture of photographs too: mesh_textured.*")
-    least_piece: float = setting(
-        0.01, "connected pieces smaller than this share of the largest one are removed", within=(0, 1)
-    )
 
 
 _MAPPING = ("mapping",)

@@ -37,7 +37,7 @@ _FIXED = {
     "global_ba": "features words loop_shared_points richness loop_similarity miou_weight appearance_weight "
     "structure_weight loop_error loop_share loop_sure_inliers loop_rotation loop_translation loop_drift "
     "loop_angle_drift loop_scale_drift loop_inliers drift_px joint_px loop_candidates",
-    "export": "truncation least_weight",
+    "export": "truncation least_weight least_piece",
 }
 FIXED = frozenset(f"{section}.{name}" for section, names in _FIXED.items() for name in names.split())
 """Constants now, beside the code that uses them, at what was their default."""

@@ -40,13 +40,17 @@ def depth_views(outcome: Outcome, settings: ExportConfig, progress: Progress) ->
     return [depth_view(gaussian_map, poses[r], camera) for r in progress.track(rows, "depth views", len(rows))]
 
 
+_LEAST_PIECE = 0.01
+"""Connected pieces smaller than this share of the largest one are floaters."""
+
+
 def make_mesh(outcome: Outcome, views: list[DepthView], settings: ExportConfig, progress: Progress) -> SemanticMesh:
     """The surface of the map as the keyframes see it; without a vertex where nothing is seen twice."""
     gaussian_map = outcome.require_map()
     voxel = settings.voxel * _median_depth(views)
     volume = fuse(views, voxel, TRUNCATION, settings.max_blocks, get_threads())
     least = LEAST_WEIGHT if len(views) >= 4 else 0.5
-    vertices, faces = without_floaters(*extract_surface(volume, least), settings.least_piece)
+    vertices, faces = without_floaters(*extract_surface(volume, least), _LEAST_PIECE)
     painted = progress.track(_painted(gaussian_map, views), "painting", len(views))
     colors, labels = paint(vertices, painted, tuple(outcome.label_of_channel.tolist()), 2 * volume.truncation)
     return SemanticMesh(vertices, faces, colors, labels)
