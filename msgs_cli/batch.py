@@ -11,6 +11,8 @@ import click
 from msgs_cli.options import (
     FOLDER,
     UNTIL,
+    engine_options,
+    require_engine,
     set_up_logging,
     settings_options,
     source_options,
@@ -28,11 +30,7 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("folder", type=FOLDER)
 @click.option("--out", type=FOLDER, required=True, metavar="RUNS", help="Where the runs, batch.json and batch.md go.")
-@click.option(
-    "--engine", "engine_name", type=click.Choice(["local", "ray"]), default="local", show_default=True,
-    help="local: one recording after the other; ray: as many at once as the cluster has room for.",
-)  # fmt: skip
-@click.option("--address", default="", metavar="HOST:PORT", help="Join this Ray cluster. Default: this machine alone.")
+@engine_options("local: one recording after the other; ray: as many at once as the cluster has room for.")
 @click.option("--shard", default="0/1", metavar="K/N", help="Every N-th recording only, the K-th from 0 on.")
 @settings_options
 @source_options
@@ -58,8 +56,7 @@ def batch(
     indexed jobs, AWS Batch: docs/batch.md).
     """
     set_up_logging(quiet, verbose)
-    if address and engine_name != "ray":
-        raise click.UsageError("--address is of --engine ray")
+    require_engine(engine_name, address)
     from formats.jsonfile import read_toml
     from pipelines.batch import Shard, find_recordings, run_batch, table_rows, write_table
     from pipelines.config import load_config

@@ -25,6 +25,8 @@ from msgs_cli.options import (
     LOG_FORMAT,
     RUN_ARGUMENT,
     UNTIL,
+    cluster_workers,
+    engine_options,
     make_progress,
     open_run,
     set_up_logging,
@@ -100,6 +102,7 @@ def main() -> None:
     "--hold-out", type=click.IntRange(0), metavar="N",
     help="Keep every N-th frame out of the map, to measure it there (evaluate). Default: 0, use all.",
 )  # fmt: skip
+@engine_options("local: all in this process; ray: keyframes' depths and submaps on the nodes of a cluster.")
 @verbosity_options
 def reconstruct(
     sources: tuple[Path, ...],
@@ -108,6 +111,8 @@ def reconstruct(
     overrides: tuple[str, ...],
     until: str,
     hold_out: int | None,
+    engine_name: str,
+    address: str,
     quiet: bool,
     verbose: bool,
     **about_source: str | None,
@@ -128,8 +133,11 @@ def reconstruct(
     texts = source_settings(about_source)
     texts += [f"mapping.hold_out={hold_out}"] if hold_out is not None else []
     config = load_config(config_file, [*overrides, *texts], base=existing_config(run))
-    with stopping_softly(f"Go on with: msgs-slam resume {run.root}"):
-        records = run_reconstruct(one_source(sources, run), run, config, make_progress(quiet), until)
+    with (
+        cluster_workers(engine_name, address, config, quiet, verbose) as (workers, config),
+        stopping_softly(f"Go on with: msgs-slam resume {run.root}"),
+    ):
+        records = run_reconstruct(one_source(sources, run), run, config, make_progress(quiet), until, workers)
     if not quiet:
         _print_summary(run.root, records)
 
@@ -138,9 +146,17 @@ def reconstruct(
 @RUN_ARGUMENT
 @settings_options
 @UNTIL
+@engine_options("local: all in this process; ray: keyframes' depths and submaps on the nodes of a cluster.")
 @verbosity_options
 def resume(
-    run_path: Path, config_file: Path | None, overrides: tuple[str, ...], until: str, quiet: bool, verbose: bool
+    run_path: Path,
+    config_file: Path | None,
+    overrides: tuple[str, ...],
+    until: str,
+    engine_name: str,
+    address: str,
+    quiet: bool,
+    verbose: bool,
 ) -> None:
     """Go on with RUN where it stopped. Finished stages are kept unless one of their settings is changed."""
     set_up_logging(quiet, verbose)
@@ -153,8 +169,11 @@ def resume(
     run = RunFolder(run_path)
     require_run(run)
     config = load_config(config_file, overrides, base=load_settings(run))
-    with stopping_softly(f"Go on with: msgs-slam resume {run.root}"):
-        records = run_resume(run, make_progress(quiet), config, until)
+    with (
+        cluster_workers(engine_name, address, config, quiet, verbose) as (workers, config),
+        stopping_softly(f"Go on with: msgs-slam resume {run.root}"),
+    ):
+        records = run_resume(run, make_progress(quiet), config, until, workers)
     if not quiet:
         _print_summary(run.root, records)
 
@@ -175,6 +194,7 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
         return
     say(f"{run.root}: made from {found.source}\n")
     say(status_table(found.stages, verbose))
+    say(found.memory)
     records = {s.name: s.record for s in found.stages if s.record}
     whole = {s.name: s.record for s in found.stages if s.record and not s.damaged}
     for line in scale_lines(run.root, whole):

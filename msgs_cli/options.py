@@ -8,6 +8,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,8 +20,10 @@ from msgs_cli.text import PrintableFormatter, say
 from pipelines.run_folder_names import STAGES
 
 if TYPE_CHECKING:
+    from pipelines.config import Config
     from pipelines.progress import Progress
     from pipelines.run_folder import RunFolder
+    from pipelines.workers import Workers
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 RUN_ARGUMENT = click.argument("run_path", metavar="RUN", type=FOLDER)
@@ -59,6 +62,52 @@ def settings_options(command: Callable[..., None]) -> Callable[..., None]:
         "--config", "config_file", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
         help="Settings in TOML; `msgs-slam config` prints one to start from.",
     )(command)  # fmt: skip
+
+
+def engine_options(help: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """--engine and --address."""
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        command = click.option(
+            "--address", default="", metavar="HOST:PORT", help="Join this Ray cluster. Default: this machine alone."
+        )(command)
+        engines = click.Choice(["local", "ray"])
+        return click.option("--engine", "engine_name", type=engines, default="local", show_default=True, help=help)(
+            command
+        )
+
+    return decorate
+
+
+def require_engine(name: str, address: str) -> None:
+    """Refuse an address that nobody would join."""
+    if address and name != "ray":
+        raise click.UsageError("--address is of --engine ray")
+
+
+@contextmanager
+def cluster_workers(
+    name: str, address: str, config: Config, quiet: bool, verbose: bool
+) -> Iterator[tuple[Workers | None, Config]]:
+    """The workers that take a run's tasks, None for this process, and the settings that follow: the same number of
+    threads on every node, or the results would differ."""
+    require_engine(name, address)
+    if name == "local":
+        yield None, config
+        return
+    from pipelines.engines import RayEngine
+    from pipelines.workers import Workers
+
+    engine = RayEngine(address)
+    try:
+        threads = config.run.threads or engine.smallest_node
+        setup, gpus = worker_setup(quiet, verbose, True), int(config.run.device == "cuda")
+        yield (
+            Workers(engine, setup, threads, gpus, engine.room(threads)),
+            replace(config, run=replace(config.run, threads=threads)),
+        )
+    finally:
+        engine.close()
 
 
 _SOURCE_OPTIONS = {

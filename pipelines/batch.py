@@ -6,7 +6,6 @@ any number of batches over the same folders may be started, killed and started a
 
 from __future__ import annotations
 
-import platform
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,11 +21,11 @@ from pipelines.engines import Call, Engine
 from pipelines.frames.recording import open_recording
 from pipelines.lock import RunBusyError
 from pipelines.progress import Progress, log
-from pipelines.reconstruct import all_stages, existing_config, reconstruct
+from pipelines.reconstruct import existing_config, reconstruct
 from pipelines.records import load_records
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
-from pipelines.stage_identity import stage_identity
+from pipelines.workers import code_identity, require_same_world
 
 _VIDEOS = {
     ".3gp", ".avi", ".flv", ".insv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".sens",
@@ -145,7 +144,7 @@ def work_on(job: Job) -> str:
     by anybody."""
     recording, progress = job.recording, job.prepare(job.recording.name)
     try:
-        _require_same_world(job)
+        require_same_world([recording.source, recording.run.parent], job.code)
         reconstruct(recording.source, RunFolder(recording.run), job.config(), progress, job.until)
     except RunBusyError:
         return ELSEWHERE
@@ -157,27 +156,6 @@ def work_on(job: Job) -> str:
         return FAILED
     recording.failure_file.unlink(missing_ok=True)
     return DONE
-
-
-def _require_same_world(job: Job) -> None:
-    """This node sees the folders, and has the program that the others have."""
-    recording, node = job.recording, platform.node()
-    for folder in (recording.source, recording.run.parent):
-        if not folder.exists():
-            raise InputError(
-                f"the node {node} does not see {folder}: sources and runs must lie on a disk that all nodes have under "
-                "the same path"
-            )
-    if job.code != (here := code_identity()):
-        raise InputError(
-            f"the node {node} has another version of the program ({here[:12]}, not {job.code[:12]}): install the same "
-            "on every node"
-        )
-
-
-def code_identity() -> str:
-    """Of what the stages compute with."""
-    return " ".join(stage_identity(stage.name, stage.file) for stage in all_stages())
 
 
 def table_rows(recordings: Iterable[Recording]) -> list[dict[str, Any]]:

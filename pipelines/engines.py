@@ -151,6 +151,10 @@ class RayEngine:
         nodes = [n["Resources"].get("CPU", 0) for n in self._ray.nodes() if n["Alive"]]
         return max(int(min((c for c in nodes if c >= 1), default=1)), 1)
 
+    def room(self, cpus: int) -> int:
+        """How many calls of so many CPUs there is room for."""
+        return max(sum(int(n["Resources"].get("CPU", 0)) // cpus for n in self._ray.nodes() if n["Alive"]), 1)
+
     def run(self, calls: Sequence[Call]) -> Iterator[Ended]:
         """As they end."""
         ray = self._ray

@@ -20,6 +20,7 @@ from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import SOURCE_LIST, STAGES
 from pipelines.settings_file import load_settings
 from pipelines.stages import Stage, run_stages
+from pipelines.workers import Workers
 
 
 def all_stages() -> list[Stage]:
@@ -78,7 +79,12 @@ def made_with(run: RunFolder) -> Config:
 
 
 def reconstruct(
-    source: Path, run: RunFolder, config: Config, progress: Progress, until: str = STAGES[-1]
+    source: Path,
+    run: RunFolder,
+    config: Config,
+    progress: Progress,
+    until: str = STAGES[-1],
+    workers: Workers | None = None,
 ) -> dict[str, StageRecord]:
     """Make, or bring up to date, the run of `source`.
 
@@ -90,11 +96,15 @@ def reconstruct(
     config = _with_device(config)
     with locked(run):
         _require_same_source(run, source, digest)
-        return _run(run, source.resolve(), digest, config, progress, until)
+        return _run(run, source.resolve(), digest, config, progress, until, workers)
 
 
 def resume(
-    run: RunFolder, progress: Progress, config: Config | None = None, until: str = STAGES[-1]
+    run: RunFolder,
+    progress: Progress,
+    config: Config | None = None,
+    until: str = STAGES[-1],
+    workers: Workers | None = None,
 ) -> dict[str, StageRecord]:
     """Go on with a run from its own settings, or from `config`."""
     require_run(run)
@@ -104,7 +114,7 @@ def resume(
     source = Path(origin.path)
     config = _with_device(config or load_settings(run))
     with locked(run):
-        return _run(run, source, origin.digest, config, progress, until)
+        return _run(run, source, origin.digest, config, progress, until, workers)
 
 
 def require_run(run: RunFolder) -> None:
@@ -116,7 +126,13 @@ def require_run(run: RunFolder) -> None:
 
 
 def _run(
-    run: RunFolder, source: Path, digest: str, config: Config, progress: Progress, until: str
+    run: RunFolder,
+    source: Path,
+    digest: str,
+    config: Config,
+    progress: Progress,
+    until: str,
+    workers: Workers | None,
 ) -> dict[str, StageRecord]:
     def same_source() -> None:
         kept = f"What is done so far is kept: bring it back, then type `msgs-slam resume {run.root}`"
@@ -130,8 +146,8 @@ def _run(
                 "folder: --out NEW"
             )
 
-    _set_threads(config.run.threads or os.cpu_count() or 1)
-    return run_stages(all_stages(), run, source, digest, config, progress, until, same_source)
+    set_threads(config.run.threads or os.cpu_count() or 1)
+    return run_stages(all_stages(), run, source, digest, config, progress, until, same_source, workers)
 
 
 def _require_run_or_empty(run: RunFolder) -> None:
@@ -162,7 +178,8 @@ def _with_device(config: Config) -> Config:
     return replace(config, run=replace(config.run, device=settle_device(config.run.device)))
 
 
-def _set_threads(threads: int) -> None:
+def set_threads(threads: int) -> None:
+    """How many CPU threads this process uses."""
     import cv2
     import torch
 

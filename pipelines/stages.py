@@ -38,6 +38,7 @@ from pipelines.settings_file import save_settings
 from pipelines.stage_identity import stage_identity
 from pipelines.stopping import stop_if_asked
 from pipelines.streamed import memory_room
+from pipelines.workers import Workers
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -58,7 +59,8 @@ class StageContext:
     `folder` is the stage's own unfinished folder: it writes its result there, and may keep snapshots under
     `folder / "snapshot"`, which is removed when the stage ends well. What an interrupted attempt with the same
     settings and inputs has left in `folder` is still there when the stage starts again. `stages` are all of the run;
-    `same_source` raises RecoverableError where the source is not, or no longer, what the run was begun from.
+    `same_source` raises RecoverableError where the source is not, or no longer, what the run was begun from; `workers`
+    take the tasks that a stage is divided into, None for this process.
     """
 
     run: RunFolder
@@ -69,6 +71,7 @@ class StageContext:
     warnings: list[str] = field(default_factory=list)
     stages: list[Stage] = field(default_factory=list)
     same_source: SameSource = _trusted
+    workers: Workers | None = None
 
     @property
     def snapshot(self) -> Path:
@@ -93,9 +96,11 @@ class StageContext:
         return settle_device(self.config.run.device)
 
     def each(self, work: Callable[[T, Progress], R], tasks: Sequence[T]) -> list[R]:
-        """What `work`, a function of a module's top level, returns of every task, in their order: here, one after the
-        other."""
-        return [work(task, self.progress) for task in tasks]
+        """What `work`, a function of a module's top level, returns of every task, in their order: done here, one after
+        the other, or by the workers. A task leaves files below `folder`, and does nothing where they are."""
+        if self.workers is None:
+            return [work(task, self.progress) for task in tasks]
+        return self.workers.each(work, tasks, self.folder)
 
     def warn(self, message: str) -> None:
         """A degraded result: logged now, counted and kept for the report."""
@@ -133,6 +138,7 @@ def run_stages(
     progress: Progress,
     until: str = STAGES[-1],
     same_source: SameSource = _trusted,
+    workers: Workers | None = None,
 ) -> dict[str, StageRecord]:
     """Bring every stage up to `until` up to date; returns their records.
 
@@ -156,7 +162,7 @@ def run_stages(
             if _drop(records, stage.name):
                 write_manifest(run.manifest_file, Manifest(origin, records))
             folder = run.partial(stage.name)
-            context = StageContext(run, source, config, folder, progress, stages=stages, same_source=same_source)
+            context = StageContext(run, source, config, folder, progress, [], stages, same_source, workers)
             record = _run_one(stage, context, fingerprint, inputs[stage.name])
             records[stage.name] = record
             write_manifest(run.manifest_file, Manifest(origin, records))

@@ -9,6 +9,7 @@ from pipelines.records import StageRecord, differing_settings, load_records, loa
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
 from pipelines.settings_file import load_settings
+from pipelines.streamed import memory_room
 
 DONE, DAMAGED, INTERRUPTED, OUTDATED, NOT_YET = "done", "damaged", "interrupted", "outdated", "not yet"
 
@@ -29,11 +30,21 @@ class StageStatus:
 
 @dataclass(frozen=True)
 class RunStatus:
-    """source: the path that the run was made from; stages: all of them, in order."""
+    """source: the path that the run was made from; stages: all of them, in order; planned_mb: the memory that windows
+    are chosen by, `run.memory_mb` or half of this machine's."""
 
     run: RunFolder
     source: str
     stages: tuple[StageStatus, ...]
+    planned_mb: float
+
+    @property
+    def memory(self) -> str:
+        """What stages plan with here, and what the ones that are done have needed most."""
+        peaks = {s.name: s.record.peak_memory_mb for s in self.stages if s.record}
+        most = max(peaks, key=lambda name: peaks[name], default="")
+        needed = f"; at most {peaks[most]:.0f} MB were needed ({most})" if most else ""
+        return f"memory: planned with {self.planned_mb:.0f} MB{needed}"
 
     @property
     def warnings(self) -> list[str]:
@@ -62,7 +73,13 @@ class RunStatus:
             stages.append(
                 {"name": s.name, "state": s.state, "changed": s.changed, "damaged": s.damaged, "record": record}
             )
-        return {"run": str(self.run.root), "source": self.source, "stages": stages, "warnings": self.warnings}
+        return {
+            "run": str(self.run.root),
+            "source": self.source,
+            "planned_mb": round(self.planned_mb),
+            "stages": stages,
+            "warnings": self.warnings,
+        }
 
 
 def run_status(run: RunFolder) -> RunStatus:
@@ -77,7 +94,7 @@ def run_status(run: RunFolder) -> RunStatus:
         changed = tuple(differing_settings(record, config)) if record else ()
         damaged = tuple(run.damaged(name))
         stages.append(StageStatus(name, _state(run, name, record, damaged), record, changed, damaged))
-    return RunStatus(run, load_source(run).path, tuple(stages))
+    return RunStatus(run, load_source(run).path, tuple(stages), memory_room(config.run.memory_mb) / 1e6)
 
 
 def _state(run: RunFolder, name: str, record: StageRecord | None, damaged: tuple[str, ...]) -> str:

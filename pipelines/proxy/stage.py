@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
-from pipelines.config import ProxyConfig
+from pipelines.config import Config, ProxyConfig
 from pipelines.frames.recording import open_recording
-from pipelines.progress import log
+from pipelines.progress import Progress, log
 from pipelines.proxy.compact import compact
 from pipelines.proxy.inputs import check_proxy, proxy_inputs
 from pipelines.proxy.metres import reference_scale, scale_figures
@@ -24,6 +24,7 @@ from pipelines.proxy.selection import Surroundings, open_depth, open_semantics
 from pipelines.proxy.sequence import Sequence
 from pipelines.proxy.symmetry import find_mirror_planes, mirror_pairs
 from pipelines.run_folder import (
+    RunFolder,
     load_proxy_maps,
     proxy_path,
     save_classes,
@@ -36,28 +37,22 @@ from pipelines.run_folder import (
 from pipelines.stages import Stage, StageContext
 from pipelines.types import VOID, Features, Frame, ProxyMaps
 
+_PORTIONS = 3
+"""Tasks a worker, so that all end at about the same time."""
+
 
 def run(context: StageContext) -> dict[str, Any]:
     """Provide maps of every keyframe (every frame without a backbone, or on request)."""
     config = context.config.proxy
     sequence = _load_sequence(context)
-    around = Surroundings(
-        context.source,
-        sequence,
-        config,
-        lambda name: context.snapshot / name,
-        context.threads,
-        context.config.run.device,
-        context.progress,
-        open_recording(context.source, context.config.run.format),
-        context.config.run.cache_mb,
-    )
+    around = _surroundings(context, sequence)
     depths = open_depth(around)
     semantics = open_semantics(around)
     log.info("proxy: depth by %s, classes by %s", depths.name, semantics.name)
     frames = _frames_to_do(context, sequence, config, depths)
     _warn_of_missing(context, frames, depths, semantics)
     _warn_of_distortion(context, sequence, depths, semantics)
+    _depths_by_workers(context, frames)
     _depth_pass(context, sequence, frames, depths)
     scale = measure_scale(sequence, frames, lambda frame: _load_depth(context.snapshot, frame))
     reference = reference_scale(
@@ -82,6 +77,20 @@ def run(context: StageContext) -> dict[str, Any]:
     _warn_of_focal(context, sequence, report.get("network_focal_px"))
     save_figures(context.folder, "proxy", report)
     return report
+
+
+def _surroundings(context: StageContext, sequence: Sequence) -> Surroundings:
+    return Surroundings(
+        context.source,
+        sequence,
+        context.config.proxy,
+        lambda name: context.snapshot / name,
+        context.threads,
+        context.config.run.device,
+        context.progress,
+        open_recording(context.source, context.config.run.format),
+        context.config.run.cache_mb,
+    )
 
 
 def _load_sequence(context: StageContext) -> Sequence:
@@ -147,6 +156,48 @@ def _depth_pass(context: StageContext, sequence: Sequence, frames: list[Frame], 
             arrays = {"depth": estimate.depth, "confidence": estimate.confidence, "invalid": np.array(estimate.invalid)}
             normals = {} if estimate.normals is None else {"normals": estimate.normals}
             save_scratch(path, **arrays, **normals)
+
+
+@dataclass(frozen=True)
+class DepthTask:
+    """The depths of some frames of a run, into the unfinished folder of this stage."""
+
+    run: RunFolder
+    source: Path
+    config: Config
+    folder: Path
+    frame_ids: tuple[int, ...]
+
+
+def _depths_by_workers(context: StageContext, frames: list[Frame]) -> None:
+    """What `_depth_pass` is to find: first what each frame's depth needs of the others, then the depths."""
+    if context.workers is None:
+        return
+    count = min(_PORTIONS * context.workers.at_once, len(frames))
+    portions = np.array_split(np.array([f.id for f in frames]), max(count, 1))
+    tasks = [
+        DepthTask(context.run, context.source, context.config, context.folder, tuple(ids.tolist())) for ids in portions
+    ]
+    for work in (prepare_depths, make_depths):
+        context.each(work, tasks)
+
+
+def prepare_depths(task: DepthTask, progress: Progress) -> None:
+    """The slow passes over the frames."""
+    _, _, frames, depths = _opened(task, progress)
+    depths.prepare(frames)
+
+
+def make_depths(task: DepthTask, progress: Progress) -> None:
+    """The depths of the frames."""
+    _depth_pass(*_opened(task, progress))
+
+
+def _opened(task: DepthTask, progress: Progress) -> tuple[StageContext, Sequence, list[Frame], DepthProvider]:
+    context = StageContext(task.run, task.source, task.config, task.folder, progress)
+    sequence = _load_sequence(context)
+    frames = [f for f in sequence.frames if f.id in set(task.frame_ids)]
+    return context, sequence, frames, open_depth(_surroundings(context, sequence))
 
 
 def _depth_path(snapshot: Path, frame: Frame) -> Path:

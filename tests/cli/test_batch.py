@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 from formats.errors import InputError
 from formats.images import write_rgb
 from msgs_cli.main import main
-from pipelines import batch
+from pipelines import workers
 from pipelines.batch import DONE, ELSEWHERE, FAILED, Job, Recording, Shard, find_recordings, work_on
 from pipelines.engines import Call, Ended
 from pipelines.lock import locked
@@ -75,7 +75,7 @@ class Here:
 
 def job_of(recording: Recording, **changes: object) -> Job:
     given = {"settings": {}, "overrides": QUICK, "until": "frames", "prepare": _silent, "code": ""}
-    return Job(recording, **{**given, "code": batch.code_identity(), **changes})  # type: ignore[arg-type]
+    return Job(recording, **{**given, "code": workers.code_identity(), **changes})  # type: ignore[arg-type]
 
 
 def _silent(name: str) -> SilentProgress:
@@ -96,7 +96,7 @@ def test_what_another_process_works_on_is_left_to_it(recordings: Path, tmp_path:
 def test_a_node_that_sees_no_folder_or_has_another_program_is_named(
     recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(batch.platform, "node", lambda: "node-7")
+    monkeypatch.setattr(workers.platform, "node", lambda: "node-7")
     elsewhere = Recording("walk", tmp_path / "disk" / "walk", tmp_path / "walk.msgs")
     assert work_on(job_of(elsewhere)) == FAILED
     assert "the node node-7 does not see" in elsewhere.failure_file.read_text()

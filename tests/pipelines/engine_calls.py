@@ -5,6 +5,9 @@ import signal
 import time
 from pathlib import Path
 
+from formats.errors import InputError
+from pipelines.progress import SilentProgress
+
 
 def double(value: int) -> int:
     return 2 * value
@@ -31,3 +34,15 @@ def wait(marker: str) -> None:
     for _ in range(600):
         stop_if_asked()
         time.sleep(0.05)
+
+
+def silent(name: str) -> SilentProgress:
+    """As a process elsewhere begins a task."""
+    return SilentProgress()
+
+
+def halve(value: int, progress: SilentProgress) -> int:
+    """A task that refuses odd numbers."""
+    if value % 2:
+        raise InputError(f"{value} is odd")
+    return value // 2

@@ -1,0 +1,94 @@
+"""Where the tasks of one run are worked on when that is not this process: by an engine, over a shared disk."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from formats.atomic import watched_by
+from formats.errors import InputError, RecoverableError
+from pipelines.engines import Call, Engine
+from pipelines.journal import Journal
+from pipelines.progress import Progress
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Workers:
+    """`prepare` sets logging up there and makes the progress of a named task; threads, gpus: what a task takes of its
+    node; at_once: how many tasks may run at the same time."""
+
+    engine: Engine
+    prepare: Callable[[str], Progress]
+    threads: int
+    gpus: int = 0
+    at_once: int = 1
+
+    def each(self, work: Callable[[T, Progress], R], tasks: Sequence[T], folder: Path) -> list[R]:
+        """What `work` returns of every task, in their order; the tasks write below `folder`, a stage's unfinished one.
+
+        Raises RecoverableError where a task was refused or lost; what the others have written stays.
+        """
+        code, kind = code_identity(), work.__name__
+        names = [f"{kind} {n}" for n in range(1, len(tasks) + 1)]
+        calls = [
+            Call(name, _work_on, (work, task, name, self.prepare, folder, self.threads, code), self.threads, self.gpus)
+            for name, task in zip(names, tasks, strict=True)
+        ]
+        found: dict[str, R] = {}
+        for ended in self.engine.run(calls):
+            if ended.failure:
+                raise RecoverableError(
+                    f"{ended.call.name}: {ended.failure.rstrip()}\nWhat the other tasks have done is kept: type "
+                    f"`msgs-slam resume {folder.parent}`"
+                )
+            refused, found[ended.call.name] = ended.value
+            if refused:
+                raise RecoverableError(f"{ended.call.name}: {refused}")
+        return [found[name] for name in names]
+
+
+def _work_on(
+    work: Callable[[Any, Progress], Any], task: Any, name: str, prepare: Callable[[str], Progress], folder: Path,
+    threads: int, code: str,
+) -> tuple[str, Any]:  # fmt: skip
+    """(why it is refused or "", what `work` returns)."""
+    from pipelines.reconstruct import set_threads
+
+    progress = prepare(name)
+    try:
+        require_same_world([folder], code)
+        set_threads(threads)
+        with watched_by(Journal(folder)):
+            return "", work(task, progress)
+    except InputError as error:
+        return str(error), None
+
+
+def require_same_world(folders: Sequence[Path], code: str) -> None:
+    """Raise InputError unless this node sees the folders, and has the program that the others have."""
+    node = platform.node()
+    for folder in folders:
+        if not folder.exists():
+            raise InputError(
+                f"the node {node} does not see {folder}: sources and runs must lie on a disk that all nodes have under "
+                "the same path"
+            )
+    if code != (here := code_identity()):
+        raise InputError(
+            f"the node {node} has another version of the program ({here[:12]}, not {code[:12]}): install the same "
+            "on every node"
+        )
+
+
+def code_identity() -> str:
+    """Of what the stages compute with."""
+    from pipelines.reconstruct import all_stages
+    from pipelines.stage_identity import stage_identity
+
+    return " ".join(stage_identity(stage.name, stage.file) for stage in all_stages())
