@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 from formats.errors import InputError
 from formats.images import write_rgb
 from msgs_cli.main import main
-from pipelines import workers
+from pipelines import batch, workers
 from pipelines.batch import DONE, ELSEWHERE, FAILED, Job, Recording, Shard, find_recordings, work_on
 from pipelines.engines import Call, Ended
 from pipelines.lock import locked
