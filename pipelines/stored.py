@@ -25,6 +25,7 @@ _RIGID = 1e-4
 
 TRAJECTORY = {
     "frame_ids": "i N", "timestamps": "f N", "cam_from_world": "f N 4 4", "is_keyframe": "b N", "lost_reasons": "u N",
+    "by_rotation?": "b N",
 }  # fmt: skip
 SPARSE_MODEL = {
     "frame_ids": "i N", "cam_from_world": "f N 4 4", "points_in_world": "f P 3", "colors": "i P 3",

@@ -12,7 +12,7 @@ Conventions
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -260,7 +260,8 @@ class Trajectory:
     """A pose for every picked frame, or the reason why there is none.
 
     frame_ids (N,) int, timestamps (N,) seconds, cam_from_world (N, 4, 4) float64 (identity where lost),
-    is_keyframe (N,) bool, lost_reasons: N strings, "" where the frame is posed.
+    is_keyframe (N,) bool, lost_reasons: N strings, "" where the frame is posed. by_rotation (N,) bool: of the pose only
+    the rotation is known, the frame was put where its neighbour stands; by default of none.
     """
 
     frame_ids: NDArray[np.int64]
@@ -268,12 +269,16 @@ class Trajectory:
     cam_from_world: NDArray[np.float64]
     is_keyframe: NDArray[np.bool_]
     lost_reasons: tuple[str, ...]
+    by_rotation: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
 
     def __post_init__(self) -> None:
         n = len(self.frame_ids)
+        if not len(self.by_rotation):
+            object.__setattr__(self, "by_rotation", np.zeros(n, bool))
         require_shape("timestamps", self.timestamps, (n,))
         require_shape("cam_from_world", self.cam_from_world, (n, 4, 4))
         require_shape("is_keyframe", self.is_keyframe, (n,))
+        require_shape("by_rotation", self.by_rotation, (n,))
         if len(self.lost_reasons) != n:
             raise ValueError(f"lost_reasons: got {len(self.lost_reasons)}, expected {n}")
         if (self.is_keyframe & ~self.is_posed).any():
@@ -283,6 +288,11 @@ class Trajectory:
     def is_posed(self) -> NDArray[np.bool_]:
         """(N,) bool."""
         return np.array([not reason for reason in self.lost_reasons], dtype=bool)
+
+    @property
+    def is_placed(self) -> NDArray[np.bool_]:
+        """(N,) bool: of the pose both rotation and place are known."""
+        return self.is_posed & ~self.by_rotation
 
     @property
     def world_from_cam(self) -> NDArray[np.float64]:

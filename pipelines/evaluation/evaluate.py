@@ -127,7 +127,7 @@ def camera_cells(outcome: Outcome, truth: Sequence) -> dict[str, Any]:
 def trajectory_cells(outcome: Outcome, matched: MatchedTruth) -> tuple[dict[str, Any], AbsoluteError | None]:
     """ATE and RPE, and the Sim(3) alignment over all frames (SE(3) where the depth is metric)."""
     t = outcome.trajectory
-    usable = t.is_posed & matched.has_pose
+    usable = t.is_placed & matched.has_pose
     if usable.sum() < 3:
         why = f"only {int(usable.sum())} posed frames have a true pose, three are needed"
         return {"missing": why}, None
@@ -165,7 +165,7 @@ def frame_errors(outcome: Outcome, matched: MatchedTruth, alignment: AbsoluteErr
     """[frame id, metres] of every frame that the alignment was made from."""
     if alignment is None:
         return []
-    ids = outcome.trajectory.frame_ids[outcome.trajectory.is_posed & matched.has_pose]
+    ids = outcome.trajectory.frame_ids[outcome.trajectory.is_placed & matched.has_pose]
     return [[int(i), float(e)] for i, e in zip(ids, alignment.errors, strict=True)]
 
 

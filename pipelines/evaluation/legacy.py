@@ -21,7 +21,7 @@ NOTE = (
 def legacy_cells(outcome: Outcome, matched: MatchedTruth, measured: Measured | None) -> dict[str, Any]:
     """Both trajectories begin at the identity; then the mean distance of cam_from_world translations after a rigid
     alignment; PSNR over keyframes at their own poses."""
-    rows = np.flatnonzero(outcome.trajectory.is_posed & matched.has_pose)
+    rows = np.flatnonzero(outcome.trajectory.is_placed & matched.has_pose)
     if len(rows) < 3:
         return {"note": NOTE, "missing": "fewer than three frames have both poses"}
     estimate = outcome.trajectory.cam_from_world[rows]

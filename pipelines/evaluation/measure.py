@@ -120,7 +120,7 @@ def _jobs(
     t = outcome.trajectory
     keyframes, held_out = split_frames(t, outcome.config.mapping.hold_out)
     used = {*keyframes, *held_out, *t.frame_ids[t.is_keyframe].tolist()}
-    between = [i for i in t.frame_ids[t.is_posed].tolist() if i not in used]
+    between = [i for i in t.frame_ids[t.is_placed].tolist() if i not in used]
     poses = dict(zip(t.frame_ids.tolist(), t.cam_from_world, strict=True))
     jobs = []
     for kind, ids in ((KEYFRAMES, keyframes), (HELD_OUT, held_out), (BETWEEN, between)):

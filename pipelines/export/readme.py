@@ -8,7 +8,8 @@ from pipelines.upright.world import World
 _FILES = """\
 What is in this folder
 
-sparse/0/                 camera, poses and points as a COLMAP model, binary and text; pinhole, no distortion left.
+sparse/0/                 camera, poses and points as a COLMAP model, binary and text; pinhole, no distortion left. A
+                          frame of which only the rotation is known is in trajectory.txt alone.
                           Opens in COLMAP, pycolmap, and any Gaussian splatting trainer.
 frames/                   the undistorted frames that the model names.
 masks/                    only where people or --masks leave something out: NAME.png for the frame NAME, black is left

@@ -57,7 +57,7 @@ def run(context: StageContext) -> dict[str, Any]:
     if len(mesh.faces) == 0:
         context.warn("the mesh is empty: no surface is seen by enough keyframes")
     return {
-        "images": int(outcome.trajectory.is_posed.sum()),
+        "images": int(outcome.trajectory.is_placed.sum()),
         "gaussians": len(outcome.require_map()),
         "compact_map_mb": round((context.folder / "point_cloud_compact.safetensors").stat().st_size / 1e6, 2),
         **mesh_figures(mesh),

@@ -25,13 +25,14 @@ from pipelines.outcome import Outcome
 from pipelines.run_folder import save_classes
 from pipelines.types import SparseModel
 from pipelines.upright.world import World, save_world
+from pipelines.wording import stretches
 
 
 def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
-    """`sparse/0` (binary and text) and transforms.json, with the posed frames beside them in `frames/`, and their masks
-    in `masks/` where they have any."""
+    """`sparse/0` (binary and text) and transforms.json, with the frames whose place is known beside them in `frames/`,
+    and their masks in `masks/` where they have any."""
     trajectory, k = outcome.trajectory, outcome.calibration.intrinsics
-    posed = np.flatnonzero(trajectory.is_posed)
+    posed = np.flatnonzero(trajectory.is_placed)
     name_of = {f.id: f.name for f in outcome.frames}
     names = tuple(name_of[int(i)] for i in trajectory.frame_ids[posed])
     camera = (k.width, k.height, k.fx, k.fy, k.cx, k.cy)
@@ -117,8 +118,10 @@ def _by_class(cloud: GaussianCloud, outcome: Outcome) -> GaussianCloud:
 
 
 def write_trajectory(outcome: Outcome, folder: Path) -> list[Path]:
-    """The poses of all posed frames, of panoramas those of their middle."""
+    """The poses of all posed frames, of panoramas those of their middle; a comment names those that only turned."""
     t, note = outcome.trajectory, lengths(outcome.metres, outcome.metric)
+    if t.by_rotation.any():
+        note += f"\nTurned only, so put where their neighbours stand: frames {stretches(t.frame_ids[t.by_rotation])}."
     posed = np.flatnonzero(t.is_posed)
     posed = posed[t.frame_ids[posed] < rig_of(outcome.calibration.directions, len(outcome.frames)).stations]
     write_tum(folder / "trajectory.txt", t.timestamps[posed], t.world_from_cam[posed], note)

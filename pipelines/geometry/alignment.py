@@ -68,3 +68,9 @@ def align_points(source: NDArray, target: NDArray, with_scale: bool = True) -> S
     rotation = (u * signs) @ vt
     scale = float(d @ signs / (source_centred**2).sum(1).mean()) if with_scale else 1.0
     return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
+
+
+def best_rotation(source: Array, target: Array) -> Array:
+    """(3, 3) in SO(3) that takes the directions source (N, 3) nearest to target (N, 3) (Kabsch 1976)."""
+    u, _, vt = np.linalg.svd(target.T @ source)
+    return np.asarray((u * [1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt, np.float64)

@@ -106,8 +106,8 @@ def load_view(
 
 
 def split_frames(trajectory: Trajectory, hold_out: int) -> tuple[list[int], list[int]]:
-    """(ids of keyframes to use, ids of posed frames held out: every `hold_out`-th, from half of that on)."""
-    posed = trajectory.frame_ids[trajectory.is_posed].tolist()
+    """(ids of keyframes to use, ids held out of the placed frames: every `hold_out`-th, from half of that on)."""
+    posed = trajectory.frame_ids[trajectory.is_placed].tolist()
     keyframes = trajectory.frame_ids[trajectory.is_keyframe].tolist()
     if hold_out <= 0:
         return keyframes, []

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from formats.errors import InputError
 from pipelines.correspondence.matching import VerifiedPair
+from pipelines.geometry.alignment import best_rotation
 
 HOW_TO_FILM = (
     "Film again while walking: move the camera sideways by a tenth of the distance to what it shows, rather than "
@@ -79,9 +80,7 @@ def rotation_residual(
     centre = np.array(size) / 2
     first = _rays(xy[pair.first][pair.matches[:, 0]] - centre, focal)
     second = _rays(xy[pair.second][pair.matches[:, 1]] - centre, focal)
-    u, _, vt = np.linalg.svd(second.T @ first)
-    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    angle = np.linalg.norm(first @ rotation.T - second, axis=1)
+    angle = np.linalg.norm(first @ best_rotation(first, second).T - second, axis=1)
     return float(np.percentile(angle, 80) * focal)
 
 

@@ -39,6 +39,7 @@ def _alone(state: TrackState, segment: int) -> TrackState:
         segment=dict.fromkeys(inside, segment),
         rendered=[i for i in state.rendered if state.segment[i] == segment],
         rig=state.rig,
+        turned=[i for i in state.turned if state.segment[i] == segment],
     )
 
 
@@ -51,6 +52,7 @@ def to_trajectory(state: TrackState, frames: list[Frame]) -> Trajectory:
         cam_from_world=np.array([state.poses.get(f.id, np.eye(4)) for f in frames]),
         is_keyframe=np.array([f.id in keyframes for f in frames]),
         lost_reasons=tuple("" if f.id in state.poses else state.lost.get(f.id, "not tracked") for f in frames),
+        by_rotation=np.isin([f.id for f in frames], state.turned),
     )
 
 

@@ -20,6 +20,7 @@ from pipelines.tracking.refine import RenderWeights, compare_frame
 from pipelines.tracking.result import split_worlds, to_sparse_model, to_trajectory
 from pipelines.tracking.segments import join_segments, split_segments
 from pipelines.tracking.state import FEATURE_SD, TrackState
+from pipelines.tracking.turn import hold_turns
 from pipelines.types import Frame
 from pipelines.wording import stretches
 
@@ -44,6 +45,12 @@ def run(context: StageContext) -> dict[str, Any]:
         )
     report = adjust_state(state, intrinsics, pictures.proxy, metric, settings)
     compared = compare_all(context, state, pictures) if settings.render == "all" else {}
+    hold_turns(state, pictures, context.config.run.seed)
+    if state.turned:
+        context.warn(
+            f"{len(state.turned)} frames ({stretches(state.turned)}) are posed by rotation alone: how they are turned "
+            "against the frames beside them is known, where they stand is not"
+        )
     state, *pieces = split_worlds(state, context.config.frames.least_piece)
     save_pieces(context, pieces, frames)
 
@@ -144,6 +151,7 @@ def describe(state: TrackState, frames: list[Frame], report: Report, metric: boo
         "posed": len(state.poses),
         "keyframes": len(state.keyframes),
         "by_rendering": len(state.rendered),
+        "by_rotation": len(state.turned),
         "lost": {str(i): reason for i, reason in sorted(state.lost.items())},
         "scale": "metric" if metric and world else "free",
         "scale_relative_sd": world.relative_sd if world else None,

@@ -52,8 +52,8 @@ class TrackState:
     """points (P, 3) in the world, colors (P, 3); per frame id its pose cam_from_world, its sightings or why it is lost.
 
     `segment` numbers connected stretches: poses of different segments cannot be compared. `rendered` are the
-    frames that only rendering could pose; `done` counts the frames that have been visited; `rig` says which frames were
-    taken at one place.
+    frames that only rendering could pose, `turned` those of which only the rotation is known; `done` counts the frames
+    that have been visited; `rig` says which frames were taken at one place.
     """
 
     points: Array = field(default_factory=lambda: np.zeros((0, 3)))
@@ -66,6 +66,7 @@ class TrackState:
     rendered: list[int] = field(default_factory=list)
     done: int = 0
     rig: Rig = ONE_CAMERA
+    turned: list[int] = field(default_factory=list)
 
     @staticmethod
     def from_backbone(model: SparseModel, sd: float, rig: Rig = ONE_CAMERA) -> TrackState:

@@ -170,8 +170,8 @@ def measure_ours(name: str, work: Path, settings: Sequence[str], until: str) -> 
     truth = [case.truth(n, f.source_index) for n, f in zip(originals, frames, strict=True)]
     metric = bool(run.load_proxy_report().get("metric", False))
     return {
-        **errors(trajectory.cam_from_world, trajectory.is_posed, truth, metric),
-        "pieces": {name: errors(t.cam_from_world, t.is_posed, truth, False) for name, t in pieces.items()},
+        **errors(trajectory.cam_from_world, trajectory.is_placed, truth, metric),
+        "pieces": {name: errors(t.cam_from_world, t.is_placed, truth, False) for name, t in pieces.items()},
         "cpu_seconds": {stage: round(spent["cpu"], 1) for stage, spent in seconds.items()},
         "clock_seconds": {stage: round(spent["clock"], 1) for stage, spent in seconds.items()},
         "adjustment_cpu_seconds": round(sum(adjusting), 1),
@@ -392,6 +392,9 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
     parser.add_argument("--until", choices=("tracking", "mapping", "global_ba"), default="tracking")
     parser.add_argument("--colmap", action="store_true")
+    parser.add_argument(
+        "--mapper", action="append", choices=("incremental", "global"), help="of pycolmap's, this alone"
+    )
     parser.add_argument("--lengths", nargs="*", type=int, default=[])
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, help="folder for the runs, which a second call then takes up again")
@@ -407,7 +410,7 @@ def main() -> None:
                 ("ours", measure_ours, (name, work, arguments.set, arguments.until))
             ]
             if arguments.colmap and not name.startswith("walk_"):
-                jobs += [(m, measure_colmap, (name, work, m)) for m in ("incremental", "global")]
+                jobs += [(m, measure_colmap, (name, work, m)) for m in arguments.mapper or ("incremental", "global")]
             for method, job, args in jobs:
                 row = in_process(job, *args)
                 print_row(name, method, row)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -96,7 +96,7 @@ def room_frames() -> tuple[Intrinsics, list[WorldFrame]]:
 
 @pytest.fixture(scope="session")
 def make_run(room_frames: tuple[Intrinsics, list[WorldFrame]]) -> Callable[..., MadeRun]:
-    """make_run(folder, keyframes=..., depth_factor=..., metric=..., blank=..., all_proxies=...)."""
+    """make_run(folder, keyframes=..., depth_factor=..., metric=..., blank=..., all_proxies=..., more=...)."""
 
     def make(
         folder: Path,
@@ -106,8 +106,9 @@ def make_run(room_frames: tuple[Intrinsics, list[WorldFrame]]) -> Callable[..., 
         metric: bool = True,
         blank: tuple[int, ...] = (),
         all_proxies: bool = False,
+        more: Sequence[WorldFrame] = (),
     ) -> MadeRun:
-        intrinsics, frames = room_frames
+        intrinsics, frames = room_frames[0], [*room_frames[1], *more]
         truth = np.linalg.inv(np.array([f.world_from_cam for f in frames]))
         for sub in ("frames/backbone", "proxy/maps"):
             (folder / sub).mkdir(parents=True)
