@@ -34,6 +34,7 @@ class FrontEnd:
     ) -> None:
         self.state, self.pictures, self.settings, self.seed, self.weights = state, pictures, settings, seed, weights
         self.times = {i: frame.timestamp for i, frame in pictures.frames.items()}
+        self.looked: dict[int, int] = {}
 
     def track(self, frame_id: int, may_start: bool = True) -> None:
         """Pose one frame, or note why it is lost.
@@ -45,7 +46,9 @@ class FrontEnd:
         reason = f"{len(seen)} points followed from its keyframes, {_count(solved)} agree on a pose"
         if not self.is_trusted(seen, solved) and self.extend_before(frame_id):
             seen, solved, start = self.by_flow(frame_id)
-        if not self.is_trusted(seen, solved):
+        # As long as there is no further keyframe, a frame that was recognised nowhere is not.
+        if not self.is_trusted(seen, solved) and self.looked.get(frame_id) != len(self.state.keyframes):
+            self.looked[frame_id] = len(self.state.keyframes)
             seen, solved = relocalise(frame_id, self.state, self.pictures, self.seed)
             reason += f"; {len(seen)} matched in similar keyframes, {_count(solved)} agree"
         if solved is not None and self.is_trusted(seen, solved):
@@ -53,7 +56,7 @@ class FrontEnd:
             self.state.add_frame(frame_id, solved.cam_from_world, seen.select(solved.inliers), False, segment)
             self.extend_at(frame_id)
         elif not (self._by_rendering(frame_id) or (may_start and self._start(frame_id, start))):
-            self.state.lost[frame_id] = reason
+            self.state.lost.setdefault(frame_id, reason)
 
     def by_flow(self, frame_id: int) -> tuple[Sightings, FramePose | None, Array | None]:
         """Sightings, the pose they agree on, and the predicted one, in the segment of the frames before."""
