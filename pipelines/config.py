@@ -69,7 +69,8 @@ class FramesConfig:
     parallax: float = setting(
         0.025, "a new keyframe when points have moved by this fraction of the image width", within=(0.001, 0.5)
     )
-    max_features: int = setting(3000, "SIFT features of a keyframe, at most about this many", within=(50, 100_000))
+    features: str = setting("sift", "sift; aliked, with LightGlue, needs networks of 49 MB", ("sift", "aliked"))
+    max_features: int = setting(3000, "features of a keyframe, at most about this many", within=(50, 100_000))
     overlap: int = setting(
         8, "each keyframe is matched with this many after it (and a few further ones)", within=(1, 1000)
     )

@@ -41,12 +41,13 @@ def rows_by(group: NDArray[np.integer], count: int) -> list[NDArray[np.int64]]:
 
 @dataclass(frozen=True)
 class Features:
-    """keypoints (F, 4) float32: x, y in pixels, scale, orientation in radians; descriptors (F, 128) uint8 of length
-    NORM."""
+    """keypoints (F, 4) float32: x, y in pixels, scale, orientation in radians; descriptors (F, 128): SIFT as uint8 of
+    length NORM, learned ones, whose numbers have signs, as int8 of length SIGNED_NORM."""
 
     keypoints: NDArray[np.float32]
-    descriptors: NDArray[np.uint8]
+    descriptors: NDArray[np.uint8] | NDArray[np.int8]
     NORM: ClassVar[int] = 512
+    SIGNED_NORM: ClassVar[int] = 254
 
     def __post_init__(self) -> None:
         require_shape("keypoints", self.keypoints, (None, 4))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 from pipelines.jit import kernel
 from pipelines.types import Features
 
-MAX_RATIO, MAX_ANGLE = 0.8, 0.7
+_SIFT, _LEARNED = (0.8, 0.7), (1.0, 0.555)
 """Of the angle between two descriptors that match: as a share of the next best one's (Lowe), and in radians."""
+Descriptors = NDArray[np.uint8] | NDArray[np.int8]
 _MAX_ERROR, _MIN_INLIERS = 2.0, 15
 """Pixels within which a match obeys a geometry, and how many have to."""
 _FIRST_LOOK, _NEARLY = 300, 0.8
@@ -38,9 +40,10 @@ class VerifiedPair:
 
 
 def match_descriptors(
-    first: NDArray[np.uint8], second: NDArray[np.uint8], max_ratio: float = MAX_RATIO, max_angle: float = MAX_ANGLE
+    first: Descriptors, second: Descriptors, limits: tuple[float, float] | None = None
 ) -> NDArray[np.uint32]:
-    """(M, 2) mutual nearest neighbours that pass Lowe's ratio test, sorted by the first index.
+    """(M, 2) mutual nearest neighbours that pass Lowe's ratio test, sorted by the first index; `limits` are the largest
+    ratio and angle, those of the kind of descriptor unless given.
 
     The products of byte descriptors are whole numbers below 2^24, so the float matrix product is exact and the
     result does not depend on the order in which a BLAS adds.
@@ -49,8 +52,11 @@ def match_descriptors(
         return np.zeros((0, 2), np.uint32)
     similarity = first.astype(np.float32) @ second.astype(np.float32).T
     best, score, runner_up, best_back = _two_nearest(similarity)
-    angle = np.arccos(np.clip(score / Features.NORM**2, 0, 1))
-    next_angle = np.arccos(np.clip(runner_up / Features.NORM**2, 0, 1))
+    is_sift = first.dtype == np.uint8
+    max_ratio, max_angle = limits or (_SIFT if is_sift else _LEARNED)
+    norm = Features.NORM if is_sift else Features.SIGNED_NORM
+    angle = np.arccos(np.clip(score / norm**2, 0, 1))
+    next_angle = np.arccos(np.clip(runner_up / norm**2, 0, 1))
     index = np.arange(len(first))
     good = (best_back[best] == index) & (angle < max_angle) & (angle < max_ratio * next_angle)
     return np.stack([index[good], best[good]], axis=1).astype(np.uint32)
@@ -79,14 +85,23 @@ def _two_nearest(similarity):  # type: ignore[no-untyped-def]
     return best, score, runner_up, column_best
 
 
+def match_features(first: Features, second: Features) -> NDArray[np.uint32]:
+    """(M, 2) indices of features that are alike."""
+    return match_descriptors(first.descriptors, second.descriptors)
+
+
 def match_pair(
-    pair: tuple[int, int], features: tuple[Features, Features], camera: pycolmap.Camera, seed: int
+    pair: tuple[int, int],
+    features: tuple[Features, Features],
+    camera: pycolmap.Camera,
+    seed: int,
+    match: Callable[[Features, Features], NDArray[np.uint32]] = match_features,
 ) -> VerifiedPair | None:
     """Match two keyframes and keep what one epipolar geometry or homography explains; None where nothing does.
 
     The random choices depend on the seed and the pair alone, so pairs may be verified in any order on any thread.
     """
-    matches = match_descriptors(features[0].descriptors, features[1].descriptors)
+    matches = match(*features)
     if len(matches) < _MIN_INLIERS:
         return None
     return verify_matches(pair, matches, (features[0].xy, features[1].xy), camera, seed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,11 @@ from formats.jsonfile import read_json, write_json
 from formats.video import VideoFrame
 from pipelines.config import Config, FramesConfig
 from pipelines.correspondence.features import to_grey
+from pipelines.correspondence.matching import match_features
 from pipelines.correspondence.snapshots import Snapshots
 from pipelines.frames.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
 from pipelines.frames.keyframes import KeyframeChoice, choose_keyframes
+from pipelines.frames.learned import learned_inputs, open_learned, picture_features
 from pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
 from pipelines.frames.pick import sharpest_of_windows
 from pipelines.frames.recording import RecordingSource
@@ -42,7 +45,7 @@ from pipelines.structure.calibration import read_intrinsics
 from pipelines.structure.lens import Lens, distortion_of, make_lens, to_pycolmap, unknown_camera
 from pipelines.structure.parallax import require_motion
 from pipelines.structure.sfm import Structure, StructureFromMotion, parallel_map
-from pipelines.types import Calibration, Frame
+from pipelines.types import Calibration, Features, Frame
 
 _SIGNIFICANT_SHIFT_PX = 0.3
 _FEW_KEYFRAMES = 12
@@ -109,6 +112,7 @@ def check(source: Path, config: Config) -> None:
     opened = open_source(source, config.run.format)
     _require_several(opened)
     check_masks(source, config)
+    open_learned(config.frames)
     faces = find_faces(opened, config.frames)
     if faces is None and config.frames.intrinsics:
         read_intrinsics(config.frames.intrinsics, opened.width, opened.height)
@@ -245,12 +249,19 @@ def _structure(
     masks: FrameMasks,
     rig: Rig,
 ) -> Structure:
+    settings, size = context.config.frames, (camera.width, camera.height)
+    learned = open_learned(settings)
+
+    def extract(frame_id: int) -> Features:
+        rgb = read_rgb(_picked(context, frames[frame_id].name))
+        return picture_features(rgb, masks.left_out(frames[frame_id], *size), settings, learned)
+
     structure = StructureFromMotion(
-        config=context.config.frames,
+        config=settings,
         camera=camera,
         is_fixed=is_fixed,
-        load_gray=lambda frame_id: _gray(context, frames[frame_id]),
-        left_out=lambda frame_id: masks.left_out(frames[frame_id], camera.width, camera.height),
+        extract=extract,
+        match=match_features if learned is None else partial(learned.match, size=size),
         snapshots=Snapshots(context.snapshot),
         progress=context.progress,
         threads=context.threads,
@@ -394,7 +405,11 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
     }
 
 
+def _inputs(source: Path, config: Config) -> dict[str, str] | None:
+    return (mask_inputs(source, config) or {}) | learned_inputs(config.frames) or None
+
+
 STAGE = Stage(
     "frames", run, "pick frames, calibrate the camera, structure from motion over keyframes",
-    inputs=mask_inputs, check=check,
+    inputs=_inputs, check=check,
 )  # fmt: skip

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from formats.errors import InputError
 from pipelines.config import Config, ProxyConfig
+from pipelines.correspondence.features import extract_features, to_grey
 from pipelines.frames.recording import open_recording
 from pipelines.progress import Progress, log
 from pipelines.proxy.compact import compact
@@ -274,6 +275,8 @@ def _symmetry_pass(
     def features_of(frame: Frame) -> Features:
         kept = context.run.load_features(frame.id)
         assert kept is not None  # every frame with a pose is a keyframe
+        if kept.descriptors.dtype != np.uint8:  # nobody knows how a learned descriptor looks in a mirror
+            kept = extract_features(to_grey(context.run.image(frame)), context.config.frames.max_features)
         return replace(kept, keypoints=(kept.keypoints / [enlarge, enlarge, enlarge, 1]).astype(np.float32))
 
     planes = find_mirror_planes(

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from formats.errors import InputError
 from pipelines.config import FramesConfig
 from pipelines.correspondence.database import write_database
-from pipelines.correspondence.features import extract_features
 from pipelines.correspondence.matching import VerifiedPair, match_pair
 from pipelines.correspondence.retrieval import (
     Looks,
@@ -82,15 +81,15 @@ class _Adjusted:
 
 @dataclass(frozen=True)
 class StructureFromMotion:
-    """`load_gray(frame_id)` gives an (H, W) uint8 frame, `left_out(frame_id)` what of it is no part of the scene
-    (H, W), None where all of it is; `camera` is what is known of the camera before, and `is_fixed` says that it is
-    known exactly. cam_from_rig (C, 3, 3): the keyframes come direction by direction, as `Rig` counts frames."""
+    """`extract(frame_id)` gives a frame's features, `match` the pairs of two frames' that are alike; `camera` is what
+    is known of the camera before, and `is_fixed` says that it is known exactly. cam_from_rig (C, 3, 3): the keyframes
+    come direction by direction, as `Rig` counts frames."""
 
     config: FramesConfig
     camera: pycolmap.Camera
     is_fixed: bool
-    load_gray: Callable[[int], NDArray[np.uint8]]
-    left_out: Callable[[int], NDArray[np.bool_] | None]
+    extract: Callable[[int], Features]
+    match: Callable[[Features, Features], NDArray[np.uint32]]
     snapshots: Snapshots
     progress: Progress
     threads: int
@@ -189,11 +188,8 @@ class StructureFromMotion:
         return replace(found, model=largest), others
 
     def _features(self, keyframe_ids: Sequence[int]) -> Streamed[Features]:
-        def extract(frame_id: int) -> Features:
-            return extract_features(self.load_gray(frame_id), self.config.max_features, self.left_out(frame_id))
-
         def stored(frame_id: int) -> Features:
-            return self.snapshots.features(frame_id, lambda: extract(frame_id))
+            return self.snapshots.features(frame_id, lambda: self.extract(frame_id))
 
         found = parallel_map(stored, keyframe_ids, self.threads)
         room = _FEATURES_SHARE * self.memory
@@ -215,7 +211,7 @@ class StructureFromMotion:
         blocks = [proposed[i : i + _PAIRS_PER_BLOCK] for i in range(0, len(proposed), _PAIRS_PER_BLOCK)]
 
         def match(pair: tuple[int, int]) -> VerifiedPair | None:
-            return match_pair(pair, (features[pair[0]], features[pair[1]]), self.camera, self.seed)
+            return match_pair(pair, (features[pair[0]], features[pair[1]]), self.camera, self.seed, self.match)
 
         def match_block(block: Sequence[tuple[int, int]]) -> list[VerifiedPair]:
             return [p for p in parallel_map(match, block, self.threads) if p is not None]

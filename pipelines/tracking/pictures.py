@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.config import FramesConfig
-from pipelines.correspondence.features import extract_features, to_grey
+from pipelines.correspondence.features import to_grey
 from pipelines.correspondence.retrieval import describe
+from pipelines.frames.learned import open_learned, picture_features
 from pipelines.run_folder import RunFolder
 from pipelines.types import Features, ProxyMaps
 
@@ -42,6 +43,7 @@ class Pictures:
         self.vocabulary = run.load_vocabulary()
         self.frames = {f.id: f for f in run.load_frames()}
         self.intrinsics = run.load_calibration().intrinsics
+        self._learned = open_learned(settings)
         self._grey = _Recent(lambda i: to_grey(self.color(i)), kept)
         self._left_out = _Recent(lambda i: run.left_out(self.frames[i]), kept)
         self._features = _Recent(self._load_features, 4 * kept)
@@ -70,14 +72,14 @@ class Pictures:
         return ~(inside & left_out[np.where(inside, row, 0), np.where(inside, column, 0)])
 
     def features(self, frame_id: int) -> Features:
-        """SIFT features: those that structure from motion had, of other frames new ones."""
+        """Features: those that structure from motion had, of other frames new ones."""
         return self._features(frame_id)
 
     def _load_features(self, frame_id: int) -> Features:
         kept = self.run.load_features(frame_id)
         if kept is not None:
             return kept
-        return extract_features(self.grey(frame_id), self.settings.max_features, self.left_out(frame_id))
+        return picture_features(self.color(frame_id), self.left_out(frame_id), self.settings, self._learned)
 
     def descriptor(self, frame_id: int) -> NDArray[np.float32]:
         """How the frame looks, for retrieval."""

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-PARTED = ("whiteroom_halves", "whiteroom_apart", "kitchen_two", "kitchen_7scenes")
+PARTED = ("whiteroom_halves", "whiteroom_apart", "two_rooms", "kitchen_two", "kitchen_7scenes")
 LONG = "kitchen_long/kitchen_33s_640x480_30fps.mp4"
 _SECOND = 500
 """The frame of the long kitchen video at which its second half begins."""
@@ -29,11 +29,25 @@ def write_parted(name: str, folder: Path, data: Path) -> Path:
 
 
 def _halves(folder: Path, data: Path, before: int) -> Path:
-    """The first third of whiteroom's walk, and the last: from 414 on it passes over where it began."""
+    """The first third of whiteroom's walk, and the last: from 414 on it passes over where it began. Before that both
+    look across the table at the same walls: no two stretches of 25 pictures of this room share less than 15 %."""
     (folder / "rgb").mkdir(exist_ok=True)
     for picture in sorted((data / "whiteroom" / "rgb").glob("*.jpg")):
         if int(picture.stem) < 150 or 300 <= int(picture.stem) < before:
             shutil.copy(picture, folder / "rgb" / picture.name)
+    return folder / "rgb"
+
+
+def _two_rooms(folder: Path, data: Path) -> Path:
+    """The first 60 pictures each of two rooms, which share nothing but the camera's size and focal length (525 px)."""
+    (folder / "rgb").mkdir(exist_ok=True)
+    kitchen = sorted((data / "kitchen").glob("*.color.jpg"))[:60]
+    white = sorted((data / "whiteroom" / "rgb").glob("*.jpg"))[:60]
+    walk = np.loadtxt(data / "whiteroom" / "traj.txt").reshape(-1, 4, 4)
+    poses = [np.loadtxt(str(p).replace("color.jpg", "pose.txt")) for p in kitchen] + [walk[int(p.stem)] for p in white]
+    for row, picture in enumerate((*kitchen, *white)):
+        shutil.copy(picture, folder / "rgb" / f"{row:06d}.jpg")
+    np.savetxt(folder / "traj.txt", np.reshape(poses, (-1, 16)))
     return folder / "rgb"
 
 
@@ -71,6 +85,7 @@ def _frames(path: Path) -> list[np.ndarray]:
 _WRITERS: dict[str, Callable[[Path, Path], Path]] = {
     "whiteroom_halves": lambda folder, data: _halves(folder, data, before=450),
     "whiteroom_apart": lambda folder, data: _halves(folder, data, before=405),
+    "two_rooms": _two_rooms,
     "kitchen_two": _kitchen_two,
     "kitchen_7scenes": _seven_scenes,
 }

@@ -115,6 +115,7 @@ def cases(work: Path) -> dict[str, Case]:
         "kitchen_two": Case(work / "kitchen_two" / "both.videos", (), lambda _, index: long[kitchen_two_row(index)]),
         "whiteroom_halves": Case(work / "whiteroom_halves" / "rgb", PLAIN, room),
         "whiteroom_apart": Case(work / "whiteroom_apart" / "rgb", PLAIN, room),
+        "two_rooms": Case(work / "two_rooms" / "rgb", PLAIN, written_truth(work / "two_rooms" / "traj.txt")),
         **{
             name: Case(work / name / "rgb", (*PLAIN, *COARSE), written_truth(work / name / "traj.txt")) for name in HARD
         },

@@ -171,8 +171,9 @@ class ModelStore:
 
     def add(self, file: Path, family: str, name: str = "") -> Model:
         """Copy the user's own file into the cache as a model of `family`. InputError unless it fits the family."""
-        if family not in self.families or family in ("head", "dinov2-ade20k"):
-            raise InputError(f"there is no family {family!r}; known: {', '.join(self.families)}")
+        known = [name for name, keys in self.families.items() if "input" in keys and name != "dinov2-ade20k"]
+        if family not in known:
+            raise InputError(f"there is no family {family!r}; known: {', '.join(known)}")
         require_file(file)
         from pipelines.proxy.networks.session import Network
 

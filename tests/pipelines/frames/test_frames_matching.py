@@ -68,7 +68,7 @@ def test_matching_equals_its_definition() -> None:
         j, k = np.argsort(angle[i], kind="stable")[:2]
         if angle[i, j] < 1.2 and angle[i, j] < 0.9 * angle[i, k] and np.argmin(angle[:, j]) == i:
             expected.append((i, j))
-    assert match_descriptors(first, second, 0.9, 1.2).tolist() == [list(map(int, m)) for m in expected]
+    assert match_descriptors(first, second, (0.9, 1.2)).tolist() == [list(map(int, m)) for m in expected]
     assert 20 < len(expected) < 40
 
 

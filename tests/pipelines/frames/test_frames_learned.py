@@ -1,0 +1,169 @@
+"""Learned features, by networks of the real ones' names and shapes: patches of the picture, and their best partners.
+
+The real files cannot be had here. What is tested is all that is around them: padding, pixels, masks, packing, matching,
+and what is said where they are missing.
+"""
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+import pipelines.frames.learned as learned
+from formats.errors import InputError
+from pipelines.config import FramesConfig, load_config
+from pipelines.correspondence.matching import match_descriptors
+from pipelines.frames.learned import EXTRACTOR, MATCHER, LearnedFeatures, learned_inputs, open_learned
+from pipelines.frames.stage import check
+from pipelines.proxy.models.registry import ModelStore
+from pipelines.types import Features
+
+STEP, SIDE = 16, 128
+"""The stand-in has a feature in each cell; the picture it is made for has this side after padding."""
+
+
+def constant(name: str, value: np.ndarray) -> onnx.TensorProto:
+    return numpy_helper.from_array(value, name)
+
+
+def save(path: Path, nodes: list, inputs: list, outputs: list, constants: list) -> None:
+    graph = helper.make_graph(nodes, "stand_in", inputs, outputs, constants)
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), path)
+
+
+def write_extractor(path: Path) -> None:
+    """Keypoints at the cells' centres; descriptors are the cell's 16 x 16 pixels of the first channel, averaged in
+    pairs, without their mean, of length one."""
+    cells = SIDE // STEP
+    centre = (np.arange(cells) * STEP + (STEP - 1) / 2) / (SIDE - 1) * 2 - 1
+    points = np.stack(np.meshgrid(centre, centre), -1).reshape(1, -1, 2).astype(np.float32)
+    value = helper.make_tensor_value_info
+    nodes = [
+        helper.make_node("Slice", ["image", "zero", "one", "axis"], ["red"]),
+        helper.make_node("AveragePool", ["red"], ["small"], kernel_shape=[1, 2], strides=[1, 2]),
+        helper.make_node("Reshape", ["small", "rows"], ["split"]),
+        helper.make_node("Transpose", ["split"], ["cells"], perm=[0, 2, 1, 3]),
+        helper.make_node("Reshape", ["cells", "flat"], ["patches"]),
+        helper.make_node("ReduceMean", ["patches"], ["mean"], axes=[2]),
+        helper.make_node("Sub", ["patches", "mean"], ["centred"]),
+        helper.make_node("LpNormalization", ["centred"], ["descriptors"], axis=2, p=2),
+        helper.make_node("Identity", ["points"], ["keypoints"]),
+        helper.make_node("ReduceMax", ["descriptors"], ["best"], axes=[2], keepdims=0),
+        helper.make_node("Cast", ["max_keypoints"], ["limit"], to=TensorProto.FLOAT),
+        helper.make_node("Sum", ["best", "limit", "min_score"], ["scores"]),
+    ]
+    constants = [
+        constant("zero", np.array([0])), constant("one", np.array([1])), constant("axis", np.array([1])),
+        constant("rows", np.array([cells, STEP, cells, STEP // 2])), constant("flat", np.array([1, cells**2, 128])),
+        constant("points", points),
+    ]  # fmt: skip
+    inputs = [
+        value("image", TensorProto.FLOAT, [1, 3, "h", "w"]),
+        value("max_keypoints", TensorProto.INT64, []),
+        value("min_score", TensorProto.FLOAT, []),
+    ]
+    outputs = [value(n, TensorProto.FLOAT, None) for n in ("keypoints", "descriptors", "scores")]
+    save(path, nodes, inputs, outputs, constants)
+
+
+def write_matcher(path: Path) -> None:
+    """Each feature's partner is the one of the largest product, which is the score."""
+    value = helper.make_tensor_value_info
+    nodes = [
+        helper.make_node("Transpose", ["desc1"], ["turned"], perm=[0, 2, 1]),
+        helper.make_node("MatMul", ["desc0", "turned"], ["alike"]),
+        helper.make_node("ArgMax", ["alike"], ["partner"], axis=2, keepdims=0),
+        helper.make_node("ReduceMax", ["alike"], ["score"], axes=[2], keepdims=0),
+        helper.make_node("Squeeze", ["partner", "first"], ["matches0"]),
+        helper.make_node("Squeeze", ["score", "first"], ["plain"]),
+        *(helper.make_node("ReduceSum", [n], [f"sum_{n}"], keepdims=0) for n in NOT_LOOKED_AT),
+        helper.make_node("Sum", [f"sum_{n}" for n in NOT_LOOKED_AT], ["all"]),
+        helper.make_node("Mul", ["all", "nothing"], ["none"]),
+        helper.make_node("Add", ["plain", "none"], ["mscores0"]),
+    ]
+    sizes = {"kpts0": [1, "m", 2], "kpts1": [1, "n", 2], "desc0": [1, "m", 128], "desc1": [1, "n", 128]}
+    sizes |= {"image_size0": [1, 2], "image_size1": [1, 2]}
+    inputs = [value(name, TensorProto.FLOAT, shape) for name, shape in sizes.items()]
+    outputs = [value("matches0", TensorProto.INT64, None), value("mscores0", TensorProto.FLOAT, None)]
+    save(
+        path, nodes, inputs, outputs, [constant("first", np.array([0])), constant("nothing", np.float32(0).reshape(()))]
+    )
+
+
+NOT_LOOKED_AT = ("kpts0", "kpts1", "image_size0", "image_size1")
+
+
+def picture(seed: int) -> np.ndarray:
+    grey = cv2.GaussianBlur(np.random.default_rng(seed).integers(0, 256, (100, 120)).astype(np.uint8), (0, 0), 1.0)
+    return np.repeat(grey[..., None], 3, axis=2)
+
+
+@pytest.fixture
+def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModelStore:
+    """A cache with the stand-ins under the real ones' names, and a table that knows their hashes."""
+    monkeypatch.setenv("MSGS_SLAM_CACHE", str(tmp_path))
+    plain = ModelStore.open()
+    rows = []
+    for name, write in ((EXTRACTOR, write_extractor), (MATCHER, write_matcher)):
+        path = plain.path(plain.get(name))
+        write(path)
+        data = path.read_bytes()
+        rows.append(replace(plain.get(name), bytes=len(data), sha256=hashlib.sha256(data).hexdigest()))
+    found = replace(plain, models=tuple(rows))
+    monkeypatch.setattr(learned.ModelStore, "open", staticmethod(lambda: found))
+    return found
+
+
+def test_features_lie_where_the_network_sees_them_and_none_in_padding_or_mask(store: ModelStore) -> None:
+    found = LearnedFeatures(store).extract(picture(0), 500, None)
+    # Cells of 16 pixels in 128 x 128; centres beyond the picture's 120 x 100 are padding.
+    assert len(found) == 7 * 6
+    np.testing.assert_allclose(found.xy[0], [8, 8], atol=1e-3)
+    np.testing.assert_allclose(found.xy[-1], [104, 88], atol=1e-3)
+    assert found.descriptors.dtype == np.int8
+    length = np.linalg.norm(found.descriptors.astype(float), axis=1) / Features.SIGNED_NORM
+    assert np.abs(length - 1).max() < 0.05
+    left = np.zeros((100, 120), bool)
+    left[:, :60] = True
+    masked = LearnedFeatures(store).extract(picture(0), 500, left)
+    assert 0 < len(masked) < len(found)
+    assert (masked.xy[:, 0] >= 60).all()
+
+
+def test_both_matchers_find_the_same_picture_and_not_another(store: ModelStore) -> None:
+    networks = LearnedFeatures(store)
+    first, other = (networks.extract(picture(seed), 500, None) for seed in (0, 1))
+    order = np.random.default_rng(2).permutation(len(first))
+    shuffled = Features(first.keypoints[order], first.descriptors[order])
+    wanted = np.stack([np.arange(len(first)), np.argsort(order)], 1)
+    np.testing.assert_array_equal(networks.match(first, shuffled, (120, 100)), wanted)
+    np.testing.assert_array_equal(match_descriptors(first.descriptors, shuffled.descriptors), wanted)
+    assert len(match_descriptors(first.descriptors, other.descriptors)) == 0
+    none = Features(np.zeros((0, 4), np.float32), np.zeros((0, 128), np.int8))
+    assert networks.match(first, none, (120, 100)).shape == (0, 2)
+
+
+def test_networks_are_part_of_what_the_stage_is_made_from(store: ModelStore) -> None:
+    asked = load_config(overrides=["frames.features=aliked"]).frames
+    assert learned_inputs(asked) == {EXTRACTOR: store.get(EXTRACTOR).sha256, MATCHER: store.get(MATCHER).sha256}
+    assert learned_inputs(FramesConfig()) == {}
+    assert open_learned(FramesConfig()) is None
+    assert isinstance(open_learned(asked), LearnedFeatures)
+    path = store.path(store.get(MATCHER))
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    with pytest.raises(InputError, match=f"damaged; type: msgs-slam models pull {MATCHER}"):
+        open_learned(asked)
+
+
+def test_without_the_networks_the_stage_says_what_to_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MSGS_SLAM_CACHE", str(tmp_path / "empty"))
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), picture(i))
+    with pytest.raises(InputError, match=r"49 MB.*type: msgs-slam models pull aliked-n16rot"):
+        check(tmp_path, load_config(overrides=["frames.features=aliked"]))
+    check(tmp_path, load_config())
