@@ -125,10 +125,6 @@ class TrackingConfig:
         "fallback", "compare with Gaussians, eq. (16): lost frames, all, or never", ("fallback", "all", "never")
     )
     use_depth: bool = setting(True, "tie triangulated points to metric proxy depths in the adjustment")
-    adjust_frames: int = setting(
-        400, "up to this many frames are adjusted together; of more only the keyframes", within=(2, 100_000)
-    )
-    snapshot_every: int = setting(50, "frames between two snapshots", within=(1, 100_000))
 
 
 @dataclass(frozen=True)

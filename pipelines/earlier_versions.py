@@ -28,7 +28,7 @@ _FIXED = {
     "proxy": "alpha beta gamma theta_slope theta_middle",
     "tracking": "flow_window flow_levels flow_error flow_sd feature_sd pose_error min_inliers new_points "
     "keyframe_share relocalise_candidates silhouette color_weight render_loss depth_sd grid_rows grid_columns "
-    "adjust_iterations",
+    "adjust_iterations adjust_frames snapshot_every",
     "mapping": "fine_share flat_share window_steps coarse_share color_weight ssim_weight depth_nu label_every "
     "edge_sharpness size_weight size_limit silhouette_weight depth_fields depth_check silhouette_threshold "
     "depth_tolerance densify_every densify_until split_radius prune_opacity prune_weight prune_radius mean_rate "

@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 
 LoadProxy = Callable[[int], ProxyMaps | None]
 OUTLIER_SD = 4.0
+MOST_FRAMES = 400
+"""Up to so many frames are adjusted together; of more only the keyframes."""
 ROUNDS = 3
 ITERATIONS = 20
 """Of each round's bundle adjustment."""
@@ -66,10 +68,10 @@ def adjust_state(
 ) -> Report:
     """Adjust `state` in place: rounds of scale fields, bundle adjustment and removal of outliers.
 
-    With more frames than `settings.adjust_frames` only keyframes and points are adjusted together, and every other
+    With more than MOST_FRAMES only keyframes and points are adjusted together, and every other
     frame follows by itself: the cost grows with the number of keyframes, not of frames.
     """
-    frame_ids = sorted(state.poses) if len(state.poses) <= settings.adjust_frames else list(state.keyframes)
+    frame_ids = sorted(state.poses) if len(state.poses) <= MOST_FRAMES else list(state.keyframes)
     bundle = make_bundle(state, frame_ids)
     ties = sample_depths(bundle, frame_ids, state, intrinsics, load_proxy, metric)
     initial = None

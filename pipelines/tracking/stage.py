@@ -24,8 +24,8 @@ from pipelines.tracking.turn import hold_turns
 from pipelines.types import Frame
 from pipelines.wording import stretches
 
-SNAPSHOTS = 20
-"""Of a long recording no more are taken: each holds all that is known so far."""
+SNAPSHOT_EVERY, SNAPSHOTS = 50, 20
+"""Frames between two; of a long recording no more are taken in all, since each holds all that is known so far."""
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -78,7 +78,7 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
         settings = replace(settings, new_segments=False, render="never")
     state = TrackState.load(snapshot, rig) if snapshot.exists() else start_state(context, rig)
     front_end = FrontEnd(state, pictures, settings, context.config.run.seed, weights)
-    every = max(settings.snapshot_every, len(frames) // SNAPSHOTS)
+    every = max(SNAPSHOT_EVERY, len(frames) // SNAPSHOTS)
     for frame in context.progress.track(frames[state.done :], "tracking", len(frames) - state.done):
         if frame.id not in state.poses:
             front_end.track(frame.id)

@@ -15,6 +15,7 @@ from pipelines.geometry import se3
 from pipelines.geometry.alignment import align_points
 from pipelines.run_folder import load_sparse_model, save_sparse_model
 from pipelines.stages import StageContext
+from pipelines.tracking import adjust, stage
 from pipelines.tracking.stage import STAGE, stretches
 from pipelines.types import SparseModel
 from tests.pipelines.tracking.conftest import MadeRun
@@ -85,10 +86,14 @@ def test_scale_free_proxies_leave_the_world_as_it_is(
 
 
 def test_frames_outside_the_adjustment_follow_it(
-    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
+    tmp_path: Path,
+    make_run: Callable[..., MadeRun],
+    open_stage: Callable[..., StageContext],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(adjust, "MOST_FRAMES", 12)
     made = make_run(tmp_path / "run", backbone_scale=0.4)
-    figures = finish(open_stage(made.run, "tracking", load_config(overrides=["tracking.adjust_frames=12"])))
+    figures = finish(open_stage(made.run, "tracking"))
     assert figures["adjusted_frames"] == 9
     assert figures["posed"] == 24
     assert 0 < trajectory_error(made, scale=False) < 0.01
@@ -108,15 +113,18 @@ def test_a_frame_without_picture_is_lost_and_named(
 
 
 def test_interrupted_work_ends_with_the_same_bytes(
-    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
+    tmp_path: Path,
+    make_run: Callable[..., MadeRun],
+    open_stage: Callable[..., StageContext],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    config = load_config(overrides=["tracking.snapshot_every=5"])
+    monkeypatch.setattr(stage, "SNAPSHOT_EVERY", 5)
     whole, broken = make_run(tmp_path / "a"), make_run(tmp_path / "b")
-    finish(open_stage(whole.run, "tracking", config))
+    finish(open_stage(whole.run, "tracking"))
     with pytest.raises(KeyboardInterrupt):
-        STAGE.run(interrupted(open_stage(broken.run, "tracking", config), after=13))
+        STAGE.run(interrupted(open_stage(broken.run, "tracking"), after=13))
     assert (broken.run.partial("tracking") / "snapshot" / "state.npz").exists()
-    finish(open_stage(broken.run, "tracking", config))
+    finish(open_stage(broken.run, "tracking"))
     for name in ("trajectory.npz", "sparse.npz", "depth_fields.npz", "tracking.json"):
         assert (whole.run.stage("tracking") / name).read_bytes() == (broken.run.stage("tracking") / name).read_bytes()
 
