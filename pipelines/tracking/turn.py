@@ -28,8 +28,8 @@ _TRIALS, _CORNERS = 200, 300
 
 def hold_turns(state: TrackState, pictures: Pictures, seed: int) -> None:
     """Pose lost frames next to posed ones by rotation alone, in place: each stands where the nearer of the posed frames
-    beside its stretch does, and has no sightings. They are noted in `state.turned`, no other frame is changed. Panoramas
-    see all round: a turn leads them away from nothing."""
+    beside its stretch does, and has no sightings. They are noted in `state.turned`, no other frame is changed. A turn
+    leads panoramas away from nothing."""
     if len(state.rig) > 1:
         return
     for _, numbered in groupby(enumerate(sorted(state.lost)), lambda pair: pair[1] - pair[0]):
