@@ -14,6 +14,7 @@ from formats.reading import read_bytes
 from pipelines.config import Config, config_to_dict, config_to_toml
 from pipelines.evaluation.facts import Capture, advice, lost_stretches, read_capture
 from pipelines.evaluation.html import bullets, chips, drawing, page, section, table
+from pipelines.evaluation.lengths import found_lengths
 from pipelines.evaluation.plots import RED, Line, plot
 from pipelines.evaluation.report_views import RenderedViews, class_section, quality_section, render_views
 from pipelines.evaluation.table import evaluation_table
@@ -110,6 +111,7 @@ def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[Loo
             ", ".join(f"{n} {v:.4f}" for n, v in zip(("k1", "k2", "p1", "p2", "k3"), c.distortion, strict=False)),
         ),
         ("scale", _scale_text(outcome)),
+        *found_lengths(outcome),
         ("depth", str(outcome.run.load_proxy_report().get("depth", ""))),
         ("classes", f"{outcome.semantics}: {len(outcome.classes)}"),
     ]

@@ -13,12 +13,14 @@ from finished import note_finished
 from formats.datasets import Sequence
 from formats.errors import InputError
 from pipelines.evaluation.facts import Capture, advice, lost_stretches
+from pipelines.evaluation.lengths import found_lengths
 from pipelines.evaluation.plots import Line, plot, ticks
 from pipelines.evaluation.report import write_report
 from pipelines.evaluation.write import PATH_FROM_ABOVE, write_evaluation
 from pipelines.outcome import load_outcome
 from pipelines.run_folder import RunFolder, save_trajectory
 from pipelines.types import LoopEdge, SparseModel
+from pipelines.upright.world import SAME, World, save_world
 
 OracleRun = Callable[..., RunFolder]
 VOID_TAGS = {"img", "meta", "rect", "line", "path", "circle"}
@@ -56,6 +58,8 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
     classes = json.loads((run.stage("proxy") / "classes.json").read_text())
     classes[0]["name"] = "<script>alert(1)</script>"
     (run.stage("proxy") / "classes.json").write_text(json.dumps(classes))
+    run.stage("export").mkdir(exist_ok=True)
+    save_world(run.stage("export"), World("up", "floor", True, SAME), "metre")
     note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
     html = write_report(run).read_text()
     parsed = Balanced()
@@ -65,6 +69,9 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
     for heading in ("Advice", "What was found", "Camera path", "Against the truth", "Stages", "Settings"):
         assert heading in parsed.text
     assert "ATE Sim(3)" in parsed.text
+    lengths = found_lengths(load_outcome(run))
+    assert len(lengths) == 5
+    assert all(what in parsed.text and text in parsed.text for what, text in lengths)
     assert "<script" not in html
     assert "onload" not in html
     assert re.findall(r'(?:src|href)="(?!data:)', html) == []

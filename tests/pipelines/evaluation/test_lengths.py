@@ -1,0 +1,86 @@
+"""Lengths in the report against the truth of the made-up room, and in the words of the tape."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from finished import note_finished
+from scipy.spatial.transform import Rotation
+
+from formats.datasets import Sequence
+from pipelines.evaluation.lengths import camera_height, extents, found_lengths, path_length
+from pipelines.geometry.alignment import Similarity
+from pipelines.outcome import load_outcome
+from pipelines.run_folder import RunFolder
+from pipelines.types import Metres
+from pipelines.upright.world import World, save_world
+from pipelines.viewer_tape import tape_text
+from tests.world.room import HEIGHT, LENGTH, WIDTH
+
+OracleRun = Callable[..., RunFolder]
+TURNED = Similarity(0.5, np.array([[0.8, -0.6, 0], [0, 0, -1], [0.6, 0.8, 0]]), np.array([0.3, -1.0, 2.0]))
+
+
+def _exported(run: RunFolder, move: Similarity, floor: bool = True) -> RunFolder:
+    (run.stage("export")).mkdir(exist_ok=True)
+    save_world(run.stage("export"), World("up", "floor", floor, move), "free")
+    note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
+    return run
+
+
+def test_lengths_of_the_made_up_room(oracle_run: OracleRun, truth: Sequence) -> None:
+    outcome = load_outcome(oracle_run())
+    assert truth.world_from_cam is not None
+    centers = truth.world_from_cam[:, :3, 3]
+    length = path_length(outcome)
+    assert length is not None
+    assert length[0] == pytest.approx(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum(), rel=1e-3)
+    assert 0 < length[1] < 0.02
+    assert camera_height(outcome)[0] == pytest.approx(np.median(centers[:, 2]), abs=1e-3)
+    (long, _), (wide, _), (high, _) = extents(outcome)
+    assert long == pytest.approx(LENGTH, rel=0.02)
+    assert 0.8 * WIDTH < wide < WIDTH  # half a lap does not see the walls on its own side
+    assert high < HEIGHT
+
+
+def test_a_turned_box_with_floaters_about_it_has_its_own_size(oracle_run: OracleRun) -> None:
+    outcome, rng, sides = load_outcome(oracle_run()), np.random.default_rng(0), np.array([6.0, 3.0, 2.5])
+    gaussians = outcome.require_map()
+    points = rng.uniform(-0.5, 0.5, (len(gaussians), 3)) * sides
+    face = rng.integers(0, 3, len(points))
+    points[np.arange(len(points)), face] = rng.choice([-0.5, 0.5], len(points)) * sides[face]
+    points[::300] *= 4
+    turn = Rotation.from_euler("z", 25, degrees=True).as_matrix()
+    box = replace(gaussians, means=torch.from_numpy((points @ turn.T + 7).astype(np.float32)))
+    for (found, sd), true in zip(extents(replace(outcome, gaussian_map=box)), sides, strict=True):
+        assert abs(found - true) < 0.02 * true
+        assert 0 <= sd < 0.05 * true
+
+
+def test_they_are_said_as_the_tape_says_them(oracle_run: OracleRun) -> None:
+    run = _exported(oracle_run(TURNED.inverse(), metric=False), TURNED)
+    outcome = load_outcome(run)
+    rows = dict(found_lengths(outcome))
+    assert list(rows)[:2] == ["length of the path", "height of the camera over the floor"]
+    assert len(rows) == 5
+    true = load_outcome(oracle_run())
+    in_world = path_length(true)
+    assert in_world is not None
+    assert rows["length of the path"] == tape_text(*in_world, False, None)
+    known = replace(outcome, metres=Metres(0.5, 0.1, True, ("a table",)))
+    assert dict(found_lengths(known))["length of the path"].endswith(" m")
+
+
+def test_what_is_not_known_is_not_told(oracle_run: OracleRun) -> None:
+    run = oracle_run()
+    assert found_lengths(load_outcome(run)) == []
+    rows = dict(found_lengths(load_outcome(_exported(run, TURNED, floor=False))))
+    assert "height of the camera over the floor" not in rows
+    t = run.load_trajectory("tracking")
+    lost = tuple("lost" if i > 3 else "" for i in range(len(t.lost_reasons)))
+    few = load_outcome(run)
+    assert path_length(replace(few, trajectory=replace(t, is_keyframe=t.frame_ids == 0, lost_reasons=lost))) is None
