@@ -204,12 +204,16 @@ class RunFolder(FinishedFiles):
 
     def load_class_ids(self) -> tuple[int, ...]:
         """The label of each class channel of the map."""
-        path = self.file("mapping", "mapping.json")
-        value = read_json_object(path)
-        with reading(path, "table of class channels"):
-            ids = tuple(int(i) for i in value["class_ids"])
+        with reading(path := self.file("mapping", "mapping.json"), "table of class channels"):
+            ids = tuple(int(i) for i in read_json_object(path)["class_ids"])
             stored.require_indices("class_ids", np.array(ids, np.int64), VOID)
             return ids
+
+    def load_submaps(self) -> list[dict[str, NDArray[np.int64]]]:
+        """Of each submap the frame ids "own" and "border" and the numbers "beside" it; [] of a map made whole."""
+        with reading(path := self.file("mapping", "mapping.json"), "table of submaps"):
+            rows = read_json_object(path).get("submaps", [])
+            return [{k: np.array(row[k], np.int64).reshape(-1) for k in ("own", "border", "beside")} for row in rows]
 
     def load_loops(self) -> list[LoopEdge]:
         """The verified loops of the global adjustment."""

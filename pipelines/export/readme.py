@@ -31,6 +31,8 @@ mesh_textured.obj, .mtl, .png, mesh_textured.glb   only with --set export.textur
                           group for each class.
 classes.json              number, name and colour of each class; 255 is "unknown".
 scale.json                how many metres a unit of the run is, its relative standard deviation, and who says so.
+submap_1/ and so on       only where the map was made in parts (mapping.submap): point_cloud.ply of each part, and
+                          coarse.ply, about a tenth of it for a look from afar; tiles.json says where each lies.
 piece_2/ and so on        only where nothing joins some frames to the rest: the same of them, in a world of their own.
 world.json                what the axes are, what told which way is up, and how this world lies to the run's own.
 

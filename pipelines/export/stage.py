@@ -14,6 +14,7 @@ from formats.mesh import read_mesh_ply
 from pipelines.config import Config, ExportConfig
 from pipelines.export.mesh import depth_views, make_mesh, mesh_figures, write_mesh
 from pipelines.export.textured import make_textured, write_textured
+from pipelines.export.tiles import write_tiles
 from pipelines.export.writers import (
     write_colmap,
     write_glb_file,
@@ -170,6 +171,7 @@ def write_all_but_mesh(outcome: Outcome, world: World, settings: ExportConfig, f
     paths = write_colmap(outcome, folder) + write_ply(outcome, settings.sh_rest, folder)
     paths += write_spz_file(outcome, world, settings.spz_version, folder) if settings.spz else []
     paths += write_glb_file(outcome, world, folder) if settings.splat_glb else []
+    paths += write_tiles(outcome, folder)
     return paths + write_trajectory(outcome, folder) + write_notes(outcome, world, folder)
 
 

@@ -21,6 +21,7 @@ from pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_f
 from pipelines.global_ba.move_map import follow_keyframes, move_map
 from pipelines.global_ba.semantics import LabelSummary, summarise_labels
 from pipelines.global_ba.verify import KeyframeView, Loop, make_view
+from pipelines.mapping.divided import refine_divided
 from pipelines.mapping.load import load_views
 from pipelines.mapping.poses import move_trajectory
 from pipelines.run_folder import (
@@ -214,13 +215,20 @@ def refine(
     if settings.joint == "never" or (settings.joint == "moved" and moved_px < JOINT_PX):
         return None
     mapping = context.config.mapping
+    exposure = context.run.load_exposure()
+    if context.run.load_submaps():
+        exposures = exposure["log_gains"], exposure["offsets"]
+        before, made, after = refine_divided(
+            context, gaussian_map, trajectory, fields, exposures, settings.joint_passes
+        )
+        kept = (made.gaussian_map, made.cam_from_world, made.log_gains, made.offsets)
+        return Refined(*kept, before, after, after >= before)
     article, memory = context.config.article, context.memory_room
     given = load_views(context.run, trajectory, mapping, article, context.device, fields, memory)
     views = given.views
     if steps := context.config.article.loop_steps:
         ends = loop_keyframes(found.loops, [v.frame_id for v in views])
         views = adjust_views(views, ends, gaussian_map, mapping, steps)
-    exposure = context.run.load_exposure()
     gains = {int(i): g for i, g in zip(exposure["frame_ids"], exposure["log_gains"], strict=True)}
     offsets = {int(i): o for i, o in zip(exposure["frame_ids"], exposure["offsets"], strict=True)}
     exposures = np.array([gains[v.frame_id] for v in views]), np.array([offsets[v.frame_id] for v in views])

@@ -10,13 +10,17 @@ from numpy.typing import NDArray
 
 from pipelines.depth.fields import DepthFields
 from pipelines.depth.posed import PosedDepth, overlaps
+from pipelines.gaussian_map import GaussianMap
 from pipelines.mapping.load import mapped_classes, split_frames
 from pipelines.mapping.measure import ViewFigures
 from pipelines.mapping.poses import interpolate_rows, move_trajectory
-from pipelines.mapping.state import OptimisedMap
+from pipelines.mapping.state import Exposures, OptimisedMap
 from pipelines.mapping.submap_tasks import (
+    JOINED,
     REFINED,
+    SubmapResult,
     SubmapTask,
+    belonging,
     in_order,
     join_submap,
     make_submap,
@@ -54,10 +58,42 @@ def map_divided(context: StageContext, trajectory: Trajectory) -> Mapped:
     tasks = submap_tasks(context, submaps, trajectory, fields, mapped_classes(run, kept))
     for work in (make_submap, join_submap, refine_submap):
         context.each(work, tasks)
-    result, ids = _all_together(tasks)
+    result, ids = all_together(tasks, REFINED)
     moved = move_trajectory(trajectory, ids, result.cam_from_world)
-    keyframes, held_out = measure(context, tasks, moved, ids, result)
+    keyframes, held_out = measure(context, tasks, moved, ids, (result.log_gains, result.offsets), REFINED)
     return Mapped(result, ids, tasks[0].class_ids, moved, keyframes, held_out, submaps)
+
+
+def refine_divided(
+    context: StageContext,
+    gaussian_map: GaussianMap,
+    trajectory: Trajectory,
+    fields: DepthFields,
+    exposure: Exposures,
+    passes: float,
+) -> tuple[float, OptimisedMap, float]:
+    """A map that was made in submaps, its keyframes with `exposure` (N, 3) each, refined in them: mean keyframe PSNR
+    before, the refined map, PSNR after."""
+    run, anchors = context.run, gaussian_map.anchor_frame_ids.cpu().numpy()
+    submaps = [Submap(s["own"], s["border"], tuple(s["beside"].tolist())) for s in run.load_submaps()]
+    ids = np.sort(np.concatenate([s.own for s in submaps]))
+    tasks = submap_tasks(context, submaps, trajectory, fields, run.load_class_ids())
+    for task in tasks:
+        rows = np.isin(ids, task.submap.own)
+        poses = rows_of(trajectory, task.submap.own).cam_from_world
+        own = belonging(gaussian_map, anchors, task.submap)
+        nothing = np.zeros((0, 1, 1), np.float32), np.zeros(1, np.int64)
+        task.save(JOINED, SubmapResult(own, ids[rows], poses, exposure[0][rows], exposure[1][rows], *nothing))
+    context.each(refine_submap, [replace(task, passes=passes, first_rate=1.0) for task in tasks])
+    result, _ = all_together(tasks, REFINED)
+    before, _ = measure(context, tasks, trajectory, ids, exposure, JOINED)
+    moved = move_trajectory(trajectory, ids, result.cam_from_world)
+    after, _ = measure(context, tasks, moved, ids, (result.log_gains, result.offsets), REFINED)
+    return _mean_psnr(before), result, _mean_psnr(after)
+
+
+def _mean_psnr(figures: Sequence[ViewFigures]) -> float:
+    return float(np.mean([f.psnr for f in figures]))
 
 
 def submap_tasks(
@@ -106,19 +142,24 @@ def _only(fields: DepthFields, frame_ids: NDArray[np.int64]) -> DepthFields:
     return DepthFields(wanted) if wanted else fields  # one without any field means another thing
 
 
-def _all_together(tasks: Sequence[SubmapTask]) -> tuple[OptimisedMap, NDArray[np.int64]]:
+def all_together(tasks: Sequence[SubmapTask], kind: str) -> tuple[OptimisedMap, NDArray[np.int64]]:
     """The whole map with all keyframes in order, and their ids."""
-    results = [task.load(REFINED, task.number) for task in tasks]
+    results = [task.load(kind, task.number) for task in tasks]
     ids, poses, (gains, offsets) = in_order(results)
     steps = sum(int(r.steps.sum()) for r in results)
     return OptimisedMap(together([r.gaussian_map for r in results]), poses, gains, offsets, steps), ids
 
 
 def measure(
-    context: StageContext, tasks: Sequence[SubmapTask], moved: Trajectory, ids: NDArray[np.int64], result: OptimisedMap
+    context: StageContext,
+    tasks: Sequence[SubmapTask],
+    moved: Trajectory,
+    ids: NDArray[np.int64],
+    exposure: Exposures,
+    kind: str,
 ) -> tuple[list[ViewFigures], list[ViewFigures]]:
-    """Figures of the keyframes, in order, and of the frames held out, each measured with the submap of the keyframe
-    before it."""
+    """Figures that results of a kind show of the keyframes, in order, and of the frames held out, each measured with
+    the submap of the keyframe before it."""
     times = moved.timestamps[np.isin(moved.frame_ids, ids)]
     _, held = split_frames(moved, context.config.mapping.hold_out)
     before = ids[np.clip(np.searchsorted(ids, held) - 1, 0, None)]
@@ -126,9 +167,9 @@ def measure(
     for task in tasks:
         wanted = np.append(task.submap.own, np.array(held, np.int64)[np.isin(before, task.submap.own)])
         part = rows_of(moved, wanted)
-        gains, offsets = (interpolate_rows(part.timestamps, times, a) for a in (result.log_gains, result.offsets))
+        gains, offsets = (interpolate_rows(part.timestamps, times, a) for a in exposure)
         fields = _only(context.run.load_depth_fields("tracking"), wanted)
-        measuring.append(replace(task, trajectory=part, exposure=(gains, offsets), fields=fields))
+        measuring.append(replace(task, trajectory=part, exposure=(gains, offsets), fields=fields, measured=kind))
     found = context.each(measure_submap, measuring)
     ranked = np.argsort(np.concatenate([task.submap.own for task in tasks]))
     keyframes = [figures for own, _ in found for figures in own]

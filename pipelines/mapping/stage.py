@@ -36,7 +36,7 @@ def run(context: StageContext) -> dict[str, Any]:
     save_trajectory(context.folder, mapped.moved)
     save_exposure(context.folder, ids, result.log_gains, result.offsets)
     figures = _figures(mapped)
-    submaps = [{"own": s.own.tolist(), "border": s.border.tolist()} for s in mapped.submaps]
+    submaps = [{"own": s.own.tolist(), "border": s.border.tolist(), "beside": list(s.beside)} for s in mapped.submaps]
     save_figures(context.folder, "mapping", {**figures, "class_ids": list(mapped.class_ids), "submaps": submaps})
     return figures
 

@@ -44,7 +44,7 @@ _DEPTH_SIDE = 160
 class SubmapTask:
     """What it takes to work on submap `number`: `trajectory` holds its views (to measure it: its own keyframes, and
     what is held out), `exposure` theirs, `fields` brings their depths into the world, `files` is the folder of all
-    submaps' results; `passes` and `first_rate` of the refinement."""
+    submaps' results; `passes` and `first_rate` of the refinement; `measured`: kind of result."""
 
     run: RunFolder
     config: Config
@@ -58,6 +58,7 @@ class SubmapTask:
     exposure: Exposures | None = None
     passes: float = REFINING_PASSES
     first_rate: float = REFINING_RATE
+    measured: str = REFINED
 
     @property
     def device(self) -> str:
@@ -121,7 +122,7 @@ def join_submap(task: SubmapTask, progress: Progress) -> None:
     m = own.gaussian_map
     best = nearest_seeing(m.means.cpu().double().numpy(), progress.track(views, "joining", len(views)))
     anchors = np.where(best >= 0, ids[best], m.anchor_frame_ids.cpu().numpy())
-    task.save(JOINED, replace(own, gaussian_map=_belonging(m, anchors, task.submap), depths=own.depths[:0]))
+    task.save(JOINED, replace(own, gaussian_map=belonging(m, anchors, task.submap), depths=own.depths[:0]))
 
 
 def refine_submap(task: SubmapTask, progress: Progress) -> None:
@@ -136,7 +137,7 @@ def refine_submap(task: SubmapTask, progress: Progress) -> None:
     refined = _optimise(task, given, progress, REFINED, initial, (gains[rows], offsets[rows]))
     result = _result(task, refined, given.views)
     anchors = result.gaussian_map.anchor_frame_ids.cpu().numpy()
-    task.save(REFINED, replace(result, gaussian_map=_belonging(result.gaussian_map, anchors, task.submap)))
+    task.save(REFINED, replace(result, gaussian_map=belonging(result.gaussian_map, anchors, task.submap)))
 
 
 def in_order(results: Sequence[SubmapResult]) -> tuple[NDArray[np.int64], NDArray[np.float64], Exposures]:
@@ -149,7 +150,7 @@ def in_order(results: Sequence[SubmapResult]) -> tuple[NDArray[np.int64], NDArra
 
 def measure_submap(task: SubmapTask, progress: Progress) -> tuple[list[ViewFigures], list[ViewFigures]]:
     """Figures of its own keyframes and of the frames held out among those of its trajectory, where that puts them."""
-    maps = [task.load(REFINED, n).gaussian_map for n in (task.number, *task.submap.beside)]
+    maps = [task.load(task.measured, n).gaussian_map for n in (task.number, *task.submap.beside)]
     given = task.views(task.trajectory, task.config.mapping.hold_out)
     rows = {int(i): row for row, i in enumerate(task.trajectory.frame_ids)}
     whole = together(maps)
@@ -208,7 +209,7 @@ def _posed(results: Iterable[SubmapResult], full: Intrinsics) -> list[PosedDepth
     ]
 
 
-def _belonging(gaussian_map: GaussianMap, anchors: NDArray[np.int64], submap: Submap) -> GaussianMap:
+def belonging(gaussian_map: GaussianMap, anchors: NDArray[np.int64], submap: Submap) -> GaussianMap:
     """The Gaussians that are anchored (M,) at the submap's own keyframes."""
     kept = torch.from_numpy(np.isin(anchors, submap.own)).to(gaussian_map.means.device)
     anchored = replace(gaussian_map, anchor_frame_ids=torch.from_numpy(anchors).to(gaussian_map.means.device))

@@ -1,19 +1,28 @@
 """A map made in parts is as good as one made whole, and the same however often its making is broken off."""
 
+import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from finished import note_finished
 from scipy import sparse
 
+from formats.gaussian_ply import read_gaussian_ply
 from pipelines.config import Config, MappingConfig, RunConfig
 from pipelines.depth.posed import PosedDepth
+from pipelines.export.tiles import write_tiles
+from pipelines.gaussians.render import render
 from pipelines.geometry import se3
 from pipelines.mapping import stage as mapping_stage
 from pipelines.mapping import submaps
+from pipelines.mapping.divided import refine_divided
 from pipelines.mapping.submaps import BORDER, divide, nearest_seeing
+from pipelines.outcome import load_outcome
 from pipelines.progress import SilentProgress
 from pipelines.run_folder import RunFolder
 from pipelines.stages import StageContext
@@ -150,3 +159,49 @@ def test_broken_off_anywhere_it_ends_with_the_same_bytes(
         assert figures == divided[1]
         for name in ("map.safetensors", "trajectory.npz", "exposure.npz", "mapping.json"):
             assert (folder / name).read_bytes() == (divided[0] / name).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def finished(small_run: RunFolder, divided: tuple[Path, dict], tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A run whose map was made in parts."""
+    run = RunFolder(tmp_path_factory.mktemp("finished") / "run")
+    shutil.copytree(small_run.root, run.root)
+    shutil.copytree(divided[0], run.stage("mapping"), ignore=shutil.ignore_patterns("snapshot"))
+    note_finished(run, ("frames", "proxy", "tracking", "mapping"), CONFIG)
+    return run
+
+
+def test_a_shaken_map_is_refined_in_its_parts(finished: RunFolder, tmp_path: Path) -> None:
+    gaussian_map, exposure = finished.load_map("mapping"), finished.load_exposure()
+    noise = torch.randn(gaussian_map.colors.shape, generator=torch.Generator().manual_seed(0))
+    shaken = replace(gaussian_map, colors=gaussian_map.colors + 0.05 * noise)
+    context = StageContext(finished, finished.root, CONFIG, tmp_path, SilentProgress())
+    poses, fields = finished.load_trajectory("mapping"), finished.load_depth_fields("tracking")
+    exposures = exposure["log_gains"], exposure["offsets"]
+    before, made, after = refine_divided(context, shaken, poses, fields, exposures, 2.0)
+    assert after > before + 1
+    assert 0.8 < len(made.gaussian_map) / len(gaussian_map) < 1.6
+    assert made.cam_from_world.shape == (14, 4, 4)
+
+
+def test_tiles_are_the_map_and_a_coarse_one(finished: RunFolder, tmp_path: Path) -> None:
+    outcome = load_outcome(finished, "cpu")
+    paths = write_tiles(outcome, tmp_path)
+    rows = json.loads((tmp_path / "tiles.json").read_text())
+    assert [p.name for p in paths] == ["submap_1", "submap_2", "submap_3", "tiles.json"]
+    tiles = [read_gaussian_ply(tmp_path / row["folder"] / "point_cloud.ply") for row in rows]
+    assert sum(len(t) for t in tiles) == len(outcome.require_map())
+    camera = outcome.calibration.intrinsics
+    row = outcome.frame_row(int(finished.load_submaps()[0]["own"][1]))
+    pose = torch.from_numpy(outcome.trajectory.cam_from_world[row])
+    shown = []
+    for name in ("point_cloud.ply", "coarse.ply"):
+        clouds = [read_gaussian_ply(tmp_path / r["folder"] / name) for r in rows]
+        columns = ("means", "log_scales", "opacity_logits", "colors")
+        means, scales, logits, colors = (
+            torch.from_numpy(np.concatenate([getattr(c, n) for c in clouds])) for n in columns
+        )
+        shown.append(render(means, scales[:, 0].exp(), logits.sigmoid(), colors, pose, camera))
+    assert all(row["coarse_gaussians"] < 0.4 * row["gaussians"] for row in rows)
+    assert float((shown[0].features - shown[1].features).abs().mean()) < 0.08
+    assert float(shown[1].silhouette.mean()) > 0.9 * float(shown[0].silhouette.mean())
