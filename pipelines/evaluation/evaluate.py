@@ -107,6 +107,7 @@ def frame_cells(outcome: Outcome, matched: MatchedTruth) -> dict[str, Any]:
     return {
         "picked": len(t.frame_ids),
         "posed": int(t.is_posed.sum()),
+        "by rotation alone": int(t.by_rotation.sum()),
         "keyframes": int(t.is_keyframe.sum()),
         "with true pose": int(matched.has_pose.sum()),
         "with true image": int((matched.image >= 0).sum()),

@@ -67,6 +67,8 @@ def _load_loops(outcome: Outcome) -> list[LoopEdge]:
 def _figures(outcome: Outcome, views: RenderedViews | None) -> list[tuple[str, str]]:
     t = outcome.trajectory
     pairs = [("frames posed", f"{int(t.is_posed.sum())} / {len(t.frame_ids)}")]
+    if t.by_rotation.any():
+        pairs.append(("of them by rotation alone", str(int(t.by_rotation.sum()))))
     pairs.append(("keyframes", str(int(t.is_keyframe.sum()))))
     if outcome.gaussian_map is not None:
         pairs.append(("Gaussians", f"{len(outcome.gaussian_map):,}"))

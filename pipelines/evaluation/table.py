@@ -23,6 +23,8 @@ def _rows(result: dict[str, Any]) -> list[Row]:
     stage = result["stage"]
     frames = result["frames"]
     of = f"{frames['picked']} picked, {frames['keyframes']} keyframes, {frames['with true pose']} with a true pose"
+    if frames.get("by rotation alone"):
+        of += f"; {frames['by rotation alone']} by rotation alone, which no error of a place counts"
     rows = [("frames posed", str(frames["posed"]), of), _camera_row(result["camera"])]
     rows += _trajectory_rows(result["trajectory"], stage["poses"])
     rows += _scale_rows(result["scale"])
