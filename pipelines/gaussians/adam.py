@@ -35,17 +35,21 @@ class AdamTable:
             self.second.setdefault(key, torch.zeros_like(self.values[key].detach()))
 
     def step(
-        self, gradients: Mapping[str, Tensor | None], rates: Mapping[str, float], shares: Tensor | None = None
+        self,
+        gradients: Mapping[str, Tensor | None],
+        rates: Mapping[str, float],
+        shares: Mapping[str, Tensor] | None = None,
     ) -> None:
         """One Adam step for the parameters that have a gradient and a rate.
 
-        `shares` (M,): how much of the step each row takes, None for all of it.
+        `shares`, (M,) each: how much of the step each row takes, all of it where there are none.
         """
         self.steps += 1
         for key, value in self.values.items():
             gradient, rate = gradients.get(key), rates.get(key, 0.0)
             if gradient is not None and rate != 0:
-                descend(value.detach(), gradient, self.first[key], self.second[key], rate, self.steps, shares)
+                share = None if shares is None else shares.get(key)
+                descend(value.detach(), gradient, self.first[key], self.second[key], rate, self.steps, share)
 
     def keep(self, rows: Tensor) -> None:
         """Keep only the given rows: (M,) bool or indices."""
@@ -98,6 +102,9 @@ def descend(
 ) -> None:
     """The `steps`-th step of Kingma and Ba 2015 on (M, ...) values and moments, in place; `shares` (M,) of it or all.
 
+    Numbers with a gradient of 0 wait, and so do their moments: most Gaussians are seen by few of the views, and would
+    drift on in between by what the last of them wanted.
+
     float32 on a CPU takes a compiled loop, one pass over memory; everything else plain torch.
     """
     if value.device.type == "cpu" and value.dtype == torch.float32 and value.ndim in (1, 2) and value.is_contiguous():
@@ -110,9 +117,11 @@ def plain_descend(
     value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, steps: int, shares: Tensor | None
 ) -> None:
     """The same by torch's own functions."""
-    first.lerp_(gradient, 1 - _BETA1)
-    second.mul_(_BETA2).addcmul_(gradient, gradient, value=1 - _BETA2)
+    waits = gradient == 0
+    first.copy_(torch.where(waits, first, first.lerp(gradient, 1 - _BETA1)))
+    second.copy_(torch.where(waits, second, (second * _BETA2).addcmul_(gradient, gradient, value=1 - _BETA2)))
     change = first / (second.sqrt() / math.sqrt(1 - _BETA2**steps) + _EPSILON) * (-rate / (1 - _BETA1**steps))
+    change = change.masked_fill(waits, 0)
     value.add_(change if shares is None else change * shares.reshape(-1, *[1] * (value.ndim - 1)))
 
 
@@ -151,6 +160,8 @@ def _descend_rows(
         share = scale * shares[row] if len(shares) else scale
         for c in range(width):
             i, g = row * width + c, gradient[row * stride + c]
+            if g == 0:
+                continue
             m = keep1 * first[i] + new1 * g
             v = keep2 * second[i] + new2 * g * g
             first[i], second[i] = m, v

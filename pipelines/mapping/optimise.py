@@ -16,6 +16,7 @@ from pipelines.gaussians.adam import AdamTable, gradients_of
 from pipelines.gaussians.render import Rendering, blending_weights, render
 from pipelines.mapping.growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
 from pipelines.mapping.objective import Objective
+from pipelines.mapping.parameters import KEYS
 from pipelines.mapping.schedule import Schedule, Seeding, Step
 from pipelines.mapping.splitting import Blame, blame
 from pipelines.mapping.state import Exposures, OptimisedMap, OptimiserState, expose
@@ -24,8 +25,8 @@ from pipelines.progress import Progress, SilentProgress
 from pipelines.stopping import is_asked
 from pipelines.streamed import Streamed
 
-MAP_RATES = {"means": 3e-4, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2, "class_logits": 6e-2}
-"""Learning rates of Adam, of positions in units of the scene's median depth."""
+MAP_RATES = {"means": 0.1, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2, "class_logits": 6e-2}
+"""Learning rates of Adam, of positions in radii of the Gaussian: what is small has to be placed finely."""
 HALVES_ROOM = 250e6
 """Bytes of views at half the size that are kept; to halve one takes a hundredth of a visit."""
 POSE_RATE, EXPOSURE_RATE = 1e-4, 1e-2
@@ -100,7 +101,8 @@ class MapOptimiser:
         rendering = self.draw(view, table, with_classes)
         loss = self.objective.of(view, table, rendering, parameters["log_radii"], with_labels) * step.weight
         of_map, of_view = gradients_of(loss, (parameters.table, table))
-        parameters.table.step(of_map, self._map_rates(step.rate), self._shares())
+        rates = {key: rate * step.rate for key, rate in MAP_RATES.items()}
+        parameters.table.step(of_map, rates, self._shares())
         table.step(of_view, self._view_rates(step))
         if step.grow:
             self.growth.grow(step.view, Rendering(*(x.detach() for x in vars(rendering).values())))
@@ -155,19 +157,17 @@ class MapOptimiser:
             twist=table.values["twist"] if self.settings.refine_poses else None,
         )
 
-    def _shares(self) -> Tensor:
-        """(M,) step sizes by confidence class (MSGS-SLAM 3.4).
+    def _shares(self) -> dict[str, Tensor]:
+        """(M,) step sizes by confidence class (MSGS-SLAM 3.4), those of positions times the radius.
 
         The article has small steps where depth is unreliable. Measured, the contrary helps: what stands in the wrong
         place has farther to go, and colours have to lead it there.
         """
         trust = self.state.parameters.trust
         shares = torch.where(trust > LOW_RELIABILITY, math.sqrt(LOW_TRUST_STEP), LOW_TRUST_STEP)
-        return torch.where(trust > HIGH_RELIABILITY, 1.0, shares)
-
-    def _map_rates(self, factor: float) -> dict[str, float]:
-        rates = {**MAP_RATES, "means": MAP_RATES["means"] * self.unit}
-        return {k: v * factor for k, v in rates.items()}
+        shares = torch.where(trust > HIGH_RELIABILITY, 1.0, shares)
+        radii = torch.exp(self.state.parameters["log_radii"].detach())
+        return {**dict.fromkeys(KEYS, shares), "means": shares * radii}
 
     def _view_rates(self, step: Step) -> dict[str, float]:
         s = self.settings

@@ -32,10 +32,24 @@ def test_the_compiled_step_is_the_plain_one(shape: tuple[int, ...], shared: bool
     shares = torch.rand(shape[0], generator=generator) if shared else None
     for steps in (5, 6):
         gradient = torch.randn(shape, generator=generator)
+        gradient[torch.rand(shape, generator=generator) < 0.3] = 0
         descend(fast[0], gradient, fast[1], fast[2], 0.1, steps, shares)
         plain_descend(plain[0], gradient, plain[1], plain[2], 0.1, steps, shares)
     for a, b in zip(fast, plain, strict=True):
         assert torch.allclose(a, b, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_has_no_gradient_waits(dtype: torch.dtype) -> None:
+    """Neither values nor moments go on where a view shows nothing."""
+    table = AdamTable({"x": torch.zeros(2, 3, dtype=dtype)})
+    table.step({"x": torch.ones(2, 3, dtype=dtype)}, {"x": 0.1})
+    before = [x.detach().clone() for x in (table.values["x"], table.first["x"], table.second["x"])]
+    table.step({"x": torch.tensor([[0.0] * 3, [1.0] * 3], dtype=dtype)}, {"x": 0.1})
+    after = [x.detach() for x in (table.values["x"], table.first["x"], table.second["x"])]
+    for old, new in zip(before, after, strict=True):
+        assert torch.equal(old[0], new[0])
+        assert not torch.equal(old[1], new[1])
 
 
 def test_a_gradient_may_be_columns_of_a_larger_one() -> None:
@@ -51,8 +65,10 @@ def test_a_gradient_may_be_columns_of_a_larger_one() -> None:
 
 
 def test_steps_by_shares() -> None:
-    table = AdamTable({"x": torch.zeros(3, 2)})
-    table.step({"x": torch.ones(3, 2)}, {"x": 0.1}, torch.tensor([0.25, 1.0, 0.0]))
+    table = AdamTable({"x": torch.zeros(3, 2), "y": torch.zeros(3, 2)})
+    gradients = dict.fromkeys("xy", torch.ones(3, 2))
+    table.step(gradients, dict.fromkeys("xy", 0.1), {"x": torch.tensor([0.25, 1.0, 0.0])})
+    assert torch.allclose(table.values["y"], torch.tensor(-0.1), rtol=1e-4)
     assert torch.allclose(table.values["x"], torch.tensor([[-0.025], [-0.1], [0.0]]).expand(3, 2), rtol=1e-4)
 
 
