@@ -6,14 +6,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipelines.export.volume import DepthView
+from pipelines.depth.posed import PosedDepth
 from pipelines.gaussian_map import GaussianMap
 from pipelines.gaussians.render import median_depth, render
 from pipelines.types import Intrinsics
 
 
 @torch.no_grad()
-def depth_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], camera: Intrinsics) -> DepthView:
+def depth_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], camera: Intrinsics) -> PosedDepth:
     """Median depth with a weight: none where the map is thin or the depth jumps, less far away."""
     m = gaussian_map
     pose = torch.as_tensor(cam_from_world, device=m.means.device)
@@ -23,7 +23,7 @@ def depth_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], c
     typical = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
     # The error of a depth grows with its square.
     weight = np.where(solid, np.clip(typical / np.maximum(depth, 1e-9), 0.2, 1.5) ** 2 * silhouette, 0)
-    return DepthView(camera, cam_from_world, depth.astype(np.float32), weight.astype(np.float32))
+    return PosedDepth(camera, cam_from_world, depth.astype(np.float32), weight.astype(np.float32))
 
 
 def _jumps(depth: NDArray[np.float32], tolerance: float = 0.08) -> NDArray[np.bool_]:

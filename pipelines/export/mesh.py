@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from formats.mesh import write_mesh_glb, write_mesh_ply
 from pipelines.config import ExportConfig
+from pipelines.depth.posed import PosedDepth
 from pipelines.export.depth_views import depth_view
 from pipelines.export.paint import PaintedView, paint
 from pipelines.export.surface import extract_surface, without_floaters
-from pipelines.export.volume import DepthView, fuse
+from pipelines.export.volume import fuse
 from pipelines.gaussian_map import GaussianMap, decided_channels
 from pipelines.gaussians.render import get_threads, render
 from pipelines.outcome import Outcome, evenly
@@ -32,7 +33,7 @@ def keyframe_rows(outcome: Outcome, settings: ExportConfig) -> list[int]:
     return evenly(np.flatnonzero(outcome.trajectory.is_keyframe).tolist(), settings.max_views)
 
 
-def depth_views(outcome: Outcome, settings: ExportConfig, progress: Progress) -> list[DepthView]:
+def depth_views(outcome: Outcome, settings: ExportConfig, progress: Progress) -> list[PosedDepth]:
     """What the map shows as depth in each of the `keyframe_rows`."""
     rows, gaussian_map = keyframe_rows(outcome, settings), outcome.require_map()
     camera = outcome.calibration.intrinsics.at_most(settings.mesh_side)
@@ -44,7 +45,7 @@ _LEAST_PIECE = 0.01
 """Connected pieces smaller than this share of the largest one are floaters."""
 
 
-def make_mesh(outcome: Outcome, views: list[DepthView], settings: ExportConfig, progress: Progress) -> SemanticMesh:
+def make_mesh(outcome: Outcome, views: list[PosedDepth], settings: ExportConfig, progress: Progress) -> SemanticMesh:
     """The surface of the map as the keyframes see it; without a vertex where nothing is seen twice."""
     gaussian_map = outcome.require_map()
     voxel = settings.voxel * _median_depth(views)
@@ -68,13 +69,13 @@ def write_mesh(
     return [folder / "mesh.ply", folder / "mesh.glb"]
 
 
-def _median_depth(views: Sequence[DepthView]) -> float:
-    seen = np.concatenate([v.depth[v.weight > 0][::16] for v in views])
+def _median_depth(views: Sequence[PosedDepth]) -> float:
+    seen = np.concatenate([v.depth[v.trust > 0][::16] for v in views])
     return float(np.median(seen)) if len(seen) else 1.0
 
 
 @torch.no_grad()
-def _painted(gaussian_map: GaussianMap, views: Sequence[DepthView]) -> Iterator[PaintedView]:
+def _painted(gaussian_map: GaussianMap, views: Sequence[PosedDepth]) -> Iterator[PaintedView]:
     m = gaussian_map
     features = torch.cat([m.colors, m.class_logits], dim=1)
     for view in views:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.export.volume import DepthView
+from pipelines.depth.posed import PosedDepth
 from pipelines.geometry.camera import project
 from pipelines.types import VOID
 
@@ -17,7 +17,7 @@ from pipelines.types import VOID
 class PaintedView:
     """A depth view with its colors (H, W, 3) float32 0..1 and class channels (H, W) int64, -1 = none."""
 
-    depth_view: DepthView
+    depth_view: PosedDepth
     colors: NDArray[np.float32]
     channels: NDArray[np.int64] | None
 
@@ -34,7 +34,7 @@ def paint(
     votes = np.zeros((len(vertices), max(len(class_ids), 1)), np.float32)
     for view in views:
         rows, place = _seen(vertices, view.depth_view, tolerance)
-        share = view.depth_view.weight[place]
+        share = view.depth_view.trust[place]
         total[rows] += view.colors[place] * share[:, None]
         weight[rows] += share
         if view.channels is not None and class_ids:
@@ -47,7 +47,7 @@ def paint(
 
 
 def _seen(
-    vertices: NDArray[np.float32], view: DepthView, tolerance: float
+    vertices: NDArray[np.float32], view: PosedDepth, tolerance: float
 ) -> tuple[NDArray[np.int64], tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Which vertices the view sees, and the (row, column) of each."""
     pose = view.cam_from_world
@@ -55,5 +55,5 @@ def _seen(
     inside = np.flatnonzero(((xy >= 0) & (xy < (view.intrinsics.width, view.intrinsics.height))).all(1))
     place = xy[inside].astype(int)
     close = np.abs(view.depth[place[:, 1], place[:, 0]] - z[inside]) < tolerance
-    close &= view.weight[place[:, 1], place[:, 0]] > 0
+    close &= view.trust[place[:, 1], place[:, 0]] > 0
     return inside[close], (place[close, 1], place[close, 0])

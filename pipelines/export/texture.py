@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.depth.posed import PosedDepth
 from pipelines.export.atlas import Atlas, owners
-from pipelines.export.volume import DepthView
 from pipelines.gaussians.render.threads import for_each
 from pipelines.geometry.camera import project
 from pipelines.jit import kernel
@@ -32,7 +32,7 @@ class Shot:
     """A keyframe to paint from: what it sees as depth, its full camera, how sharp it is among the others (1 = as most),
     and `photo` () -> (H, W, 3) float32 0..1 without exposure."""
 
-    depth_view: DepthView
+    depth_view: PosedDepth
     camera: Intrinsics
     sharpness: float
     photo: Callable[[], NDArray[np.float32]]
@@ -93,16 +93,16 @@ def _density(
     size = np.array([view.intrinsics.width, view.intrinsics.height])
     inside = np.all((xy >= 0) & (xy < size), axis=1)
     place = np.where(inside.reshape(-1, 1), xy, 0).astype(np.int64)
-    depth, weight = view.depth[place[:, 1], place[:, 0]], view.weight[place[:, 1], place[:, 0]]
+    depth, weight = view.depth[place[:, 1], place[:, 0]], view.trust[place[:, 1], place[:, 0]]
     seen = inside & (weight > 0) & (np.abs(depth - z) < AGREES * np.abs(z))
     towards = -(normals @ pose[:3, :3].T * in_cam).sum(1) / np.maximum(np.linalg.norm(in_cam, axis=1), 1e-9)
     density = shot.camera.fx * towards / np.where(seen, z, 1)
     return np.where(seen, density.clip(0), 0), place
 
 
-def _feather(view: DepthView) -> NDArray[np.float32]:
+def _feather(view: PosedDepth) -> NDArray[np.float32]:
     """(H, W) 0..1: distance from the rim of what the view sees, in units of `_FEATHER`."""
-    valid = np.pad((view.weight > 0).astype(np.uint8), 1)
+    valid = np.pad((view.trust > 0).astype(np.uint8), 1)
     away = cv2.distanceTransform(valid, cv2.DIST_L2, 3)[1:-1, 1:-1]
     return np.minimum(away / (_FEATHER * view.depth.shape[1]), 1).astype(np.float32)
 
@@ -119,7 +119,7 @@ def _add(
     pose, photo = view.cam_from_world, np.ascontiguousarray(shot.photo(), np.float32)
     in_cam = (atlas.mesh.vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])[atlas.corner_vertex]
     camera = np.array([k.fx, k.fy, k.cx, k.cy, small.width / k.width, small.height / k.height])
-    depth = np.where(view.weight > 0, view.depth, 0).astype(np.float32)
+    depth = np.where(view.trust > 0, view.depth, 0).astype(np.float32)
 
     def band(a: int, b: int) -> None:
         _sample(

@@ -13,10 +13,10 @@ from scipy.ndimage import median_filter
 
 from formats.textured_mesh import TexturedMesh, write_textured_glb, write_textured_obj
 from pipelines.config import ExportConfig
+from pipelines.depth.posed import PosedDepth
 from pipelines.export.atlas import simplified, unwrapped
 from pipelines.export.mesh import keyframe_rows
 from pipelines.export.texture import Shot, paint_texture, texels_wanted
-from pipelines.export.volume import DepthView
 from pipelines.outcome import Outcome
 from pipelines.progress import Progress
 from pipelines.types import Frame, SemanticMesh
@@ -26,7 +26,7 @@ TEXTURE_SIDE = 4096
 
 
 def make_textured(
-    outcome: Outcome, mesh: SemanticMesh, views: Sequence[DepthView], settings: ExportConfig, progress: Progress
+    outcome: Outcome, mesh: SemanticMesh, views: Sequence[PosedDepth], settings: ExportConfig, progress: Progress
 ) -> TexturedMesh:
     """A tenth of the mesh's vertices, and a picture of its surface from the keyframes that `views` are of."""
     shots = _shots(outcome, views, settings)
@@ -47,7 +47,7 @@ def write_textured(
     return [*paths, folder / "mesh_textured.glb"]
 
 
-def _shots(outcome: Outcome, views: Sequence[DepthView], settings: ExportConfig) -> list[Shot]:
+def _shots(outcome: Outcome, views: Sequence[PosedDepth], settings: ExportConfig) -> list[Shot]:
     frame_of = {f.id: f for f in outcome.frames}
     frames = [frame_of[int(outcome.trajectory.frame_ids[r])] for r in keyframe_rows(outcome, settings)]
     measured = np.array([f.sharpness for f in frames])
@@ -57,12 +57,12 @@ def _shots(outcome: Outcome, views: Sequence[DepthView], settings: ExportConfig)
     return [_shot(outcome, *of_one) for of_one in zip(frames, views, sharpness.tolist(), strict=True)]
 
 
-def _shot(outcome: Outcome, frame: Frame, view: DepthView, sharpness: float) -> Shot:
+def _shot(outcome: Outcome, frame: Frame, view: PosedDepth, sharpness: float) -> Shot:
     hidden = outcome.run.left_out(frame)
     if hidden is not None:
         size = (view.depth.shape[1], view.depth.shape[0])
         kept = cv2.resize(hidden.astype(np.uint8), size, interpolation=cv2.INTER_AREA) == 0
-        view = replace(view, weight=np.where(kept, view.weight, 0).astype(np.float32))
+        view = replace(view, trust=np.where(kept, view.trust, 0).astype(np.float32))
 
     def photo() -> NDArray[np.float32]:
         picture = outcome.run.image(frame).astype(np.float32) / np.float32(255)

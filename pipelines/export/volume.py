@@ -9,22 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.depth.posed import PosedDepth
 from pipelines.gaussians.render.jit import kernel
 from pipelines.geometry.camera import unproject_depth
-from pipelines.types import Intrinsics
 
 SIDE = 8
 """Voxels along the side of a block."""
-
-
-@dataclass(frozen=True)
-class DepthView:
-    """depth and weight (H, W) float32, 0 = nothing seen; cam_from_world (4, 4)."""
-
-    intrinsics: Intrinsics
-    cam_from_world: NDArray[np.float64]
-    depth: NDArray[np.float32]
-    weight: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -42,13 +32,13 @@ class Volume:
     weight: NDArray[np.float32]
 
 
-def touched_blocks(views: list[DepthView], voxel: float, truncation: float) -> NDArray[np.int32]:
+def touched_blocks(views: list[PosedDepth], voxel: float, truncation: float) -> NDArray[np.int32]:
     """(B, 3) coordinates of the blocks within the truncation of a seen surface, sorted."""
     found = np.zeros((0, 3), np.int32)
     for view in views:
         world_from_cam = np.linalg.inv(view.cam_from_world)
         points = unproject_depth(view.depth, view.intrinsics)[::3, ::3]
-        points = points[(view.weight[::3, ::3] > 0) & (view.depth[::3, ::3] > 0)]
+        points = points[(view.trust[::3, ::3] > 0) & (view.depth[::3, ::3] > 0)]
         rays = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-9)
         offsets = np.arange(-1, 1.01, 0.5)[:, None, None] * truncation
         near = ((points + offsets * rays).reshape(-1, 3)) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
@@ -57,7 +47,7 @@ def touched_blocks(views: list[DepthView], voxel: float, truncation: float) -> N
     return found
 
 
-def fuse(views: list[DepthView], voxel: float, truncation_voxels: float, max_blocks: int, threads: int) -> Volume:
+def fuse(views: list[PosedDepth], voxel: float, truncation_voxels: float, max_blocks: int, threads: int) -> Volume:
     """The weighted mean of all views' truncated distances; the voxels grow until at most `max_blocks` are needed."""
     blocks = touched_blocks(views, voxel, voxel * truncation_voxels)
     while len(blocks) > max_blocks:
@@ -73,7 +63,7 @@ def fuse(views: list[DepthView], voxel: float, truncation_voxels: float, max_blo
             camera = np.array([k.fx, k.fy, k.cx, k.cy])
             jobs = [
                 pool.submit(
-                    _integrate, blocks[a:b], distance[a:b], weight[a:b], view.depth, view.weight,
+                    _integrate, blocks[a:b], distance[a:b], weight[a:b], view.depth, view.trust,
                     np.ascontiguousarray(view.cam_from_world), camera, voxel, truncation,
                 )
                 for a, b in itertools.pairwise(bounds)

@@ -102,7 +102,7 @@ def load_view(
 ) -> View:
     """One frame as a view."""
     image, left_out = run.image(frame), run.left_out(frame)
-    return make_view(frame.id, intrinsics, cam_from_world, image, maps, 1.0, class_ids, device, left_out)
+    return make_view(frame.id, intrinsics, cam_from_world, image, maps, class_ids, device, left_out)
 
 
 def split_frames(trajectory: Trajectory, hold_out: int) -> tuple[list[int], list[int]]:

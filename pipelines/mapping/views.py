@@ -81,7 +81,6 @@ def make_view(
     cam_from_world: NDArray[np.float64],
     image: NDArray[np.uint8],
     maps: ProxyMaps | None,
-    depth_scale: float,
     class_ids: tuple[int, ...],
     device: torch.device | str = "cpu",
     left_out: NDArray[np.bool_] | None = None,
@@ -98,7 +97,7 @@ def make_view(
         maps = resize_maps(maps, width, height)
     arrays = (
         image,
-        (maps.depth * depth_scale).astype(np.float32),
+        maps.depth.astype(np.float32),
         np.round(maps.confidence * 255).astype(np.uint8),
         channel_table(class_ids)[maps.labels],
         np.round(maps.label_confidence * 255).astype(np.uint8),

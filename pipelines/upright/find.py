@@ -87,11 +87,11 @@ def surface_voxels(outcome: Outcome, cam_from_world: Sequence[Array]) -> Voxels:
     """The surface that the map shows from poses (N, 4, 4), as voxels a sixtieth of its usual depth wide."""
     gaussian_map, camera = outcome.require_map(), outcome.calibration.intrinsics.at_most(_SIDE)
     views = [depth_view(gaussian_map, pose, camera) for pose in cam_from_world]
-    seen = np.concatenate([np.zeros(0), *(v.depth[v.weight > 0] for v in views)])
+    seen = np.concatenate([np.zeros(0), *(v.depth[v.trust > 0] for v in views)])
     size = float(np.median(seen)) / _VOXELS_PER_DEPTH if len(seen) else 1.0
     black = np.zeros((camera.height, camera.width, 3), np.uint8)
     rows = (
-        gather_frame(v.depth, v.weight, black, camera, np.linalg.inv(v.cam_from_world).astype(np.float64), size)
+        gather_frame(v.depth, v.trust, black, camera, np.linalg.inv(v.cam_from_world).astype(np.float64), size)
         for v in views
     )
     voxels = merge(size, rows)

@@ -56,7 +56,7 @@ class Shot:
 
     def view(self, sequence: Sequence, camera: Intrinsics, classes: tuple[int, ...]) -> View:
         """As mapping sees it, at its true pose."""
-        return make_view(self.index, camera, pose_of(sequence, self.index), self.image, self.maps, 1.0, classes)
+        return make_view(self.index, camera, pose_of(sequence, self.index), self.image, self.maps, classes)
 
 
 def pose_of(sequence: Sequence, index: int) -> NDArray[np.float64]:

@@ -5,9 +5,10 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+from pipelines.depth.posed import PosedDepth
 from pipelines.export.paint import PaintedView, paint
 from pipelines.export.surface import extract_surface, without_floaters
-from pipelines.export.volume import DepthView, Volume, fuse
+from pipelines.export.volume import Volume, fuse
 from pipelines.types import VOID, Intrinsics
 
 CAMERA = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
@@ -34,16 +35,16 @@ def pixel_rays() -> NDArray[np.float64]:
     return np.stack([(x - CAMERA.cx) / CAMERA.fx, (y - CAMERA.cy) / CAMERA.fy, np.ones_like(x)], axis=-1)
 
 
-def sphere(pose: NDArray[np.float64]) -> DepthView:
+def sphere(pose: NDArray[np.float64]) -> PosedDepth:
     """Exact z-depth of the sphere at the origin, 0 beside it."""
     rays, center = pixel_rays(), pose[:3, 3]
     a, b, c = (rays**2).sum(-1), rays @ center, center @ center - RADIUS**2
     root = b**2 - a * c
     depth = np.where(root > 0, (b - np.sqrt(np.maximum(root, 0))) / a, 0).astype(np.float32)
-    return DepthView(CAMERA, pose, depth, (depth > 0).astype(np.float32))
+    return PosedDepth(CAMERA, pose, depth, (depth > 0).astype(np.float32))
 
 
-def painted(view: DepthView) -> PaintedView:
+def painted(view: PosedDepth) -> PaintedView:
     """Where x < 0 in the world channel 0 and red, else channel 1 and blue."""
     points = (pixel_rays() * view.depth[..., None] - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
     left = points[..., 0] < 0
@@ -113,7 +114,7 @@ def test_threads_do_not_change_a_byte() -> None:
 
 def test_nothing_seen_gives_an_empty_surface() -> None:
     view = sphere(orbit(1)[0])
-    nothing = DepthView(CAMERA, view.cam_from_world, view.depth * 0, view.weight * 0)
+    nothing = PosedDepth(CAMERA, view.cam_from_world, view.depth * 0, view.trust * 0)
     vertices, faces = extract_surface(fuse([nothing, nothing], VOXEL, 4.0, 1000, 1), 1.0)
     assert len(vertices) == len(faces) == 0
 

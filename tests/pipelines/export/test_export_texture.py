@@ -5,10 +5,10 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+from pipelines.depth.posed import PosedDepth
 from pipelines.export import texture
 from pipelines.export.atlas import Atlas, owners, simplified, unwrapped
 from pipelines.export.texture import Shot, paint_texture, texels_wanted, vertex_normals, view_weights
-from pipelines.export.volume import DepthView
 from pipelines.gaussians.render.threads import get_threads, set_threads
 from pipelines.progress import SilentProgress
 from pipelines.types import VOID, Intrinsics, SemanticMesh
@@ -46,7 +46,7 @@ def view_of_sphere(angle: float, camera: Intrinsics) -> tuple[NDArray, NDArray, 
 def shot(angle: float, sharpness: float = 1.0, photo: NDArray[np.float32] | None = None) -> Shot:
     pose, depth, _ = view_of_sphere(angle, CAMERA)
     shown = view_of_sphere(angle, FULL)[2] if photo is None else photo
-    return Shot(DepthView(CAMERA, pose, depth, (depth > 0).astype(np.float32)), FULL, sharpness, lambda: shown)
+    return Shot(PosedDepth(CAMERA, pose, depth, (depth > 0).astype(np.float32)), FULL, sharpness, lambda: shown)
 
 
 SHOTS = [shot(a) for a in np.arange(12) * np.pi / 6]
@@ -130,7 +130,7 @@ def test_what_nobody_sees_has_the_vertices_colours(atlas: Atlas) -> None:
 def test_no_texel_is_left_black(atlas: Atlas) -> None:
     """What lies beside charts goes on with their colours, for small pictures of the texture."""
     nothing = shot(0.0)
-    nothing.depth_view.weight[:] = 0
+    nothing.depth_view.trust[:] = 0
     assert (owners(atlas) < 0).any()
     assert (paint_texture(atlas, [nothing], SilentProgress()) == 128).all()
 
@@ -148,7 +148,7 @@ def test_an_occluder_in_front_is_not_painted_on(atlas: Atlas) -> None:
     pose, depth, _ = view_of_sphere(0.0, CAMERA)
     full = view_of_sphere(0.0, FULL)[2].copy()
     depth[40:80, 60:100], full[80:160, 120:200] = 1.0, (1.0, 0.0, 1.0)
-    board = Shot(DepthView(CAMERA, pose, depth, (depth > 0).astype(np.float32)), FULL, 1.0, lambda: full)
+    board = Shot(PosedDepth(CAMERA, pose, depth, (depth > 0).astype(np.float32)), FULL, 1.0, lambda: full)
     with_board = paint_texture(atlas, [board], SilentProgress())
     assert not ((with_board[..., 0] > 240) & (with_board[..., 1] < 20)).any()
 

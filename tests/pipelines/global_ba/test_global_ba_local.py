@@ -43,7 +43,7 @@ def seen(gaussian_map: GaussianMap, frame_id: int, believed: np.ndarray) -> View
     sure = np.ones((120, 160), np.float32)
     maps = ProxyMaps(shown.depth.numpy(), sure, shown.features.argmax(-1).numpy().astype(np.uint8), sure)
     image = np.zeros((120, 160, 3), np.uint8)
-    return make_view(frame_id, CAMERA, believed, image, maps, 1.0, tuple(range(9)))
+    return make_view(frame_id, CAMERA, believed, image, maps, tuple(range(9)))
 
 
 def error(view: View) -> tuple[float, float]:

@@ -250,7 +250,7 @@ def a_view() -> tuple[View, Callable]:
     """A view of random colours, and the loss with its gradient of a picture of it that is a bit off."""
     camera = Intrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
     image = np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8)
-    view = make_view(0, camera, np.eye(4), image, None, 1.0, ())
+    view = make_view(0, camera, np.eye(4), image, None, ())
 
     def loss_of(seen: View) -> tuple[float, torch.Tensor]:
         shown = (view.colors * 0.9 + 0.03).requires_grad_()
