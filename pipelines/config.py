@@ -144,7 +144,7 @@ class MappingConfig:
         or_zero=True,
     )
     seed_stride: int = setting(2, "pixels between two new Gaussians where the map has a hole", within=(1, 64))
-    passes: float = setting(10.0, "how often each keyframe is visited once all are seeded", within=(0, 1000))
+    passes: float = setting(9.0, "how often each keyframe is visited once all are seeded", within=(0, 1000))
     min_iterations: int = setting(400, "at least this many such visits in all", within=(0, 10_000_000))
     snapshot_every: int = setting(150, "steps between two snapshots", within=(1, 1_000_000))
     max_gaussians: int = setting(
