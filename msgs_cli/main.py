@@ -218,7 +218,7 @@ def export(
     quiet: bool,
     verbose: bool,
 ) -> None:
-    """Write the files for other programs: COLMAP model, Gaussian PLY, SPZ or GLB, labelled mesh,
+    """Write the files for other programs: COLMAP model, Gaussian PLY, SPZ, SOG or GLB, labelled mesh,
     the same with a texture, TUM trajectory.
 
     Other settings than the run's own (--set export.voxel=0.02, --set export.spz=true) need --to; `msgs-slam resume RUN

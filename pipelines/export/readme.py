@@ -22,6 +22,7 @@ point_cloud.ply           the map: Gaussians in the layout of the original 3D Ga
 point_cloud_semantic.ply  the same, coloured by class, without the probabilities.
 point_cloud_compact.safetensors   the same in a fraction of the space.
 point_cloud.spz           only with --set export.spz=true: the colours of the map, small, for viewers on the web.
+point_cloud.sog           only by `msgs-slam export RUN --only sog`: the same, smaller still (PlayCanvas, SuperSplat).
 point_cloud.glb           only with --set export.splat_glb=true: the map in glTF (KHR_gaussian_splatting), classes as
                           attribute _LABEL; programs that do not know the extension show coloured points.
 mesh.ply, mesh.glb        the surface with a colour and a label (PLY: property label, GLB: attribute _LABEL) at each

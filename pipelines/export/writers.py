@@ -16,6 +16,7 @@ from formats.gaussian_glb import write_gaussian_glb
 from formats.gaussian_ply import write_gaussian_ply
 from formats.gaussians import GaussianCloud, isotropic_cloud
 from formats.nerfstudio import write_transforms
+from formats.sog import write_sog
 from formats.spz import write_spz
 from formats.trajectory import write_tum
 from pipelines.export.readme import lengths, readme
@@ -94,6 +95,16 @@ def write_spz_file(outcome: Outcome, world: World, version: int, folder: Path) -
     """
     write_spz(folder / "point_cloud.spz", _turned(map_cloud(outcome), world), version)
     return [folder / "point_cloud.spz"]
+
+
+def write_sog_file(outcome: Outcome, world: World, folder: Path) -> list[Path]:
+    """The map's colours in a fifteenth of the space of the PLY, upright in viewers that turn splat PLYs over; nothing
+    where there are no Gaussians."""
+    cloud = map_cloud(outcome)
+    if len(cloud) == 0:
+        return []
+    write_sog(folder / "point_cloud.sog", _turned(cloud, world))
+    return [folder / "point_cloud.sog"]
 
 
 def write_glb_file(outcome: Outcome, world: World, folder: Path) -> list[Path]:
