@@ -135,6 +135,7 @@ def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
         "colmap": "transforms.json",
         "ply": "point_cloud.ply",
         "spz": "point_cloud.spz",
+        "sog": "point_cloud.sog",
         "glb": "point_cloud.glb",
         "tum": "trajectory.txt",
     }
