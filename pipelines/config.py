@@ -95,9 +95,7 @@ class ProxyConfig:
 
     depth: str = setting("auto", "depth provider: auto, multiview, files:FOLDER, files, onnx:CARD or onnx:MODEL")
     semantics: str = setting("auto", "semantics provider: auto, segments, files:FOLDER, files, onnx:CARD or onnx:MODEL")
-    frames: str = setting(
-        "keyframes", "which frames get maps; all needs depth that needs no poses", ("keyframes", "all")
-    )
+    frames: str = setting("keyframes", "which frames get maps; all needs depth without poses", ("keyframes", "all"))
     max_side: int = setting(640, "the maps are at most this many pixels on the long side", within=(64, 8192))
     depth_scale: float = setting(0.001, "metres per unit of integer depth files", within=(1e-9, 1000))
     scale_ref: str = setting(
@@ -113,6 +111,7 @@ class ProxyConfig:
     )
     stereo_side: int = setting(320, "multiview matches images of this many pixels on the long side", within=(32, 4096))
     stereo_planes: int = setting(96, "multiview tries this many depths", within=(4, 1024))
+    moving: str = setting("auto", "auto leaves out what moved, by depth and poses; keep maps it", ("auto", "keep"))
     max_classes: int = setting(16, "segments and clusters make at most this many classes", within=(1, 254))
 
 

@@ -104,13 +104,13 @@ class RunFolder(FinishedFiles):
 
     def left_out(self, frame: Frame) -> NDArray[np.bool_] | None:
         """(H, W) what of the undistorted frame is no part of the scene; None where all of it is."""
-        path = self.mask_file(frame.name)
-        return None if path is None else read_mask(path)
+        found = [read_mask(p) for s in ("frames", "proxy") if (p := self.mask_file(frame.name, s)) is not None]
+        return np.asarray(np.logical_or.reduce(found)) if found else None
 
-    def mask_file(self, name: str) -> Path | None:
-        """The mask of the frame's picture `name`; None where all of it is scene."""
+    def mask_file(self, name: str, stage: str = "frames") -> Path | None:
+        """The mask by which a stage leaves something of the frame's picture `name` out; None where it has none."""
         mask = f"masks/{name}.png"
-        return self.file("frames", mask) if self.has("frames", mask) else None
+        return self.file(stage, mask) if self.has(stage, mask) else None
 
     # proxy ------------------------------------------------------------------------------------------------------
 

@@ -23,7 +23,7 @@ from pipelines.export.readme import lengths, readme
 from pipelines.geometry.rig import rig_of
 from pipelines.metres.files import save_metres
 from pipelines.outcome import Outcome
-from pipelines.run_folder import save_classes
+from pipelines.run_folder import save_classes, save_left_out
 from pipelines.types import SparseModel
 from pipelines.upright.world import World, save_world
 from pipelines.wording import stretches
@@ -34,13 +34,14 @@ def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
     and their masks in `masks/` where they have any."""
     trajectory, k = outcome.trajectory, outcome.calibration.intrinsics
     posed = np.flatnonzero(trajectory.is_placed)
-    name_of = {f.id: f.name for f in outcome.frames}
-    names = tuple(name_of[int(i)] for i in trajectory.frame_ids[posed])
+    frame_of = {f.id: f for f in outcome.frames}
+    frames = [frame_of[int(i)] for i in trajectory.frame_ids[posed]]
+    names = tuple(f.name for f in frames)
     camera = (k.width, k.height, k.fx, k.fy, k.cx, k.cy)
-    for name in names:
-        copy_file(outcome.run.file("frames", name), folder / "frames" / name)
-        if (mask := outcome.run.mask_file(name)) is not None:
-            copy_file(mask, folder / "masks" / mask.name)
+    for frame in frames:
+        copy_file(outcome.run.image_file(frame), folder / "frames" / frame.name)
+        if (left_out := outcome.run.left_out(frame)) is not None:
+            save_left_out(folder / "masks", frame, left_out)
     points = seen_points(outcome.load_sparse(), trajectory.frame_ids[posed])
     write_colmap_model(folder / "sparse" / "0", *camera, names, trajectory.cam_from_world[posed], *points)
     paths = [f"frames/{name}" for name in names]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +14,7 @@ from formats.errors import InputError
 from pipelines.config import Config, ProxyConfig
 from pipelines.correspondence.features import extract_features, to_grey
 from pipelines.frames.recording import open_recording
+from pipelines.masks.moving import SIDE, MovingView, find_moving, to_lab
 from pipelines.progress import Progress, log
 from pipelines.proxy.compact import compact
 from pipelines.proxy.inputs import check_proxy, proxy_inputs
@@ -22,16 +24,19 @@ from pipelines.proxy.reliability import reliability, semantic_agreement, theta, 
 from pipelines.proxy.scale import DepthScale, measure_scale
 from pipelines.proxy.scratch import load_scratch, save_scratch
 from pipelines.proxy.selection import Surroundings, open_depth, open_semantics
-from pipelines.proxy.sequence import Sequence
+from pipelines.proxy.sequence import Sequence, resample_nearest, resize_area
 from pipelines.proxy.symmetry import find_mirror_planes, mirror_pairs
 from pipelines.run_folder import (
     RunFolder,
+    load_left_out,
     load_proxy_maps,
     proxy_path,
+    read_mask,
     save_classes,
     save_descriptors,
     save_figures,
     save_frame_scales,
+    save_left_out,
     save_mirror_pairs,
     save_proxy_maps,
 )
@@ -55,12 +60,11 @@ def run(context: StageContext) -> dict[str, Any]:
     _warn_of_distortion(context, sequence, depths, semantics)
     _depths_by_workers(context, frames)
     _depth_pass(context, sequence, frames, depths)
-    scale = measure_scale(sequence, frames, lambda frame: _load_depth(context.snapshot, frame))
-    reference = reference_scale(
-        context, sequence, frames, depths, scale, lambda frame: _load_depth(context.snapshot, frame)
-    )
+    scale = measure_scale(sequence, frames, lambda frame: _load_depth(context, frame))
+    moving = _moving_pass(context, sequence, frames, scale) if config.moving == "auto" else {}
+    reference = reference_scale(context, sequence, frames, depths, scale, lambda frame: _load_depth(context, frame))
     metres = reference.factor if reference else 1.0
-    semantics.prepare(frames, lambda frame: scale.in_backbone_unit(_load_depth(context.snapshot, frame)))
+    semantics.prepare(frames, lambda frame: scale.in_backbone_unit(_load_depth(context, frame)))
     for message in semantics.warnings():
         context.warn(message)
     save_classes(context.folder, semantics.classes())
@@ -74,6 +78,7 @@ def run(context: StageContext) -> dict[str, Any]:
         **_report(context, frames, depths, semantics, agreements),
         **scale_figures(depths, scale, reference),
         **mirrors,
+        **moving,
     }
     _warn_of_focal(context, sequence, report.get("network_focal_px"))
     save_figures(context.folder, "proxy", report)
@@ -98,7 +103,14 @@ def _load_sequence(context: StageContext) -> Sequence:
     calibration = context.run.load_calibration()
     camera = calibration.intrinsics.at_most(context.config.proxy.max_side)
     run = context.run
-    return Sequence(run.load_frames(), calibration, camera, run.load_backbone(), run.image, run.left_out)
+
+    def left_out(frame: Frame) -> NDArray[np.bool_] | None:
+        """By the stage before this one, and by what of this one is done."""
+        path = run.mask_file(frame.name)
+        before, moved = None if path is None else read_mask(path), load_left_out(context.folder / "masks", frame)
+        return before if moved is None else moved if before is None else before | moved
+
+    return Sequence(run.load_frames(), calibration, camera, run.load_backbone(), run.image, left_out)
 
 
 def _frames_to_do(context: StageContext, sequence: Sequence, config: ProxyConfig, depths: DepthProvider) -> list[Frame]:
@@ -205,9 +217,43 @@ def _depth_path(snapshot: Path, frame: Frame) -> Path:
     return snapshot / "depth" / f"{frame.id:06d}.npz"
 
 
-def _load_depth(snapshot: Path, frame: Frame) -> DepthEstimate:
-    stored = load_scratch(_depth_path(snapshot, frame))
+def _load_depth(context: StageContext, frame: Frame) -> DepthEstimate:
+    """Unknown where something moved, once that has been looked for."""
+    found = _computed_depth(context, frame)
+    moved = load_left_out(context.folder / "masks", frame)
+    if moved is None:
+        return found
+    height, width = found.depth.shape
+    return found.without(cv2.resize(moved.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0)
+
+
+def _computed_depth(context: StageContext, frame: Frame) -> DepthEstimate:
+    stored = load_scratch(_depth_path(context.snapshot, frame))
     return DepthEstimate(stored["depth"], stored["confidence"], int(stored["invalid"]), stored.get("normals"))
+
+
+def _moving_pass(
+    context: StageContext, sequence: Sequence, frames: list[Frame], scale: DepthScale
+) -> dict[str, float | int]:
+    """Masks of what moved; says in how many frames, and how much of those. Made anew from the depth when resumed."""
+    posed = [f for f in frames if f.id in sequence.cam_from_world]
+    camera = sequence.intrinsics.at_most(SIDE)
+
+    def view(k: int) -> MovingView:
+        seen = scale.in_backbone_unit(_computed_depth(context, posed[k]))
+        sure = reliability(seen.depth, seen.confidence, 1.0)
+        depth, trust = (resample_nearest(a, camera.height, camera.width) for a in (seen.depth, sure))
+        lab = to_lab(resize_area(sequence.image(posed[k]), camera.width, camera.height))
+        return MovingView(depth, trust, lab, sequence.cam_from_world[posed[k].id])
+
+    poses = np.array([sequence.cam_from_world[f.id] for f in posed]).reshape(-1, 4, 4)
+    found = find_moving(poses, view, camera, context.progress)
+    full = sequence.calibration.intrinsics
+    for k, moved in found.items():
+        shown = cv2.resize(moved.astype(np.float32), (full.width, full.height), interpolation=cv2.INTER_LINEAR) > 0.5
+        save_left_out(context.folder / "masks", posed[k], shown)
+    share = round(float(np.mean([m.mean() for m in found.values()])), 4) if found else 0.0
+    return {"moving_frames": len(found), "moving_share": share} if found else {}
 
 
 # maps -----------------------------------------------------------------------------------------------------------
@@ -231,7 +277,7 @@ def _maps_pass(
     previous: Frame | None = None
     for frame in context.progress.track(frames, "classes", len(frames)):
         path = proxy_path(context.folder, frame.id)
-        depth = _load_depth(context.snapshot, frame)
+        depth = _load_depth(context, frame)
         seen = scale.in_backbone_unit(depth)
         labels = semantics.estimate(frame, seen).without(sequence.left_out(frame))
         m = _agreement(context, sequence, frame, previous, seen, labels)
@@ -282,7 +328,7 @@ def _symmetry_pass(
     planes = find_mirror_planes(
         sequence,
         frames,
-        lambda frame: scale.in_backbone_unit(_load_depth(context.snapshot, frame)),
+        lambda frame: scale.in_backbone_unit(_load_depth(context, frame)),
         features_of,
         context.progress,
     )
@@ -312,7 +358,7 @@ def _report(
     invalid = 0
     for frame in frames:
         path = proxy_path(context.folder, frame.id)
-        invalid += _load_depth(context.snapshot, frame).invalid
+        invalid += _load_depth(context, frame).invalid
         maps = load_proxy_maps(path)
         sizes.append(path.stat().st_size)
         reliable.append(float((maps.confidence > 0.35).mean()))

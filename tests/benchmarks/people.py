@@ -1,10 +1,12 @@
 """A person who walks through a room: what she costs, and whether she leaves a ghost.
 
     python tests/benchmarks/people.py --out DIR [CASE ...] [--frames 30] [--threads 1] [--poses] [--json FILE]
+                                       [--set KEY=VALUE ...]
 
 The woman of `people/` is cut out by the person network and pasted, walking to and fro, into `whiteroom` (exact poses
 and depth). Cases: clean (without her), networks (found by the networks), masks (the mask she was pasted by given as
---masks, no networks), nothing (she is taken for scene). Needs the recordings in ../shared/data beside the repository.
+--masks, no networks), moving (found by what other keyframes see behind her, no networks), nothing (she is taken for
+scene). Needs the recordings in ../shared/data beside the repository.
 A case that is done in DIR is not done again. With --poses nothing is mapped, and depth, of which the poses are made
 without, is coarse: for the whole walk of 150 frames.
 
@@ -48,7 +50,7 @@ DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 CAMERA = Intrinsics(640, 480, 525.0, 525.0, 320.0, 240.0)
 STEP = 3
 """Every third frame of whiteroom has a picture and a depth map."""
-CASES = ("clean", "networks", "masks", "nothing")
+CASES = ("clean", "networks", "masks", "moving", "nothing")
 TURN = 22
 """Frames (of 10 a second) in which she walks to and fro once."""
 TALL = 440
@@ -114,16 +116,18 @@ def paste(
     return np.round(image + full[..., None] * (over.astype(np.float32) - image)).astype(np.uint8), full
 
 
-def run_case(case: str, folder: Path, threads: int, poses: bool) -> RunFolder:
+def run_case(case: str, folder: Path, threads: int, poses: bool, extra: list[str]) -> RunFolder:
     """Reconstruct one case at a small size; without labels, which have no part in this."""
     run = RunFolder(folder / f"{case}.msgs")
     settings = [f"run.threads={threads}", "run.device=cpu", 'proxy.semantics="segments"', "mapping.max_side=320"]
     if case != "networks":
         settings.append('frames.people="keep"')
+    if case == "nothing":
+        settings.append('proxy.moving="keep"')
     if case == "masks":
         settings.append(f'frames.masks="{folder / "masks"}"')
     source = folder / ("clean" if case == "clean" else "crowded")
-    settings += COARSE if poses else []
+    settings += [*(COARSE if poses else []), *extra]
     until = "tracking" if poses else "export"
     reconstruct(source, run, load_config(overrides=settings), SilentProgress(), until)
     return run
@@ -144,8 +148,11 @@ def measure_path(case: str, run: RunFolder, clip: Clip) -> tuple[dict[str, Any],
         "ate_cm": round(100 * float(np.sqrt((error**2).mean())), 3),
         "person_share": round(float(np.mean([p.mean() for p in person])), 3),
     }
-    if case in ("networks", "masks"):
+    if case in ("networks", "masks", "moving"):
         found = [run.left_out(f) for f in frames]
+        if case == "moving":  # looks at keyframes alone
+            keyframes = np.flatnonzero(trajectory.is_keyframe)
+            found, person = [found[k] for k in keyframes], [person[k] for k in keyframes]
         hit = [float((f & p)[p].mean()) if f is not None else 0.0 for f, p in zip(found, person, strict=True)]
         beside = [float((f & ~p).mean()) for f, p in zip(found, person, strict=True) if f is not None]
         row["person_masked"] = round(float(np.mean(hit)), 3)
@@ -239,6 +246,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--poses", action="store_true")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--set", action="append", default=[], dest="settings", metavar="KEY=VALUE")
     given = parser.parse_args()
     out = given.out.resolve()
     os.environ["MSGS_SLAM_CACHE"] = str(out / "cache")
@@ -247,7 +255,7 @@ def main() -> None:
     clip = make_clip(out, given.frames, Network(store.card(store.get("person")), given.threads, "cpu"))
     rows = []
     for case in given.cases:
-        run = run_case(case, out, given.threads, given.poses)
+        run = run_case(case, out, given.threads, given.poses, given.settings)
         row, true_from_ours = measure_path(case, run, clip)
         rows.append(row if given.poses else row | measure_map(run, clip, true_from_ours, out, case))
         print(json.dumps(rows[-1]), flush=True)
