@@ -150,7 +150,7 @@ class MappingConfig:
         1000000, "the map, or each submap, stops growing at this many", within=(100, 50_000_000)
     )
     submap: int = setting(
-        0, "more keyframes are mapped in overlapping parts of about this many, joined at the end; 0 = never",
+        250, "more keyframes are mapped in overlapping parts of about this many, joined at the end; 0 = never",
         within=(4, 1_000_000), or_zero=True,
     )  # fmt: skip
     depth_weight: float = setting(4.8, "λ_D of eq. (18); 0 = no depth loss", within=(0, 1000))

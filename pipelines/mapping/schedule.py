@@ -81,7 +81,8 @@ class Schedule:
         first_rate: float = 1.0,
     ) -> Schedule:
         """The schedule for these views; `passes` overrides that of the settings, which also have a least count;
-        `keyframe_miou` is T_sem of eq. (12), 0 leaves it away; `first_rate`: learning rates of the first visit."""
+        `keyframe_miou` is T_sem of eq. (12), 0 leaves it away; `first_rate`: learning rates of the first visit; below 1
+        the map only settles, and does not grow."""
         visits = round(passes * len(views)) if passes is not None else round(settings.passes * len(views))
         if passes is None:
             visits = max(visits, settings.min_iterations)
@@ -136,7 +137,7 @@ class Schedule:
         if number < coarse_passes:
             return True, False
         turn = (number - coarse_passes) % DENSIFY_EVERY == 0
-        return False, turn and number < DENSIFY_UNTIL * passes
+        return False, turn and number < DENSIFY_UNTIL * passes and self.first_rate == 1
 
     def _follows_new_ones(self, number: int) -> bool:
         """Whether the pass before this one added to the map: pruned any sooner, the new ones would go while they are

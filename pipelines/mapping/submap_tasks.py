@@ -34,8 +34,9 @@ from pipelines.types import Intrinsics, Trajectory
 
 MADE, JOINED, REFINED = "made", "joined", "refined"
 _ARRAYS = ("frame_ids", "cam_from_world", "log_gains", "offsets", "depths", "steps")
-REFINING_PASSES, REFINING_RATE = 2.0, 0.1
-"""Visits of each view once the maps are joined, and the learning rates of the first of them."""
+REFINING_PASSES, REFINING_RATE = 2.0, 0.3
+"""Visits of each view once the maps are joined, and the learning rates of the first of them. On one made-up walk in
+three parts of 18 keyframes: 33.4 dB, at a rate of 0.1 33.1, where the map may grow as well 32.1; made whole 33.2."""
 _DEPTH_SIDE = 160
 """Pixels on the long side of the depths by which Gaussians are given to views."""
 

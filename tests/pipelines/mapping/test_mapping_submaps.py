@@ -141,8 +141,8 @@ def test_parts_show_what_the_whole_shows(small_run: RunFolder, divided: tuple[Pa
     assert figures["submaps"] == 3
     assert whole["submaps"] == 1
     assert figures["keyframes"] == whole["keyframes"] == 14
-    assert figures["keyframe_psnr"] > whole["keyframe_psnr"] - 0.5
-    assert figures["held_out_psnr"] > whole["held_out_psnr"] - 0.5
+    assert figures["keyframe_psnr"] > whole["keyframe_psnr"] - 0.3
+    assert figures["held_out_psnr"] > whole["held_out_psnr"] - 0.3
     assert 0.7 < figures["gaussians"] / whole["gaussians"] < 1.4  # copies of the same surface are not kept
 
 
