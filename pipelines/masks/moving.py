@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.camera import project, unproject_depth
+from pipelines.jit import kernel
 from pipelines.progress import Progress
 from pipelines.types import Intrinsics
 
@@ -78,9 +78,9 @@ def find_moving(
             if not (depth > 0).any():
                 continue
             others = _witnesses(poses, k, float(np.median(depth[depth > 0])))
-            seen = (_carried(view(o), view(k), before.get(o), camera) for o in others)
             rules = _AGAIN if number else _FIRST
-            new = _things(_evidence(view(k).lab, seen, rules.confidence), rules.gap, before.get(k))
+            witnesses = ((view(o), before.get(o)) for o in others)
+            new = _things(_evidence(view(k), witnesses, camera, rules.confidence), rules.gap, before.get(k))
             if new.any():
                 found[k] = new
         if not found:
@@ -105,52 +105,71 @@ def _witnesses(poses: NDArray[np.float64], k: int, depth: float) -> list[int]:
     return [int(i) for i in order]
 
 
-def _carried(
-    other: MovingView, view: MovingView, moved: NDArray[np.bool_] | None, camera: Intrinsics
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """What the other sees, in this picture: Lab (h, w, 3) as bright as here, confidence (h, w), where at all (h, w)."""
-    height, width = view.depth.shape
-    view_from_other = view.cam_from_world @ np.linalg.inv(other.cam_from_world)
-    points = unproject_depth(other.depth, camera).reshape(-1, 3) @ view_from_other[:3, :3].T + view_from_other[:3, 3]
-    xy, z = project(points, camera)
-    place = np.floor(np.nan_to_num(xy, nan=-1.0).clip(-1, max(height, width))).astype(np.int64)
-    use = (other.depth.ravel() > 0) & (z > 0) & ((place >= 0) & (place < [width, height])).all(1)
-    if moved is not None:
-        use &= ~moved.ravel()
-    which = np.flatnonzero(use)
-    which = which[np.argsort(-z[which], kind="stable")]
-    source = np.full((height, width), -1, np.int64)
-    source[place[which, 1], place[which, 0]] = which
-    known = source >= 0
-    lab = other.lab.reshape(-1, 3)[source]
-    confidence = np.where(known, other.confidence.ravel()[source], np.float32(0))
-    sure = confidence > 0.5
-    if sure.sum() > _SURE_COUNT:
-        lab = lab + np.median((view.lab - lab)[sure], 0)
-    return lab, confidence, known
-
-
 def _evidence(
-    lab: NDArray[np.float32],
-    seen: Iterator[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]],
+    view: MovingView,
+    witnesses: Iterator[tuple[MovingView, NDArray[np.bool_] | None]],
+    camera: Intrinsics,
     least: float,
 ) -> NDArray[np.bool_]:
-    """(h, w) where more witnesses say that another colour belongs there than this one."""
-    against, for_it = np.zeros(lab.shape[:2], np.int64), np.zeros(lab.shape[:2], np.int64)
-    for expected, confidence, known in seen:
-        unlike = _difference(lab, expected)
-        against += known & (confidence > least) & (unlike > _UNLIKE)
-        for_it += known & (unlike < _LIKE)
+    """(h, w) where more witnesses, each with what of it moved (h, w), say that another colour belongs there than this
+    one. Only depth of more than the confidence `least` accuses."""
+    weight = np.array([0.6, 1, 1], np.float32)
+    own, votes = np.ascontiguousarray(view.lab * weight), np.zeros((2, *view.depth.shape), np.int64)
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    for other, moved in witnesses:
+        view_from_other = view.cam_from_world @ np.linalg.inv(other.cam_from_world)
+        depth = other.depth if moved is None else np.where(moved, np.float32(0), other.depth)
+        source = _nearest(np.ascontiguousarray(depth), view_from_other, lens)
+        expected = np.ascontiguousarray((other.lab * weight).reshape(-1, 3)[source])
+        confidence = np.where(source >= 0, other.confidence.ravel()[source], np.float32(0))
+        sure = confidence > 0.5
+        if sure.sum() > _SURE_COUNT:
+            expected = expected + np.median((own - expected)[sure], 0)
+        _judge(own, expected, source >= 0, confidence > least, votes)
+    against, for_it = votes
     return cv2.medianBlur(((against >= _LEAST) & (against > for_it)).astype(np.uint8), 3) > 0
 
 
-def _difference(lab: NDArray[np.float32], expected: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(h, w) least difference of the expected colour to those of a pixel and its neighbours."""
-    height, width = lab.shape[:2]
-    weight = np.array([0.6, 1, 1], np.float32)
-    around = cv2.copyMakeBorder(lab * weight, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
-    steps = (around[y : y + height, x : x + width] - expected * weight for y in range(3) for x in range(3))
-    return np.asarray(np.sqrt(np.minimum.reduce([(s**2).sum(-1) for s in steps])), np.float32)
+@kernel
+def _nearest(depth: NDArray, view_from_other: NDArray[np.float64], lens: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(h, w) number of the pixel of another view that shows the nearest surface at each of this one's; -1 for none."""
+    height, width = depth.shape
+    source = np.full((height, width), -1, np.int64)
+    front = np.full((height, width), np.inf)
+    fx, fy, cx, cy = lens
+    turn, shift = np.ascontiguousarray(view_from_other[:3, :3]), view_from_other[:3, 3]
+    for y in range(height):
+        for x in range(width):
+            if depth[y, x] <= 0:
+                continue
+            away = (x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy
+            px, py, pz = depth[y, x] * (turn[:, 0] * away[0] + turn[:, 1] * away[1] + turn[:, 2]) + shift
+            column, row = np.floor(fx * px / pz + cx), np.floor(fy * py / pz + cy)
+            if pz > 0 and 0 <= column < width and 0 <= row < height and pz <= front[int(row), int(column)]:
+                front[int(row), int(column)] = pz
+                source[int(row), int(column)] = y * width + x
+    return source
+
+
+@kernel
+def _judge(
+    own: NDArray, expected: NDArray, known: NDArray[np.bool_], may_accuse: NDArray[np.bool_], votes: NDArray[np.int64]
+) -> None:
+    """Count one witness in `votes` (2, h, w), against and for: by the least difference of the expected colour to those
+    of a pixel and its neighbours."""
+    height, width = known.shape
+    for y in range(height):
+        for x in range(width):
+            if known[y, x]:
+                least = np.inf
+                for v in range(max(y - 1, 0), min(y + 2, height)):
+                    for u in range(max(x - 1, 0), min(x + 2, width)):
+                        far = 0.0
+                        for c in range(3):
+                            far += (own[v, u, c] - expected[y, x, c]) ** 2
+                        least = min(least, far)
+                votes[0, y, x] += may_accuse[y, x] and least > _UNLIKE**2
+                votes[1, y, x] += least < _LIKE**2
 
 
 def _things(evidence: NDArray[np.bool_], gap: float, before: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
