@@ -133,13 +133,17 @@ class MapOptimiser:
         return view.of_scene((expose(colors, self.state.view_tables[index]) - view.colors).abs().mean(-1))
 
     def _blending_weights(self) -> Tensor:
-        """(M,) the largest weight with which each Gaussian stands in any pixel of any view."""
+        """(M,) the largest weight with which each Gaussian stands in any pixel of any view. What stands only where
+        views show no part of the scene has none: nothing tells it where to be."""
         p = self.state.parameters
         arguments = (p["means"], torch.exp(p["log_radii"]), torch.sigmoid(p["opacity_logits"]))
         largest = torch.zeros(len(p), device=p["means"].device)
         for index, view in enumerate(self.views):
             pose = self.state.cam_from_world(index, view)
-            largest = torch.maximum(largest, blending_weights(*arguments, pose, view.intrinsics).largest)
+            counts = None if view.scene is None else view.scene.float()
+            found = blending_weights(*arguments, pose, view.intrinsics, counts=counts)
+            seen = found.largest if counts is None else torch.minimum(found.largest, found.total)
+            largest = torch.maximum(largest, seen)
         return largest
 
     def draw(self, view: View, table: AdamTable, with_classes: bool) -> Rendering:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from formats.errors import InputError
 from pipelines.geometry.camera import unproject_depth
+from pipelines.jit import kernel
 from pipelines.progress import Progress
 from pipelines.proxy.palette import class_colors
 from pipelines.proxy.providers import DepthEstimate, LabelEstimate
@@ -157,11 +158,26 @@ def label_pixels(votes: NDArray[np.float32], trust: NDArray[np.float32], image: 
     """Labels (h, w) from votes (h, w, C) that count by the `trust` (h, w) in the place they are of, spread along like
     colours of the image to where it is low; VOID where nothing is known from near or far."""
     total = spread_votes(votes * (_LEAST_VOTE + trust**2)[..., None], image, _REACH, _COLOR_SD)
-    heard = total.sum(-1)
-    best = total.argmax(-1).astype(np.uint8)
-    best[heard < 1e-4] = VOID
-    share = total.max(-1) / np.maximum(heard, 1e-9)
-    return LabelEstimate(best, np.where(best == VOID, 0, share * np.minimum(1, 2 * heard)).astype(np.float32))
+    return LabelEstimate(*_settle(total))
+
+
+@kernel
+def _settle(total: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """(h, w) the label with the most of the votes (h, w, C) and its share of them; VOID and 0 where hardly any are."""
+    height, width, classes = total.shape
+    labels = np.full((height, width), VOID, np.uint8)
+    confidence = np.zeros((height, width), np.float32)
+    for y in range(height):
+        for x in range(width):
+            best, heard = 0, total[y, x, 0]
+            for c in range(1, classes):
+                heard += total[y, x, c]
+                if total[y, x, c] > total[y, x, best]:
+                    best = c
+            if heard >= 1e-4:
+                labels[y, x] = best
+                confidence[y, x] = total[y, x, best] / heard * min(1.0, 2 * heard)
+    return labels, confidence
 
 
 def _scene_depth(estimates: list[DepthEstimate]) -> float:

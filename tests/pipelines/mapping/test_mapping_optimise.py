@@ -10,6 +10,7 @@ import torch
 from pipelines.config import ArticleConfig, MappingConfig
 from pipelines.gaussians.render import Rendering
 from pipelines.geometry import se3
+from pipelines.geometry.camera import project_gaussians
 from pipelines.mapping import growth, objective, optimise, schedule
 from pipelines.mapping.load import MappingInput
 from pipelines.mapping.measure import ViewFigures, measure_view
@@ -68,6 +69,25 @@ def test_splitting_stops_at_the_largest_map(room: MappingInput) -> None:
     optimiser = MapOptimiser(room.views, classes, replace(SETTINGS, max_gaussians=most), ArticleConfig(), state)
     optimiser.growth.split(optimiser._blame())
     assert len(state.parameters) == len(few.gaussian_map) + 30
+
+
+def test_what_stands_only_where_a_view_shows_no_scene_has_no_weight(room: MappingInput, mapped: OptimisedMap) -> None:
+    view, m = room.views[0], mapped.gaussian_map
+    middle = view.intrinsics.width // 2
+    scene = (torch.arange(view.intrinsics.width) >= middle).expand(view.depth.shape)
+
+    def weights(seen: View) -> torch.Tensor:
+        state = OptimiserState.fresh([seen], len(room.class_ids), m, None)
+        return MapOptimiser([seen], len(room.class_ids), SETTINGS, ArticleConfig(), state)._blending_weights()
+
+    in_cam = m.means @ view.cam_from_world[:3, :3].float().T + view.cam_from_world[:3, 3].float()
+    u, _, sigma, z = project_gaussians(in_cam, m.radii, view.intrinsics, 0.1)
+    left, right = ((z > 0.1) & (u + 5 * sigma < middle)), ((z > 0.1) & (u - 5 * sigma > middle))
+    all_of_it, masked = weights(view), weights(replace(view, scene=scene))
+    assert all_of_it[left].max() > 0.5
+    assert masked[left].max() == 0
+    assert all_of_it[right].max() > 0.5
+    assert torch.equal(masked[right], all_of_it[right])
 
 
 @pytest.mark.parametrize("iteration", [0, 1])
