@@ -30,6 +30,7 @@ from pipelines.upright.world import load_world
 
 Array = NDArray[np.float64]
 WRONG, OFF = 12, np.array([500.0, 0, 0])
+LEAST = 5
 RANSAC_METRES = 15.0
 """EXIF's own accuracy is about 10 m."""
 
@@ -72,13 +73,18 @@ def with_priors(model: pycolmap.Reconstruction, names: list[str], fixes: Array, 
     return model
 
 
-def own_model(folder: Path, names: list[str], work: Path) -> pycolmap.Reconstruction:
-    """pycolmap's incremental model with all its defaults; every picture is matched with every other."""
+def own_models(folder: Path, names: list[str], work: Path) -> dict[str, pycolmap.Reconstruction | None]:
+    """The largest model of each of pycolmap's mappers with all its defaults; every picture is matched with every
+    other."""
     database = work / "database.db"
     pycolmap.extract_features(database, folder, names, pycolmap.CameraMode.SINGLE)
     pycolmap.match_exhaustive(database)
-    models = pycolmap.incremental_mapping(database, folder, work / "models")
-    return max(models.values(), key=lambda m: m.num_reg_images())
+    made = {}
+    for name, mapper in (("incremental", pycolmap.incremental_mapping), ("global", pycolmap.global_mapping)):
+        (work / name).mkdir()
+        models = mapper(database, folder, work / name)
+        made[name] = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
+    return made
 
 
 def main() -> None:
@@ -126,9 +132,17 @@ def main() -> None:
             )
     if arguments.colmap:
         with tempfile.TemporaryDirectory() as work:
-            model = own_model(source.path, names, Path(work))
-            model.transform(pycolmap.align_reconstruction_to_locations(model, names, fixes, 3, ransac()))
-            tell("pycolmap's own model", centers(model, names), fixes, ours, np.ones(len(names), bool))
+            for name, own in own_models(source.path, names, Path(work)).items():
+                what = f"pycolmap's own {name} model"
+                if own is None or own.num_reg_images() < LEAST:
+                    print(f"  {what}: {0 if own is None else own.num_reg_images()} pictures, too few to align")
+                    continue
+                move = pycolmap.align_reconstruction_to_locations(own, names, fixes, 3, ransac())
+                if move is None:
+                    print(f"  {what}: {own.num_reg_images()} pictures, no three agree with their fixes")
+                    continue
+                own.transform(move)
+                tell(what, centers(own, names), fixes, ours, np.ones(len(names), bool))
 
 
 if __name__ == "__main__":
