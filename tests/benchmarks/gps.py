@@ -74,15 +74,19 @@ def with_priors(model: pycolmap.Reconstruction, names: list[str], fixes: Array, 
 
 
 def own_models(folder: Path, names: list[str], work: Path) -> dict[str, pycolmap.Reconstruction | None]:
-    """The largest model of each of pycolmap's mappers with all its defaults; every picture is matched with every
-    other."""
+    """The largest model of pycolmap's incremental mapper with all its defaults, and with less asked of the first pair
+    and of a picture that is added; every picture is matched with every other."""
     database = work / "database.db"
     pycolmap.extract_features(database, folder, names, pycolmap.CameraMode.SINGLE)
     pycolmap.match_exhaustive(database)
     made = {}
-    for name, mapper in (("incremental", pycolmap.incremental_mapping), ("global", pycolmap.global_mapping)):
+    relaxed = pycolmap.IncrementalPipelineOptions()
+    relaxed.min_model_size, relaxed.random_seed = 3, 0
+    relaxed.mapper.init_min_num_inliers, relaxed.mapper.init_min_tri_angle = 30, 4.0
+    relaxed.mapper.abs_pose_min_num_inliers = 15
+    for name, options in (("default", pycolmap.IncrementalPipelineOptions()), ("relaxed", relaxed)):
         (work / name).mkdir()
-        models = mapper(database, folder, work / name)
+        models = pycolmap.incremental_mapping(database, folder, work / name, options)
         made[name] = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
     return made
 
