@@ -26,7 +26,7 @@ from pipelines.proxy.providers import DepthProvider, SemanticsProvider
 from pipelines.proxy.regions.provider import SegmentLabels
 from pipelines.proxy.scale import measure_scale
 from pipelines.proxy.sequence import Sequence
-from pipelines.proxy.stereo.provider import MultiviewDepth, StereoSettings
+from pipelines.proxy.stereo.provider import MultiviewDepth
 
 LEARNED_SPREAD = 0.02
 """Files whose depths stray by more from the triangulated points, relatively and within one frame, are taken for a
@@ -187,8 +187,10 @@ def missing_networks() -> str | None:
 
 
 def _multiview(around: Surroundings) -> MultiviewDepth:
-    settings = StereoSettings(side=around.config.stereo_side, planes=around.config.stereo_planes)
-    return MultiviewDepth(around.sequence, settings, lambda: around.scratch("stereo"), around.threads, around.progress)
+    side, planes = around.config.stereo_side, around.config.stereo_planes
+    return MultiviewDepth(
+        around.sequence, side, planes, lambda: around.scratch("stereo"), around.threads, around.progress
+    )
 
 
 def _segments(around: Surroundings) -> SegmentLabels:

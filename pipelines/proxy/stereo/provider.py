@@ -8,7 +8,6 @@ and hold only a few frames at a time.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -30,26 +29,19 @@ from pipelines.proxy.stereo.refine import refine_inverse_depth
 from pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
 from pipelines.proxy.stereo.sweep import sweep_cost, warps_to
 from pipelines.proxy.stereo.upsample import upsample_depth
+from pipelines.proxy.stereo.window import LEAST_TEXTURE, texture
 from pipelines.types import Frame, Intrinsics, SparseModel
 
 _CACHED_FRAMES = 48
-
-
-@dataclass(frozen=True)
-class StereoSettings:
-    """Numbers of the stereo; lengths in pixels of the sweep's image."""
-
-    side: int = 320
-    planes: int = 96
-    views: int = 6
-    best: int = 3
-    fuse_views: int = 8
-    best_angle: float = 8.0
-    small_step: float = 0.05
-    jump: float = 0.4
-    edge: float = 0.05
-    stiffness: float = 0.01
-    tolerance: float = 0.01
+_VIEWS, _BEST, _FUSE_VIEWS = 6, 3, 8
+"""Keyframes that one is matched with, those of them that count at a pixel, and those whose depths are compared."""
+_BEST_ANGLE = 8.0
+"""Degrees between the views of a pair."""
+_SMALL_STEP, _JUMP, _EDGE = 0.05, 0.4, 0.05
+"""Of the smoothing: a plane more or less, any other step, and the intensity step that makes it cheap."""
+_STIFFNESS = 0.01
+_TOLERANCE = 0.01
+"""Relative difference between depths that agree."""
 
 
 class MultiviewDepth:
@@ -59,20 +51,21 @@ class MultiviewDepth:
     name = "multiview"
 
     def __init__(
-        self, sequence: Sequence, settings: StereoSettings, folder: Callable[[], Path], threads: int, progress: Progress
+        self, sequence: Sequence, side: int, planes: int, folder: Callable[[], Path], threads: int, progress: Progress
     ) -> None:
-        """`folder` gives a place for the maps between the passes. InputError without a backbone of two keyframes."""
+        """side: of the images that are matched, pixels; planes: depths that are tried; `folder` gives a place for the
+        maps between the passes. InputError without a backbone of two keyframes."""
         if sequence.backbone is None or len(sequence.backbone.frame_ids) < 2:
             raise InputError(
                 "depth from several views needs parallax, and structure from motion found none: the camera stands "
                 "still or only turns. Move it sideways, or give depth with --depth files:FOLDER or --depth onnx:CARD"
             )
-        self._sequence, self._settings, self._folder, self._progress = sequence, settings, folder, progress
+        self._sequence, self._planes, self._folder, self._progress = sequence, planes, folder, progress
         self._model: SparseModel = sequence.backbone
         self._index = {int(f): i for i, f in enumerate(self._model.frame_ids)}
         self._frame = {f.id: f for f in sequence.frames}
         self._bands = Bands(threads)
-        self._camera: Intrinsics = sequence.calibration.intrinsics.at_most(settings.side)
+        self._camera: Intrinsics = sequence.calibration.intrinsics.at_most(side)
         self._grey = lru_cache(_CACHED_FRAMES)(self._read_grey)
         self._raw = lru_cache(_CACHED_FRAMES)(self._load_raw)
 
@@ -91,22 +84,21 @@ class MultiviewDepth:
 
     def _sweep(self, index: int) -> NDArray[np.float32]:
         """(H, W) inverse depth of one keyframe from its neighbours alone; 0 where it has none to match with."""
-        s, camera = self._settings, self._camera
-        companions = self._neighbours(index, s.views)
+        camera = self._camera
+        companions = self._neighbours(index, _VIEWS)
         limits = depth_range(self._model, index, companions)
         if len(companions) == 0 or limits is None:
             return np.zeros((camera.height, camera.width), np.float32)
         image, left_out = self._grey(int(self._model.frame_ids[index]))
         others = np.stack([_blanked(*self._grey(int(self._model.frame_ids[j]))) for j in companions])
         warps = self._warps(index, companions)
-        planes = np.linspace(1 / limits[1], 1 / limits[0], s.planes)
+        planes = np.linspace(1 / limits[1], 1 / limits[0], self._planes)
         step = planes[1] - planes[0]
-        cost = sweep_cost(image, others, warps, planes, s.best, self._bands)
-        total = smooth_cost(cost, image, s.small_step, s.jump, s.edge, self._bands)
-        picked, _ = pick_planes(total)
-        inverse = (planes[0] + picked * step).astype(np.float32)
+        cost = sweep_cost(image, others, warps, planes, _BEST, self._bands)
+        total = smooth_cost(cost, image, _SMALL_STEP, _JUMP, _EDGE, self._bands)
+        inverse = (planes[0] + pick_planes(total) * step).astype(np.float32)
         inverse = cv2.bilateralFilter(inverse, 7, step, 2.0)
-        inverse, _ = refine_inverse_depth(image, others, warps, inverse, step / 3, 2, s.stiffness, s.best, self._bands)
+        inverse = refine_inverse_depth(image, others, warps, inverse, step / 3, 2, _STIFFNESS, _BEST, self._bands)
         inverse = cv2.bilateralFilter(inverse, 7, 0.7 * step, 2.0)
         inverse = np.clip(inverse, planes[0], planes[-1]).astype(np.float32)
         return inverse if left_out is None else np.where(left_out, np.float32(0), inverse)
@@ -123,11 +115,12 @@ class MultiviewDepth:
         depth, confidence = self._fuse(index)
         image = self._sequence.image(frame)
         size = (self._camera.width, self._camera.height)
-        depth, confidence = fill_unsure(depth, confidence, resize_area(image, *size))
+        textured = texture(self._grey(frame.id)[0]) > LEAST_TEXTURE
+        depth, confidence = fill_unsure(depth, confidence, resize_area(image, *size), textured)
         return upsample_depth(depth, confidence, image)
 
     def _fuse(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        companions = self._neighbours(index, self._settings.fuse_views)
+        companions = self._neighbours(index, _FUSE_VIEWS)
         companions = np.array([j for j in companions if self._path(int(self._model.frame_ids[j])).exists()], np.int64)
         depth = self._raw(index)
         if len(companions) == 0:
@@ -135,7 +128,7 @@ class MultiviewDepth:
         others = np.stack([self._raw(int(j)) for j in companions])
         back = np.array([self._warps(int(j), np.array([index]))[0][2] for j in companions])
         fused, support, conflict = fuse_depths(
-            depth, others, self._warps(index, companions), back, self._settings.tolerance, self._bands
+            depth, others, self._warps(index, companions), back, _TOLERANCE, self._bands
         )
         return fused, agreement(support, conflict)
 
@@ -150,7 +143,7 @@ class MultiviewDepth:
 
     def _neighbours(self, index: int, count: int) -> NDArray[np.int64]:
         camera = self._sequence.calibration.intrinsics
-        return choose_neighbours(self._model, camera, index, count, self._settings.best_angle)
+        return choose_neighbours(self._model, camera, index, count, _BEST_ANGLE)
 
     def _warps(self, index: int, others: NDArray[np.int64]) -> NDArray[np.float64]:
         matrix, poses = self._camera.matrix, self._model.cam_from_world

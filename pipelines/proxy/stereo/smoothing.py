@@ -84,22 +84,16 @@ def _scan_paths(
 
 
 @kernel
-def pick_planes(total: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(H, W) best plane as a fractional index (a parabola through the lowest sum and its two neighbours), and
-    (H, W) margin: by how much the second best, non-adjacent plane is worse, relative to the best."""
+def pick_planes(total: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H, W) best plane as a fractional index: a parabola through the lowest sum and its two neighbours."""
     height, width, planes = total.shape
     index = np.empty((height, width), np.float32)
-    margin = np.empty((height, width), np.float32)
     for y in range(height):
         for x in range(width):
             k = 0
             for d in range(1, planes):
                 if total[y, x, d] < total[y, x, k]:
                     k = d
-            second = np.float32(1e9)
-            for d in range(planes):
-                if abs(d - k) > 2:
-                    second = min(second, total[y, x, d])
             offset = np.float32(0)
             if 0 < k < planes - 1:
                 a, b, c = total[y, x, k - 1], total[y, x, k], total[y, x, k + 1]
@@ -107,5 +101,4 @@ def pick_planes(total: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArra
                 if bend > 0:
                     offset = min(max((a - c) / (2 * bend), np.float32(-0.5)), np.float32(0.5))
             index[y, x] = np.float32(k) + offset
-            margin[y, x] = (second - total[y, x, k]) / max(total[y, x, k], np.float32(1e-3))
-    return index, margin
+    return index

@@ -11,11 +11,7 @@ from numpy.typing import NDArray
 
 from pipelines.jit import kernel
 from pipelines.proxy.stereo.bands import BAND_ROWS, Bands
-from pipelines.proxy.stereo.window import RADIUS, best_mean, correlate_row, weigh_windows
-
-LIKENESS = 0.04
-"""How unlike a pixel may be and still count, of intensities 0..1: more than the texture of most surfaces, less than the
-step from one to the next."""
+from pipelines.proxy.stereo.window import LIKENESS, RADIUS, best_mean, correlate_row, ranges, warp_row, weigh_windows
 
 
 def warps_to(
@@ -47,60 +43,20 @@ def sweep_cost(
     """
     height, width = image.shape
     cost = np.empty((height, width, len(inverse_depths)), np.float32)
+    low, high = ranges(image)
 
     def work(first: int, last: int) -> None:
-        _sweep_band(image, others, warps, inverse_depths, best, first, last, cost)
+        _sweep_band(image, low, high, others, warps, inverse_depths, best, first, last, cost)
 
     bands.run(height, work)
     return cost
 
 
 @kernel
-def _warp_row(
-    other: NDArray[np.float32],
-    warp: NDArray[np.float64],
-    inverse_depth: float,
-    y: int,
-    width: int,
-    row: NDArray[np.float32],
-    seen: NDArray[np.uint8],
-) -> None:
-    """Samples of `other` for one row of the reference on a plane of constant inverse depth; the border is repeated."""
-    rows, columns = other.shape
-    v = y + 0.5
-    bx = np.float32(warp[0, 1] * v + warp[0, 2] + warp[0, 3] * inverse_depth)
-    by = np.float32(warp[1, 1] * v + warp[1, 2] + warp[1, 3] * inverse_depth)
-    bz = np.float32(warp[2, 1] * v + warp[2, 2] + warp[2, 3] * inverse_depth)
-    ax = np.float32(warp[0, 0])
-    ay = np.float32(warp[1, 0])
-    az = np.float32(warp[2, 0])
-    right = np.float32(columns - 1.001)
-    bottom = np.float32(rows - 1.001)
-    half = np.float32(0.5)
-    for x in range(width):
-        u = np.float32(x) + half
-        z = az * u + bz
-        scale = np.float32(1) / max(z, np.float32(1e-6))
-        px = (ax * u + bx) * scale - half
-        py = (ay * u + by) * scale - half
-        seen[x] = (z > np.float32(1e-6)) & (px >= -half) & (py >= -half) & (px <= right + half) & (py <= bottom + half)
-        px = min(max(px, np.float32(0)), right)
-        py = min(max(py, np.float32(0)), bottom)
-        ix = np.int32(px)
-        iy = np.int32(py)
-        fx = px - np.float32(ix)
-        fy = py - np.float32(iy)
-        top = other[iy, ix] + fx * (other[iy, ix + 1] - other[iy, ix])
-        low = other[iy + 1, ix] + fx * (other[iy + 1, ix + 1] - other[iy + 1, ix])
-        row[x + RADIUS] = top + fy * (low - top)
-    for i in range(RADIUS):
-        row[i] = row[RADIUS]
-        row[width + RADIUS + i] = row[width + RADIUS - 1]
-
-
-@kernel
 def _sweep_band(
     image: NDArray[np.float32],
+    low: NDArray[np.float32],
+    high: NDArray[np.float32],
     others: NDArray[np.float32],
     warps: NDArray[np.float64],
     inverse_depths: NDArray[np.float64],
@@ -114,7 +70,8 @@ def _sweep_band(
     padded = width + 2 * RADIUS
     warped = np.empty((BAND_ROWS + 2 * RADIUS, padded), np.float32)
     seen = np.empty((BAND_ROWS + 2 * RADIUS, width), np.uint8)
-    weights, weighted, moments = weigh_windows(image, first, last, LIKENESS)
+    plane = np.zeros(width, np.float32)
+    weights, weighted, moments = weigh_windows(image, low, high, first, last, LIKENESS)
     sums = np.empty((3, width), np.float32)
     scores = np.empty((BAND_ROWS, views, width), np.float32)
     block = np.empty((len(inverse_depths), last - first, width), np.float32)
@@ -122,7 +79,7 @@ def _sweep_band(
         for n in range(views):
             for k in range(last - first + 2 * RADIUS):
                 y = min(max(first + k - RADIUS, 0), height - 1)
-                _warp_row(others[n], warps[n], inverse_depths[d], y, width, warped[k], seen[k])
+                warp_row(others[n], warps[n], plane, inverse_depths[d], y, warped[k], seen[k])
             for k in range(last - first):
                 correlate_row(
                     warped[k:], weights[k], weighted[k], moments[k], seen[k + RADIUS], sums, scores[k, n]

@@ -3,7 +3,8 @@
 A plain square that reaches over the border of an object is matched by that border, so the object grows by half a
 window into whatever lies behind it. With weights by colour (Yoon and Kweon, PAMI 2006) a pixel is compared by its own
 surface. The weights fall off as a Gaussian and not as an exponential: the contrast of a border is so much larger than
-the texture of a wall that a thousandth of the weight still decides the correlation.
+the texture of a wall that a thousandth of the weight still decides the correlation. So does the pixel of the border
+itself, mixed of both sides: between thin bars every window has some, and an even wall there would go with the bars.
 
 No kernel that correlates is compiled with fastmath: machine code made in the process and the same taken from the cache
 were seen to round differently with it, and a run has to end with the same bytes either way.
@@ -11,6 +12,7 @@ were seen to round differently with it, and a run has to end with the same bytes
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,15 +22,35 @@ RADIUS = 3
 STEP = 2
 SIDE = 4
 """Every second pixel of 7 x 7, from -RADIUS to RADIUS: as good as all of them, at a third of the time."""
+LIKENESS = 0.04
+"""How unlike a pixel may be and still count, of intensities 0..1: more than the texture of most surfaces, less than the
+step from one to the next."""
+STRONG = 0.12
+"""A step of so much beside a pixel makes it one of the border, mixed of both sides: it does not count, however like."""
+_PURE = 3.0
+"""Where no more than so many of the SIDE² pixels are left, as on a thin bar or in a fine pattern, the border counts."""
+LEAST_TEXTURE = 4e-5
+"""Variance of a window's like pixels below which it has nothing to match: noise of one grey level and faint shades."""
 VARIANCE_FLOOR = 2e-5
 """Added to both variances (intensities 0..1): below about one grey level there is no texture, only noise."""
 OUTSIDE = -2.0
 """Marks the score of a view that does not see the pixel."""
 
 
+def ranges(image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(H, W) least and largest intensity round every pixel."""
+    square = np.ones((3, 3), np.uint8)
+    return np.asarray(cv2.erode(image, square), np.float32), np.asarray(cv2.dilate(image, square), np.float32)
+
+
 @kernel
 def weigh_windows(
-    image: NDArray[np.float32], first: int, last: int, likeness: float
+    image: NDArray[np.float32],
+    low: NDArray[np.float32],
+    high: NDArray[np.float32],
+    first: int,
+    last: int,
+    likeness: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Of rows first..last of the image (H, W): the windows' weights and the weights times intensity, both
     (rows, SIDE, SIDE, W) with sums of one window 1 and its mean; and mean and variance (rows, 2, W).
@@ -43,6 +65,17 @@ def weigh_windows(
     for k in range(last - first):
         for x in range(width):
             middle = image[first + k, x]
+            # The middle is no part of the window; the floor keeps a lone bright pixel from dividing by nothing.
+            floor = np.float32(1e-6)
+            pure = np.float32(0)
+            for j in range(SIDE):
+                row = min(max(first + k + j * STEP - RADIUS, 0), height - 1)
+                for i in range(SIDE):
+                    column = min(max(x + i * STEP - RADIUS, 0), width - 1)
+                    unlike = max(high[row, column] - middle, middle - low[row, column])
+                    weights[k, j, i, x] = np.exp(narrow * (image[row, column] - middle) ** 2)
+                    weighted[k, j, i, x] = weights[k, j, i, x] if unlike < STRONG else np.exp(narrow * unlike**2)
+                    pure += weighted[k, j, i, x]
             total = np.float32(0)
             mean = np.float32(0)
             square = np.float32(0)
@@ -50,8 +83,7 @@ def weigh_windows(
                 row = min(max(first + k + j * STEP - RADIUS, 0), height - 1)
                 for i in range(SIDE):
                     value = image[row, min(max(x + i * STEP - RADIUS, 0), width - 1)]
-                    # The middle is no part of the window; the floor keeps a lone bright pixel from dividing by nothing.
-                    weight = np.exp(narrow * (value - middle) ** 2) + np.float32(1e-6)
+                    weight = (weighted[k, j, i, x] if pure > _PURE else weights[k, j, i, x]) + floor
                     total += weight
                     mean += weight * value
                     square += weight * value * value
@@ -66,6 +98,53 @@ def weigh_windows(
             moments[k, 0, x] = mean
             moments[k, 1, x] = max(square * share - mean * mean, np.float32(0))
     return weights, weighted, moments
+
+
+def texture(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H, W) variance of the window round every pixel, of what is like it: what there is to match."""
+    _, _, moments = weigh_windows(image, *ranges(image), 0, image.shape[0], LIKENESS)
+    return np.ascontiguousarray(moments[:, 1])
+
+
+@kernel
+def warp_row(
+    other: NDArray[np.float32],
+    warp: NDArray[np.float64],
+    inverse_depths: NDArray[np.float32],
+    offset: float,
+    y: int,
+    row: NDArray[np.float32],
+    seen: NDArray[np.uint8],
+) -> None:
+    """Into `row` samples of `other` for row y of the reference, its pixels of inverse depths (W,) plus `offset`, the
+    border repeated; into `seen` (W,) whether they lie in the other view."""
+    rows, columns = other.shape
+    width = len(inverse_depths)
+    v = y + 0.5
+    bx = np.float32(warp[0, 1] * v + warp[0, 2])
+    by = np.float32(warp[1, 1] * v + warp[1, 2])
+    bz = np.float32(warp[2, 1] * v + warp[2, 2])
+    ax, ay, az = np.float32(warp[0, 0]), np.float32(warp[1, 0]), np.float32(warp[2, 0])
+    tx, ty, tz = np.float32(warp[0, 3]), np.float32(warp[1, 3]), np.float32(warp[2, 3])
+    right, bottom, half = np.float32(columns - 1.001), np.float32(rows - 1.001), np.float32(0.5)
+    for x in range(width):
+        w = inverse_depths[x] + np.float32(offset)
+        u = np.float32(x) + half
+        z = az * u + bz + tz * w
+        scale = np.float32(1) / max(z, np.float32(1e-6))
+        px = (ax * u + bx + tx * w) * scale - half
+        py = (ay * u + by + ty * w) * scale - half
+        seen[x] = (z > np.float32(1e-6)) & (px >= -half) & (py >= -half) & (px <= right + half) & (py <= bottom + half)
+        px = min(max(px, np.float32(0)), right)
+        py = min(max(py, np.float32(0)), bottom)
+        ix, iy = np.int32(px), np.int32(py)
+        fx, fy = px - np.float32(ix), py - np.float32(iy)
+        top = other[iy, ix] + fx * (other[iy, ix + 1] - other[iy, ix])
+        low = other[iy + 1, ix] + fx * (other[iy + 1, ix + 1] - other[iy + 1, ix])
+        row[x + RADIUS] = top + fy * (low - top)
+    for i in range(RADIUS):
+        row[i] = row[RADIUS]
+        row[width + RADIUS + i] = row[width + RADIUS - 1]
 
 
 @kernel

@@ -18,16 +18,16 @@ from pipelines.proxy.reliability import semantic_agreement, warp_labels
 from pipelines.proxy.scale import measure_scale
 from pipelines.proxy.selection import Surroundings, open_depth
 from pipelines.proxy.sequence import Sequence
-from pipelines.proxy.stereo.provider import MultiviewDepth, StereoSettings
+from pipelines.proxy.stereo.provider import MultiviewDepth
 from pipelines.types import VOID, Frame, Intrinsics
 
-SETTINGS = StereoSettings(side=256, planes=64)
+SIDE, PLANES = 256, 64
 
 
 @pytest.fixture(scope="module")
 def stereo(room: Room, tmp_path_factory: pytest.TempPathFactory) -> MultiviewDepth:
     folder = tmp_path_factory.mktemp("stereo")
-    provider = MultiviewDepth(room.sequence(), SETTINGS, lambda: folder, 2, SilentProgress())
+    provider = MultiviewDepth(room.sequence(), SIDE, PLANES, lambda: folder, 2, SilentProgress())
     provider.prepare(room.frames)
     return provider
 
@@ -52,9 +52,9 @@ def test_multiview_is_exact_where_it_is_sure_and_its_confidence_sorts(room: Room
 
 
 def test_multiview_gives_the_same_bytes_with_other_threads(room: Room, stereo: MultiviewDepth, tmp_path: Path) -> None:
-    single = MultiviewDepth(room.sequence(), SETTINGS, lambda: tmp_path, 1, SilentProgress())
+    single = MultiviewDepth(room.sequence(), SIDE, PLANES, lambda: tmp_path, 1, SilentProgress())
     single.prepare(room.frames[4:6])
-    few = MultiviewDepth(room.sequence(), SETTINGS, lambda: tmp_path, 3, SilentProgress())
+    few = MultiviewDepth(room.sequence(), SIDE, PLANES, lambda: tmp_path, 3, SilentProgress())
     few.prepare(room.frames[6:8])
     for frame in room.frames[4:8]:
         ours, theirs = (p._path(frame.id).read_bytes() for p in (few, stereo))
@@ -64,7 +64,7 @@ def test_multiview_gives_the_same_bytes_with_other_threads(room: Room, stereo: M
 def test_multiview_without_parallax_says_so(room: Room) -> None:
     still = Sequence(room.frames, room.calibration, room.calibration.intrinsics, None, lambda f: room.views[f.id].rgb)
     with pytest.raises(InputError, match="parallax"):
-        MultiviewDepth(still, SETTINGS, lambda: Path("nowhere"), 1, SilentProgress())
+        MultiviewDepth(still, SIDE, PLANES, lambda: Path("nowhere"), 1, SilentProgress())
     with pytest.raises(InputError, match="poses"):
         SegmentLabels(still, 16, SilentProgress())
 
