@@ -102,7 +102,7 @@ def make_view(
         channel_table(class_ids)[maps.labels],
         np.round(maps.label_confidence * 255).astype(np.uint8),
     )
-    pose = torch.as_tensor(cam_from_world, dtype=torch.float64, device=device)
+    pose = torch.tensor(cam_from_world, dtype=torch.float64, device=device)  # a copy: workers get arrays to read only
     colors, depth, reliability, channels, confidence = (
         torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays
     )

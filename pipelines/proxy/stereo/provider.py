@@ -29,7 +29,6 @@ from pipelines.proxy.stereo.refine import refine_inverse_depth
 from pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
 from pipelines.proxy.stereo.sweep import sweep_cost, warps_to
 from pipelines.proxy.stereo.upsample import upsample_depth
-from pipelines.proxy.stereo.window import LEAST_TEXTURE, texture
 from pipelines.types import Frame, Intrinsics, SparseModel
 
 _CACHED_FRAMES = 48
@@ -115,8 +114,7 @@ class MultiviewDepth:
         depth, confidence = self._fuse(index)
         image = self._sequence.image(frame)
         size = (self._camera.width, self._camera.height)
-        textured = texture(self._grey(frame.id)[0]) > LEAST_TEXTURE
-        depth, confidence = fill_unsure(depth, confidence, resize_area(image, *size), textured)
+        depth, confidence = fill_unsure(depth, confidence, resize_area(image, *size))
         return upsample_depth(depth, confidence, image)
 
     def _fuse(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

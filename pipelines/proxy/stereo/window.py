@@ -29,8 +29,6 @@ STRONG = 0.12
 """A step of so much beside a pixel makes it one of the border, mixed of both sides: it does not count, however like."""
 _PURE = 3.0
 """Where no more than so many of the SIDE² pixels are left, as on a thin bar or in a fine pattern, the border counts."""
-LEAST_TEXTURE = 4e-5
-"""Variance of a window's like pixels below which it has nothing to match: noise of one grey level and faint shades."""
 VARIANCE_FLOOR = 2e-5
 """Added to both variances (intensities 0..1): below about one grey level there is no texture, only noise."""
 OUTSIDE = -2.0
@@ -98,12 +96,6 @@ def weigh_windows(
             moments[k, 0, x] = mean
             moments[k, 1, x] = max(square * share - mean * mean, np.float32(0))
     return weights, weighted, moments
-
-
-def texture(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W) variance of the window round every pixel, of what is like it: what there is to match."""
-    _, _, moments = weigh_windows(image, *ranges(image), 0, image.shape[0], LIKENESS)
-    return np.ascontiguousarray(moments[:, 1])
 
 
 @kernel
