@@ -60,7 +60,7 @@ def _refine_band(
     padded = width + 2 * RADIUS
     warped = np.empty((BAND_ROWS + 2 * RADIUS, padded), np.float32)
     seen = np.empty((BAND_ROWS + 2 * RADIUS, width), np.uint8)
-    weights, weighted, moments = weigh_windows(image, image, image, first, last, _ALIKE)
+    weights, weighted, moments = weigh_windows(image, first, last, _ALIKE)
     sums = np.empty((3, width), np.float32)
     scores = np.empty((BAND_ROWS, views, width), np.float32)
     total = np.empty((2 * reach + 1, BAND_ROWS, width), np.float32)

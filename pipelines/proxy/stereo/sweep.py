@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipelines.jit import kernel
 from pipelines.proxy.stereo.bands import BAND_ROWS, Bands
-from pipelines.proxy.stereo.window import LIKENESS, RADIUS, best_mean, correlate_row, ranges, warp_row, weigh_windows
+from pipelines.proxy.stereo.window import LIKENESS, RADIUS, best_mean, correlate_row, warp_row, weigh_windows
 
 
 def warps_to(
@@ -43,10 +43,9 @@ def sweep_cost(
     """
     height, width = image.shape
     cost = np.empty((height, width, len(inverse_depths)), np.float32)
-    low, high = ranges(image)
 
     def work(first: int, last: int) -> None:
-        _sweep_band(image, low, high, others, warps, inverse_depths, best, first, last, cost)
+        _sweep_band(image, others, warps, inverse_depths, best, first, last, cost)
 
     bands.run(height, work)
     return cost
@@ -55,8 +54,6 @@ def sweep_cost(
 @kernel
 def _sweep_band(
     image: NDArray[np.float32],
-    low: NDArray[np.float32],
-    high: NDArray[np.float32],
     others: NDArray[np.float32],
     warps: NDArray[np.float64],
     inverse_depths: NDArray[np.float64],
@@ -71,7 +68,7 @@ def _sweep_band(
     warped = np.empty((BAND_ROWS + 2 * RADIUS, padded), np.float32)
     seen = np.empty((BAND_ROWS + 2 * RADIUS, width), np.uint8)
     plane = np.zeros(width, np.float32)
-    weights, weighted, moments = weigh_windows(image, low, high, first, last, LIKENESS)
+    weights, weighted, moments = weigh_windows(image, first, last, LIKENESS)
     sums = np.empty((3, width), np.float32)
     scores = np.empty((BAND_ROWS, views, width), np.float32)
     block = np.empty((len(inverse_depths), last - first, width), np.float32)

@@ -3,8 +3,7 @@
 A plain square that reaches over the border of an object is matched by that border, so the object grows by half a
 window into whatever lies behind it. With weights by colour (Yoon and Kweon, PAMI 2006) a pixel is compared by its own
 surface. The weights fall off as a Gaussian and not as an exponential: the contrast of a border is so much larger than
-the texture of a wall that a thousandth of the weight still decides the correlation. So does the pixel of the border
-itself, mixed of both sides: between thin bars every window has some, and an even wall there would go with the bars.
+the texture of a wall that a thousandth of the weight still decides the correlation.
 
 No kernel that correlates is compiled with fastmath: machine code made in the process and the same taken from the cache
 were seen to round differently with it, and a run has to end with the same bytes either way.
@@ -12,7 +11,6 @@ were seen to round differently with it, and a run has to end with the same bytes
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,30 +23,15 @@ SIDE = 4
 LIKENESS = 0.04
 """How unlike a pixel may be and still count, of intensities 0..1: more than the texture of most surfaces, less than the
 step from one to the next."""
-STRONG = 0.12
-"""A step of so much beside a pixel makes it one of the border, mixed of both sides: it does not count, however like."""
-_PURE = 3.0
-"""Where no more than so many of the SIDE² pixels are left, as on a thin bar or in a fine pattern, the border counts."""
 VARIANCE_FLOOR = 2e-5
 """Added to both variances (intensities 0..1): below about one grey level there is no texture, only noise."""
 OUTSIDE = -2.0
 """Marks the score of a view that does not see the pixel."""
 
 
-def ranges(image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(H, W) least and largest intensity round every pixel."""
-    square = np.ones((3, 3), np.uint8)
-    return np.asarray(cv2.erode(image, square), np.float32), np.asarray(cv2.dilate(image, square), np.float32)
-
-
 @kernel
 def weigh_windows(
-    image: NDArray[np.float32],
-    low: NDArray[np.float32],
-    high: NDArray[np.float32],
-    first: int,
-    last: int,
-    likeness: float,
+    image: NDArray[np.float32], first: int, last: int, likeness: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Of rows first..last of the image (H, W): the windows' weights and the weights times intensity, both
     (rows, SIDE, SIDE, W) with sums of one window 1 and its mean; and mean and variance (rows, 2, W).
@@ -63,17 +46,6 @@ def weigh_windows(
     for k in range(last - first):
         for x in range(width):
             middle = image[first + k, x]
-            # The middle is no part of the window; the floor keeps a lone bright pixel from dividing by nothing.
-            floor = np.float32(1e-6)
-            pure = np.float32(0)
-            for j in range(SIDE):
-                row = min(max(first + k + j * STEP - RADIUS, 0), height - 1)
-                for i in range(SIDE):
-                    column = min(max(x + i * STEP - RADIUS, 0), width - 1)
-                    unlike = max(high[row, column] - middle, middle - low[row, column])
-                    weights[k, j, i, x] = np.exp(narrow * (image[row, column] - middle) ** 2)
-                    weighted[k, j, i, x] = weights[k, j, i, x] if unlike < STRONG else np.exp(narrow * unlike**2)
-                    pure += weighted[k, j, i, x]
             total = np.float32(0)
             mean = np.float32(0)
             square = np.float32(0)
@@ -81,7 +53,8 @@ def weigh_windows(
                 row = min(max(first + k + j * STEP - RADIUS, 0), height - 1)
                 for i in range(SIDE):
                     value = image[row, min(max(x + i * STEP - RADIUS, 0), width - 1)]
-                    weight = (weighted[k, j, i, x] if pure > _PURE else weights[k, j, i, x]) + floor
+                    # The middle is no part of the window; the floor keeps a lone bright pixel from dividing by nothing.
+                    weight = np.exp(narrow * (value - middle) ** 2) + np.float32(1e-6)
                     total += weight
                     mean += weight * value
                     square += weight * value * value
