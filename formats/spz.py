@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from formats.atomic import write_bytes
 from formats.errors import InputError
+from formats.gaussian_ply import SH_C0
 from formats.gaussians import GaussianCloud, unit_quaternions
 from formats.reading import opened, parsing, require_file
 
@@ -31,7 +32,6 @@ _MOST_FRACTION_BITS = 24
 _LEAST_LIMIT, _HIGHEST_RATIO = 32 << 20, 30
 """Bytes that any file may unpack to, and how often its own size: real maps pack to a half, bombs to a thousandth."""
 _COLOR_SCALE = 0.15
-_SH_C0 = 0.28209479177387814
 # SPZ keeps x right, y up, z back; splat PLYs and this program x right, y down, z forward.
 _FLIP = np.array([1, -1, -1], dtype=np.float32)
 
@@ -51,7 +51,7 @@ def write_spz(path: Path, cloud: GaussianCloud, version: int = 4) -> None:
     streams = [
         _fixed24(cloud.means * _FLIP, fraction_bits).tobytes(),
         _byte(opacity * 255).tobytes(),
-        _byte((cloud.colors - 0.5) / _SH_C0 * (_COLOR_SCALE * 255) + 0.5 * 255).tobytes(),
+        _byte((cloud.colors - 0.5) / SH_C0 * (_COLOR_SCALE * 255) + 0.5 * 255).tobytes(),
         _byte((cloud.log_scales + 10) * 16).tobytes(),
         _packed_rotations(cloud.quat_wxyz[:, [1, 2, 3, 0]] * np.append(_FLIP, 1)).tobytes(),
     ]
@@ -119,7 +119,7 @@ def _unpacked(streams: list[NDArray[np.uint8]], degree: int, fraction_bits: int)
         log_scales=(scales / 16.0 - 10).astype(np.float32),
         quat_wxyz=unit_quaternions((quat_xyzw * np.append(_FLIP, 1))[:, [3, 0, 1, 2]]),
         opacity_logits=np.log(inside / (1 - inside)).astype(np.float32),
-        colors=((colors / 255.0 - 0.5) / _COLOR_SCALE * _SH_C0 + 0.5).astype(np.float32),
+        colors=((colors / 255.0 - 0.5) / _COLOR_SCALE * SH_C0 + 0.5).astype(np.float32),
         dropped_sh_degree=degree,
     )
 

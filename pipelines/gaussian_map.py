@@ -51,6 +51,10 @@ class GaussianMap:
         """(M,) in 0..1."""
         return torch.sigmoid(self.opacity_logits)
 
+    def only(self, rows: Tensor) -> GaussianMap:
+        """The Gaussians of rows (M,) bool or indices."""
+        return GaussianMap(**{name: tensor[rows] for name, tensor in vars(self).items()})
+
     def moved(self, other_from_world: Similarity) -> GaussianMap:
         """The same map in another world; radii grow with the scale."""
         means = other_from_world.apply(self.means.detach().cpu().numpy().astype("float64"))

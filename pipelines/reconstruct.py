@@ -154,11 +154,8 @@ def _require_run_or_empty(run: RunFolder) -> None:
     """Nothing is written, not even a lock, into a folder that holds something else."""
     if not run.root.is_dir() or run.manifest_file.exists():
         return
-    begun = {
-        LOCK,
-        SOURCE_LIST,
-        temporary_of(run.manifest_file).name,
-    }  # all that there is when the first file is being written
+    # All that there is when the first file is being written.
+    begun = {LOCK, SOURCE_LIST, temporary_of(run.manifest_file).name}
     if any(p.name not in begun for p in run.root.iterdir()):
         raise InputError(f"{run.root} exists and is not a run folder. Choose another with --out FOLDER")
 

@@ -26,6 +26,8 @@ TRUNCATION = 4.0
 """Voxels on either side of a surface that a depth speaks for."""
 LEAST_WEIGHT = 1.5
 """A voxel seen with less weight, in views at the median depth, has no surface."""
+_LEAST_PIECE = 0.01
+"""Connected pieces smaller than this share of the largest one are floaters."""
 
 
 def keyframe_rows(outcome: Outcome, settings: ExportConfig) -> list[int]:
@@ -39,10 +41,6 @@ def depth_views(outcome: Outcome, settings: ExportConfig, progress: Progress) ->
     camera = outcome.calibration.intrinsics.at_most(settings.mesh_side)
     poses = outcome.trajectory.cam_from_world
     return [depth_view(gaussian_map, poses[r], camera) for r in progress.track(rows, "depth views", len(rows))]
-
-
-_LEAST_PIECE = 0.01
-"""Connected pieces smaller than this share of the largest one are floaters."""
 
 
 def make_mesh(outcome: Outcome, views: list[PosedDepth], settings: ExportConfig, progress: Progress) -> SemanticMesh:

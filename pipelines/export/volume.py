@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from pipelines.depth.posed import PosedDepth
 from pipelines.gaussians.render.jit import kernel
 from pipelines.geometry.camera import unproject_depth
+from pipelines.proxy.regions.voxels import cells_of, voxel_keys
 
 SIDE = 8
 """Voxels along the side of a block."""
-_FARTHEST = 2**20
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def touched_blocks(views: list[PosedDepth], voxel: float, truncation: float) -> 
     Those further than a million blocks from the origin are left out.
     """
     # One number a block: rows of three are sorted ten times as slowly.
-    found, base = np.zeros(0, np.int64), np.int64(2 * _FARTHEST)
+    found = np.zeros(0, np.int64)
     for view in views:
         world_from_cam = np.linalg.inv(view.cam_from_world)
         points = unproject_depth(view.depth, view.intrinsics)[::3, ::3]
@@ -47,10 +47,8 @@ def touched_blocks(views: list[PosedDepth], voxel: float, truncation: float) -> 
         rays = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-9)
         offsets = np.arange(-1, 1.01, 0.5)[:, None, None] * truncation
         near = ((points + offsets * rays).reshape(-1, 3)) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
-        blocks = np.floor(near / (voxel * SIDE))
-        x, y, z = (blocks[(np.abs(blocks) < _FARTHEST).all(1)].astype(np.int64) + _FARTHEST).T
-        found = np.unique(np.concatenate([found, np.unique((x * base + y) * base + z)]))
-    return (np.stack([found // base**2, found // base % base, found % base], 1) - _FARTHEST).astype(np.int32)
+        found = np.unique(np.concatenate([found, np.unique(voxel_keys(near, voxel * SIDE))]))
+    return cells_of(found[found >= 0]).astype(np.int32)
 
 
 def fuse(views: list[PosedDepth], voxel: float, truncation_voxels: float, max_blocks: int, threads: int) -> Volume:

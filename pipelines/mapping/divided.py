@@ -60,7 +60,7 @@ def map_divided(context: StageContext, trajectory: Trajectory) -> Mapped:
         context.each(work, tasks)
     result, ids = all_together(tasks, REFINED)
     moved = move_trajectory(trajectory, ids, result.cam_from_world)
-    keyframes, held_out = measure(context, tasks, moved, ids, (result.log_gains, result.offsets), REFINED)
+    keyframes, held_out = measure(context, tasks, moved, ids, (result.log_gains, result.offsets), REFINED, fields)
     return Mapped(result, ids, tasks[0].class_ids, moved, keyframes, held_out, submaps)
 
 
@@ -86,9 +86,9 @@ def refine_divided(
         task.save(JOINED, SubmapResult(own, ids[rows], poses, exposure[0][rows], exposure[1][rows], *nothing))
     context.each(refine_submap, [replace(task, passes=passes, first_rate=1.0) for task in tasks])
     result, _ = all_together(tasks, REFINED)
-    before, _ = measure(context, tasks, trajectory, ids, exposure, JOINED)
+    before, _ = measure(context, tasks, trajectory, ids, exposure, JOINED, fields)
     moved = move_trajectory(trajectory, ids, result.cam_from_world)
-    after, _ = measure(context, tasks, moved, ids, (result.log_gains, result.offsets), REFINED)
+    after, _ = measure(context, tasks, moved, ids, (result.log_gains, result.offsets), REFINED, fields)
     return _mean_psnr(before), result, _mean_psnr(after)
 
 
@@ -134,7 +134,9 @@ def rows_of(trajectory: Trajectory, frame_ids: NDArray[np.int64]) -> Trajectory:
     """The same with these frames alone."""
     rows = np.flatnonzero(np.isin(trajectory.frame_ids, frame_ids))
     t, reasons = trajectory, tuple(trajectory.lost_reasons[r] for r in rows)
-    return Trajectory(t.frame_ids[rows], t.timestamps[rows], t.cam_from_world[rows], t.is_keyframe[rows], reasons)
+    return Trajectory(
+        t.frame_ids[rows], t.timestamps[rows], t.cam_from_world[rows], t.is_keyframe[rows], reasons, t.by_rotation[rows]
+    )
 
 
 def _only(fields: DepthFields, frame_ids: NDArray[np.int64]) -> DepthFields:
@@ -157,6 +159,7 @@ def measure(
     ids: NDArray[np.int64],
     exposure: Exposures,
     kind: str,
+    fields: DepthFields,
 ) -> tuple[list[ViewFigures], list[ViewFigures]]:
     """Figures that results of a kind show of the keyframes, in order, and of the frames held out, each measured with
     the submap of the keyframe before it."""
@@ -168,8 +171,8 @@ def measure(
         wanted = np.append(task.submap.own, np.array(held, np.int64)[np.isin(before, task.submap.own)])
         part = rows_of(moved, wanted)
         gains, offsets = (interpolate_rows(part.timestamps, times, a) for a in exposure)
-        fields = _only(context.run.load_depth_fields("tracking"), wanted)
-        measuring.append(replace(task, trajectory=part, exposure=(gains, offsets), fields=fields, measured=kind))
+        own = _only(fields, wanted)
+        measuring.append(replace(task, trajectory=part, exposure=(gains, offsets), fields=own, measured=kind))
     found = context.each(measure_submap, measuring)
     ranked = np.argsort(np.concatenate([task.submap.own for task in tasks]))
     keyframes = [figures for own, _ in found for figures in own]

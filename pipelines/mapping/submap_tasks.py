@@ -214,7 +214,7 @@ def belonging(gaussian_map: GaussianMap, anchors: NDArray[np.int64], submap: Sub
     """The Gaussians that are anchored (M,) at the submap's own keyframes."""
     kept = torch.from_numpy(np.isin(anchors, submap.own)).to(gaussian_map.means.device)
     anchored = replace(gaussian_map, anchor_frame_ids=torch.from_numpy(anchors).to(gaussian_map.means.device))
-    return GaussianMap(**{name: tensor[kept] for name, tensor in vars(anchored).items()})
+    return anchored.only(kept)
 
 
 def _shown(gaussian_map: GaussianMap, views: Iterable[View]) -> GaussianMap:
@@ -223,7 +223,7 @@ def _shown(gaussian_map: GaussianMap, views: Iterable[View]) -> GaussianMap:
     seen = torch.zeros(len(m), dtype=torch.bool, device=m.means.device)
     for view in views:
         seen |= blending_weights(m.means, m.radii, m.opacities, view.cam_from_world, view.intrinsics).largest > 0
-    return GaussianMap(**{name: tensor[seen] for name, tensor in vars(m).items()})
+    return m.only(seen)
 
 
 def together(maps: Sequence[GaussianMap]) -> GaussianMap:

@@ -88,11 +88,6 @@ def find_moving(
     return found
 
 
-def to_lab(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(h, w, 3) RGB → CIE Lab."""
-    return np.asarray(cv2.cvtColor((image / np.float32(255)).astype(np.float32), cv2.COLOR_RGB2LAB), np.float32)
-
-
 def _witnesses(poses: NDArray[np.float64], k: int, depth: float) -> list[int]:
     """Keyframes that look where this one does, evenly from near to far: neighbours in time show the thing too."""
     centres = -np.einsum("nij,ni->nj", poses[:, :3, :3], poses[:, :3, 3])

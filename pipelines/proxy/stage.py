@@ -14,12 +14,13 @@ from formats.errors import InputError
 from pipelines.config import Config, ProxyConfig
 from pipelines.correspondence.features import extract_features, to_grey
 from pipelines.frames.recording import open_recording
-from pipelines.masks.moving import SIDE, MovingView, find_moving, to_lab
+from pipelines.masks.moving import SIDE, MovingView, find_moving
 from pipelines.progress import Progress, log
 from pipelines.proxy.compact import compact
 from pipelines.proxy.inputs import check_proxy, proxy_inputs
 from pipelines.proxy.metres import reference_scale, scale_figures
 from pipelines.proxy.providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider
+from pipelines.proxy.regions.voxels import to_lab
 from pipelines.proxy.reliability import reliability, semantic_agreement, theta, warp_labels
 from pipelines.proxy.scale import DepthScale, measure_scale
 from pipelines.proxy.scratch import load_scratch, save_scratch
@@ -209,7 +210,8 @@ def make_depths(task: DepthTask, progress: Progress) -> None:
 def _opened(task: DepthTask, progress: Progress) -> tuple[StageContext, Sequence, list[Frame], DepthProvider]:
     context = StageContext(task.run, task.source, task.config, task.folder, progress)
     sequence = _load_sequence(context)
-    frames = [f for f in sequence.frames if f.id in set(task.frame_ids)]
+    wanted = set(task.frame_ids)
+    frames = [f for f in sequence.frames if f.id in wanted]
     return context, sequence, frames, open_depth(_surroundings(context, sequence))
 
 

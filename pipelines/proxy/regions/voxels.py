@@ -42,6 +42,11 @@ def voxel_keys(points: NDArray[np.float64], size: float) -> NDArray[np.int64]:
     return np.where(inside, (cell[..., 0] << 2 * _BITS) | (cell[..., 1] << _BITS) | cell[..., 2], -1)
 
 
+def cells_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(V,) → (V, 3) the cubes that `voxel_keys` are of; sorted keys give sorted cubes."""
+    return np.stack([keys >> 2 * _BITS, keys >> _BITS & (1 << _BITS) - 1, keys & (1 << _BITS) - 1], -1) - _HALF
+
+
 def neighbour_keys(keys: NDArray[np.int64], reach: NDArray[np.int64] = _OFFSETS) -> NDArray[np.int64]:
     """(V,) → (V, R) keys of the cubes around each, in a fixed order."""
     return keys[:, None] + ((reach[:, 0] << 2 * _BITS) + (reach[:, 1] << _BITS) + reach[:, 2])[None]
@@ -83,6 +88,11 @@ def normals_in_cam(depth: NDArray[np.float32], intrinsics: Intrinsics) -> NDArra
     return np.where(facing, -normal, normal)
 
 
+def to_lab(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(h, w, 3) RGB → CIE Lab."""
+    return np.asarray(cv2.cvtColor((image / np.float32(255)).astype(np.float32), cv2.COLOR_RGB2LAB), np.float32)
+
+
 def gather_frame(
     depth: NDArray[np.float32],
     weight: NDArray[np.float32],
@@ -103,7 +113,7 @@ def gather_frame(
         known = np.abs(given_normals).sum(-1, keepdims=True) > 0
         normals = np.where(known & (np.abs(normals).sum(-1, keepdims=True) > 0), given_normals / 127.0, normals)
     normals = normals @ world_from_cam[:3, :3].T
-    lab = cv2.cvtColor((image / np.float32(255)).astype(np.float32), cv2.COLOR_RGB2LAB)
+    lab = to_lab(image)
     use = (depth > 0) & (weight > 0) & (np.abs(normals).sum(-1) > 0)
     keys = voxel_keys(points, size)
     use &= keys >= 0

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.masks.moving import MovingView, find_moving, to_lab
+from pipelines.masks.moving import MovingView, find_moving
 from pipelines.progress import SilentProgress
+from pipelines.proxy.regions.voxels import to_lab
 from pipelines.types import Intrinsics
 
 CAMERA = Intrinsics(160, 120, 140.0, 140.0, 80.0, 60.0)
