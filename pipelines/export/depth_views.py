@@ -1,29 +1,51 @@
-"""What the finished map shows as depth: rendered median depth with a weight."""
+"""What the finished map shows in a view: median depth with a weight, colours and classes."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from pipelines.depth.posed import PosedDepth
-from pipelines.gaussian_map import GaussianMap
+from pipelines.gaussian_map import GaussianMap, decided_channels
 from pipelines.gaussians.render import median_depth, render
 from pipelines.types import Intrinsics
 
 
+@dataclass(frozen=True)
+class DrawnView:
+    """Depth and trust, colors (H, W, 3) uint8 and class channels (H, W) int16, -1 = none; None for a map without."""
+
+    shown: PosedDepth
+    colors: NDArray[np.uint8]
+    channels: NDArray[np.int16] | None
+
+
 @torch.no_grad()
-def depth_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], camera: Intrinsics) -> PosedDepth:
+def drawn_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], camera: Intrinsics) -> DrawnView:
     """Median depth with a weight: none where the map is thin or the depth jumps, less far away."""
     m = gaussian_map
-    pose = torch.as_tensor(cam_from_world, device=m.means.device)
-    depth = median_depth(m.means, m.radii, m.opacities, pose, camera).cpu().numpy()
-    silhouette = render(m.means, m.radii, m.opacities, m.colors, pose, camera).silhouette.cpu().numpy()
+    geometry, pose = (m.means, m.radii, m.opacities), torch.as_tensor(cam_from_world, device=m.means.device)
+    depth = median_depth(*geometry, pose, camera).cpu().numpy()
+    rendering = render(*geometry, torch.cat([m.colors, m.class_logits], dim=1), pose, camera)
+    silhouette, features = rendering.silhouette.cpu().numpy(), rendering.features
     solid = (silhouette > 0.7) & (depth > 0) & ~_jumps(depth)
     typical = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
     # The error of a depth grows with its square.
     weight = np.where(solid, np.clip(typical / np.maximum(depth, 1e-9), 0.2, 1.5) ** 2 * silhouette, 0)
-    return PosedDepth(camera, cam_from_world, depth.astype(np.float32), weight.astype(np.float32))
+    channels = decided_channels(features[..., 3:]).to(torch.int16).cpu().numpy() if features.shape[-1] > 3 else None
+    colors = (features[..., :3].clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    return DrawnView(
+        PosedDepth(camera, cam_from_world, depth.astype(np.float32), weight.astype(np.float32)), colors, channels
+    )
+
+
+def depth_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], camera: Intrinsics) -> PosedDepth:
+    """The depth of a `drawn_view` alone."""
+    without_classes = replace(gaussian_map, class_logits=gaussian_map.class_logits[:, :0])
+    return drawn_view(without_classes, cam_from_world, camera).shown
 
 
 def _jumps(depth: NDArray[np.float32], tolerance: float = 0.08) -> NDArray[np.bool_]:

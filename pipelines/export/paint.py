@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.depth.posed import PosedDepth
+from pipelines.export.depth_views import DrawnView
 from pipelines.geometry.camera import project
 from pipelines.types import VOID
 
 
-@dataclass(frozen=True)
-class PaintedView:
-    """A depth view with its colors (H, W, 3) float32 0..1 and class channels (H, W) int64, -1 = none."""
-
-    depth_view: PosedDepth
-    colors: NDArray[np.float32]
-    channels: NDArray[np.int64] | None
-
-
 def paint(
-    vertices: NDArray[np.float32], views: Iterable[PaintedView], class_ids: tuple[int, ...], tolerance: float
+    vertices: NDArray[np.float32], views: Iterable[DrawnView], class_ids: tuple[int, ...], tolerance: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """colors (V, 3) uint8 and labels (V,) uint8: weighted mean and vote of the views that see a vertex.
 
@@ -33,17 +24,17 @@ def paint(
     weight = np.zeros(len(vertices), np.float32)
     votes = np.zeros((len(vertices), max(len(class_ids), 1)), np.float32)
     for view in views:
-        rows, place = _seen(vertices, view.depth_view, tolerance)
-        share = view.depth_view.trust[place]
+        rows, place = _seen(vertices, view.shown, tolerance)
+        share = view.shown.trust[place]
         total[rows] += view.colors[place] * share[:, None]
         weight[rows] += share
         if view.channels is not None and class_ids:
             channel = view.channels[place]
             votes[rows[channel >= 0], channel[channel >= 0]] += share[channel >= 0]
-    colors = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-9)[:, None], 0.5)
+    colors = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-9)[:, None], 127.5)
     table = np.array([*class_ids, VOID] if class_ids else [VOID, VOID], np.uint8)
     labels = np.where(votes.max(1) > 0, votes.argmax(1), len(table) - 1)
-    return np.round(colors.clip(0, 1) * 255).astype(np.uint8), table[labels]
+    return np.round(colors).astype(np.uint8), table[labels]
 
 
 def _seen(

@@ -6,7 +6,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipelines.depth.posed import PosedDepth
-from pipelines.export.paint import PaintedView, paint
+from pipelines.export.depth_views import DrawnView
+from pipelines.export.paint import paint
 from pipelines.export.surface import extract_surface, without_floaters
 from pipelines.export.volume import Volume, fuse
 from pipelines.types import VOID, Intrinsics
@@ -44,12 +45,12 @@ def sphere(pose: NDArray[np.float64]) -> PosedDepth:
     return PosedDepth(CAMERA, pose, depth, (depth > 0).astype(np.float32))
 
 
-def painted(view: PosedDepth) -> PaintedView:
+def painted(view: PosedDepth) -> DrawnView:
     """Where x < 0 in the world channel 0 and red, else channel 1 and blue."""
     points = (pixel_rays() * view.depth[..., None] - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
     left = points[..., 0] < 0
-    colors = np.where(left[..., None], [0.8, 0, 0], [0, 0, 0.8]).astype(np.float32)
-    return PaintedView(view, colors, np.where(left, 0, 1))
+    colors = np.where(left[..., None], [204, 0, 0], [0, 0, 204]).astype(np.uint8)
+    return DrawnView(view, colors, np.where(left, 0, 1).astype(np.int16))
 
 
 def fused(count: int = 24, max_blocks: int = 100_000, threads: int = 2) -> Volume:
