@@ -192,9 +192,9 @@ class ExportConfig:
     )
     voxel: float = setting(0.008, "voxel of the mesh, in units of the scene's median depth", within=(0.0005, 1))
     max_blocks: int = setting(
-        80000, "blocks of 8 x 8 x 8 voxels; voxels grow where more would be needed", within=(10, 10_000_000)
-    )
-    max_views: int = setting(200, "keyframes the mesh is fused from, evenly spread", within=(1, 100_000))
+        80000, "blocks of 8 x 8 x 8 voxels for 200 keyframes, more for more; voxels grow where that is too few",
+        within=(10, 10_000_000),
+    )  # fmt: skip
     mesh_side: int = setting(640, "pixels on the long side of their depth images", within=(16, 8192))
     scale: str = setting(
         "auto",

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import prod
+from pathlib import Path
+from tempfile import TemporaryFile
 
 import numpy as np
 import torch
@@ -21,6 +26,55 @@ class DrawnView:
     shown: PosedDepth
     colors: NDArray[np.uint8]
     channels: NDArray[np.int16] | None
+
+    @property
+    def arrays(self) -> list[NDArray]:
+        """Depth, trust, colors, and channels where there are any."""
+        return [self.shown.depth, self.shown.trust, self.colors, *([] if self.channels is None else [self.channels])]
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return sum(a.nbytes for a in self.arrays)
+
+
+class Shown(Sequence[PosedDepth]):
+    """The depths alone of views that are loaded as they are asked for."""
+
+    def __init__(self, views: Sequence[DrawnView]) -> None:
+        self._views = views
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __getitem__(self, index: int) -> PosedDepth:  # type: ignore[override]
+        return self._views[index].shown
+
+
+class ViewsOnDisk:
+    """Views in a file of `folder` that has no name and goes with this process, however that ends."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._file = TemporaryFile(dir=folder)  # noqa: SIM115  as long as the views are needed
+        self._views: list[tuple[int, PosedDepth, list[tuple[np.dtype, tuple[int, ...]]]]] = []
+
+    def append(self, view: DrawnView) -> None:
+        """One more."""
+        start = self._file.seek(0, os.SEEK_END)
+        nothing = np.zeros((0, 0), np.float32)
+        shapes = [(a.dtype, a.shape) for a in view.arrays]
+        self._views.append((start, replace(view.shown, depth=nothing, trust=nothing), shapes))
+        for array in view.arrays:
+            self._file.write(np.ascontiguousarray(array).data)
+
+    def load(self, index: int) -> DrawnView:
+        """As it was."""
+        start, shown, shapes = self._views[index]
+        self._file.seek(start)
+        arrays = [np.frombuffer(self._file.read(t.itemsize * prod(shape)), t).reshape(shape) for t, shape in shapes]
+        depth, trust, colors = arrays[:3]
+        return DrawnView(replace(shown, depth=depth, trust=trust), colors, arrays[3] if len(arrays) > 3 else None)
 
 
 @torch.no_grad()

@@ -11,46 +11,62 @@ from numpy.typing import NDArray
 from formats.mesh import write_mesh_glb, write_mesh_ply
 from pipelines.config import ExportConfig
 from pipelines.depth.posed import PosedDepth
-from pipelines.export.depth_views import DrawnView, drawn_view
+from pipelines.export.depth_views import DrawnView, Shown, ViewsOnDisk, drawn_view
 from pipelines.export.paint import paint
-from pipelines.export.surface import extract_surface, without_floaters
-from pipelines.export.volume import fuse
+from pipelines.export.surface import EMPTY, extract_surface, join_faces, without_floaters
+from pipelines.export.volume import fuse, make_grid
 from pipelines.gaussians.render import get_threads
-from pipelines.outcome import Outcome, evenly
+from pipelines.outcome import Outcome
 from pipelines.progress import Progress
+from pipelines.streamed import Streamed
 from pipelines.types import VOID, SemanticMesh
 
 TRUNCATION = 4.0
 """Voxels on either side of a surface that a depth speaks for."""
 LEAST_WEIGHT = 1.5
 """A voxel seen with less weight, in views at the median depth, has no surface."""
+LONG = 200
+"""Keyframes of a recording for which `export.max_blocks` is meant; a longer one may have more by its length."""
+_KEPT_BYTES = 200e6
 _LEAST_PIECE = 0.01
 """Connected pieces smaller than this share of the largest one are floaters."""
 
 
-def keyframe_rows(outcome: Outcome, settings: ExportConfig) -> list[int]:
+def keyframe_rows(outcome: Outcome) -> list[int]:
     """The rows of the trajectory whose views the mesh is made from."""
-    return evenly(np.flatnonzero(outcome.trajectory.is_keyframe).tolist(), settings.max_views)
+    return np.flatnonzero(outcome.trajectory.is_keyframe).tolist()
 
 
-def drawn_views(outcome: Outcome, settings: ExportConfig, progress: Progress) -> list[DrawnView]:
-    """What the map shows in each of the `keyframe_rows`."""
-    rows, gaussian_map = keyframe_rows(outcome, settings), outcome.require_map()
+def drawn_views(outcome: Outcome, settings: ExportConfig, progress: Progress, folder: Path) -> Sequence[DrawnView]:
+    """What the map shows in each of the `keyframe_rows`, on disk in `folder` but for those used last."""
+    rows, gaussian_map = keyframe_rows(outcome), outcome.require_map()
     camera = outcome.calibration.intrinsics.at_most(settings.mesh_side)
     poses = outcome.trajectory.cam_from_world
-    return [drawn_view(gaussian_map, poses[r], camera) for r in progress.track(rows, "drawing", len(rows))]
+    drawn = ViewsOnDisk(folder)
+    for row in progress.track(rows, "drawing", len(rows)):
+        drawn.append(drawn_view(gaussian_map, poses[row], camera))
+    return Streamed(len(rows), drawn.load, lambda view: view.size, _KEPT_BYTES)
 
 
 def make_mesh(outcome: Outcome, views: Sequence[DrawnView], settings: ExportConfig, progress: Progress) -> SemanticMesh:
-    """The surface of the map as the keyframes see it; without a vertex where nothing is seen twice."""
-    shown = [view.shown for view in views]
-    voxel = settings.voxel * _median_depth(shown)
-    volume = fuse(shown, voxel, TRUNCATION, settings.max_blocks, get_threads())
-    least = LEAST_WEIGHT if len(views) >= 4 else 0.5
-    vertices, faces = without_floaters(*extract_surface(volume, least), _LEAST_PIECE)
-    painting = progress.track(views, "painting", len(views))
-    colors, labels = paint(vertices, painting, tuple(outcome.label_of_channel.tolist()), 2 * volume.truncation)
-    return SemanticMesh(vertices, faces, colors, labels)
+    """The surface of the map as the keyframes see it, a region of the grid after the other; without a vertex where
+    nothing is seen twice."""
+    shown = Shown(views)
+    most = int(settings.max_blocks * max(len(views) / LONG, 1))
+    grid = make_grid(shown, settings.voxel * _median_depth(shown), TRUNCATION, most)
+    least, class_ids = LEAST_WEIGHT if len(views) >= 4 else 0.5, tuple(outcome.label_of_channel.tolist())
+    surfaces, painted = [EMPTY], [(np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8))]
+    regions = list(grid.regions())
+    for number, chunks in enumerate(regions, 1):
+        near, of = grid.views_of(chunks), f", {number} of {len(regions)}" if len(regions) > 1 else ""
+        fusing = (views[n].shown for n in progress.track(near, "fusing" + of, len(near)))
+        surfaces.append(extract_surface(fuse(grid, chunks, fusing, get_threads()), chunks, least))
+        painting = (views[n] for n in progress.track(near, "painting" + of, len(near)))
+        painted.append(paint(surfaces[-1].vertices, painting, class_ids, 2 * grid.truncation))
+    vertices = np.concatenate([surface.vertices for surface in surfaces])
+    rows, faces = without_floaters(join_faces(surfaces), len(vertices), _LEAST_PIECE)
+    colors, labels = (np.concatenate(of_regions)[rows] for of_regions in zip(*painted, strict=True))
+    return SemanticMesh(vertices[rows], faces, colors, labels)
 
 
 def write_mesh(
@@ -66,7 +82,8 @@ def write_mesh(
 
 
 def _median_depth(views: Sequence[PosedDepth]) -> float:
-    seen = np.concatenate([v.depth[v.trust > 0][::16] for v in views])
+    step = 16 * -(-len(views) // LONG)
+    seen = np.concatenate([v.depth[v.trust > 0][::step] for v in views])
     return float(np.median(seen)) if len(seen) else 1.0
 
 

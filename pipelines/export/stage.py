@@ -12,6 +12,7 @@ from formats.digest import file_sha256
 from formats.gps import read_track
 from formats.mesh import read_mesh_ply
 from pipelines.config import Config, ExportConfig
+from pipelines.export.depth_views import Shown
 from pipelines.export.mesh import drawn_views, make_mesh, mesh_figures, write_mesh
 from pipelines.export.textured import make_textured, write_textured
 from pipelines.export.tiles import write_tiles
@@ -80,15 +81,14 @@ def write_meshes(
     """Make the mesh, unless it is `finished`, and write those `kinds` of it ("mesh", "texture") that are not yet."""
     if finished is not None and "texture" not in kinds:
         return finished, []
-    views, names, axes = drawn_views(outcome, settings, progress), outcome.classes.names, world.gltf_from_exported
+    views, names = drawn_views(outcome, settings, progress, folder), outcome.classes.names
+    axes = world.gltf_from_exported
     mesh, paths = finished, []
     if mesh is None:
         mesh = make_mesh(outcome, views, settings, progress)
         paths += write_mesh(mesh, names, folder, axes) if "mesh" in kinds else []
     if "texture" in kinds and len(mesh.faces):
-        paths += write_textured(
-            make_textured(outcome, mesh, [v.shown for v in views], settings, progress), names, folder, axes
-        )
+        paths += write_textured(make_textured(outcome, mesh, Shown(views), progress), names, folder, axes)
     return mesh, paths
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -41,19 +42,21 @@ class Shot:
 def texels_wanted(vertices: NDArray[np.float32], faces: NDArray[np.int32], shots: Sequence[Shot]) -> float:
     """Texels a unit of length at which nine of ten vertices keep the pixels of the view that sees them closest."""
     normals = vertex_normals(vertices, faces)
-    density = np.stack([_density(vertices, normals, shot)[0] for shot in shots]).max(0)
+    density = functools.reduce(np.maximum, (_density(vertices, normals, shot)[0] for shot in shots))
     return float(np.quantile(density[density > 0], 0.9)) if (density > 0).any() else 1.0
 
 
 def paint_texture(atlas: Atlas, shots: Sequence[Shot], progress: Progress) -> NDArray[np.uint8]:
     """(height, width, 3) RGB; what no view sees has its vertices' colours, what no face covers those beside it."""
     vertices, faces = atlas.mesh.vertices, atlas.mesh.faces
-    weights = view_weights(vertices, vertex_normals(vertices, faces), shots)[:, atlas.corner_vertex]
-    owner = owners(atlas)
+    normals, owner = vertex_normals(vertices, faces), owners(atlas)
+    of_each = (view_weights(vertices, normals, shot) for shot in shots)
+    best = np.maximum(functools.reduce(np.maximum, of_each), np.finfo(np.float32).tiny)
     total = np.zeros((atlas.height, atlas.width, 4), np.float32)
-    for shot, weight in zip(progress.track(shots, "texture", len(shots)), weights, strict=True):
+    for shot in progress.track(shots, "texture", len(shots)):
+        weight = (view_weights(vertices, normals, shot) / best).astype(np.float32, copy=False)
         if weight.any():
-            _add(total, owner, atlas, shot, weight)
+            _add(total, owner, atlas, shot, weight[atlas.corner_vertex])
     base = (atlas.mesh.colors / np.float32(255))[atlas.corner_vertex]
     _in_bands(atlas.height, lambda a, b: _finish(total[a:b], owner[a:b], a, atlas.corners, atlas.corner_faces, base))
     return np.round(_filled(total)[..., :3].clip(0, 1) * 255).astype(np.uint8)
@@ -69,18 +72,14 @@ def vertex_normals(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> N
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
 
 
-def view_weights(
-    vertices: NDArray[np.float32], normals: NDArray[np.float64], shots: Sequence[Shot]
-) -> NDArray[np.float32]:
-    """(N, V) how much each shot counts at each vertex: 0 where it does not see it, 1 for the best of all."""
-    weights = np.zeros((len(shots), len(vertices)), np.float32)
-    for n, shot in enumerate(shots):
-        density, place = _density(vertices, normals, shot)
-        seen = density > 0
-        weights[n, seen] = (shot.sharpness * density[seen]) ** POWER * _feather(shot.depth_view)[
-            place[seen, 1], place[seen, 0]
-        ]
-    return weights / np.maximum(weights.max(0), np.finfo(np.float32).tiny)
+def view_weights(vertices: NDArray[np.float32], normals: NDArray[np.float64], shot: Shot) -> NDArray[np.float32]:
+    """(V,) how much a shot counts at each vertex beside others: 0 where it does not see it."""
+    weights = np.zeros(len(vertices), np.float32)
+    density, place = _density(vertices, normals, shot)
+    seen = density > 0
+    feather = _feather(shot.depth_view)[place[seen, 1], place[seen, 0]]
+    weights[seen] = (shot.sharpness * density[seen]) ** POWER * feather
+    return weights
 
 
 def _density(

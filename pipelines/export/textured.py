@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from formats.textured_mesh import TexturedMesh, write_textured_glb, write_textured_obj
-from pipelines.config import ExportConfig
 from pipelines.depth.posed import PosedDepth
 from pipelines.export.atlas import simplified, unwrapped
 from pipelines.export.mesh import keyframe_rows
 from pipelines.export.texture import Shot, paint_texture, texels_wanted
 from pipelines.outcome import Outcome
 from pipelines.progress import Progress
+from pipelines.streamed import Streamed
 from pipelines.types import Frame, SemanticMesh
 
 TEXTURE_SIDE = 4096
@@ -26,10 +26,10 @@ TEXTURE_SIDE = 4096
 
 
 def make_textured(
-    outcome: Outcome, mesh: SemanticMesh, views: Sequence[PosedDepth], settings: ExportConfig, progress: Progress
+    outcome: Outcome, mesh: SemanticMesh, views: Sequence[PosedDepth], progress: Progress
 ) -> TexturedMesh:
     """A tenth of the mesh's vertices, and a picture of its surface from the keyframes that `views` are of."""
-    shots = _shots(outcome, views, settings)
+    shots = _shots(outcome, views)
     light = simplified(mesh)
     atlas = unwrapped(light, texels_wanted(light.vertices, light.faces, shots), TEXTURE_SIDE)
     texture = paint_texture(atlas, shots, progress)
@@ -47,14 +47,14 @@ def write_textured(
     return [*paths, folder / "mesh_textured.glb"]
 
 
-def _shots(outcome: Outcome, views: Sequence[PosedDepth], settings: ExportConfig) -> list[Shot]:
+def _shots(outcome: Outcome, views: Sequence[PosedDepth]) -> Sequence[Shot]:
     frame_of = {f.id: f for f in outcome.frames}
-    frames = [frame_of[int(outcome.trajectory.frame_ids[r])] for r in keyframe_rows(outcome, settings)]
+    frames = [frame_of[int(outcome.trajectory.frame_ids[r])] for r in keyframe_rows(outcome)]
     measured = np.array([f.sharpness for f in frames])
     # Blank walls count as blurred in themselves: neighbours, which see about the same, tell what is sharp there.
     usual = median_filter(measured, size=7, mode="nearest")
     sharpness = np.sqrt(np.minimum(measured / np.maximum(usual, 1e-9), 1))
-    return [_shot(outcome, *of_one) for of_one in zip(frames, views, sharpness.tolist(), strict=True)]
+    return Streamed(len(frames), lambda n: _shot(outcome, frames[n], views[n], float(sharpness[n])), lambda shot: 1, 1)
 
 
 def _shot(outcome: Outcome, frame: Frame, view: PosedDepth, sharpness: float) -> Shot:

@@ -1,8 +1,13 @@
-"""A truncated signed distance field in sparse blocks: depth images in, distances out (Curless and Levoy 1996)."""
+"""A truncated signed distance field in sparse blocks: depth images in, distances out (Curless and Levoy 1996).
+
+The blocks of a long recording are fused region by region, each from the views that can see it: what is in memory at a
+time does not grow with the recording.
+"""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -13,9 +18,37 @@ from pipelines.depth.posed import PosedDepth
 from pipelines.gaussians.render.jit import kernel
 from pipelines.geometry.camera import unproject_depth
 from pipelines.proxy.regions.voxels import cells_of, voxel_keys
+from pipelines.types import Intrinsics
 
 SIDE = 8
 """Voxels along the side of a block."""
+CHUNK = 8
+"""Blocks along the side of a chunk, of which regions are made; surfaces are extracted chunk by chunk."""
+_AT_ONCE = 32_000
+"""Blocks of a region, 4 kB each, without the layer that it shares with its neighbours."""
+
+
+@dataclass(frozen=True)
+class Frustum:
+    """Where a view can see anything: its camera, and the largest depth that it trusts (0: none)."""
+
+    camera: Intrinsics
+    cam_from_world: NDArray[np.float64]
+    far: float
+
+    @staticmethod
+    def of(view: PosedDepth) -> Frustum:
+        """Of one view."""
+        return Frustum(view.intrinsics, view.cam_from_world, float(view.depth[view.trust > 0].max(initial=0)))
+
+    def meets(self, centers: NDArray[np.floating], radius: float, beyond: float) -> NDArray[np.bool_]:
+        """(M,) whether balls at `centers` (M, 3) may reach into it, or `beyond` behind the last depth."""
+        x, y, z = self.cam_from_world[:3, :3] @ centers.T + self.cam_from_world[:3, 3:]
+        k, meets = self.camera, (z > -radius) & (z < self.far + beyond + radius)
+        for along, focal, middle, size in ((x, k.fx, k.cx, k.width), (y, k.fy, k.cy, k.height)):
+            meets &= focal * along + middle * z > -radius * np.hypot(focal, middle)
+            meets &= focal * along + (middle - size) * z < radius * np.hypot(focal, middle - size)
+        return meets
 
 
 @dataclass(frozen=True)
@@ -33,13 +66,56 @@ class Volume:
     weight: NDArray[np.float32]
 
 
-def touched_blocks(views: list[PosedDepth], voxel: float, truncation: float) -> NDArray[np.int32]:
+@dataclass(frozen=True)
+class Grid:
+    """The `blocks` (B, 3) near what `frusta`, one a view, see."""
+
+    voxel: float
+    truncation: float
+    blocks: NDArray[np.int32]
+    frusta: Sequence[Frustum]
+
+    def regions(self, at_once: int = _AT_ONCE) -> Iterator[NDArray[np.int32]]:
+        """(R, 3) chunks that lie together and have about so many blocks."""
+        chunks, counts = np.unique(self.blocks // CHUNK, axis=0, return_counts=True)
+        order = np.argsort(_along_curve(chunks), kind="stable")
+        number = (np.cumsum(counts[order]) - 1) // at_once
+        for n in np.unique(number):
+            yield chunks[order[number == n]]
+
+    def blocks_of(self, chunks: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Those in the chunks, and the layer after them, without which their last cells would have no corners."""
+        wanted, home = np.sort(_keys(chunks)), self.blocks // CHUNK
+        first = self.blocks % CHUNK == 0
+        inside = np.zeros(len(self.blocks), bool)
+        for back in itertools.product((0, 1), repeat=3):
+            inside |= first[:, np.flatnonzero(back)].all(1) & np.isin(_keys(home - np.array(back)), wanted)
+        return self.blocks[inside]
+
+    def views_of(self, chunks: NDArray[np.int32]) -> list[int]:
+        """The numbers of the views that may see anything of the chunks."""
+        side = self.voxel * SIDE
+        centers, radius = (chunks * CHUNK + (CHUNK + 1) / 2) * side, (CHUNK + 1) / 2 * side * 3**0.5
+        return [n for n, f in enumerate(self.frusta) if f.far and f.meets(centers, radius, self.truncation).any()]
+
+
+def make_grid(views: Sequence[PosedDepth], voxel: float, truncation_voxels: float, max_blocks: int) -> Grid:
+    """The blocks that are needed; the voxels grow until they are at most `max_blocks`."""
+    frusta = [Frustum.of(view) for view in views]
+    blocks = touched_blocks(views, voxel, voxel * truncation_voxels)
+    while len(blocks) > max_blocks:
+        voxel *= 1.25
+        blocks = touched_blocks(views, voxel, voxel * truncation_voxels)
+    return Grid(voxel, voxel * truncation_voxels, blocks, frusta)
+
+
+def touched_blocks(views: Iterable[PosedDepth], voxel: float, truncation: float) -> NDArray[np.int32]:
     """(B, 3) coordinates of the blocks within the truncation of a seen surface, sorted.
 
     Those further than a million blocks from the origin are left out.
     """
-    # One number a block: rows of three are sorted ten times as slowly.
-    found = np.zeros(0, np.int64)
+    # One number a block: rows of three are sorted ten times as slowly. Sorted in with the others once they are as many.
+    found, waiting = np.zeros(0, np.int64), [np.zeros(0, np.int64)]
     for view in views:
         world_from_cam = np.linalg.inv(view.cam_from_world)
         points = unproject_depth(view.depth, view.intrinsics)[::3, ::3]
@@ -47,30 +123,44 @@ def touched_blocks(views: list[PosedDepth], voxel: float, truncation: float) -> 
         rays = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-9)
         offsets = np.arange(-1, 1.01, 0.5)[:, None, None] * truncation
         near = ((points + offsets * rays).reshape(-1, 3)) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
-        found = np.unique(np.concatenate([found, np.unique(voxel_keys(near, voxel * SIDE))]))
+        waiting.append(np.unique(voxel_keys(near, voxel * SIDE)))
+        if sum(map(len, waiting)) > len(found):
+            found, waiting = np.unique(np.concatenate([found, *waiting])), []
+    found = np.unique(np.concatenate([found, *waiting]))
     return cells_of(found[found >= 0]).astype(np.int32)
 
 
-def fuse(views: list[PosedDepth], voxel: float, truncation_voxels: float, max_blocks: int, threads: int) -> Volume:
-    """The weighted mean of all views' truncated distances; the voxels grow until at most `max_blocks` are needed."""
-    blocks = touched_blocks(views, voxel, voxel * truncation_voxels)
-    while len(blocks) > max_blocks:
-        voxel *= 1.25
-        blocks = touched_blocks(views, voxel, voxel * truncation_voxels)
-    truncation = voxel * truncation_voxels
+def _keys(cells: NDArray[np.int32]) -> NDArray[np.int64]:
+    return voxel_keys(cells.astype(np.float64), 1.0)
+
+
+def _along_curve(cells: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Numbers in whose order neighbours follow each other: the bits of the coordinates in turn (Morton 1966)."""
+    cells = cells.astype(np.int64) - cells.min(axis=0, initial=0)
+    number = np.zeros(len(cells), np.int64)
+    for bit in range(21):
+        for axis in range(3):
+            number |= (cells[:, axis] >> bit & 1) << 3 * bit + axis
+    return number
+
+
+def fuse(grid: Grid, chunks: NDArray[np.int32], views: Iterable[PosedDepth], threads: int) -> Volume:
+    """The weighted mean of the views' truncated distances in these chunks; views that see nothing of them may lack."""
+    blocks, voxel, truncation = grid.blocks_of(chunks), grid.voxel, grid.truncation
     distance = np.zeros((len(blocks), SIDE, SIDE, SIDE), np.float32)
     weight = np.zeros_like(distance)
-    bounds = np.linspace(0, len(blocks), threads + 1).astype(int)
+    centers, radius = (blocks + 0.5) * (voxel * SIDE), voxel * SIDE * 0.87
     with ThreadPoolExecutor(threads) as pool:
         for view in views:
             k = view.intrinsics
             camera = np.array([k.fx, k.fy, k.cx, k.cy])
+            rows = np.flatnonzero(Frustum.of(view).meets(centers, radius, truncation))
             jobs = [
                 pool.submit(
-                    _integrate, blocks[a:b], distance[a:b], weight[a:b], view.depth, view.trust,
+                    _integrate, part, blocks, distance, weight, view.depth, view.trust,
                     np.ascontiguousarray(view.cam_from_world), camera, voxel, truncation,
                 )
-                for a, b in itertools.pairwise(bounds)
+                for part in np.array_split(rows, threads)
             ]  # fmt: skip
             for job in jobs:
                 job.result()
@@ -78,17 +168,11 @@ def fuse(views: list[PosedDepth], voxel: float, truncation_voxels: float, max_bl
 
 
 @kernel
-def _integrate(blocks, distance, weight, depth, depth_weight, pose, camera, voxel, truncation):  # type: ignore[no-untyped-def]
+def _integrate(rows, blocks, distance, weight, depth, depth_weight, pose, camera, voxel, truncation):  # type: ignore[no-untyped-def]
     height, width = depth.shape
     fx, fy, cx, cy = camera
-    radius = voxel * SIDE * 0.87
-    for b in range(len(blocks)):
+    for b in rows:
         bx, by, bz = blocks[b, 0] * SIDE * voxel, blocks[b, 1] * SIDE * voxel, blocks[b, 2] * SIDE * voxel
-        half = voxel * SIDE / 2
-        mx, my, mz = bx + half, by + half, bz + half
-        z = pose[2, 0] * mx + pose[2, 1] * my + pose[2, 2] * mz + pose[2, 3]
-        if z < -radius:
-            continue
         for i in range(SIDE):
             for j in range(SIDE):
                 for k in range(SIDE):

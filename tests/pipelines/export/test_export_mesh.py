@@ -1,15 +1,19 @@
 """Fusion of depth images of a sphere whose surface, colours and classes are known."""
 
+import tracemalloc
+from collections.abc import Sequence
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
 
 from pipelines.depth.posed import PosedDepth
-from pipelines.export.depth_views import DrawnView
+from pipelines.export.depth_views import DrawnView, ViewsOnDisk
 from pipelines.export.paint import paint
-from pipelines.export.surface import extract_surface, without_floaters
-from pipelines.export.volume import Volume, fuse
+from pipelines.export.surface import EMPTY, extract_surface, join_faces, without_floaters
+from pipelines.export.volume import CHUNK, Grid, Volume, fuse, make_grid
 from pipelines.types import VOID, Intrinsics
 
 CAMERA = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
@@ -53,13 +57,52 @@ def painted(view: PosedDepth) -> DrawnView:
     return DrawnView(view, colors, np.where(left, 0, 1).astype(np.int16))
 
 
+class Corridor(Sequence[PosedDepth]):
+    """Views along a corridor two metres wide and high, made as they are asked for."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> PosedDepth:  # type: ignore[override]
+        if index >= self.count:
+            raise IndexError
+        pose = np.eye(4)
+        pose[2, 3] = -0.5 * index
+        rays = np.abs(pixel_rays()[..., :2]).max(-1)
+        depth = np.minimum(1 / np.maximum(rays, 1e-9), 6).astype(np.float32)
+        return PosedDepth(CAMERA, pose, depth, (depth < 5).astype(np.float32))
+
+
 def fused(count: int = 24, max_blocks: int = 100_000, threads: int = 2) -> Volume:
-    return fuse([sphere(p) for p in orbit(count)], VOXEL, 4.0, max_blocks, threads)
+    views = [sphere(p) for p in orbit(count)]
+    grid = make_grid(views, VOXEL, 4.0, max_blocks)
+    return fuse(grid, all_chunks(grid), views, threads)
+
+
+def all_chunks(grid: Grid) -> NDArray[np.int32]:
+    return np.unique(grid.blocks // CHUNK, axis=0)
+
+
+def extracted(views: Sequence[PosedDepth], voxel: float, at_once: int, least: float = 1.5) -> trimesh.Trimesh:
+    """The surface, made region by region."""
+    grid = make_grid(views, voxel, 4.0, 10_000_000)
+    surfaces = [
+        extract_surface(fuse(grid, chunks, (views[n] for n in grid.views_of(chunks)), 1), chunks, least)
+        for chunks in grid.regions(at_once)
+    ]
+    vertices = np.concatenate([s.vertices for s in surfaces])
+    rows, faces = without_floaters(join_faces(surfaces), len(vertices), 0.0)
+    return trimesh.Trimesh(vertices[rows], faces, process=False)
 
 
 @pytest.fixture(scope="module")
 def surface() -> trimesh.Trimesh:
-    return trimesh.Trimesh(*extract_surface(fused(), 1.5), process=False)
+    volume = fused()
+    whole = extract_surface(volume, np.unique(volume.blocks // CHUNK, axis=0), 1.5)
+    return trimesh.Trimesh(whole.vertices, whole.faces, process=False)
 
 
 def test_sphere_comes_back(surface: trimesh.Trimesh) -> None:
@@ -116,14 +159,71 @@ def test_threads_do_not_change_a_byte() -> None:
 def test_nothing_seen_gives_an_empty_surface() -> None:
     view = sphere(orbit(1)[0])
     nothing = PosedDepth(CAMERA, view.cam_from_world, view.depth * 0, view.trust * 0)
-    vertices, faces = extract_surface(fuse([nothing, nothing], VOXEL, 4.0, 1000, 1), 1.0)
-    assert len(vertices) == len(faces) == 0
+    grid = make_grid([nothing, nothing], VOXEL, 4.0, 1000)
+    assert list(grid.regions()) == []
+    assert len(fuse(grid, all_chunks(grid), [nothing], 1).blocks) == 0
+    assert join_faces([EMPTY]).shape == (0, 3)
 
 
 def test_small_pieces_go() -> None:
     plane = trimesh.creation.icosphere(subdivisions=3)
     speck = trimesh.creation.icosahedron()
     both = trimesh.util.concatenate([plane, speck.apply_translation([9, 9, 9])])
-    vertices, faces = without_floaters(both.vertices.astype(np.float32), both.faces.astype(np.int32), 0.05)
-    assert (len(vertices), len(faces)) == (len(plane.vertices), len(plane.faces))
-    assert np.abs(vertices).max() < 2
+    rows, faces = without_floaters(both.faces.astype(np.int32), len(both.vertices), 0.05)
+    assert (len(rows), len(faces)) == (len(plane.vertices), len(plane.faces))
+    assert np.abs(both.vertices[rows]).max() < 2
+    np.testing.assert_array_equal(both.vertices[rows][faces], plane.triangles)
+
+
+@pytest.mark.parametrize("at_once", [1, 40])
+def test_regions_give_the_mesh_of_the_whole(at_once: int) -> None:
+    """The sphere crosses several chunks; not every view sees each."""
+    views = [sphere(p) for p in orbit(12)]
+    whole, parts = extracted(views, 0.012, 10_000_000), extracted(views, 0.012, at_once)
+    assert len(whole.vertices) == len(parts.vertices) > 5000
+    assert len(whole.faces) == len(parts.faces)
+    np.testing.assert_array_equal(*(np.unique(m.triangles_center.round(7), axis=0) for m in (whole, parts)))
+    assert parts.edges_unique.shape == whole.edges_unique.shape  # sewn together where regions meet
+
+
+def test_a_view_is_fused_wherever_it_sees_anything() -> None:
+    """Left away are only views that would change nothing."""
+    views = Corridor(24)
+    grid = make_grid(views, 0.1, 4.0, 10_000_000)
+    left_away = 0
+    for chunks in grid.regions(1):
+        near = grid.views_of(chunks)
+        left_away += len(views) - len(near)
+        some, all_of_them = fuse(grid, chunks, (views[n] for n in near), 1), fuse(grid, chunks, views, 1)
+        assert some.weight.tobytes() == all_of_them.weight.tobytes()
+        assert some.distance.tobytes() == all_of_them.distance.tobytes()
+    assert left_away > 10
+
+
+def test_memory_of_fusing_does_not_grow_with_the_length() -> None:
+    def peak(count: int) -> float:
+        tracemalloc.start()
+        mesh = extracted(Corridor(count), 0.1, 12, least=0.5)
+        found = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert np.ptp(mesh.vertices[:, 2]) > 0.45 * count
+        return found - 3 * (mesh.vertices.nbytes + mesh.faces.nbytes)  # the mesh itself does
+
+    extracted(Corridor(2), 0.1, 12)
+    assert peak(36) < 1.2 * peak(12)
+
+
+def test_views_come_back_from_disk(tmp_path: Path) -> None:
+    rng, kept = np.random.default_rng(0), ViewsOnDisk(tmp_path)
+    shown = sphere(orbit(1)[0])
+    colors = rng.integers(0, 255, (3, 120, 160, 3)).astype(np.uint8)
+    channels = [None, rng.integers(-1, 4, (120, 160)).astype(np.int16), None]
+    for color, channel in zip(colors, channels, strict=True):
+        kept.append(DrawnView(shown, color, channel))
+    assert list(tmp_path.iterdir()) == []
+    for n in (2, 0, 1):
+        view = kept.load(n)
+        assert (view.shown.intrinsics, view.shown.cam_from_world.tolist()) == (CAMERA, shown.cam_from_world.tolist())
+        for found, wanted in zip(view.arrays, DrawnView(shown, colors[n], channels[n]).arrays, strict=True):
+            assert found.dtype == wanted.dtype
+            np.testing.assert_array_equal(found, wanted)

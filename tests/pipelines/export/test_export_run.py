@@ -124,7 +124,7 @@ def test_texture_shows_the_photographs(run: RunFolder, folder: Path, exported: O
 
 
 def test_texture_alone(run: RunFolder, tmp_path: Path) -> None:
-    few = replace(SETTINGS, texture=False, max_views=2, mesh_side=160)
+    few = replace(SETTINGS, texture=False, mesh_side=160)
     names = [path.name for path in export_run(run, tmp_path, "texture", settings=few)]
     assert names == [*(f"mesh_textured.{kind}" for kind in ("obj", "mtl", "png", "glb")), "world.json"]
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)

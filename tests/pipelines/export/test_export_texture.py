@@ -137,7 +137,8 @@ def test_no_texel_is_left_black(atlas: Atlas) -> None:
 
 def test_blurred_and_hidden_views_count_less(atlas: Atlas) -> None:
     vertices, normals = atlas.mesh.vertices, vertex_normals(atlas.mesh.vertices, atlas.mesh.faces)
-    weights = view_weights(vertices, normals, [SHOTS[0], shot(0.0, sharpness=0.5), SHOTS[6]])
+    shots = (SHOTS[0], shot(0.0, sharpness=0.5), SHOTS[6])
+    weights = np.stack([view_weights(vertices, normals, one) for one in shots])
     seen = weights[0] > 0
     np.testing.assert_allclose(weights[1, seen], weights[0, seen] / 2**texture.POWER, rtol=1e-5)
     assert not (seen & (weights[2] > 0)).any()  # the other side
