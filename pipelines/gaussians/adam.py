@@ -39,17 +39,20 @@ class AdamTable:
         gradients: Mapping[str, Tensor | None],
         rates: Mapping[str, float],
         shares: Mapping[str, Tensor] | None = None,
+        rows: Tensor | None = None,
     ) -> None:
         """One Adam step for the parameters that have a gradient and a rate.
 
-        `shares`, (M,) each: how much of the step each row takes, all of it where there are none.
+        `rows` (n,): indices, each once, of those that gradients and shares belong to, None for all. `shares`, (n,)
+        each: how much of the step each of them takes, all of it where there are none.
         """
         self.steps += 1
         for key, value in self.values.items():
             gradient, rate = gradients.get(key), rates.get(key, 0.0)
             if gradient is not None and rate != 0:
                 share = None if shares is None else shares.get(key)
-                descend(value.detach(), gradient, self.first[key], self.second[key], rate, self.steps, share)
+                moments = self.first[key], self.second[key]
+                descend(value.detach(), gradient, *moments, rate, self.steps, share, rows)
 
     def keep(self, rows: Tensor) -> None:
         """Keep only the given rows: (M,) bool or indices."""
@@ -86,21 +89,23 @@ class AdamTable:
         )
 
 
-def gradients_of(loss: Tensor, tables: Sequence[AdamTable]) -> list[dict[str, Tensor | None]]:
+def gradients_of(loss: Tensor, tables: Sequence[Mapping[str, Tensor]]) -> list[dict[str, Tensor | None]]:
     """The loss's gradients by the values of each table; None for what it does not depend on.
 
     Unlike backward(), which copies a gradient that is part of a larger tensor, this hands it on as it lies.
     """
-    leaves = [value for table in tables for value in table.values.values()]
+    leaves = [value for table in tables for value in table.values()]
     found = iter(torch.autograd.grad(loss, leaves, allow_unused=True))
-    return [{key: next(found) for key in table.values} for table in tables]
+    return [{key: next(found) for key in table} for table in tables]
 
 
 @torch.no_grad()
 def descend(
-    value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, steps: int, shares: Tensor | None
-) -> None:
-    """The `steps`-th step of Kingma and Ba 2015 on (M, ...) values and moments, in place; `shares` (M,) of it or all.
+    value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, steps: int, shares: Tensor | None,
+    rows: Tensor | None = None,
+) -> None:  # fmt: skip
+    """The `steps`-th step of Kingma and Ba 2015 on (M, ...) values and moments, in place; `shares` (n,) of it or all.
+    The gradient is that of the rows (n,), of all where None.
 
     Numbers with a gradient of 0 wait, and so do their moments: most Gaussians are seen by few of the views, and would
     drift on in between by what the last of them wanted.
@@ -108,15 +113,20 @@ def descend(
     float32 on a CPU takes a compiled loop, one pass over memory; everything else plain torch.
     """
     if value.device.type == "cpu" and value.dtype == torch.float32 and value.ndim in (1, 2) and value.is_contiguous():
-        _descend_fast(value, gradient, first, second, rate, steps, shares)
-    else:
+        _descend_fast(value, gradient, first, second, rate, steps, shares, rows)
+    elif rows is None:
         plain_descend(value, gradient, first, second, rate, steps, shares)
+    else:
+        parts = [x[rows] for x in (value, first, second)]
+        plain_descend(parts[0], gradient, parts[1], parts[2], rate, steps, shares)
+        for whole, part in zip((value, first, second), parts, strict=True):
+            whole[rows] = part
 
 
 def plain_descend(
     value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, steps: int, shares: Tensor | None
 ) -> None:
-    """The same by torch's own functions."""
+    """The same by torch's own functions, for all rows."""
     waits = gradient == 0
     first.copy_(torch.where(waits, first, first.lerp(gradient, 1 - _BETA1)))
     second.copy_(torch.where(waits, second, (second * _BETA2).addcmul_(gradient, gradient, value=1 - _BETA2)))
@@ -126,40 +136,43 @@ def plain_descend(
 
 
 def _descend_fast(
-    value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, steps: int, shares: Tensor | None
-) -> None:
-    rows, width = len(value), value[0].numel() if len(value) else 0
-    if width == 0:
+    value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, steps: int, shares: Tensor | None,
+    rows: Tensor | None,
+) -> None:  # fmt: skip
+    count, width = len(gradient), value[0].numel() if len(value) else 0
+    if count * width == 0:
         return
     if width > 1 and gradient.stride(-1) != 1:
         gradient = gradient.contiguous()
     stride = gradient.stride(0)
     # A gradient may be some columns of a larger one: taken as one long array from its first number to its last.
-    lies = torch.as_strided(gradient, (stride * (rows - 1) + width,), (1,)).numpy()
+    lies = torch.as_strided(gradient, (stride * (count - 1) + width,), (1,)).numpy()
     arrays = [x.numpy().reshape(-1) for x in (value, first, second)]
+    chosen = np.empty(0, np.int64) if rows is None else rows.numpy()
     own = np.empty(0, np.float32) if shares is None else shares.numpy()
     scale, root = np.float32(-rate / (1 - _BETA1**steps)), np.float32(1 / math.sqrt(1 - _BETA2**steps))
 
     def work(block: int) -> None:
         _descend_rows(
-            *arrays, lies, own, block * _ROWS, min(rows, (block + 1) * _ROWS), width, stride, scale, root,
+            *arrays, lies, chosen, own, block * _ROWS, min(count, (block + 1) * _ROWS), width, stride, scale, root,
         )  # fmt: skip
 
-    for_each(work, -(-rows // _ROWS))
+    for_each(work, -(-count // _ROWS))
 
 
 @kernel
 def _descend_rows(
-    value: NDArray, first: NDArray, second: NDArray, gradient: NDArray, shares: NDArray, start: int, end: int,
-    width: int, stride: int, scale: float, root: float,
+    value: NDArray, first: NDArray, second: NDArray, gradient: NDArray, rows: NDArray, shares: NDArray, start: int,
+    end: int, width: int, stride: int, scale: float, root: float,
 ) -> None:  # fmt: skip
-    """Rows start to end - 1 of `width` numbers each; a gradient's row starts every `stride` numbers."""
+    """The gradient's rows start to end - 1, of `width` numbers each; one starts every `stride` numbers."""
     keep1, keep2, tiny = np.float32(_BETA1), np.float32(_BETA2), np.float32(_EPSILON)
     new1, new2 = np.float32(1 - _BETA1), np.float32(1 - _BETA2)
     for row in range(start, end):
         share = scale * shares[row] if len(shares) else scale
+        at = (rows[row] if len(rows) else row) * width
         for c in range(width):
-            i, g = row * width + c, gradient[row * stride + c]
+            i, g = at + c, gradient[row * stride + c]
             if g == 0:
                 continue
             m = keep1 * first[i] + new1 * g

@@ -58,6 +58,6 @@ def _adjusted(view: View, gaussian_map: GaussianMap, settings: MappingConfig, st
         loss = loss + _POSE_WEIGHT * ((twist[:3] / unit).square().sum() + twist[3:].square().sum())
         if (value := float(loss.detach())) < best:
             best, pose = value, se3.exp(twist.detach().double()) @ view.cam_from_world
-        (gradient,) = gradients_of(loss, (table,))
+        (gradient,) = gradients_of(loss, (table.values,))
         table.step(gradient, {"twist": _RATE})
     return replace(view, cam_from_world=pose)

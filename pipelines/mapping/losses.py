@@ -30,9 +30,12 @@ def label_loss(logits: Tensor, labels: Tensor, weight: Tensor) -> Tensor:
 
 
 def size_loss(log_radii: Tensor, unit: float) -> Tensor:
-    """L_reg of eq. (18): mean squared log excess of (M,) radii over the limit, `unit` being the scene's depth."""
+    """L_reg of eq. (18): mean squared log excess of (M,) radii over the limit, `unit` being the scene's depth.
+
+    0 without a Gaussian.
+    """
     excess = (log_radii - torch.log(torch.tensor(SIZE_LIMIT * unit, device=log_radii.device))).clamp(min=0)
-    return (excess * excess).mean()
+    return (excess * excess).sum() / max(len(excess), 1)
 
 
 def silhouette_loss(silhouette: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial, reduce
 from pathlib import Path
 
@@ -13,10 +13,10 @@ from torch import Tensor
 from pipelines.config import ArticleConfig, MappingConfig
 from pipelines.gaussian_map import GaussianMap
 from pipelines.gaussians.adam import AdamTable, gradients_of
-from pipelines.gaussians.render import Rendering, blending_weights, render
+from pipelines.gaussians.render import Rendering, blending_weights, in_view, render
 from pipelines.mapping.growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
 from pipelines.mapping.objective import Objective
-from pipelines.mapping.parameters import KEYS
+from pipelines.mapping.parameters import COLOR_KEYS, KEYS
 from pipelines.mapping.schedule import Schedule, Seeding, Step
 from pipelines.mapping.splitting import Blame, blame
 from pipelines.mapping.state import Exposures, OptimisedMap, OptimiserState, expose
@@ -98,11 +98,15 @@ class MapOptimiser:
             return
         with_labels = self.objective.uses_labels(step.iteration)
         with_classes = with_labels or (step.grow and self.article.class_growth)
-        rendering = self.draw(view, table, with_classes)
-        loss = self.objective.of(view, table, rendering, parameters["log_radii"], with_labels) * step.weight
-        of_map, of_view = gradients_of(loss, (parameters.table, table))
+        # What the view does not show has no gradient and would wait anyway.
+        pose, radii = self.state.cam_from_world(step.view, view), torch.exp(parameters["log_radii"].detach())
+        rows = in_view(parameters["means"].detach(), radii, pose, view.intrinsics)
+        values = {k: parameters[k].detach()[rows].requires_grad_() for k in (KEYS if with_classes else COLOR_KEYS)}
+        rendering = self.draw(view, table, values)
+        loss = self.objective.of(view, table, rendering, values["log_radii"], with_labels) * step.weight
+        of_map, of_view = gradients_of(loss, (values, table.values))
         rates = {key: rate * step.rate for key, rate in MAP_RATES.items()}
-        parameters.table.step(of_map, rates, self._shares())
+        parameters.table.step(of_map, rates, self._shares(rows, values["log_radii"].detach()), rows)
         table.step(of_view, self._view_rates(step))
         if step.grow:
             self.growth.grow(step.view, Rendering(*(x.detach() for x in vars(rendering).values())))
@@ -115,7 +119,8 @@ class MapOptimiser:
     def _seed(self, index: int, what: Seeding) -> None:
         known = len(self.state.parameters) > 0
         view, table = self.views[index], self.state.view_tables[index]
-        self.growth.seed(index, what, self.draw(view, table, with_classes=False) if known else None)
+        values = {k: self.state.parameters[k] for k in COLOR_KEYS}
+        self.growth.seed(index, what, self.draw(view, table, values) if known else None)
 
     def _blame(self) -> Blame:
         """What each Gaussian answers for in the view where that is most."""
@@ -146,14 +151,14 @@ class MapOptimiser:
             largest = torch.maximum(largest, seen)
         return largest
 
-    def draw(self, view: View, table: AdamTable, with_classes: bool) -> Rendering:
-        """The map as the view's camera sees it now, with the classes' logits behind the colours or without."""
-        p, kappa = self.state.parameters, self.article.kappa
+    def draw(self, view: View, table: AdamTable, values: Mapping[str, Tensor]) -> Rendering:
+        """Gaussians of raw parameters as the view's camera sees them now, with class logits where they have any."""
+        kappa, colors = self.article.kappa, values["colors"]
         return render(
-            p["means"],
-            torch.exp(p["log_radii"]),
-            torch.sigmoid(p["opacity_logits"]),
-            torch.cat([p["colors"], p["class_logits"]], dim=1) if with_classes else p["colors"],
+            values["means"],
+            torch.exp(values["log_radii"]),
+            torch.sigmoid(values["opacity_logits"]),
+            torch.cat([colors, values["class_logits"]], dim=1) if "class_logits" in values else colors,
             view.cam_from_world,
             view.intrinsics,
             proxy_depth=view.depth if kappa > 0 else None,
@@ -161,17 +166,16 @@ class MapOptimiser:
             twist=table.values["twist"] if self.settings.refine_poses else None,
         )
 
-    def _shares(self) -> dict[str, Tensor]:
-        """(M,) step sizes by confidence class (MSGS-SLAM 3.4), those of positions times the radius.
+    def _shares(self, rows: Tensor, log_radii: Tensor) -> dict[str, Tensor]:
+        """(n,) step sizes of some rows by confidence class (MSGS-SLAM 3.4), those of positions times the radius.
 
         The article has small steps where depth is unreliable. Measured, the contrary helps: what stands in the wrong
         place has farther to go, and colours have to lead it there.
         """
-        trust = self.state.parameters.trust
+        trust = self.state.parameters.trust[rows]
         shares = torch.where(trust > LOW_RELIABILITY, math.sqrt(LOW_TRUST_STEP), LOW_TRUST_STEP)
         shares = torch.where(trust > HIGH_RELIABILITY, 1.0, shares)
-        radii = torch.exp(self.state.parameters["log_radii"].detach())
-        return {**dict.fromkeys(KEYS, shares), "means": shares * radii}
+        return {**dict.fromkeys(KEYS, shares), "means": shares * torch.exp(log_radii)}
 
     def _view_rates(self, step: Step) -> dict[str, float]:
         s = self.settings

@@ -11,7 +11,8 @@ from torch import Tensor
 from pipelines.gaussian_map import GaussianMap
 from pipelines.gaussians.adam import AdamTable
 
-KEYS = ("means", "log_radii", "opacity_logits", "colors", "class_logits")
+COLOR_KEYS = ("means", "log_radii", "opacity_logits", "colors")
+KEYS = (*COLOR_KEYS, "class_logits")
 
 
 @dataclass

@@ -5,6 +5,7 @@
 """
 
 from pipelines.gaussians.render.compositing import Composite, composite
+from pipelines.gaussians.render.culling import in_view
 from pipelines.gaussians.render.inspection import BlendingWeights, blending_weights, median_depth
 from pipelines.gaussians.render.rendering import Rendering, render
 from pipelines.gaussians.render.threads import get_threads, set_threads
@@ -18,6 +19,7 @@ __all__ = [
     "blending_weights",
     "composite",
     "get_threads",
+    "in_view",
     "median_depth",
     "render",
     "set_threads",

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from pipelines.gaussians.render.compositing import choose_backend, require_finite
-from pipelines.gaussians.render.rendering import NEAR, project_map
+from pipelines.gaussians.render.culling import NEAR, in_view
+from pipelines.gaussians.render.rendering import project_map
 from pipelines.types import Intrinsics
 
 
@@ -60,8 +62,10 @@ def _inspect(
     counts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     require_finite("opacities", opacities)
-    projected = project_map(means.detach(), radii.detach(), cam_from_world.detach(), intrinsics, near=near)
-    module = choose_backend(backend, means)
-    size = (intrinsics.width, intrinsics.height)
-    median, total, largest = module.inspect(*projected, opacities.detach(), *size, near, counts)
+    rows = in_view(means, radii, cam_from_world, intrinsics, near)
+    drawn = means.detach()[rows], radii.detach()[rows]
+    projected = project_map(*drawn, cam_from_world.detach(), intrinsics, near=near)
+    module, size = choose_backend(backend, means), (intrinsics.width, intrinsics.height)
+    median, *weights = module.inspect(*projected, opacities.detach()[rows], *size, near, counts)
+    total, largest = (torch.zeros_like(radii.detach()).index_copy(0, rows, weight) for weight in weights)
     return median, total, largest

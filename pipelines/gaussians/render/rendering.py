@@ -8,12 +8,10 @@ import torch
 from torch import Tensor
 
 from pipelines.gaussians.render.compositing import composite, require_finite
+from pipelines.gaussians.render.culling import NEAR, in_view
 from pipelines.geometry import se3
 from pipelines.geometry.camera import project_gaussians
 from pipelines.types import Intrinsics
-
-NEAR = 0.01
-"""Gaussians whose centre is nearer than this (or behind the camera) are not drawn; in the unit of the map."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,11 @@ def render(
     proxy_depth (H, W) or None, twist (6,) translation first (see `pipelines.geometry.se3`). Raises ValueError for NaN,
     infinity or wrong shapes.
     """
-    u, v, sigma_px, z = project_map(means, radii, cam_from_world, intrinsics, twist, near)
+    pose = cam_from_world if twist is None else moved(cam_from_world, twist)
+    if not torch.is_grad_enabled():
+        rows = in_view(means, radii, pose, intrinsics, near)
+        means, radii, opacities, features = means[rows], radii[rows], opacities[rows], features[rows]
+    u, v, sigma_px, z = project_map(means, radii, pose, intrinsics, near)
     image = composite(
         u, v, sigma_px, z, opacities, features, intrinsics.width, intrinsics.height, proxy_depth, kappa, backend, near
     )
@@ -52,21 +54,18 @@ def render(
     return Rendering(image.features, depth, image.silhouette)
 
 
+def moved(cam_from_world: Tensor, twist: Tensor) -> Tensor:
+    """exp(twist) @ cam_from_world in the pose's own precision (float64 in this project); raises ValueError for NaN."""
+    require_finite("twist", twist)
+    return se3.exp(twist.to(cam_from_world.dtype)) @ cam_from_world
+
+
 def project_map(
-    means: Tensor,
-    radii: Tensor,
-    cam_from_world: Tensor,
-    intrinsics: Intrinsics,
-    twist: Tensor | None = None,
-    near: float = NEAR,
+    means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float = NEAR
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """u, v, sigma_px, z (M,) of the Gaussians in the camera exp(twist) @ cam_from_world."""
+    """u, v, sigma_px, z (M,) of the Gaussians in the camera; raises ValueError for NaN."""
     for name, tensor in (("means", means), ("radii", radii), ("cam_from_world", cam_from_world)):
         require_finite(name, tensor)
-    if twist is not None:
-        require_finite("twist", twist)
-        # The product in the pose's own precision (float64 in this project), only then down to the map's.
-        cam_from_world = se3.exp(twist.to(cam_from_world.dtype)) @ cam_from_world
     points_in_cam = se3.transform(cam_from_world.to(means), means)
     return project_gaussians(points_in_cam, radii, intrinsics, near)
 

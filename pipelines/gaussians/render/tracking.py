@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipelines.gaussians.render.compositing import require_finite
-from pipelines.gaussians.render.rendering import NEAR
+from pipelines.gaussians.render.culling import NEAR
 from pipelines.geometry import se3
 from pipelines.geometry.camera import project_gaussians
 from pipelines.types import Intrinsics

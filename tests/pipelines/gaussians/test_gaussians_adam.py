@@ -13,7 +13,7 @@ def test_adam_is_torchs_adam(dtype: torch.dtype) -> None:
     reference = start.clone().requires_grad_()
     optimiser = torch.optim.Adam([reference], lr=0.01, eps=1e-15)
     for _ in range(7):
-        (gradients,) = gradients_of((table.values["x"].sin() ** 2).sum(), [table])
+        (gradients,) = gradients_of((table.values["x"].sin() ** 2).sum(), [table.values])
         table.step(gradients, {"x": 0.01, "unused": 0.01})
         (reference.sin() ** 2).sum().backward()
         optimiser.step()
@@ -40,6 +40,28 @@ def test_the_compiled_step_is_the_plain_one(shape: tuple[int, ...], shared: bool
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_step_of_some_rows_is_that_of_all_with_no_gradient_for_the_others(dtype: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(3)
+    start = {
+        "x": torch.randn(300, 3, generator=generator, dtype=dtype),
+        "y": torch.randn(300, generator=generator).to(dtype),
+    }
+    some, whole = AdamTable(dict(start)), AdamTable(dict(start))
+    rates = {"x": 0.01, "y": 0.02}
+    for _ in range(5):
+        rows = torch.nonzero(torch.rand(300, generator=generator) < 0.3)[:, 0]
+        gradients = {k: torch.randn(v[rows].shape, generator=generator, dtype=dtype) for k, v in start.items()}
+        shares = {"x": torch.rand(len(rows), generator=generator, dtype=dtype)}
+        some.step(gradients, rates, shares, rows)
+        spread = {k: torch.zeros_like(v).index_copy(0, rows, gradients[k]) for k, v in start.items()}
+        whole.step(spread, rates, {"x": torch.zeros(300, dtype=dtype).index_copy(0, rows, shares["x"])})
+    for key, value in start.items():
+        assert 0 < (some.values[key] != value).sum() < value.numel()
+        assert torch.equal(some.values[key], whole.values[key])
+        assert torch.equal(some.second[key], whole.second[key])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_what_has_no_gradient_waits(dtype: torch.dtype) -> None:
     """Neither values nor moments go on where a view shows nothing."""
     table = AdamTable({"x": torch.zeros(2, 3, dtype=dtype)})
@@ -55,7 +77,7 @@ def test_what_has_no_gradient_waits(dtype: torch.dtype) -> None:
 def test_a_gradient_may_be_columns_of_a_larger_one() -> None:
     table = AdamTable({"left": torch.zeros(50, 2), "right": torch.zeros(50, 3)})
     wanted = torch.randn(50, 5, generator=torch.Generator().manual_seed(2))
-    (gradients,) = gradients_of((torch.cat(list(table.values.values()), 1) * wanted).sum(), [table])
+    (gradients,) = gradients_of((torch.cat(list(table.values.values()), 1) * wanted).sum(), [table.values])
     right = gradients["right"]
     assert right is not None
     assert right.stride() == (5, 1), "copied: the compiled step is made for gradients that are not"

@@ -6,7 +6,7 @@ from render_scenes import IMAGES, NAMES, random_gaussians, random_proxy, room
 from torch import Tensor
 
 from pipelines.gaussians.render import composite, get_threads, render, set_threads
-from pipelines.gaussians.render.rendering import project_map
+from pipelines.gaussians.render.rendering import moved, project_map
 from pipelines.geometry import se3
 
 
@@ -119,7 +119,7 @@ def test_map_and_pose_gradients_through_the_projection():
         tensors = (scene.means, scene.radii, scene.opacities, scene.colors)
         tensors = [x.clone().to(dtype).requires_grad_() for x in tensors]
         twist = torch.zeros(6, dtype=dtype, requires_grad=True)
-        projected = project_map(*tensors[:2], MOVED, scene.intrinsics, twist)
+        projected = project_map(*tensors[:2], moved(MOVED, twist), scene.intrinsics)
         rounded = rounded or [x.detach() for x in projected]
         projected = [x + (value.to(dtype) - x).detach() for x, value in zip(projected, rounded, strict=True)]
         image = composite(*projected, *tensors[2:], 160, 120, backend=backend)

@@ -4,8 +4,9 @@ import pytest
 import torch
 from render_scenes import random_gaussians, room
 
-from pipelines.gaussians.render import blending_weights, median_depth, render, set_threads
+from pipelines.gaussians.render import blending_weights, in_view, median_depth, render, set_threads
 from pipelines.gaussians.render.compositing import choose_backend
+from pipelines.geometry import se3
 
 POSE = torch.eye(4, dtype=torch.float64)
 
@@ -58,3 +59,19 @@ def test_unseen_gaussians_weigh_nothing():
     assert (weights.total == 0).all()
     assert (weights.largest == 0).all()
     assert (median_depth(behind, scene.radii, scene.opacities, POSE, scene.intrinsics) == 0).all()
+
+
+def test_what_is_in_view_is_all_that_a_picture_depends_on():
+    """On both backends, and no more than a rim beside it."""
+    scene = room(64, 48, 2000, 1)
+    turned = se3.exp(torch.tensor([0.3, 0.0, 0.2, 0.0, 0.5, 0.1], dtype=torch.float64))
+    for backend, kind in (("cpu", torch.float32), ("reference", torch.float64)):
+        arguments = [x.to(kind) for x in (scene.means, scene.radii, scene.opacities, scene.colors)]
+        rows = in_view(*arguments[:2], turned, scene.intrinsics)
+        part, whole = (
+            render(*given, turned, scene.intrinsics, backend=backend).features
+            for given in ([x[rows] for x in arguments], arguments)
+        )
+        torch.testing.assert_close(part, whole, rtol=0, atol=0)
+        seen = blending_weights(*arguments[:3], turned, scene.intrinsics, backend=backend).total > 0
+        assert 100 < seen.sum() < len(rows) < 1.3 * seen.sum() + 50 < 2000
