@@ -22,7 +22,7 @@ from pipelines.global_ba.move_map import follow_keyframes, move_map
 from pipelines.global_ba.semantics import LabelSummary, summarise_labels
 from pipelines.global_ba.verify import KeyframeView, Loop, make_view
 from pipelines.mapping.divided import refine_divided
-from pipelines.mapping.load import load_views
+from pipelines.mapping.load import load_views, with_rigid_panoramas
 from pipelines.mapping.poses import move_trajectory
 from pipelines.run_folder import (
     RunFolder,
@@ -52,6 +52,7 @@ JOINT_PX = 0.5
 
 def run(context: StageContext) -> dict[str, Any]:
     """Find loops; where there are any, adjust everything with them and take the map along; refine both together."""
+    context = with_rigid_panoramas(context)
     model = context.run.load_sparse("tracking")
     trajectory = context.run.load_trajectory("mapping")
     gaussian_map = context.run.load_map("mapping", context.device)

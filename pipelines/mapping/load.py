@@ -16,6 +16,7 @@ from pipelines.depth.see_through import contradicted
 from pipelines.mapping.article.mirrors import Mirrors
 from pipelines.mapping.views import View, make_view, occurring_classes
 from pipelines.run_folder import RunFolder
+from pipelines.stages import StageContext
 from pipelines.streamed import Streamed
 from pipelines.types import Frame, Intrinsics, ProxyMaps, Trajectory
 
@@ -72,6 +73,14 @@ def load_views(
 
     views = without_contradicted_depth(streamed(kept, VIEWS_SHARE * memory))
     return MappingInput(views, streamed(measured, VIEWS_SHARE * memory / 8), channels)
+
+
+def with_rigid_panoramas(context: StageContext) -> StageContext:
+    """The six sides of a panorama stay one camera: its settings refine no pose."""
+    if context.run.load_calibration().directions == 1:
+        return context
+    mapping = replace(context.config.mapping, refine_poses=False)
+    return replace(context, config=replace(context.config, mapping=mapping))
 
 
 def mapped_classes(run: RunFolder, frame_ids: Iterable[int]) -> tuple[int, ...]:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from formats.errors import InputError
 from pipelines.mapping.divided import Mapped, map_divided
-from pipelines.mapping.load import load_views, split_frames
+from pipelines.mapping.load import load_views, split_frames, with_rigid_panoramas
 from pipelines.mapping.measure import ViewFigures, mean_figures, measure_view
 from pipelines.mapping.optimise import OptimisedMap, optimise_map
 from pipelines.mapping.poses import interpolate_rows, move_trajectory
@@ -23,9 +22,7 @@ from pipelines.types import Trajectory
 
 def run(context: StageContext) -> dict[str, Any]:
     """The optimised map, made whole or submap by submap; poses and exposures refined with it."""
-    if context.run.load_calibration().directions > 1:  # six sides of one place stay one camera
-        mapping = replace(context.config.mapping, refine_poses=False)
-        context = replace(context, config=replace(context.config, mapping=mapping))
+    context = with_rigid_panoramas(context)
     trajectory = context.run.load_trajectory("tracking")
     kept, _ = split_frames(trajectory, context.config.mapping.hold_out)
     _require_views(context, kept)
