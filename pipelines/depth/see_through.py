@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.depth.posed import PosedDepth, neighbours
+from pipelines.jit import kernel
 
 STRIDE = 2
 AGREES = 0.03
@@ -23,27 +24,51 @@ def contradicted(views: Sequence[PosedDepth]) -> Iterator[NDArray[np.bool_]]:
     for i, j in neighbours(views):
         seeing.setdefault(i, []).append(j)
     for i, view in enumerate(views):
-        votes = np.zeros(view.depth[::STRIDE, ::STRIDE].shape, np.int16)
-        through = np.zeros_like(votes)
+        votes = np.zeros((2, *view.depth[::STRIDE, ::STRIDE].shape), np.int16)
         for j in seeing.get(i, []):
-            confirmed, seen_through = _votes(view, views[j])
-            votes += confirmed
-            through += seen_through
-        bad = (through >= 2) & (through > votes)
+            _vote(view, views[j], votes)
+        confirmed, through = votes
+        bad = (through >= 2) & (through > confirmed)
         height, width = view.depth.shape
         yield np.repeat(np.repeat(bad, STRIDE, axis=0), STRIDE, axis=1)[:height, :width]
 
 
-def _votes(view: PosedDepth, other: PosedDepth) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """(h, w) bool each: the other view confirms the depth of the strided pixels; it sees through it."""
-    strided = view.depth[::STRIDE, ::STRIDE]
-    rows, columns = np.nonzero(strided)
-    xy = np.stack([columns, rows], 1).astype(np.float64) * STRIDE + 0.5
-    there, z, inside = other.seen(view.in_world(xy, strided[rows, columns].astype(np.float64)))
-    place = np.where(inside[:, None], there, 0).astype(int)
-    seen = other.depth[place[:, 1], place[:, 0]]
-    usable = inside & (seen > 0) & (other.trust[place[:, 1], place[:, 0]] > _TRUSTED)
-    confirmed, through = np.zeros(strided.shape, bool), np.zeros(strided.shape, bool)
-    confirmed[rows, columns] = usable & (np.abs(z - seen) < AGREES * seen)
-    through[rows, columns] = usable & (z < (1 - SEES_THROUGH) * seen)
-    return confirmed, through
+def _vote(view: PosedDepth, other: PosedDepth, votes: NDArray[np.int16]) -> None:
+    """Add to votes (2, h, w), of the view's strided pixels: the other view confirms the depth; it sees through it."""
+    relative = other.cam_from_world @ np.linalg.inv(view.cam_from_world)
+    cameras = np.array([[k.fx, k.fy, k.cx, k.cy] for k in (view.intrinsics, other.intrinsics)])
+    _count(view.depth, other.depth, other.trust, relative, cameras, votes)
+
+
+@kernel
+def _count(
+    depth: NDArray[np.float32],
+    seen_depth: NDArray[np.float32],
+    trust: NDArray[np.float32],
+    relative: NDArray[np.float64],
+    cameras: NDArray[np.float64],
+    votes: NDArray[np.int16],
+) -> None:
+    """See `_vote`; relative (4, 4): other camera from this one; cameras (2, 4): fx, fy, cx, cy of both."""
+    height, width = seen_depth.shape
+    for row in range(votes.shape[1]):
+        for column in range(votes.shape[2]):
+            d = np.float64(depth[row * STRIDE, column * STRIDE])
+            if d <= 0:
+                continue
+            x = (column * STRIDE + 0.5 - cameras[0, 2]) / cameras[0, 0] * d
+            y = (row * STRIDE + 0.5 - cameras[0, 3]) / cameras[0, 1] * d
+            z = relative[2, 0] * x + relative[2, 1] * y + relative[2, 2] * d + relative[2, 3]
+            if z <= 0:
+                continue
+            u = relative[0, 0] * x + relative[0, 1] * y + relative[0, 2] * d + relative[0, 3]
+            v = relative[1, 0] * x + relative[1, 1] * y + relative[1, 2] * d + relative[1, 3]
+            u, v = cameras[1, 0] * u / z + cameras[1, 2], cameras[1, 1] * v / z + cameras[1, 3]
+            if u < 0 or v < 0 or u >= width or v >= height:
+                continue
+            there = np.float64(seen_depth[int(v), int(u)])
+            if there > 0 and trust[int(v), int(u)] > _TRUSTED:
+                if abs(z - there) < AGREES * there:
+                    votes[0, row, column] += 1
+                elif z < (1 - SEES_THROUGH) * there:
+                    votes[1, row, column] += 1
