@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.gaussians.render.cpu_backward import backward_band
+from pipelines.gaussians.render.cpu_backward import backward_band, sum_shared
 from pipelines.gaussians.render.cpu_bands import split_into_bands
 from pipelines.gaussians.render.cpu_forward import forward_band
 from pipelines.gaussians.render.cpu_inspect import inspect
@@ -18,6 +18,7 @@ from pipelines.gaussians.render.threads import for_each
 __all__ = ["composite", "inspect"]
 
 F32 = np.float32
+_ROWS = 16384
 
 
 def composite(
@@ -73,9 +74,9 @@ class _Composite(torch.autograd.Function):
         for_each(
             lambda b: backward_band(vectors, b, bands.own(b), *places, *bands.prepared[b], *job, *results), len(bands)
         )
-        if len(straddling := bands.straddling):
-            sums = np.add.reduceat(shared, bands.slots[straddling])
-            d_geometry[:, straddling], d_features[straddling] = sums[:, :5].T, sums[:, 5:]
+        for_each(
+            lambda n: sum_shared(n * _ROWS, _ROWS, bands.slots, shared, d_geometry, d_features), -(-count // _ROWS)
+        )
         return (*torch.from_numpy(d_geometry).unbind(0), torch.from_numpy(d_features), *[None] * 5)
 
 

@@ -312,3 +312,27 @@ def backward_band(
                 d_geometry[j, i] = d_records[at + j]
             for c in range(used):
                 d_features[i, c] = values[value_at + c]
+
+
+@kernel
+def sum_shared(
+    start: int,
+    rows: int,
+    slots: NDArray[np.int64],
+    shared: NDArray[np.float32],
+    d_geometry: NDArray[np.float32],
+    d_features: NDArray[np.float32],
+) -> None:
+    """The gradients of the Gaussians in several bands, of `rows` Gaussians from `start` on: the sums of what each of
+    the bands has put into their rows of `shared`, always added in the same order."""
+    for i in range(start, min(start + rows, len(slots) - 1)):
+        if slots[i + 1] == slots[i]:
+            continue
+        first = shared[slots[i]]
+        for k in range(slots[i] + 1, slots[i + 1]):
+            for c in range(len(first)):
+                first[c] += shared[k, c]
+        for j in range(5):
+            d_geometry[j, i] = first[j]
+        for c in range(d_features.shape[1]):
+            d_features[i, c] = first[5 + c]
