@@ -225,16 +225,15 @@ def refine(
         kept = (made.gaussian_map, made.cam_from_world, made.log_gains, made.offsets)
         return Refined(*kept, before, after, after >= before)
     article, memory = context.config.article, context.memory_room
-    given = load_views(context.run, trajectory, mapping, article, context.device, fields, memory)
-    views = given.views
+    class_ids = context.run.load_class_ids()
+    views = load_views(context.run, trajectory, mapping, article, context.device, fields, memory, class_ids).views
     if steps := context.config.article.loop_steps:
         ends = loop_keyframes(found.loops, [v.frame_id for v in views])
         views = adjust_views(views, ends, gaussian_map, mapping, steps)
     gains = {int(i): g for i, g in zip(exposure["frame_ids"], exposure["log_gains"], strict=True)}
     offsets = {int(i): o for i, o in zip(exposure["frame_ids"], exposure["offsets"], strict=True)}
     exposures = np.array([gains[v.frame_id] for v in views]), np.array([offsets[v.frame_id] for v in views])
-    classes = len(context.run.load_class_ids())
-    return refine_together(context, gaussian_map, views, exposures, classes, mapping, settings.joint_passes)
+    return refine_together(context, gaussian_map, views, exposures, len(class_ids), mapping, settings.joint_passes)
 
 
 def save(

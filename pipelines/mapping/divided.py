@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipelines.depth.fields import DepthFields
 from pipelines.depth.posed import PosedDepth, overlaps
 from pipelines.gaussian_map import GaussianMap
-from pipelines.mapping.load import mapped_classes, split_frames
+from pipelines.mapping.load import split_frames
 from pipelines.mapping.measure import ViewFigures
 from pipelines.mapping.poses import interpolate_rows, move_trajectory
 from pipelines.mapping.state import Exposures, OptimisedMap
@@ -49,13 +49,13 @@ class Mapped:
     submaps: Sequence[Submap] = ()
 
 
-def map_divided(context: StageContext, trajectory: Trajectory) -> Mapped:
+def map_divided(context: StageContext, trajectory: Trajectory, class_ids: tuple[int, ...]) -> Mapped:
     """Every submap made, then all joined, refined and measured: each kind of work once the one before is all done."""
     run, settings = context.run, context.config.mapping
     kept, _ = split_frames(trajectory, settings.hold_out)
     fields = run.load_depth_fields("tracking")
     submaps = divide(np.array(kept), overlaps(_depths(run, trajectory, fields, kept)), settings.submap)
-    tasks = submap_tasks(context, submaps, trajectory, fields, mapped_classes(run, kept))
+    tasks = submap_tasks(context, submaps, trajectory, fields, class_ids)
     for work in (make_submap, join_submap, refine_submap):
         context.each(work, tasks)
     result, ids = all_together(tasks, REFINED)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,7 +55,7 @@ def load_views(
     fields = fields or run.load_depth_fields("tracking")
     symmetry = run.load_symmetry() if article and article.symmetry_weight > 0 else {}
     kept, measured = split_frames(trajectory, settings.hold_out)
-    channels = mapped_classes(run, kept) if class_ids is None else class_ids
+    channels = survey(run, kept)[0] if class_ids is None else class_ids
     poses = dict(zip(trajectory.frame_ids.tolist(), trajectory.cam_from_world, strict=True))
 
     def load(frame_id: int) -> View:
@@ -83,9 +83,17 @@ def with_rigid_panoramas(context: StageContext) -> StageContext:
     return replace(context, config=replace(context.config, mapping=mapping))
 
 
-def mapped_classes(run: RunFolder, frame_ids: Iterable[int]) -> tuple[int, ...]:
-    """The label of each class channel of a map of these keyframes."""
-    return occurring_classes(run.load_proxy(i).labels for i in frame_ids if run.has_proxy(i))
+def survey(run: RunFolder, frame_ids: Iterable[int]) -> tuple[tuple[int, ...], int]:
+    """(the label of each class channel of a map of these keyframes, how many of them have a depth), in one pass."""
+    with_depth = 0
+
+    def labels() -> Iterator[NDArray[np.uint8]]:
+        nonlocal with_depth
+        for maps in filter(None, map(run.find_proxy, frame_ids)):
+            with_depth += bool((maps.depth > 0).any())
+            yield maps.labels
+
+    return occurring_classes(labels()), with_depth
 
 
 def without_contradicted_depth(views: Streamed[View]) -> Streamed[View]:

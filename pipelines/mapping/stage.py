@@ -9,7 +9,7 @@ import numpy as np
 
 from formats.errors import InputError
 from pipelines.mapping.divided import Mapped, map_divided
-from pipelines.mapping.load import load_views, split_frames, with_rigid_panoramas
+from pipelines.mapping.load import load_views, split_frames, survey, with_rigid_panoramas
 from pipelines.mapping.measure import ViewFigures, mean_figures, measure_view
 from pipelines.mapping.optimise import OptimisedMap, optimise_map
 from pipelines.mapping.poses import interpolate_rows, move_trajectory
@@ -25,9 +25,9 @@ def run(context: StageContext) -> dict[str, Any]:
     context = with_rigid_panoramas(context)
     trajectory = context.run.load_trajectory("tracking")
     kept, _ = split_frames(trajectory, context.config.mapping.hold_out)
-    _require_views(context, kept)
+    class_ids = _require_views(context, kept)
     divided = submap_count(len(kept), context.config.mapping.submap) > 1
-    mapped = (map_divided if divided else map_whole)(context, trajectory)
+    mapped = (map_divided if divided else map_whole)(context, trajectory, class_ids)
     result, ids = mapped.result, mapped.keyframe_ids
     save_map(context.folder, result.gaussian_map)
     save_trajectory(context.folder, mapped.moved)
@@ -38,10 +38,12 @@ def run(context: StageContext) -> dict[str, Any]:
     return figures
 
 
-def map_whole(context: StageContext, trajectory: Trajectory) -> Mapped:
+def map_whole(context: StageContext, trajectory: Trajectory, class_ids: tuple[int, ...]) -> Mapped:
     """Views, depth that agrees between them, one map."""
     settings, seed, article = context.config.mapping, context.config.run.seed, context.config.article
-    given = load_views(context.run, trajectory, settings, article, context.device, memory=context.memory_room)
+    given = load_views(
+        context.run, trajectory, settings, article, context.device, memory=context.memory_room, class_ids=class_ids
+    )
     views = given.views
     result = optimise_map(
         views, len(given.class_ids), settings, seed,
@@ -57,14 +59,16 @@ def map_whole(context: StageContext, trajectory: Trajectory) -> Mapped:
     return Mapped(result, ids, given.class_ids, moved, keyframes, held_out)
 
 
-def _require_views(context: StageContext, kept: Sequence[int]) -> None:
+def _require_views(context: StageContext, kept: Sequence[int]) -> tuple[int, ...]:
+    """The label of each class channel; InputError where no keyframe has a depth."""
     run = context.run
     if not kept:
         raise InputError(
             f"{run.root}: no keyframe is left to map (mapping.hold_out = {context.config.mapping.hold_out}). "
             "Hold out fewer frames: --set mapping.hold_out=0"
         )
-    without = sum(not (run.has_proxy(i) and bool((run.load_proxy(i).depth > 0).any())) for i in kept)
+    class_ids, with_depth = survey(run, kept)
+    without = len(kept) - with_depth
     if without == len(kept):
         raise InputError(
             f"{run.root}: none of the {without} keyframes has a depth, so nothing can be mapped. Look at the "
@@ -72,6 +76,7 @@ def _require_views(context: StageContext, kept: Sequence[int]) -> None:
         )
     if without:
         context.warn(f"{without} of {len(kept)} keyframes have no proxy depth; they count by their colours only")
+    return class_ids
 
 
 def _figures(mapped: Mapped) -> dict[str, Any]:
