@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import platform
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -30,6 +31,7 @@ class Watcher(Protocol):
 
 
 _watchers: list[Watcher] = []
+_own_mark: list[str] = []
 
 
 @contextmanager
@@ -43,11 +45,24 @@ def watched_by(watcher: Watcher) -> Iterator[None]:
 
 
 @contextmanager
+def own_temporaries() -> Iterator[None]:
+    """In this block temporary files have names that no other process gives, on this machine or another: several may
+    write the same file at the same time, and the last one renamed stays. What a killed process leaves, stays too."""
+    machine = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
+    _own_mark.append(f"-{machine}-{os.getpid()}")
+    try:
+        yield
+    finally:
+        _own_mark.pop()
+
+
+@contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`, of the same suffix; rename it to `path` when the block ends well.
 
     The folder is made when missing. A block that raises leaves `path` as it was and no temporary file behind. The
-    temporary name depends on `path` alone, so what a killed process left is overwritten by the next attempt.
+    temporary name depends on `path` alone, so what a killed process left is overwritten by the next attempt; but in
+    `own_temporaries`.
 
     Raises DiskFullError when the disk is full, InputError when the folder cannot be written.
     """
@@ -74,9 +89,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 def temporary_of(path: Path) -> Path:
     """Where `atomic_path` writes first: what a killed process may leave."""
-    name = f".{path.stem}.tmp{path.suffix}"
+    end = f".tmp{''.join(_own_mark[-1:])}{path.suffix}"
+    name = f".{path.stem}{end}"
     if len(os.fsencode(name)) > _LONGEST_NAME:
-        name = f".{hashlib.sha256(os.fsencode(path.name)).hexdigest()}.tmp{path.suffix}"
+        name = f".{hashlib.sha256(os.fsencode(path.name)).hexdigest()}{end}"
     return path.with_name(name)
 
 

@@ -37,6 +37,7 @@ from msgs_cli.options import (
     verbosity_options,
 )
 from msgs_cli.text import flush_output, prepare_streams, printable, say
+from msgs_cli.work import work
 from pipelines.run_folder_names import EXPORTS
 
 
@@ -298,6 +299,7 @@ for command in (looking.evaluate, looking.report, looking.render, looking.view):
 main.add_command(models)
 main.add_command(ablate)
 main.add_command(batch)
+main.add_command(work)
 main.add_command(doctor)
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ def locked(run: RunFolder) -> Iterator[None]:
     """
     made = make_folder(run.root)
     with _open(run.root / LOCK) as stream:
-        if not _take(stream) or not _still_there(stream, run.root / LOCK):
+        if not take_lock(stream) or not _still_there(stream, run.root / LOCK):
             raise RunBusyError(f"{run.root}: another msgs-slam process is working on this run. Wait for it to end")
         try:
             yield
@@ -68,8 +68,9 @@ def _open(path: Path) -> IO[bytes]:
         ) from error
 
 
-def _take(stream: IO[bytes]) -> bool:
-    """Whether the lock could be had. A system with neither kind of lock leaves it to the user."""
+def take_lock(stream: IO[bytes]) -> bool:
+    """Whether the lock of an open file could be had; it is held until the file is closed. A system with neither kind of
+    lock leaves it to the user."""
     try:
         import fcntl
     except ImportError:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import SOURCE_LIST, STAGES
 from pipelines.settings_file import load_settings
 from pipelines.stages import Stage, run_stages
-from pipelines.workers import Workers
+from pipelines.workers import TaskWorkers
 
 
 def all_stages() -> list[Stage]:
@@ -84,7 +84,7 @@ def reconstruct(
     config: Config,
     progress: Progress,
     until: str = STAGES[-1],
-    workers: Workers | None = None,
+    workers: TaskWorkers | None = None,
 ) -> dict[str, StageRecord]:
     """Make, or bring up to date, the run of `source`.
 
@@ -104,7 +104,8 @@ def resume(
     progress: Progress,
     config: Config | None = None,
     until: str = STAGES[-1],
-    workers: Workers | None = None,
+    workers: TaskWorkers | None = None,
+    once_locked: Callable[[], None] = lambda: None,
 ) -> dict[str, StageRecord]:
     """Go on with a run from its own settings, or from `config`."""
     require_run(run)
@@ -114,6 +115,7 @@ def resume(
     source = Path(origin.path)
     config = _with_device(config or load_settings(run))
     with locked(run):
+        once_locked()
         return _run(run, source, origin.digest, config, progress, until, workers)
 
 
@@ -132,7 +134,7 @@ def _run(
     config: Config,
     progress: Progress,
     until: str,
-    workers: Workers | None,
+    workers: TaskWorkers | None,
 ) -> dict[str, StageRecord]:
     def same_source() -> None:
         kept = f"What is done so far is kept: bring it back, then type `msgs-slam resume {run.root}`"

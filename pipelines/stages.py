@@ -38,7 +38,7 @@ from pipelines.settings_file import save_settings
 from pipelines.stage_identity import stage_identity
 from pipelines.stopping import stop_if_asked
 from pipelines.streamed import memory_room
-from pipelines.workers import Workers
+from pipelines.workers import TaskWorkers
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -71,7 +71,7 @@ class StageContext:
     warnings: list[str] = field(default_factory=list)
     stages: list[Stage] = field(default_factory=list)
     same_source: SameSource = _trusted
-    workers: Workers | None = None
+    workers: TaskWorkers | None = None
 
     @property
     def snapshot(self) -> Path:
@@ -138,7 +138,7 @@ def run_stages(
     progress: Progress,
     until: str = STAGES[-1],
     same_source: SameSource = _trusted,
-    workers: Workers | None = None,
+    workers: TaskWorkers | None = None,
 ) -> dict[str, StageRecord]:
     """Bring every stage up to `until` up to date; returns their records.
 

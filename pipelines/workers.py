@@ -1,14 +1,15 @@
-"""Where the tasks of one run are worked on when that is not this process: by an engine, over a shared disk."""
+"""Where the tasks of one run are worked on when that is not this process alone, over a shared disk."""
 
 from __future__ import annotations
 
+import functools
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
-from formats.atomic import watched_by
+from formats.atomic import own_temporaries, watched_by
 from formats.errors import InputError, RecoverableError
 from pipelines.engines import Call, Engine
 from pipelines.journal import Journal
@@ -18,10 +19,23 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
+class TaskWorkers(Protocol):
+    """What takes the tasks of a stage."""
+
+    @property
+    def at_once(self) -> int:
+        """How many tasks may run at the same time."""
+        ...
+
+    def each(self, work: Callable[[T, Progress], R], tasks: Sequence[T], folder: Path) -> list[R]:
+        """What `work` returns of every task, in their order; they write below `folder`, a stage's unfinished one."""
+        ...
+
+
 @dataclass(frozen=True)
 class Workers:
-    """`prepare` sets logging up there and makes the progress of a named task; threads, gpus: what a task takes of its
-    node; at_once: how many tasks may run at the same time."""
+    """An engine. `prepare` sets logging up there and makes the progress of a named task; threads, gpus: what a task
+    takes of its node; at_once: how many tasks may run at the same time."""
 
     engine: Engine
     prepare: Callable[[str], Progress]
@@ -37,7 +51,7 @@ class Workers:
         code, kind = code_identity(), work.__name__
         names = [f"{kind} {n}" for n in range(1, len(tasks) + 1)]
         calls = [
-            Call(name, _work_on, (work, task, name, self.prepare, folder, self.threads, code), self.threads, self.gpus)
+            Call(name, work_here, (work, task, name, self.prepare, folder, self.threads, code), self.threads, self.gpus)
             for name, task in zip(names, tasks, strict=True)
         ]
         found: dict[str, R] = {}
@@ -53,18 +67,18 @@ class Workers:
         return [found[name] for name in names]
 
 
-def _work_on(
+def work_here(
     work: Callable[[Any, Progress], Any], task: Any, name: str, prepare: Callable[[str], Progress], folder: Path,
     threads: int, code: str,
 ) -> tuple[str, Any]:  # fmt: skip
-    """(why it is refused or "", what `work` returns)."""
+    """The task in this process, beside others that may write the same: (why it is refused or "", what it returns)."""
     from pipelines.reconstruct import set_threads
 
     progress = prepare(name)
     try:
         require_same_world([folder], code)
         set_threads(threads)
-        with watched_by(Journal(folder)):
+        with watched_by(Journal(folder)), own_temporaries():
             return "", work(task, progress)
     except InputError as error:
         return str(error), None
@@ -86,6 +100,7 @@ def require_same_world(folders: Sequence[Path], code: str) -> None:
         )
 
 
+@functools.cache
 def code_identity() -> str:
     """Of what the stages compute with."""
     from pipelines.reconstruct import all_stages

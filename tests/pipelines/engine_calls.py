@@ -46,3 +46,16 @@ def halve(value: int, progress: SilentProgress) -> int:
     if value % 2:
         raise InputError(f"{value} is odd")
     return value // 2
+
+
+def halve_slowly(value: int, progress: SilentProgress) -> int:
+    time.sleep(0.5)
+    return halve(value, progress)
+
+
+def halve_noted(task: tuple[Path, int], progress: SilentProgress) -> int:
+    """One mark a time that it is done, beside the result."""
+    path, value = task
+    with path.open("a") as stream:
+        stream.write("x")
+    return halve(value, progress)

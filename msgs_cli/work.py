@@ -1,0 +1,40 @@
+"""`msgs-slam work`: one of many processes at one run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from msgs_cli.options import (
+    RUN_ARGUMENT,
+    UNTIL,
+    open_run,
+    set_up_logging,
+    stopping_softly,
+    verbosity_options,
+    worker_setup,
+)
+
+
+@click.command()
+@RUN_ARGUMENT
+@click.option("--shard", required=True, metavar="K/N", help="This process is the K-th, from 0 on, of about N.")
+@UNTIL
+@verbosity_options
+def work(run_path: Path, shard: str, until: str, quiet: bool, verbose: bool) -> None:
+    """Work on RUN beside other processes that do the same, on this machine or others that see the folder.
+
+    Begin the run with `msgs-slam reconstruct SOURCE --out RUN --until frames`, with all settings, run.threads among
+    them. Then any number of processes, in any order and at any time, bring it to its end together, each its own share
+    of the tasks first; one alone would do all. What a killed one was at is done by the others. For SLURM arrays,
+    Kubernetes indexed jobs and AWS Batch: docs/batch.md.
+    """
+    set_up_logging(quiet, verbose)
+    from pipelines.batch import Shard
+    from pipelines.settings_file import load_settings
+    from pipelines.shards import work_on_run
+
+    chosen, run = Shard.parse(shard), open_run(run_path)
+    with stopping_softly(f"The same command goes on, or without others: msgs-slam resume {run.root}"):
+        work_on_run(run, chosen, load_settings(run), worker_setup(quiet, verbose, True), until)

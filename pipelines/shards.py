@@ -1,0 +1,159 @@
+"""Many processes at one run, over a shared folder alone: whoever has the run's lock leads, the others help.
+
+The leader runs the stages; where one has tasks it posts them as files in the run. Everybody, the leader too, does
+those of his own share first, then whatever nobody works on. So one process alone ends the run as any number of them do,
+in any order; one that is killed leaves its task, or its lead, to the others.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from formats.errors import InputError, RecoverableError
+from formats.jsonfile import read_json, write_json
+from pipelines.batch import Shard
+from pipelines.config import Config
+from pipelines.lock import RunBusyError, take_lock
+from pipelines.progress import Progress, log
+from pipelines.reconstruct import resume
+from pipelines.records import StageRecord
+from pipelines.run_folder import RunFolder
+from pipelines.stopping import stop_if_asked
+from pipelines.travel import load_value, name_of, of_name, save_value
+from pipelines.workers import code_identity, work_here
+
+T = TypeVar("T")
+R = TypeVar("R")
+_TASKS = ".tasks"
+_READY = "ready.json"
+_BETWEEN_LOOKS = 0.5
+"""Seconds."""
+
+
+def work_on_run(
+    run: RunFolder, shard: Shard, config: Config, prepare: Callable[[str], Progress], until: str
+) -> dict[str, StageRecord]:
+    """Lead or help until the run is done up to a stage; its records. Raises InputError as `resume` does, and for a node
+    that cannot do a task (another version of the program, a full disk): the others go on."""
+    workers = SharedWorkers(shard, prepare, config.run.threads)
+    log.info("shard %d of %d", shard.index, shard.count)
+    while True:
+        with suppress(RunBusyError):
+            return resume(run, prepare("run"), config, until, workers, lambda: _withdraw_all(run))
+        if not any(posted.do_one(shard, prepare) for posted in _posted(run)):
+            stop_if_asked()
+            time.sleep(_BETWEEN_LOOKS)
+
+
+@dataclass(frozen=True)
+class SharedWorkers:
+    """Whoever looks into the run's folder, and this process."""
+
+    shard: Shard
+    prepare: Callable[[str], Progress]
+    threads: int
+
+    @property
+    def at_once(self) -> int:
+        """How many may work at the same time."""
+        return self.shard.count
+
+    def each(self, work: Callable[[T, Progress], R], tasks: Sequence[T], folder: Path) -> list[R]:
+        """As `Workers.each`: posted, worked on here and elsewhere, gathered."""
+        posted = Posted.post(work, tasks, folder, self.threads)
+        while missing := posted.missing():
+            stop_if_asked()
+            if not posted.do_one(self.shard, self.prepare) and missing == posted.missing():
+                time.sleep(_BETWEEN_LOOKS)
+        found = [load_value(posted.done(n)) for n in range(len(tasks))]
+        posted.withdraw()
+        return found
+
+
+@dataclass(frozen=True)
+class Posted:
+    """Tasks of one kind in a folder of the run: NNNN.npz each, NNNN.lock which somebody holds who works on it, and
+    NNNN.done.npz what it has returned. They can be taken up while ready.json is there."""
+
+    folder: Path
+
+    @staticmethod
+    def post(work: Callable[..., Any], tasks: Sequence[Any], folder: Path, threads: int) -> Posted:
+        """The tasks of a stage whose unfinished folder that is."""
+        told = hashlib.sha256(f"{folder.name} {work.__name__} {time.time_ns()}".encode()).hexdigest()[:12]
+        posted = Posted(folder.parent / _TASKS / f"{work.__name__}-{told}")
+        for number, task in enumerate(tasks):
+            save_value(posted.task(number), task)
+        about = {"work": name_of(work), "folder": folder.name, "threads": threads, "count": len(tasks)}
+        write_json(posted.folder / _READY, {**about, "code": code_identity()})
+        return posted
+
+    def task(self, number: int) -> Path:
+        """What there is to do."""
+        return self.folder / f"{number:04d}.npz"
+
+    def done(self, number: int) -> Path:
+        """What it has returned."""
+        return self.folder / f"{number:04d}.done.npz"
+
+    def missing(self) -> list[int]:
+        """Tasks that are not done."""
+        return [n for n in range(self._about()["count"]) if not self.done(n).exists()]
+
+    def _about(self) -> dict[str, Any]:
+        return read_json(self.folder / _READY)
+
+    def do_one(self, shard: Shard, prepare: Callable[[str], Progress]) -> bool:
+        """Do one that nobody works on, of the shard's own first; whether there was any."""
+        try:
+            about = self._about()
+        except InputError:  # withdrawn
+            return False
+        own = set(range(shard.index, about["count"], shard.count))
+        numbers = sorted(range(about["count"]), key=lambda n: (n not in own, (n - shard.index) % about["count"]))
+        return any(self._do(n, about, prepare) for n in numbers)
+
+    def _do(self, number: int, about: dict[str, Any], prepare: Callable[[str], Progress]) -> bool:
+        with suppress(FileNotFoundError), (self.folder / f"{number:04d}.lock").open("ab") as stream:
+            if self.done(number).exists() or not take_lock(stream):
+                return False
+            if self.done(number).exists() or not (self.folder / _READY).exists():
+                return False
+            work, folder = of_name(about["work"]), self.folder.parents[1] / about["folder"]
+            name, task = f"{work.__name__} {number + 1}", load_value(self.task(number))
+            refused, value = work_here(work, task, name, prepare, folder, about["threads"], about["code"])
+            if refused:
+                raise RecoverableError(f"{name}: {refused}")
+            save_value(self.done(number), value)
+            return True
+        return False
+
+    def withdraw(self) -> None:
+        """Nobody takes one up any more; waits for those who are at one."""
+        with suppress(FileNotFoundError):
+            (self.folder / _READY).unlink()
+        for lock in sorted(self.folder.glob("*.lock")):
+            with lock.open("ab") as stream:
+                while not take_lock(stream):
+                    stop_if_asked()
+                    time.sleep(_BETWEEN_LOOKS)
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _posted(run: RunFolder) -> Iterator[Posted]:
+    folder = run.root / _TASKS
+    yield from (Posted(p) for p in (sorted(folder.iterdir()) if folder.is_dir() else ()))
+
+
+def _withdraw_all(run: RunFolder) -> None:
+    """What a leader before has left."""
+    for posted in _posted(run):
+        posted.withdraw()
+    shutil.rmtree(run.root / _TASKS, ignore_errors=True)

@@ -1,0 +1,106 @@
+"""Many processes at one run (`msgs-slam work`): in any order, twice at a time, killed; the run is that of one process.
+
+    python tests/benchmarks/shards.py --work DIR --shards 16 --seed 0
+
+A clip of the demo's room is reconstructed by one process, then by processes of which each takes one shard: begun in
+random order, at most --beside at the same time, each second one of them twice, some killed (SIGKILL) after a random
+time and begun again later. What all stages have left is compared by its bytes.
+"""
+
+# ruff: noqa: E402 (the packages are found only once the path is set)
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+from formats.digest import file_sha256
+from pipelines.demo import unpack_demo_clip
+from pipelines.run_folder_names import STAGES
+
+SETTINGS = (
+    "run.threads=1", "frames.max_features=600", "proxy.stereo_side=96", "proxy.stereo_planes=24", "mapping.passes=1",
+    "mapping.min_iterations=20", "mapping.max_side=160", "mapping.submap=6", "export.voxel=0.03",
+)  # fmt: skip
+
+
+def msgs_slam(*arguments: object) -> list[str]:
+    """The command, for subprocess."""
+    return [sys.executable, "-m", "msgs_cli.main", *map(str, arguments), "-q"]
+
+
+def begin(video: Path, run: Path, until: str) -> None:
+    """By one process."""
+    chosen = [part for setting in SETTINGS for part in ("--set", setting)]
+    subprocess.run(msgs_slam("reconstruct", video, "--out", run, "--until", until, *chosen), check=True, cwd=ROOT)
+
+
+def by_shards(run: Path, count: int, beside: int, kills: int, rng: random.Random) -> dict[str, int]:
+    """Processes until every shard has ended well once; how many there were, and how many were killed."""
+    waiting = [k for k in range(count) for _ in range(1 + k % 2)]
+    rng.shuffle(waiting)
+    running: dict[subprocess.Popen[bytes], tuple[int, float]] = {}
+    told = {"begun": 0, "killed": 0, "failed": 0}
+    while waiting or running:
+        while waiting and len(running) < beside:
+            shard, doomed = waiting.pop(), kills > told["killed"] and rng.random() < 0.7
+            process = subprocess.Popen(msgs_slam("work", run, "--shard", f"{shard}/{count}"), cwd=ROOT)
+            running[process] = shard, time.monotonic() + (rng.uniform(3, 25) if doomed else 1e9)
+            told["begun"] += 1
+        time.sleep(0.1)
+        for process, (shard, until) in list(running.items()):
+            if process.poll() is None and time.monotonic() > until:
+                process.kill()
+                process.wait()
+                told["killed"] += 1
+            if process.poll() is not None:
+                del running[process]
+                told["failed"] += process.returncode not in (0, -9)
+                if process.returncode:
+                    waiting.insert(0, shard)
+    return told
+
+
+def contents(run: Path) -> dict[str, str]:
+    """Digest of every file that the stages have left."""
+    files = (p for stage in STAGES for p in (run / stage).rglob("*") if p.is_file())
+    return {str(p.relative_to(run)): file_sha256(p) for p in files}
+
+
+def main() -> None:
+    """Print what was done and which files differ."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--shards", type=int, default=16)
+    parser.add_argument("--beside", type=int, default=4, help="processes at the same time")
+    parser.add_argument("--kills", type=int, default=8)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    (video, _), whole, shared = (
+        unpack_demo_clip(arguments.work),
+        arguments.work / "whole.msgs",
+        arguments.work / "shared.msgs",
+    )
+    begin(video, whole, STAGES[-1])
+    shutil.rmtree(shared, ignore_errors=True)
+    begin(video, shared, "frames")
+    started = time.monotonic()
+    told = by_shards(shared, arguments.shards, arguments.beside, arguments.kills, random.Random(arguments.seed))
+    seconds, (one, many) = time.monotonic() - started, (contents(r) for r in (whole, shared))
+    differing = sorted(name for name in one.keys() | many.keys() if one.get(name) != many.get(name))
+    left = [p.name for p in shared.iterdir() if p.name not in (*STAGES, ".lock", "run.toml", "manifest.json")]
+    print(json.dumps({**told, "seconds": round(seconds), "files": len(one), "differing": differing, "left": left}))
+    sys.exit(bool(differing or left))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,112 @@
+"""Processes that share the tasks of a run over its folder: each task once, whoever is killed, in any order."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import engine_calls
+import pytest
+
+from formats.errors import RecoverableError
+from pipelines import travel, workers
+from pipelines.batch import Shard
+from pipelines.run_folder import RunFolder
+from pipelines.shards import Posted, SharedWorkers, _posted
+
+HOLDS = "import fcntl, sys; f = open(sys.argv[1], 'ab'); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Of an unfinished stage; the tasks are those of the tests."""
+    monkeypatch.setattr(travel, "_OURS", "engine_calls")
+    (tmp_path / "proxy.partial").mkdir()
+    return tmp_path / "proxy.partial"
+
+
+def shared(index: int, count: int) -> SharedWorkers:
+    return SharedWorkers(Shard(index, count), engine_calls.silent, 1)
+
+
+@pytest.fixture
+def helpers(folder: Path) -> Iterator[list[int]]:
+    """Three that help until the test ends, and how many tasks each has done."""
+    ended, done = threading.Event(), [0, 0, 0]
+
+    def help_out(n: int) -> None:
+        while not ended.is_set():
+            done[n] += any(p.do_one(Shard(n + 1, 4), engine_calls.silent) for p in _posted(RunFolder(folder.parent)))
+
+    threads = [threading.Thread(target=help_out, args=(n,)) for n in range(3)]
+    for thread in threads:
+        thread.start()
+    yield done
+    ended.set()
+    for thread in threads:
+        thread.join()
+
+
+def test_every_task_is_done_once_and_comes_back_in_order(folder: Path, helpers: list[int]) -> None:
+    tasks = [(folder / f"{n}", 2 * n) for n in range(24)]
+    assert shared(0, 4).each(engine_calls.halve_noted, tasks, folder) == list(range(24))
+    assert [len(path.read_text()) for path, _ in tasks] == [1] * 24
+    assert sum(helpers) > 0
+    assert list((folder.parent / ".tasks").iterdir()) == []
+
+
+def test_one_alone_does_all_whatever_its_share(folder: Path) -> None:
+    assert shared(3, 16).each(engine_calls.halve, [6, 2], folder) == [3, 1]
+
+
+def test_its_own_share_comes_first(folder: Path) -> None:
+    posted = Posted.post(engine_calls.halve, list(range(0, 20, 2)), folder, 1)
+    order = []
+    while missing := posted.missing():
+        assert posted.do_one(Shard(1, 4), engine_calls.silent)
+        order += [n for n in missing if posted.done(n).exists()]
+    assert order[:3] == [1, 5, 9]
+    assert sorted(order) == list(range(10))
+
+
+def test_what_a_killed_process_was_at_is_done_by_another(folder: Path) -> None:
+    posted = Posted.post(engine_calls.halve, [4], folder, 1)
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDS, str(posted.folder / "0000.lock")], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    process.stdout.readline()
+    assert not posted.do_one(Shard(), engine_calls.silent)
+    process.kill()
+    process.wait()
+    assert posted.do_one(Shard(), engine_calls.silent)
+    assert travel.load_value(posted.done(0)) == 2
+
+
+def test_a_new_lead_waits_for_who_is_at_a_task_and_begins_anew(folder: Path) -> None:
+    posted = Posted.post(engine_calls.halve_slowly, [8, 6], folder, 1)
+    helper = threading.Thread(target=posted.do_one, args=(Shard(), engine_calls.silent))
+    helper.start()
+    while not list(posted.folder.glob("*.lock")):
+        time.sleep(0.01)
+    posted.withdraw()
+    assert not posted.folder.exists() or not list(posted.folder.glob("*.done.npz"))
+    helper.join(timeout=5)
+    assert not helper.is_alive()
+    assert not posted.do_one(Shard(), engine_calls.silent)
+    shutil.rmtree(folder.parent / ".tasks", ignore_errors=True)
+    assert shared(0, 2).each(engine_calls.halve, [8, 6], folder) == [4, 3]
+
+
+def test_a_node_with_another_version_says_so_and_leaves_the_task(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    posted = Posted.post(engine_calls.halve, [4], folder, 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(workers, "code_identity", lambda: "another")
+        with pytest.raises(RecoverableError, match="has another version of the program"):
+            posted.do_one(Shard(), engine_calls.silent)
+    assert posted.do_one(Shard(), engine_calls.silent)

@@ -1,0 +1,57 @@
+"""Tasks and results as files: what comes back is what was sent, and nothing else is let in."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from formats.errors import InputError
+from formats.tensors import save_arrays
+from pipelines.config import Config
+from pipelines.depth.fields import DepthFields
+from pipelines.mapping.measure import ViewFigures
+from pipelines.run_folder import RunFolder
+from pipelines.travel import load_value, of_name, save_value
+from pipelines.types import Intrinsics
+
+
+def test_what_tasks_are_made_of_comes_back(tmp_path: Path) -> None:
+    sent = (
+        RunFolder(tmp_path / "a.msgs"), Config(), None, True, 3, 0.1, "text", (1, 2), [Path("x"), ()],
+        {4: np.arange(6.0).reshape(2, 3)}, Intrinsics(4, 3, 2.0, 2.0, 2.0, 1.5), ViewFigures(30.0, 0.9, 0.1, 1.0),
+    )  # fmt: skip
+    save_value(tmp_path / "sent.npz", sent)
+    found = load_value(tmp_path / "sent.npz")
+    assert [type(f) for f in found] == [type(s) for s in sent]
+    np.testing.assert_array_equal(found[9][4], sent[9][4])  # type: ignore[index]
+    assert (*found[:9], *found[10:]) == (*sent[:9], *sent[10:])
+
+
+def test_scale_fields_come_back(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    fields = DepthFields({7: rng.random((2, 3))})
+    save_value(tmp_path / "fields.npz", fields)
+    found = load_value(tmp_path / "fields.npz")
+    assert str(asdict(found)) == str(asdict(fields))
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """Not of this program's pipelines."""
+
+    text: str
+
+
+def test_what_is_not_of_this_program_is_refused(tmp_path: Path) -> None:
+    save_value(tmp_path / "foreign.npz", Foreign("x"))
+    with pytest.raises(InputError, match="not of this program"):
+        load_value(tmp_path / "foreign.npz")
+    with pytest.raises(InputError, match="not of this program"):
+        of_name("os:system")
+    with pytest.raises(TypeError, match="does not travel"):
+        save_value(tmp_path / "thing.npz", object())
+    tree = np.frombuffer(b'{"pipelines.travel:save_value": {"path": "x", "value": 1}}', np.uint8)
+    save_arrays(tmp_path / "call.npz", {"tree": tree})
+    with pytest.raises(InputError, match="no dataclass"):
+        load_value(tmp_path / "call.npz")
