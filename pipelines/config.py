@@ -66,6 +66,9 @@ class FramesConfig:
         "auto", "auto: what the source says of itself; a panorama becomes six pictures, a fisheye of known lens one",
         ("auto", "perspective", "equirectangular", "fisheye"),
     )  # fmt: skip
+    rolling_shutter: str = setting(
+        "auto", "seconds from a frame's first row to its last; auto finds them, where they explain something; off"
+    )
     parallax: float = setting(
         0.025, "a new keyframe when points have moved by this fraction of the image width", within=(0.001, 0.5)
     )
@@ -172,7 +175,6 @@ class GlobalBaConfig:
     use_loops: bool = setting(True, "look for places that are seen again")
     use_semantics: bool = setting(True, "propose loops by semantics too, eqs. (21) to (24)")
     loop_gap: int = setting(8, "a loop joins keyframes at least this many apart", within=(1, 1_000_000))
-    loop_appearance: float = setting(0.02, "least appearance similarity of a candidate", within=(-1, 1))
     joint: str = setting("moved", "refine map and poses together", ("moved", "always", "never"))
     joint_passes: float = setting(4.0, "how often each keyframe is visited then", within=(0, 1000))
 

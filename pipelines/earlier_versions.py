@@ -36,7 +36,7 @@ _FIXED = {
     "reliability_decay region_prior",
     "global_ba": "features words loop_shared_points richness loop_similarity miou_weight appearance_weight "
     "structure_weight loop_error loop_share loop_sure_inliers loop_rotation loop_translation loop_drift "
-    "loop_angle_drift loop_scale_drift loop_inliers drift_px joint_px loop_candidates",
+    "loop_angle_drift loop_scale_drift loop_inliers drift_px joint_px loop_candidates loop_appearance",
     "export": "truncation least_weight least_piece",
 }
 FIXED = frozenset(f"{section}.{name}" for section, names in _FIXED.items() for name in names.split())

@@ -23,6 +23,7 @@ from pipelines.run_folder import (
     save_calibration,
     save_features,
     save_frames,
+    save_left_out,
     save_matching,
 )
 from pipelines.stages import Stage, StageContext, run_stages
@@ -64,8 +65,8 @@ def take_frames(context: StageContext) -> dict[str, Any]:
     frames, number = around.load_frames(), {old: new for new, old in enumerate(posed)}
     for frame in (frames[i] for i in posed):
         copy_file(around.image_file(frame), context.folder / frame.name)
-        if (mask := around.mask_file(frame.name)) is not None:
-            copy_file(mask, context.folder / "masks" / mask.name)
+        if (mask := around.mask(frame, "frames")) is not None:
+            save_left_out(context.folder / "masks", frame, mask)
     save_frames(context.folder, [replace(frames[old], id=new) for old, new in number.items()])
     save_calibration(context.folder, around.load_calibration())
     model = around.load_sparse("tracking", name)

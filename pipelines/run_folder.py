@@ -40,6 +40,7 @@ from pipelines.types import (
     SparseModel,
     Trajectory,
     Vocabulary,
+    any_of,
 )
 
 if TYPE_CHECKING:
@@ -104,13 +105,12 @@ class RunFolder(FinishedFiles):
 
     def left_out(self, frame: Frame) -> NDArray[np.bool_] | None:
         """(H, W) what of the undistorted frame is no part of the scene; None where all of it is."""
-        found = [read_mask(p) for s in ("frames", "proxy") if (p := self.mask_file(frame.name, s)) is not None]
-        return np.asarray(np.logical_or.reduce(found)) if found else None
+        return any_of(self.mask(frame, stage) for stage in ("frames", "proxy"))
 
-    def mask_file(self, name: str, stage: str = "frames") -> Path | None:
-        """The mask by which a stage leaves something of the frame's picture `name` out; None where it has none."""
-        mask = f"masks/{name}.png"
-        return self.file(stage, mask) if self.has(stage, mask) else None
+    def mask(self, frame: Frame, stage: str) -> NDArray[np.bool_] | None:
+        """(H, W) what a stage leaves out of the undistorted frame; None for nothing."""
+        name = f"masks/{frame.name}.png"
+        return read_grey_png(self.file(stage, name)) == 0 if self.has(stage, name) else None
 
     # proxy ------------------------------------------------------------------------------------------------------
 
@@ -245,12 +245,7 @@ def save_left_out(folder: Path, frame: Frame, left_out: NDArray[np.bool_]) -> No
 def load_left_out(folder: Path, frame: Frame) -> NDArray[np.bool_] | None:
     """Inverse of `save_left_out`; None where there is none."""
     path = folder / f"{frame.name}.png"
-    return read_mask(path) if path.exists() else None
-
-
-def read_mask(path: Path) -> NDArray[np.bool_]:
-    """(H, W) where a mask is black."""
-    return read_grey_png(path) == 0
+    return read_grey_png(path) == 0 if path.exists() else None
 
 
 def save_calibration(folder: Path, calibration: Calibration) -> None:

@@ -11,7 +11,7 @@ Conventions
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
@@ -31,6 +31,12 @@ def require_shape(name: str, array: NDArray, expected: Sequence[int | None]) -> 
     if len(shape) != len(expected) or any(e is not None and s != e for s, e in zip(shape, expected, strict=True)):
         want = tuple("any" if e is None else e for e in expected)
         raise ValueError(f"{name}: got shape {shape}, expected {want}")
+
+
+def any_of(masks: Iterable[NDArray[np.bool_] | None]) -> NDArray[np.bool_] | None:
+    """Where one of the masks (H, W) is; None without any."""
+    found = [m for m in masks if m is not None]
+    return np.asarray(np.logical_or.reduce(found)) if found else None
 
 
 def rows_by(group: NDArray[np.integer], count: int) -> list[NDArray[np.int64]]:
@@ -98,6 +104,11 @@ class Intrinsics:
         """(3, 3) calibration matrix K."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
+    @property
+    def numbers(self) -> NDArray[np.float64]:
+        """(4,) fx, fy, cx, cy."""
+        return np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float64)
+
     def at_most(self, side: int) -> Intrinsics:
         """The camera of images whose long side is at most `side` pixels; 0 leaves it as it is."""
         scale = min(1.0, side / max(self.width, self.height)) if side > 0 else 1.0
@@ -128,7 +139,8 @@ class Calibration:
 
     `origin` is "given", "exif" or "self-calibrated"; `focal_sd` its standard deviation in pixels (0 when given);
     `distortion` the (k1, k2, p1, p2[, k3]) that was removed from the frames, of a `fisheye` (k1, k2, k3, k4).
-    `directions`: in how many the camera looks at once, see `pipelines.geometry.rig`.
+    `directions`: in how many the camera looks at once, see `pipelines.geometry.rig`. `readout`: seconds of its rolling
+    shutter, see `pipelines.structure.rolling`.
     """
 
     intrinsics: Intrinsics
@@ -137,6 +149,7 @@ class Calibration:
     distortion: tuple[float, ...]
     fisheye: bool = False
     directions: int = 1
+    readout: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)

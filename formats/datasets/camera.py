@@ -16,6 +16,11 @@ _STRONGEST_DISTORTION = 1000.0
 _SAME_SHAPE = 0.01
 
 
+def distortion_names(fisheye: bool) -> tuple[str, ...]:
+    """What a camera's coefficients are called."""
+    return ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+
+
 @dataclass(frozen=True)
 class Camera:
     """Intrinsics in pixels, first pixel's centre at (0.5, 0.5); distortion k1, k2, p1, p2[, k3] as OpenCV has it.

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from formats.datasets.camera import Camera
+from formats.datasets.camera import Camera, distortion_names
 from formats.errors import InputError
 from formats.jsonfile import number, optional_number, read_json_object
-
-_DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3")
-_FISHEYE_NAMES = ("k1", "k2", "k3", "k4")
 
 
 def read_intrinsics_json(path: Path, *, integer_centres: bool) -> tuple[Camera, float | None]:
@@ -34,7 +31,7 @@ def read_intrinsics_json(path: Path, *, integer_centres: bool) -> tuple[Camera, 
         number(table, path, "fy"),
         number(table, path, "cx") + shift,
         number(table, path, "cy") + shift,
-        _distortion(table, path, _FISHEYE_NAMES if fisheye else _DISTORTION_NAMES),
+        _distortion(table, path, distortion_names(fisheye)),
         fisheye,
     )
     scale = optional_number(table, path, "depth_scale", "scale")
@@ -48,6 +45,7 @@ def _distortion(table: dict, path: Path, names: tuple[str, ...]) -> tuple[float,
     if values is None:
         named = tuple(optional_number(table, path, name) or 0.0 for name in names)
         return named if any(named[4:]) else named[:4]
-    if not isinstance(values, list) or not 0 < len(values) <= 5 or not all(isinstance(v, int | float) for v in values):
-        raise InputError(f"{path}: distortion is {str(values)[:80]}, expected up to five numbers k1, k2, p1, p2, k3")
-    return tuple(float(v) for v in values) + (0.0,) * (4 - len(values))
+    count = len(values) if isinstance(values, list) else 0
+    if not 0 < count <= len(names) or not all(isinstance(v, int | float) for v in values):
+        raise InputError(f"{path}: distortion is {str(values)[:80]}, expected up to {len(names)}: {', '.join(names)}")
+    return tuple(float(v) for v in values) + (0.0,) * (4 - count)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from formats.atomic import write_text
+from formats.datasets.camera import distortion_names
 from formats.jsonfile import read_json
 from formats.reading import read_bytes
 from pipelines.config import Config, config_to_dict, config_to_toml
@@ -103,14 +104,13 @@ def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[Loo
     c, t = outcome.calibration, outcome.trajectory
     k = c.intrinsics
     spread = f" ± {c.focal_sd:.2f}" if c.focal_sd > 0 else ""
+    shutter = f", rows within {1000 * sum(map(abs, c.readout)):.1f} ms" if any(c.readout) else ""
+    sides = f"centre ({k.cx:.1f}, {k.cy:.1f}), {k.width}×{k.height}{shutter}"
     rows = [
-        (
-            "camera",
-            f"{c.origin}: focal length {k.fx:.2f}{spread} px, centre ({k.cx:.1f}, {k.cy:.1f}), {k.width}×{k.height}",
-        ),
+        ("camera", f"{c.origin}: focal length {k.fx:.2f}{spread} px, {sides}"),
         (
             "distortion removed",
-            ", ".join(f"{n} {v:.4f}" for n, v in zip(("k1", "k2", "p1", "p2", "k3"), c.distortion, strict=False)),
+            ", ".join(f"{n} {v:.4f}" for n, v in zip(distortion_names(c.fisheye), c.distortion, strict=False)),
         ),
         ("scale", _scale_text(outcome)),
         *found_lengths(outcome),

@@ -20,7 +20,7 @@ from pipelines.progress import Progress
 from pipelines.proxy.models.registry import ModelStore
 from pipelines.run_folder import load_left_out, save_left_out
 from pipelines.structure.lens import Lens
-from pipelines.types import Frame
+from pipelines.types import Frame, any_of
 
 
 def mask_inputs(source: Path, config: Config) -> dict[str, str] | None:
@@ -84,9 +84,7 @@ class FrameMasks:
         given = self._files.left_out(frame.source_index, *size)
         if given is not None and self._faces is not None:
             given = self._faces.cut_mask(given, frame.id // self._rig.stations)
-        people = load_left_out(self._folder, frame)
-        parts = [p for p in (given, people) if p is not None]
-        both = np.logical_or.reduce(parts) if parts else None
+        both = any_of((given, load_left_out(self._folder, frame)))
         return both if both is not None and both.any() else None
 
     def write(self, folder: Path, frames: Sequence[Frame], lens: Lens) -> dict[str, Any]:

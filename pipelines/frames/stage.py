@@ -44,6 +44,7 @@ from pipelines.structure.backbone import to_sparse_model
 from pipelines.structure.calibration import read_intrinsics
 from pipelines.structure.lens import Lens, distortion_of, make_lens, to_pycolmap, unknown_camera
 from pipelines.structure.parallax import require_motion
+from pipelines.structure.rolling import read_readout
 from pipelines.structure.sfm import Structure, StructureFromMotion, parallel_map
 from pipelines.types import Calibration, Features, Frame
 
@@ -75,7 +76,7 @@ def run(context: StageContext) -> dict[str, Any]:
     masks.find_people(frames, keyframes, context.progress)
     structure = _structure(context, camera, origin == "given", frames, keyframes, masks, rig)
     lens = make_lens(structure.model.cameras[1])
-    calibration = _calibration(context, lens, origin, structure.focal_sd, faces)
+    calibration = replace(_calibration(context, lens, origin, structure.focal_sd, faces), readout=structure.readout)
     _write_backbone(context, structure, keyframes, lens, frames)
     _write_correspondences(context, structure, keyframes, lens)
     _write_frames(context, source, frames, lens)
@@ -113,6 +114,7 @@ def check(source: Path, config: Config) -> None:
     _require_several(opened)
     check_masks(source, config)
     open_learned(config.frames)
+    read_readout(config.frames.rolling_shutter)
     faces = find_faces(opened, config.frames)
     if faces is None and config.frames.intrinsics:
         read_intrinsics(config.frames.intrinsics, opened.width, opened.height)
@@ -261,6 +263,7 @@ def _structure(
         camera=camera,
         is_fixed=is_fixed,
         extract=extract,
+        time=lambda frame_id: frames[frame_id].timestamp,
         match=match_features if learned is None else partial(learned.match, size=size),
         snapshots=Snapshots(context.snapshot),
         progress=context.progress,
@@ -401,6 +404,7 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
         "calibration": calibration.origin,
         "focal_px": round(calibration.intrinsics.fx, 3),
         "focal_sd_px": round(calibration.focal_sd, 3),
+        "readout_seconds": round(sum(calibration.readout), 5),
         "sharpness": round(float(np.median([f.sharpness for f in frames])), 2),
     }
 

@@ -12,8 +12,8 @@ from pipelines.config import TrackingConfig
 from pipelines.geometry import se3
 from pipelines.global_ba.pose_graph import Edges, optimise_pose_graph
 from pipelines.global_ba.verify import Loop
+from pipelines.structure.bundle import reprojection_errors
 from pipelines.tracking.adjust import LoadProxy, Report, adjust_state
-from pipelines.tracking.bundle import reprojection_errors
 from pipelines.tracking.state import Sightings, TrackState
 from pipelines.types import Intrinsics
 

@@ -35,9 +35,9 @@ from pipelines.run_folder import (
     save_trajectory,
 )
 from pipelines.stages import Stage, StageContext
+from pipelines.structure.bundle import reprojection_errors
 from pipelines.tracking.adjust import align_depths, without_dependent_depth
-from pipelines.tracking.bundle import reprojection_errors
-from pipelines.tracking.pictures import Pictures
+from pipelines.tracking.pictures import Pictures, load_shutter
 from pipelines.tracking.result import to_sparse_model
 from pipelines.tracking.state import FEATURE_SD, TrackState
 from pipelines.types import VOID, Intrinsics, SparseModel, Trajectory
@@ -131,7 +131,7 @@ def adjust(context: StageContext, model: SparseModel, found: FoundLoops) -> Clos
         return None
     run, config = context.run, context.config
     intrinsics = run.load_calibration().intrinsics
-    state = TrackState.from_backbone(model, FEATURE_SD)
+    state = TrackState.from_backbone(model, FEATURE_SD, shutter=load_shutter(run))
     drift = max(loop_drift_px(loop, state, intrinsics) for loop in found.loops)
 
     report = run.load_proxy_report()

@@ -32,7 +32,6 @@ from pipelines.run_folder import (
     load_left_out,
     load_proxy_maps,
     proxy_path,
-    read_mask,
     save_classes,
     save_descriptors,
     save_figures,
@@ -42,7 +41,7 @@ from pipelines.run_folder import (
     save_proxy_maps,
 )
 from pipelines.stages import Stage, StageContext
-from pipelines.types import VOID, Features, Frame, ProxyMaps
+from pipelines.types import VOID, Features, Frame, ProxyMaps, any_of
 
 _PORTIONS = 3
 """Tasks a worker, so that all end at about the same time."""
@@ -107,9 +106,7 @@ def _load_sequence(context: StageContext) -> Sequence:
 
     def left_out(frame: Frame) -> NDArray[np.bool_] | None:
         """By the stage before this one, and by what of this one is done."""
-        path = run.mask_file(frame.name)
-        before, moved = None if path is None else read_mask(path), load_left_out(context.folder / "masks", frame)
-        return before if moved is None else moved if before is None else before | moved
+        return any_of((run.mask(frame, "frames"), load_left_out(context.folder / "masks", frame)))
 
     return Sequence(run.load_frames(), calibration, camera, run.load_backbone(), run.image, left_out)
 

@@ -35,6 +35,7 @@ from pipelines.structure.consistency import ModelReport, judge, without_misplace
 from pipelines.structure.lens import set_lens
 from pipelines.structure.mappers import calibrate_focal, map_globally, map_incrementally
 from pipelines.structure.parallax import HOW_TO_FILM, require_parallax
+from pipelines.structure.rolling import NO_READOUT, Readout, adjust_rolling, read_readout
 from pipelines.structure.seams import cut, take_out
 from pipelines.types import Features, Vocabulary
 
@@ -69,6 +70,7 @@ class Structure:
     tried: list[tuple[int, int]]
     pairs: list[VerifiedPair]
     pieces: list[pycolmap.Reconstruction]
+    readout: Readout = NO_READOUT
 
 
 @dataclass(frozen=True)
@@ -83,12 +85,13 @@ class _Adjusted:
 class StructureFromMotion:
     """`extract(frame_id)` gives a frame's features, `match` the pairs of two frames' that are alike; `camera` is what
     is known of the camera before, and `is_fixed` says that it is known exactly. cam_from_rig (C, 3, 3): the keyframes
-    come direction by direction, as `Rig` counts frames."""
+    come direction by direction, as `Rig` counts frames. time(frame_id): seconds at which a frame was taken."""
 
     config: FramesConfig
     camera: pycolmap.Camera
     is_fixed: bool
     extract: Callable[[int], Features]
+    time: Callable[[int], float]
     match: Callable[[Features, Features], NDArray[np.uint32]]
     snapshots: Snapshots
     progress: Progress
@@ -118,9 +121,12 @@ class StructureFromMotion:
             if again is not None and again.focal_sd < found.focal_sd and again.score >= _AS_GOOD * found.score:
                 found = again
         found, pieces = self._largest_first(found, self._pieces(features, pairs, found.model))
+        found, pieces, readout = self._rolling(found, pieces, xy, np.array([self.time(k) for k in keyframe_ids]))
         report = judge(found.model, pairs, xy, self._places(features), self.config.overlap)
         cut(found.model, report.parts, report.total)
-        return Structure(found.model, report, found.mapper, found.focal_sd, features, vocabulary, tried, pairs, pieces)
+        return Structure(
+            found.model, report, found.mapper, found.focal_sd, features, vocabulary, tried, pairs, pieces, readout
+        )
 
     def _places(self, features: Sequence[Features]) -> int:
         return len(features) // len(self.cam_from_rig)
@@ -186,6 +192,25 @@ class StructureFromMotion:
                     other.cameras[1].params = again.cameras[1].params.tolist()
                     adjust(other, refine_camera=False)
         return replace(found, model=largest), others
+
+    def _rolling(
+        self, found: _Adjusted, pieces: list[pycolmap.Reconstruction], xy: Sequence[NDArray[np.float64]],
+        times: NDArray[np.float64],
+    ) -> tuple[_Adjusted, list[pycolmap.Reconstruction], Readout]:  # fmt: skip
+        """All models adjusted with the readout of a rolling shutter, where one is given or the first model shows it."""
+        wanted = read_readout(self.config.rolling_shutter)
+        if len(self.cam_from_rig) > 1 or wanted == NO_READOUT:
+            return found, pieces, NO_READOUT
+        settled = adjust_rolling(found.model, xy, times, wanted, not self.is_fixed)
+        if settled is None:
+            return found, pieces, NO_READOUT
+        model, readout, focal_sd = settled
+        others = []
+        for piece in pieces:
+            piece.cameras[1].params = model.cameras[1].params.tolist()
+            again = adjust_rolling(piece, xy, times, readout, refine_camera=False)
+            others.append(piece if again is None else again[0])
+        return replace(found, model=model, focal_sd=focal_sd), others, readout
 
     def _features(self, keyframe_ids: Sequence[int]) -> Streamed[Features]:
         def stored(frame_id: int) -> Features:

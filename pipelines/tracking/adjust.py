@@ -14,7 +14,8 @@ from pipelines.depth import scales
 from pipelines.depth.align import align_keyframes
 from pipelines.depth.fields import DepthFields
 from pipelines.depth.scales import COARSE, WorldScale
-from pipelines.tracking.bundle import Bundle, adjust_bundle, adjust_pose
+from pipelines.structure.bundle import Bundle, adjust_bundle, adjust_pose
+from pipelines.structure.rolling import straight_pixels, straightened, velocities
 from pipelines.tracking.places import settle_places
 from pipelines.tracking.state import TrackState
 from pipelines.types import Intrinsics, ProxyMaps, SparseModel, rows_by
@@ -74,16 +75,17 @@ def adjust_state(
     frame_ids = sorted(state.poses) if len(state.poses) <= MOST_FRAMES else list(state.keyframes)
     bundle = make_bundle(state, frame_ids)
     ties = sample_depths(bundle, frame_ids, state, intrinsics, load_proxy, metric)
-    initial = None
+    initial, in_frame = None, bundle.obs_xy
     for round_number in range(ROUNDS):
-        bundle = set_scale(bundle, ties, intrinsics)
+        bundle = seen_at_once(set_scale(bundle, ties, intrinsics), in_frame, frame_ids, state, intrinsics)
         tied = with_depths(bundle, ties, intrinsics, settings)
         result = adjust_bundle(tied, intrinsics, ITERATIONS, ids=np.array(frame_ids), rig=state.rig)
         initial = result.initial_cost if initial is None else initial
         bundle = result.bundle
         if round_number < ROUNDS - 1:
             keep = consistent(bundle, intrinsics)
-            bundle, ties.depth, ties.reliability = bundle.select(keep), ties.depth[keep], ties.reliability[keep]
+            bundle, in_frame = bundle.select(keep), in_frame[keep]
+            ties.depth, ties.reliability = ties.depth[keep], ties.reliability[keep]
     bundle = set_scale(bundle, ties, intrinsics)
     errors = bundle.reprojection_errors(intrinsics)
     seen = np.isfinite(errors)  # not so of points that the last round has left behind a camera
@@ -100,6 +102,18 @@ def adjust_state(
         "cost_after": result.cost,
     }
     return Report(figures, frame_ids, ties)
+
+
+def seen_at_once(
+    bundle: Bundle, in_frame: Array, frame_ids: list[int], state: TrackState, intrinsics: Intrinsics
+) -> Bundle:
+    """The bundle with the pixels (O, 2) at which its frames see their points, but for what a rolling shutter adds."""
+    shutter = state.shutter
+    if not shutter.is_rolling:
+        return bundle
+    worlds = np.array([state.segment[i] for i in frame_ids])
+    velocity = velocities(bundle.cam_from_world, shutter.times[frame_ids], worlds)
+    return straightened(bundle, in_frame, intrinsics, velocity, shutter.readout)
 
 
 def align_depths(model: SparseModel, report: Report, intrinsics: Intrinsics, load_proxy: LoadProxy) -> DepthFields:
@@ -211,13 +225,17 @@ def follow_others(state: TrackState, intrinsics: Intrinsics, adjusted: set[int],
     alive = np.zeros(len(state.points), bool)
     for frame_id in adjusted:
         alive[state.sightings[frame_id].point] = True
-    for frame_id in sorted(set(state.poses) - adjusted):
+    others = sorted(set(state.poses) - adjusted)
+    for frame_id in others:
         state.poses[frame_id] = state.poses[frame_id].copy()
         state.poses[frame_id][:3, 3] *= factor
+    velocity = state.velocities() if state.shutter.is_rolling else {}
+    for frame_id in others:
         seen = state.sightings[frame_id]
         seen = seen.select(alive[seen.point])
         state.sightings[frame_id] = seen
         if len(seen) >= 6:
-            state.poses[frame_id] = adjust_pose(
-                state.poses[frame_id], state.points[seen.point], seen.xy, seen.sd, intrinsics
-            )
+            pose, points, xy = state.poses[frame_id], state.points[seen.point], seen.xy
+            if velocity:
+                xy = straight_pixels(pose, points, xy, intrinsics, velocity[frame_id], state.shutter.readout)
+            state.poses[frame_id] = adjust_pose(pose, points, xy, seen.sd, intrinsics)

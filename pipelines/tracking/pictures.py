@@ -14,6 +14,7 @@ from pipelines.correspondence.features import to_grey
 from pipelines.correspondence.retrieval import describe
 from pipelines.frames.learned import open_learned, picture_features
 from pipelines.run_folder import RunFolder
+from pipelines.structure.rolling import Shutter
 from pipelines.types import Features, ProxyMaps
 
 T = TypeVar("T")
@@ -33,6 +34,11 @@ class _Recent(Generic[T]):
                 self.kept.popitem(last=False)
         self.kept.move_to_end(key)
         return self.kept[key]
+
+
+def load_shutter(run: RunFolder) -> Shutter:
+    """How the frames of a run were taken."""
+    return Shutter(run.load_calibration().readout, np.array([f.timestamp for f in run.load_frames()]))
 
 
 class Pictures:

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipelines.tracking.bundle import adjust_pose, reprojection_errors
+from pipelines.structure.bundle import adjust_pose, reprojection_errors
 from pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]

@@ -40,6 +40,7 @@ def _alone(state: TrackState, segment: int) -> TrackState:
         rendered=[i for i in state.rendered if state.segment[i] == segment],
         rig=state.rig,
         turned=[i for i in state.turned if state.segment[i] == segment],
+        shutter=state.shutter,
     )
 
 

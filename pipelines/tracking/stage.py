@@ -12,9 +12,10 @@ from pipelines.geometry.rig import Rig, rig_of
 from pipelines.run_folder import RunFolder, save_depth_fields, save_figures, save_sparse, save_trajectory
 from pipelines.stages import Stage, StageContext
 from pipelines.stopping import is_asked
+from pipelines.structure.rolling import Shutter
 from pipelines.tracking.adjust import Report, adjust_state, align_depths, without_dependent_depth
 from pipelines.tracking.front_end import FrontEnd
-from pipelines.tracking.pictures import Pictures
+from pipelines.tracking.pictures import Pictures, load_shutter
 from pipelines.tracking.places import settle_places
 from pipelines.tracking.refine import RenderWeights, compare_frame
 from pipelines.tracking.result import split_worlds, to_sparse_model, to_trajectory
@@ -76,7 +77,8 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
     rig = rig_of(context.run.load_calibration().directions, len(frames))
     if len(rig) > 1:  # what one direction does not show, the others do
         settings = replace(settings, new_segments=False, render="never")
-    state = TrackState.load(snapshot, rig) if snapshot.exists() else start_state(context, rig)
+    shutter = load_shutter(context.run)
+    state = TrackState.load(snapshot, rig, shutter) if snapshot.exists() else start_state(context, rig, shutter)
     front_end = FrontEnd(state, pictures, settings, context.config.run.seed, weights)
     every = max(SNAPSHOT_EVERY, len(frames) // SNAPSHOTS)
     for frame in context.progress.track(frames[state.done :], "tracking", len(frames) - state.done):
@@ -105,12 +107,12 @@ def add_pieces(state: TrackState, run: RunFolder, least: int) -> None:
             state.add_segment(model)
 
 
-def start_state(context: StageContext, rig: Rig) -> TrackState:
+def start_state(context: StageContext, rig: Rig, shutter: Shutter) -> TrackState:
     """The backbone, its parts as segments, or nothing yet."""
     backbone = context.run.load_backbone()
     if backbone is None:
-        return TrackState(rig=rig)
-    state = TrackState.from_backbone(backbone, FEATURE_SD, rig)
+        return TrackState(rig=rig, shutter=shutter)
+    state = TrackState.from_backbone(backbone, FEATURE_SD, rig, shutter)
     split_segments(state)
     return state
 

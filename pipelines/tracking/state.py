@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from formats.tensors import load_arrays, save_arrays
 from pipelines.geometry.rig import ONE_CAMERA, Rig
+from pipelines.structure.rolling import Shutter, velocities
 from pipelines.types import SparseModel
 
 Array = NDArray[np.float64]
@@ -53,7 +54,7 @@ class TrackState:
 
     `segment` numbers connected stretches: poses of different segments cannot be compared. `rendered` are the
     frames that only rendering could pose, `turned` those of which only the rotation is known; `done` counts the frames
-    that have been visited; `rig` says which frames were taken at one place.
+    that have been visited; `rig` says which frames were taken at one place, `shutter` how their rows were.
     """
 
     points: Array = field(default_factory=lambda: np.zeros((0, 3)))
@@ -67,11 +68,14 @@ class TrackState:
     done: int = 0
     rig: Rig = ONE_CAMERA
     turned: list[int] = field(default_factory=list)
+    shutter: Shutter = field(default_factory=Shutter)
 
     @staticmethod
-    def from_backbone(model: SparseModel, sd: float, rig: Rig = ONE_CAMERA) -> TrackState:
+    def from_backbone(
+        model: SparseModel, sd: float, rig: Rig = ONE_CAMERA, shutter: Shutter | None = None
+    ) -> TrackState:
         """The keyframes and points of structure from motion as segment 0."""
-        state = TrackState(model.points_in_world.copy(), model.colors.copy(), rig=rig)
+        state = TrackState(model.points_in_world.copy(), model.colors.copy(), rig=rig, shutter=shutter or Shutter())
         for k, frame_id in enumerate(int(i) for i in model.frame_ids):
             mine = model.observations_of(k)
             seen = Sightings(model.obs_point[mine].astype(np.int64), model.obs_xy[mine], np.full(len(mine), sd))
@@ -112,6 +116,12 @@ class TrackState:
         nearest = self.nearest_keyframes(frame_id, _NEAR_KEYFRAMES)
         return next(self.segment[k] for k in chain(nearest, self.keyframes) if point in self.sightings[k].point)
 
+    def velocities(self) -> dict[int, Array]:
+        """(6,) twists a second of all posed frames."""
+        ids = sorted(self.poses)
+        poses, worlds = np.array([self.poses[i] for i in ids]), np.array([self.segment[i] for i in ids])
+        return dict(zip(ids, velocities(poses, self.shutter.times[ids], worlds), strict=True))
+
     def median_depth(self, frame_id: int) -> float:
         """Of the points the frame sees; 1 when it sees none."""
         motion, seen = self.poses[frame_id], self.sightings[frame_id]
@@ -148,7 +158,7 @@ class TrackState:
         save_arrays(path, arrays)
 
     @staticmethod
-    def load(path: Path, rig: Rig = ONE_CAMERA) -> TrackState:
+    def load(path: Path, rig: Rig = ONE_CAMERA, shutter: Shutter | None = None) -> TrackState:
         """Inverse of `save`."""
         a = load_arrays(path)
         ends = np.cumsum(a["counts"])
@@ -168,4 +178,5 @@ class TrackState:
             [int(i) for i in a["rendered"]],
             int(a["done"]),
             rig,
+            shutter=shutter or Shutter(),
         )

@@ -37,8 +37,8 @@ from pipelines.geometry.camera import pixel_centers, project
 from pipelines.global_ba.candidates import loop_candidates
 from pipelines.global_ba.semantics import summarise_labels
 from pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
+from pipelines.structure.bundle import adjust_bundle
 from pipelines.tracking.adjust import make_bundle
-from pipelines.tracking.bundle import adjust_bundle
 from pipelines.tracking.state import TrackState
 from pipelines.types import Intrinsics, SparseModel
 from tests.world.building import HEIGHT, LENGTH, ROOM_WIDTH, Walk, module_at

@@ -96,6 +96,41 @@ def exposure(folder: Path, data: Path) -> Array:
     return poses[[int(p.stem) for p in pictures]]
 
 
+def rolling(folder: Path, data: Path) -> Array:
+    """80 frames of a walk round the table by someone who looks left and right by 12 degrees, at 10 frames a second by a
+    camera that takes 30 ms from the first row to the last."""
+    return rolled(folder, readout=0.3)
+
+
+def rolling_not(folder: Path, data: Path) -> Array:
+    """The same by one that takes all rows at once."""
+    return rolled(folder, readout=0.0)
+
+
+def rolled(folder: Path, readout: float) -> Array:
+    from tests.world.clip import ClipOptions, develop, make_world, render_rolling
+
+    world, step = make_world("room", texel=0.006), 0.0108
+    options = ClipOptions(frames=80, width=SIZE[0], height=SIZE[1], noise=1.0, readout=readout)
+    for i in range(options.frames):
+        light = render_rolling(world, options, looking_about, i * step, step)[0]
+        save(folder, i, develop(light, options, i)[..., ::-1])
+    return looking_about(np.arange(options.frames) * step)
+
+
+def looking_about(steps: Array) -> Array:
+    """(N, 4, 4) world_from_cam of `room_walk` by someone who turns the head left and right and a little up."""
+    from tests.world.paths import room_walk
+
+    poses = room_walk(steps)
+    left = np.radians(12) * np.sin(40.7 * steps)
+    up = np.radians(4) * np.sin(64 * steps + 1)
+    for pose, yaw, pitch in zip(poses, left, up, strict=True):
+        nod = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
+        pose[:3, :3] = about_z(yaw) @ pose[:3, :3] @ nod
+    return poses
+
+
 def kitchen_twice(folder: Path, data: Path) -> Array:
     """The kitchen forth, and back between the frames of the way there: every place is seen again."""
     wanted = [*range(0, 300, 4), *range(298, 0, -4)]
@@ -129,8 +164,11 @@ def whiteroom_fast(folder: Path, data: Path) -> Array:
 
 HARD: dict[str, Callable[[Path, Path], Array]] = {
     f.__name__: f
-    for f in (turn, turn_within, fast, fast_blank, blackout, exposure, kitchen_twice, replica_fast, whiteroom_fast)
-}
+    for f in (
+        turn, turn_within, fast, fast_blank, blackout, exposure, kitchen_twice, replica_fast, whiteroom_fast, rolling,
+        rolling_not,
+    )
+}  # fmt: skip
 
 
 def standing(angles: Array, shake: float) -> Array:

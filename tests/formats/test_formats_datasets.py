@@ -211,7 +211,8 @@ def test_generic_folder_with_tum_trajectory(tmp_path: Path) -> None:
         ("intrinsics.json", '{"w": 24, "h": 18, "fx": "20"}', "expected a number"),
         ("intrinsics.json", '{"w": 24', "no valid JSON"),
         ("intrinsics.json", '{"w": 24, "h": 18, "fx": 9, "fy": 9, "cx": 500, "cy": 9}', "far outside"),
-        ("intrinsics.json", '{"w":9,"h":9,"fx":9,"fy":9,"cx":5,"cy":5,"distortion":[1,2,3,4,5,6,7]}', "up to five"),
+        ("intrinsics.json", '{"w":9,"h":9,"fx":9,"fy":9,"cx":5,"cy":5,"distortion":[1,2,3,4,5,6,7]}', "up to 5: k1"),
+        ("intrinsics.json", '{"w":9,"h":9,"fx":9,"fy":9,"cx":5,"cy":5,"model":"FISHEYE","distortion":"no"}', "k3, k4"),
         ("intrinsics.json", '{"w":9,"h":9,"fx":9,"fy":9,"cx":5,"cy":5,"pixel_centre":"?"}', "pixel_centre"),
     ],
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +18,16 @@ from tests.world.room import furnished_room
 from tests.world.stairwell import GLOSS, stairwell, stairwell_walk
 
 LAYOUTS = {"room": furnished_room, "corridor": ring_corridor, "stairwell": stairwell}
-_WALKS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+Path = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""Laps (N,) -> world_from_cam (N, 4, 4)."""
+_WALKS: dict[str, Path] = {
     "room": room_walk,
     "corridor": corridor_walk,
     "stairwell": stairwell_walk,
 }
+
+ROWS = 4
+"""Of a rolling shutter are taken at once."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +36,9 @@ class ClipOptions:
 
     laps: length of the walk; a little over 1 passes over its beginning again. k1: radial distortion of the lens.
     exposure_swing: relative change of the exposure, up and down. noise: standard deviation in grey levels.
-    shutter: open part of the frame time, 0 = no motion blur. focal: pixels, 0 = 0.85 of the width.
+    shutter: open part of the frame time, 0 = no motion blur. focal: pixels, 0 = 0.85 of the width. readout: part of the
+    frame time by which the last row is taken later than the first, 0 = all at once; a frame's pose and time are those
+    of its middle.
     """
 
     frames: int = 60
@@ -44,6 +51,7 @@ class ClipOptions:
     exposure_swing: float = 0.0
     noise: float = 0.0
     shutter: float = 0.0
+    readout: float = 0.0
     supersampling: int = 2
     seed: int = 0
 
@@ -88,27 +96,43 @@ def render_frame(world: World, options: ClipOptions, index: int) -> WorldFrame:
     step = options.laps / max(options.frames - 1, 1)
     blurs = 5 if options.shutter > 0 else 1
     offsets = options.shutter * (np.arange(blurs) - (blurs - 1) / 2) / blurs
-    poses = walk(world, (index + offsets) * step)
     middle = blurs // 2
-    color, depth, solid_at = render_view(world, options, poses[middle])
-    for k in (k for k in range(blurs) if k != middle):
-        color = color + render_view(world, options, poses[k])[0]
+    path = partial(walk, world)
+    color, depth, solid_at = render_rolling(world, options, path, index * step, step)
+    for offset in np.delete(offsets, middle):
+        color = color + render_rolling(world, options, path, (index + offset) * step, step)[0]
     labels = np.append(world.labels, np.uint8(0))[solid_at]
     rgb = develop((color / np.float32(blurs)).astype(np.float32), options, index)
-    return WorldFrame(rgb, depth, labels, poses[middle], index / options.fps)
+    return WorldFrame(rgb, depth, labels, path(np.array([index * step]))[0], index / options.fps)
+
+
+def render_rolling(
+    world: World, options: ClipOptions, path: Path, at: float, step: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
+    """As `render_view`, from where the path is `at` the middle of the frame and goes on by `step` until the next; a few
+    rows at a time are taken at once."""
+    band = ROWS if options.readout > 0 else options.height
+    firsts = np.arange(0, options.height, band)
+    late = options.readout * ((firsts + band / 2) / options.height - 0.5) * step
+    views = [
+        render_view(world, options, pose, slice(first, first + band))
+        for first, pose in zip(firsts, path(at + late), strict=True)
+    ]
+    color, depth, solid_at = (np.concatenate(parts) for parts in zip(*views, strict=True))
+    return color, depth, solid_at
 
 
 def render_view(
-    world: World, options: ClipOptions, world_from_cam: NDArray[np.float64]
+    world: World, options: ClipOptions, world_from_cam: NDArray[np.float64], rows: slice = slice(None)
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
-    """color (H, W, 3) linear light, depth (H, W) z, solid (H, W) index or -1, as seen from one pose."""
-    color, depth, solid_at = _cast(world, options, world_from_cam)
+    """color (H, W, 3) linear light, depth (H, W) z, solid (H, W) index or -1, as seen from one pose; of some `rows`."""
+    color, depth, solid_at = _cast(world, options, world_from_cam, rows)
     floor = np.append(world.labels == world.class_names.index("floor"), False)[solid_at]
     if world.gloss > 0 and floor.any():
         # The mirror image is what a camera on the other side of the floor would see if there were none.
         upside_down = np.diag([1.0, 1.0, -1.0, 1.0])
-        seen, _, _ = _cast(world.without("floor"), options, upside_down @ world_from_cam)
-        rays = np.concatenate([_rays(options)[0], np.ones((*depth.shape, 1))], -1)
+        seen, _, _ = _cast(world.without("floor"), options, upside_down @ world_from_cam, rows)
+        rays = np.concatenate([_rays(options)[0][rows], np.ones((*depth.shape, 1))], -1)
         steepness = -(rays @ world_from_cam[2, :3]) / np.linalg.norm(rays, axis=-1)
         share = world.gloss + (1 - world.gloss) * (1 - np.clip(steepness, 0, 1)) ** 5  # Schlick's
         color = np.where(floor[..., None], color + share[..., None].astype(np.float32) * (seen - color), color)
@@ -116,12 +140,12 @@ def render_view(
 
 
 def _cast(
-    world: World, options: ClipOptions, world_from_cam: NDArray[np.float64]
+    world: World, options: ClipOptions, world_from_cam: NDArray[np.float64], rows: slice
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
-    h, w = options.height, options.width
+    centers, samples = (rays[rows] for rays in _rays(options))
+    h, w = centers.shape[:2]
     color, depth = np.zeros((h, w, 3), np.float32), np.zeros((h, w), np.float32)
     solid_at = np.empty((h, w), np.int32)
-    centers, samples = _rays(options)
     pixel = 1 / (options.intrinsics.fx * options.supersampling)
     a, solids = world.atlas, world.solids
     render_rays(

@@ -37,7 +37,7 @@ from tests.world.clip import WorldFrame
 __all__ = ["make_run", "open_stage", "room_frames"]
 Array = NDArray[np.float64]
 GROWTH = 1.12
-SETTINGS = ["global_ba.loop_gap=2", "global_ba.loop_appearance=-1.0", "mapping.max_side=128"]
+SETTINGS = ["global_ba.loop_gap=2", "mapping.max_side=128"]
 
 
 def grown_about(center: Array) -> Similarity:
@@ -101,8 +101,10 @@ def close(
     make_run: Callable[..., MadeRun],
     room_frames: tuple[object, list[WorldFrame]],
     open_stage: Callable[..., StageContext],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> Callable[[str], tuple[RunFolder, dict]]:
     """close(joint): a run whose loop is closed, and the stage's figures."""
+    monkeypatch.setattr("pipelines.global_ba.candidates.LEAST_ALIKE", -1.0)
 
     def run(joint: str) -> tuple[RunFolder, dict]:
         made = make_run(tmp_path / joint, keyframes=tuple(range(0, 24, 2)), backbone_scale=1.0, metric=False)

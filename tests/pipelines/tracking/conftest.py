@@ -28,7 +28,7 @@ from pipelines.run_folder import (
     write_json,
 )  # fmt: skip
 from pipelines.stages import StageContext
-from pipelines.tracking.bundle import Bundle
+from pipelines.structure.bundle import Bundle
 from pipelines.types import Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, SparseModel
 from tests.pipelines.kept import keep_correspondences
 from tests.world.clip import ClipOptions, WorldFrame, make_world, render_frame

@@ -8,8 +8,8 @@ import pytest
 
 from pipelines.geometry import se3
 from pipelines.geometry.alignment import align_points
-from pipelines.tracking import bundle_kernels as kernels
-from pipelines.tracking.bundle import Bundle, adjust_bundle, adjust_pose
+from pipelines.structure import bundle_kernels as kernels
+from pipelines.structure.bundle import Bundle, adjust_bundle, adjust_pose
 from pipelines.tracking.pnp import colmap_camera
 from pipelines.types import Intrinsics
 from tests.pipelines.tracking.conftest import KnownBundle
@@ -85,7 +85,7 @@ def test_fixed_cameras_stay(known_bundle: KnownBundle) -> None:
 def test_sparse_and_dense_solve_the_same_system(known_bundle: KnownBundle, monkeypatch: pytest.MonkeyPatch) -> None:
     fixed = np.arange(12) == 3
     dense = adjust_bundle(known_bundle.bundle, known_bundle.intrinsics, 4, fixed=fixed).bundle
-    monkeypatch.setattr("pipelines.tracking.bundle.DENSE_CAMERAS", 1)
+    monkeypatch.setattr("pipelines.structure.bundle.DENSE_CAMERAS", 1)
     sparse = adjust_bundle(known_bundle.bundle, known_bundle.intrinsics, 4, fixed=fixed).bundle
     assert not np.array_equal(dense.points, sparse.points)
     assert np.allclose(dense.cam_from_world, sparse.cam_from_world, atol=1e-7)

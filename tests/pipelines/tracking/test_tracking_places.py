@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from pipelines.geometry import se3
 from pipelines.geometry.alignment import align_points
-from pipelines.geometry.rig import CUBE, Rig, rig_of
-from pipelines.tracking.bundle import Bundle, adjust_bundle
-from pipelines.tracking.places import settle_places, tie_cameras
+from pipelines.geometry.rig import CUBE, Rig, rig_of, tie_cameras
+from pipelines.structure.bundle import Bundle, adjust_bundle
+from pipelines.tracking.places import settle_places
 from pipelines.tracking.segments import split_segments
 from pipelines.tracking.state import Sightings, TrackState
 from pipelines.types import Intrinsics
@@ -81,7 +81,7 @@ def test_tied_blocks_are_the_system_in_the_places_steps() -> None:
 @pytest.mark.parametrize("dense", [True, False])
 def test_sides_move_together_in_the_adjustment(dense: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not dense:
-        monkeypatch.setattr("pipelines.tracking.bundle.DENSE_CAMERAS", 0)
+        monkeypatch.setattr("pipelines.structure.bundle.DENSE_CAMERAS", 0)
     rng = np.random.default_rng(1)
     true = _places(rng)
     bundle = _bundle(_sides(true), rng, noise=0.5)

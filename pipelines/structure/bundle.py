@@ -17,9 +17,8 @@ from scipy.sparse import bsr_matrix
 from scipy.sparse.linalg import splu
 
 from pipelines.geometry import se3
-from pipelines.geometry.rig import ONE_CAMERA, Rig
-from pipelines.tracking import bundle_kernels as kernels
-from pipelines.tracking.places import tie_cameras
+from pipelines.geometry.rig import ONE_CAMERA, Rig, tie_cameras
+from pipelines.structure import bundle_kernels as kernels
 from pipelines.types import Intrinsics, require_shape
 
 Array = NDArray[np.float64]
@@ -102,9 +101,7 @@ def adjust_bundle(
     where they were. `ids` (N,): the cameras' frames, of which those at one place of the `rig` move together. Stops when
     a step lowers the cost by less than `tolerance`, relatively.
     """
-    problem = _Problem(
-        bundle, intrinsics, width, fixed, np.arange(len(bundle.cam_from_world)) if ids is None else ids, rig
-    )
+    problem = Problem(bundle, intrinsics, width, fixed, ids, rig)
     motions, points = bundle.cam_from_world.copy(), bundle.points.copy()
     cost = initial = problem.cost(motions, points)
     damping, done = 1e-4, 0
@@ -130,27 +127,26 @@ def adjust_bundle(
     return Adjusted(replace(bundle, cam_from_world=motions, points=points), initial, cost, done)
 
 
-class _Problem:
+class Problem:
     """The arrays of a bundle in the order the kernels want: by point, then by camera."""
 
     def __init__(
-        self, bundle: Bundle, intrinsics: Intrinsics, width: float, fixed: NDArray[np.bool_] | None,
-        ids: NDArray[np.int64], rig: Rig,
+        self, bundle: Bundle, intrinsics: Intrinsics, width: float = 2.0, fixed: NDArray[np.bool_] | None = None,
+        ids: NDArray[np.int64] | None = None, rig: Rig = ONE_CAMERA,
     ) -> None:  # fmt: skip
         order = np.lexsort((bundle.obs_cam, bundle.obs_point))
         b = bundle.select(order)
         known = b.obs_depth > 0
         log_depth = np.log(np.where(known, b.obs_depth, 1.0))
         weight = np.where(known, 1 / np.where(known, b.obs_depth_sd, 1.0), 0.0)
-        camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
         self.obs_cam, self.obs_point = b.obs_cam.astype(np.int64), b.obs_point.astype(np.int64)
-        self.data = (camera, self.obs_cam, self.obs_point, b.obs_xy, 1 / b.obs_sd, log_depth, weight, width)
+        self.data = (intrinsics.numbers, self.obs_cam, self.obs_point, b.obs_xy, 1 / b.obs_sd, log_depth, weight, width)
         self.starts = np.searchsorted(self.obs_point, np.arange(len(b.points) + 1))
         self.free = np.ones(len(b.cam_from_world), bool) if fixed is None else ~fixed
         self.numbers, _ = kernels.number_blocks(self.starts, self.obs_cam, len(b.cam_from_world))
         self.pairs = np.argwhere(self.numbers >= 0)
         self.dense_cameras = DENSE_CAMERAS
-        self.ids, self.rig = ids, rig
+        self.ids, self.rig = np.arange(len(b.cam_from_world)) if ids is None else ids, rig
 
     def cost(self, motions: Array, points: Array) -> float:
         return float(kernels.total_cost(motions, points, *self.data))
@@ -230,8 +226,7 @@ def adjust_pose(
     """Motion-only adjustment: (4, 4) pose of one camera that sees known points (Q, 3) at pixels (Q, 2) of sd (Q,)."""
     motion = np.ascontiguousarray(cam_from_world, dtype=np.float64)
     index, none = np.zeros(len(points), np.int64), np.zeros(len(points))
-    camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
-    data = (camera, index, np.arange(len(points)), np.ascontiguousarray(xy), 1 / sd, none, none, width)
+    data = (intrinsics.numbers, index, np.arange(len(points)), np.ascontiguousarray(xy), 1 / sd, none, none, width)
     points = np.ascontiguousarray(points)
     cost, damping = kernels.total_cost(motion[None], points, *data), 1e-4
     for _ in range(iterations):

@@ -106,6 +106,45 @@ def linearise(motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_d
 
 
 @kernel
+def displacement(motions, points, camera, obs_cam, obs_point, velocity, late):  # type: ignore[no-untyped-def]
+    """(O, 2) pixels by which points move on in cameras of these velocities (N, 6) in `late` (O,) seconds."""
+    out = np.zeros((len(obs_cam), 2))
+    residual, jac_cam, jac_point, nowhere = np.empty(3), np.empty((3, 6)), np.empty((3, 3)), np.zeros(2)
+    for o in range(len(obs_cam)):
+        c = obs_cam[o]
+        if _residual(motions[c], points[obs_point[o]], camera, nowhere, 1.0, 0.0, 0.0, residual, jac_cam, jac_point):
+            for i in range(2):
+                for k in range(6):
+                    out[o, i] += late[o] * jac_cam[i, k] * velocity[c, k]
+    return out
+
+
+@kernel
+def border(  # type: ignore[no-untyped-def]
+    motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_depth, depth_weight, width, moved
+):  # fmt: skip
+    """Normal equations of one more unknown, of which a unit moves every observation by `moved` (O, 2) pixels: mixed
+    with cameras (N, 6) and points (P, 3), its own, and its right side."""
+    cams, on_points = np.zeros((len(motions), 6)), np.zeros((len(points), 3))
+    own, right = 0.0, 0.0
+    residual, jac_cam, jac_point = np.empty(3), np.empty((3, 6)), np.empty((3, 3))
+    for o in range(len(obs_cam)):
+        c, q = obs_cam[o], obs_point[o]
+        if not _residual(motions[c], points[q], camera, xy[o], inverse_sd[o], 0.0, 0.0, residual, jac_cam, jac_point):
+            continue
+        weight = _cauchy(residual[0] ** 2 + residual[1] ** 2, width)[1]
+        for i in range(2):
+            step = moved[o, i] * inverse_sd[o]
+            own += weight * step * step
+            right -= weight * step * residual[i]
+            for k in range(6):
+                cams[c, k] += weight * step * jac_cam[i, k]
+            for k in range(3):
+                on_points[q, k] += weight * step * jac_point[i, k]
+    return cams, on_points, own, right
+
+
+@kernel
 def invert_points(point_block, damping):  # type: ignore[no-untyped-def]
     """Inverses (P, 3, 3) of the damped point blocks."""
     out = np.empty_like(point_block)

@@ -1,0 +1,230 @@
+"""Rolling shutter: a sensor reads its rows one after the other, and the camera moves on meanwhile.
+
+A frame's pose is that of its middle row. What is seen `late` seconds after it lies, to first order, `late` times its
+velocity in the picture farther on; the camera's velocity comes from the poses of the frames beside it (as in Hedborg
+et al., Rolling Shutter Bundle Adjustment, CVPR 2012, whose poses between frames are interpolated). Pixels from which
+that displacement is taken away are adjusted as if they had been seen at once. How long the readout takes is one number
+of the camera, found in closed form beside all poses and points.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from formats.errors import InputError
+from pipelines.geometry import se3
+from pipelines.structure import bundle_kernels as kernels
+from pipelines.structure.adjust import adjust, reprojection_errors, solve
+from pipelines.structure.bundle import Bundle, Problem
+from pipelines.structure.lens import set_lens
+from pipelines.types import Intrinsics
+
+Array = NDArray[np.float64]
+Readout = tuple[float, float]
+"""Seconds by which the right and the lower border of a frame are taken later than the left and the upper one. Sensors
+read row by row; of a video that was filmed upright and turned these are columns."""
+NO_READOUT = (0.0, 0.0)
+
+LONGEST_STEP = 1.0
+"""Seconds: frames farther apart tell nothing of how fast the camera moved at either."""
+LEAST_GAIN = 0.01
+"""Share of the robust cost that a readout must explain. Of three cameras that take all rows at once it was less than
+0.00002, of a phone that holds still 0.001; of a Kinect 0.03 at first and 0.054 in the end."""
+REACH = (-2, -1, 1, 2)
+_ROUNDS = 3
+_FEATURE_SD = 0.5
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """How a recording was taken: the readout, and the seconds (F,) at which each of its frames was."""
+
+    readout: Readout = NO_READOUT
+    times: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def is_rolling(self) -> bool:
+        """Whether rows are taken one after the other."""
+        return any(self.readout)
+
+
+def read_readout(text: str) -> Readout | None:
+    """The setting `frames.rolling_shutter`: None for auto. Raises InputError for what is no time."""
+    if text == "auto":
+        return None
+    try:
+        seconds = 0.0 if text == "off" else float(text)
+    except ValueError:
+        seconds = math.nan
+    if not abs(seconds) <= 1:
+        raise InputError(
+            f"frames.rolling_shutter is auto, off or the seconds from a frame's first row to its last; got {text!r:.40}"
+        )
+    return 0.0, seconds
+
+
+def velocities(cam_from_world: Array, times: Array, worlds: NDArray[np.int64] | None = None) -> Array:
+    """(N, 6) twists a second of cameras (N, 4, 4) in order, at times (N,): the derivative of the polynomial through the
+    poses of up to two frames before and two after. Frames more than LONGEST_STEP away, or in another of the `worlds`
+    (N,), or of a clock that was set back, do not count; without any the velocity is zero."""
+    count = len(times)
+    steps, twists = np.zeros((len(REACH), count)), np.zeros((len(REACH), count, 6))
+    for row, offset in enumerate(REACH):
+        here = np.arange(max(0, -offset), count - max(0, offset))
+        apart = (times[here + offset] - times[here]) * np.sign(offset)
+        known = (apart > 0) & (apart <= LONGEST_STEP)
+        if worlds is not None:
+            known &= worlds[here + offset] == worlds[here]
+        here = here[known]
+        steps[row, here] = apart[known] * np.sign(offset)
+        twists[row, here] = se3.log(cam_from_world[here + offset] @ se3.inverse(cam_from_world[here]))
+    out = np.zeros((count, 6))
+    for row, step in enumerate(steps):
+        # Lagrange's weight of one of the poses in the derivative where all twists are zero.
+        others = [np.where(s != 0, s / np.where(s == step, 1.0, s - step), 1.0) for s in np.delete(steps, row, axis=0)]
+        weight = np.where(step != 0, np.prod(others, axis=0) / np.where(step != 0, step, 1.0), 0.0)
+        out += weight[:, None] * twists[row]
+    return out
+
+
+def straightened(bundle: Bundle, xy: Array, camera: Intrinsics, velocity: Array, readout: Readout) -> Bundle:
+    """The bundle with its observations where they would be in frames taken at once; xy (O, 2) are those in the frames,
+    velocity (N, 6) those of its cameras."""
+    seen = bundle.obs_cam, bundle.obs_point
+    return replace(
+        bundle, obs_xy=xy - _moved(bundle.cam_from_world, bundle.points, seen, xy, camera, velocity, readout)
+    )
+
+
+def straight_pixels(
+    cam_from_world: Array, points: Array, xy: Array, camera: Intrinsics, velocity: Array, readout: Readout
+) -> Array:
+    """(Q, 2) likewise, of one camera (4, 4) of velocity (6,) that sees points (Q, 3) at xy (Q, 2)."""
+    seen = np.zeros(len(xy), np.int64), np.arange(len(xy))
+    return xy - _moved(np.ascontiguousarray(cam_from_world)[None], points, seen, xy, camera, velocity[None], readout)
+
+
+def _moved(
+    cam_from_world: Array, points: Array, seen: tuple[NDArray[np.int64], NDArray[np.int64]], xy: Array,
+    camera: Intrinsics, velocity: Array, readout: Readout,
+) -> Array:  # fmt: skip
+    late = (xy / [camera.width, camera.height] - 0.5) @ np.array(readout)
+    return kernels.displacement(cam_from_world, points, camera.numbers, *seen, velocity, late)
+
+
+def estimate(bundle: Bundle, xy: Array, camera: Intrinsics, times: Array, direction: Readout) -> tuple[float, float]:
+    """By how much the readout in this `direction` (of one second) should grow, and the share of the robust cost by
+    which that lowers it; see `straightened` for the arguments.
+
+    One Gauss-Newton step of it together with all poses and points, which are eliminated. Since observations far off
+    weigh less, it falls short by a fixed share, and is repeated.
+    """
+    order = np.lexsort((bundle.obs_cam, bundle.obs_point))
+    bundle = bundle.select(order)
+    velocity, seen = velocities(bundle.cam_from_world, times), (bundle.obs_cam, bundle.obs_point)
+    moved = _moved(bundle.cam_from_world, bundle.points, seen, xy[order], camera, velocity, direction)
+    problem = Problem(bundle, camera)
+    blocks, cam_right, point_blocks, point_right, mixed = problem.linearise(bundle.cam_from_world, bundle.points)
+    cams, points, own, right = kernels.border(bundle.cam_from_world, bundle.points, *problem.data, moved)
+    solved = problem.solve((blocks, cams, point_blocks, points, mixed), 1e-7)
+    if solved is None:
+        return 0.0, 0.0
+    information = own - float((solved[0] * cams).sum() + (solved[1] * points).sum())
+    if not information > 1e-9 * own:
+        return 0.0, 0.0
+    step = (right - float((solved[0] * cam_right).sum() + (solved[1] * point_right).sum())) / information
+    return step, step**2 * information / max(problem.cost(bundle.cam_from_world, bundle.points), 1e-12)
+
+
+class RollingModel:
+    """A reconstruction, its keyframes' features xy (F, 2) in pixels and times (K,): image i + 1 is keyframe i."""
+
+    def __init__(self, model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array) -> None:
+        self.model = model
+        self.images = sorted(model.reg_image_ids())
+        self.xy, self.times = xy, times[[i - 1 for i in self.images]]
+
+    def seen(self, image_id: int) -> list[int]:
+        """Features that see a point."""
+        return [k for k, p in enumerate(self.model.images[image_id].points2D) if p.has_point3D()]
+
+    def bundle(self) -> tuple[Bundle, Array, Intrinsics]:
+        """In a pinhole's pixels, its observations as they stand in the model; and (O, 2), as they are in the frames."""
+        model, camera = self.model, self.model.cameras[1]
+        focal, half = camera.mean_focal_length(), np.array([camera.width, camera.height]) / 2
+        pinhole = Intrinsics(camera.width, camera.height, focal, focal, *half)
+        points = {p: k for k, p in enumerate(sorted(model.point3D_ids()))}
+        seen = [[model.images[i].points2D[k] for k in self.seen(i)] for i in self.images]
+        now = np.array([p.xy for row in seen for p in row]).reshape(-1, 2)
+        plain = np.concatenate([self.xy[i - 1][self.seen(i)] for i in self.images])
+        count = len(now)
+        bundle = Bundle(
+            np.array([np.vstack([model.images[i].cam_from_world().matrix(), [0, 0, 0, 1]]) for i in self.images]),
+            np.array([model.points3D[p].xyz for p in points]),
+            np.repeat(np.arange(len(seen)), [len(row) for row in seen]),
+            np.array([points[p.point3D_id] for row in seen for p in row], np.int64),
+            camera.cam_from_img(now) * focal + half,
+            np.full(count, _FEATURE_SD), np.zeros(count), np.ones(count),
+        )  # fmt: skip
+        return bundle, camera.cam_from_img(plain) * focal + half, pinhole
+
+    def straighten(self, readout: Readout) -> None:
+        """Put the model's observations where they would be in frames taken at once; without a readout, as they are."""
+        bundle, xy, pinhole = self.bundle()
+        velocity = velocities(bundle.cam_from_world, self.times)
+        now = straightened(bundle, xy, pinhole, velocity, readout).obs_xy
+        rays = (now - [pinhole.cx, pinhole.cy]) / pinhole.fx
+        pixels = iter(np.asarray(self.model.cameras[1].img_from_cam(np.column_stack([rays, np.ones(len(rays))]))))
+        for i in self.images:
+            points = self.model.images[i].points2D
+            for k in self.seen(i):
+                points[k].xy = next(pixels) if any(readout) else self.xy[i - 1][k]
+
+
+def find_readout(model: RollingModel) -> Readout:
+    """The readout along the axis that explains more, or none where that is less than LEAST_GAIN of the cost."""
+    bundle, xy, pinhole = model.bundle()
+    axes = ((1.0, 0.0), (0.0, 1.0))
+    found = [estimate(bundle, xy, pinhole, model.times, axis) for axis in axes]
+    (seconds, gain), axis = max(zip(found, axes, strict=True), key=lambda f: f[0][1])
+    return (axis[0] * seconds, axis[1] * seconds) if gain >= LEAST_GAIN else NO_READOUT
+
+
+def adjust_rolling(
+    model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout | None, refine_camera: bool
+) -> tuple[pycolmap.Reconstruction, Readout, float] | None:
+    """The model adjusted with the `readout` given, or found where it is None, and the standard deviation of its focal
+    length; None where there is no readout to speak of. The given model and its pixels stay as they are."""
+    rolling = RollingModel(pycolmap.Reconstruction(model), xy, times)
+    found = find_readout(rolling) if readout is None else readout
+    if not any(found):
+        return None
+    for _ in range(_ROUNDS):
+        rolling.straighten(found)
+        solve(rolling.model, rolling.images, refine_camera)
+        if readout is None:
+            bundle, plain, pinhole = rolling.bundle()
+            length = math.hypot(*found)
+            axis = found[0] / length, found[1] / length
+            step, _ = estimate(bundle, plain, pinhole, rolling.times, axis)
+            found = axis[0] * (length + step), axis[1] * (length + step)
+    rolling.straighten(found)
+    if refine_camera:
+        set_lens(rolling.model.cameras[1], 1)
+    focal_sd = adjust(rolling.model, refine_camera)
+    if readout is None and _cost(rolling.model) > (1 - LEAST_GAIN) * _cost(model):
+        return None
+    rolling.straighten(NO_READOUT)
+    return rolling.model, found, focal_sd
+
+
+def _cost(model: pycolmap.Reconstruction) -> float:
+    """Mean of Cauchy's loss over the observations."""
+    errors = reprojection_errors(model)
+    return float(np.log1p(np.where(np.isfinite(errors), errors, 10.0) ** 2).mean())
