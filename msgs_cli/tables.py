@@ -50,13 +50,18 @@ def status_table(stages: Sequence[StageStatus], everything: bool = False) -> str
     """One row a stage: state, seconds, peak memory, key figures or all of them."""
     rows = []
     for stage in stages:
+        expected = "" if stage.expected_mb is None else f"{stage.expected_mb:.0f}"
         if (record := stage.record) is None:
-            rows.append([stage.name, stage.state, "", "", ""])
+            rows.append([stage.name, stage.state, "", "", expected, ""])
             continue
         wanted = record.figures if everything else [k for k in KEY_FIGURES[stage.name] if k in record.figures]
         figures = ", ".join(f"{key} {format_figure(record.figures[key], key)}" for key in wanted)
-        rows.append([stage.name, stage.state, f"{record.seconds:.1f}", f"{record.peak_memory_mb:.0f}", figures])
-    return format_table(["stage", "state", "seconds", "peak MB", "figures"], rows, terminal_width())
+        rows.append(
+            [stage.name, stage.state, f"{record.seconds:.1f}", f"{record.peak_memory_mb:.0f}", expected, figures]
+        )
+    header = ["stage", "state", "seconds", "peak MB", "expected MB", "figures"]
+    shown = [n for n in range(len(header)) if n != 4 or any(row[n] for row in rows)]
+    return format_table([header[n] for n in shown], [[row[n] for n in shown] for row in rows], terminal_width())
 
 
 def format_figure(value: Any, key: str = "") -> str:

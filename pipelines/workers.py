@@ -77,11 +77,14 @@ def work_here(
     progress = prepare(name)
     try:
         require_same_world([folder], code)
-        set_threads(threads)
+    except InputError as error:
+        return str(error), None
+    set_threads(threads)
+    try:
         with watched_by(Journal(folder)), own_temporaries():
             return "", work(task, progress)
     except InputError as error:
-        return str(error), None
+        return f"on the node {platform.node()}: {error}", None
 
 
 def require_same_world(folders: Sequence[Path], code: str) -> None:

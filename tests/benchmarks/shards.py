@@ -28,8 +28,8 @@ from pipelines.demo import unpack_demo_clip
 from pipelines.run_folder_names import STAGES
 
 SETTINGS = (
-    "run.threads=1", "frames.max_features=600", "proxy.stereo_side=96", "proxy.stereo_planes=24", "mapping.passes=1",
-    "mapping.min_iterations=20", "mapping.max_side=160", "mapping.submap=6", "export.voxel=0.03",
+    "run.threads=1", "frames.rate=4", "frames.max_features=600", "proxy.stereo_side=96", "proxy.stereo_planes=24",
+    "mapping.passes=1", "mapping.min_iterations=20", "mapping.max_side=160", "mapping.submap=6", "export.voxel=0.03",
 )  # fmt: skip
 
 

@@ -123,3 +123,11 @@ def test_second_process_removes_nothing(tmp_path: Path, finished_run: FinishedRu
     with pytest.raises(InputError), locked(run):
         raise InputError("no")
     assert run.root.exists()
+
+
+def test_status_tells_the_memory_that_a_stage_may_need(finished_run: FinishedRun) -> None:
+    """Of runs of that size: the tests' own process holds more besides."""
+    stages = json.loads(invoke("status", finished_run.folder, "--json").stdout)["stages"]
+    for stage in stages:
+        assert stage["record"]["peak_memory_mb"] / 5 < stage["expected_mb"] < 1000
+    assert "expected MB" in invoke("status", finished_run.folder).stdout

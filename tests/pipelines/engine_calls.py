@@ -1,10 +1,12 @@
 """What the engines' tests call: it has to be importable where the calls run."""
 
 import os
+import resource
 import signal
 import time
 from pathlib import Path
 
+from formats.atomic import write_bytes
 from formats.errors import InputError
 from pipelines.progress import SilentProgress
 
@@ -46,6 +48,13 @@ def halve(value: int, progress: SilentProgress) -> int:
     if value % 2:
         raise InputError(f"{value} is odd")
     return value // 2
+
+
+def fill_disk(path: Path, progress: SilentProgress) -> None:
+    """In a process that may write files of a kilobyte only."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+    write_bytes(path, bytes(100_000))
 
 
 def halve_slowly(value: int, progress: SilentProgress) -> int:
