@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from formats.errors import InputError
 from pipelines.geometry import se3
 from pipelines.structure import bundle_kernels as kernels
-from pipelines.structure.adjust import adjust, reprojection_errors, solve
+from pipelines.structure.adjust import adjust, solve
 from pipelines.structure.bundle import Bundle, Problem
-from pipelines.structure.lens import set_lens
 from pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
@@ -119,8 +118,8 @@ def _moved(
 
 
 def estimate(bundle: Bundle, xy: Array, camera: Intrinsics, times: Array, direction: Readout) -> tuple[float, float]:
-    """By how much the readout in this `direction` (of one second) should grow, and the share of the robust cost by
-    which that lowers it; see `straightened` for the arguments.
+    """By how much the readout in this `direction` (of one second) should grow, and the share of the robust cost that a
+    second of it makes: it grows by the square. See `straightened` for the arguments.
 
     One Gauss-Newton step of it together with all poses and points, which are eliminated. Since observations far off
     weigh less, it falls short by a fixed share, and is repeated.
@@ -139,7 +138,7 @@ def estimate(bundle: Bundle, xy: Array, camera: Intrinsics, times: Array, direct
     if not information > 1e-9 * own:
         return 0.0, 0.0
     step = (right - float((solved[0] * cam_right).sum() + (solved[1] * point_right).sum())) / information
-    return step, step**2 * information / max(problem.cost(bundle.cam_from_world, bundle.points), 1e-12)
+    return step, information / max(problem.cost(bundle.cam_from_world, bundle.points), 1e-12)
 
 
 class RollingModel:
@@ -174,6 +173,11 @@ class RollingModel:
         )  # fmt: skip
         return bundle, camera.cam_from_img(plain) * focal + half, pinhole
 
+    def estimate(self, axis: Readout) -> tuple[float, float]:
+        """See `estimate`."""
+        bundle, xy, pinhole = self.bundle()
+        return estimate(bundle, xy, pinhole, self.times, axis)
+
     def straighten(self, readout: Readout) -> None:
         """Put the model's observations where they would be in frames taken at once; without a readout, as they are."""
         bundle, xy, pinhole = self.bundle()
@@ -187,44 +191,36 @@ class RollingModel:
                 points[k].xy = next(pixels) if any(readout) else self.xy[i - 1][k]
 
 
-def find_readout(model: RollingModel) -> Readout:
-    """The readout along the axis that explains more, or none where that is less than LEAST_GAIN of the cost."""
-    bundle, xy, pinhole = model.bundle()
-    axes = ((1.0, 0.0), (0.0, 1.0))
-    found = [estimate(bundle, xy, pinhole, model.times, axis) for axis in axes]
-    (seconds, gain), axis = max(zip(found, axes, strict=True), key=lambda f: f[0][1])
-    return (axis[0] * seconds, axis[1] * seconds) if gain >= LEAST_GAIN else NO_READOUT
-
-
 def adjust_rolling(
     model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout | None, refine_camera: bool
 ) -> tuple[pycolmap.Reconstruction, Readout, float] | None:
     """The model adjusted with the `readout` given, or found where it is None, and the standard deviation of its focal
-    length; None where there is no readout to speak of. The given model and its pixels stay as they are."""
-    rolling = RollingModel(pycolmap.Reconstruction(model), xy, times)
-    found = find_readout(rolling) if readout is None else readout
-    if not any(found):
+    length; None where there is no readout, or where the one found explains too little. The model given stays as it is,
+    and pixels are those in the frames before and after."""
+    axis, seconds = NO_READOUT, 0.0
+    rolling = RollingModel(model, xy, times)
+    if readout is None:
+        (seconds, share), axis = max(
+            ((rolling.estimate(axis), axis) for axis in ((1.0, 0.0), (0.0, 1.0))), key=lambda f: f[0][0] ** 2 * f[0][1]
+        )
+        if seconds**2 * share < LEAST_GAIN:
+            return None
+    elif any(readout):
+        seconds = math.hypot(*readout)
+        axis = readout[0] / seconds, readout[1] / seconds
+    else:
         return None
+    rolling = RollingModel(pycolmap.Reconstruction(model), xy, times)
     for _ in range(_ROUNDS):
-        rolling.straighten(found)
+        rolling.straighten((axis[0] * seconds, axis[1] * seconds))
         solve(rolling.model, rolling.images, refine_camera)
         if readout is None:
-            bundle, plain, pinhole = rolling.bundle()
-            length = math.hypot(*found)
-            axis = found[0] / length, found[1] / length
-            step, _ = estimate(bundle, plain, pinhole, rolling.times, axis)
-            found = axis[0] * (length + step), axis[1] * (length + step)
-    rolling.straighten(found)
-    if refine_camera:
-        set_lens(rolling.model.cameras[1], 1)
-    focal_sd = adjust(rolling.model, refine_camera)
-    if readout is None and _cost(rolling.model) > (1 - LEAST_GAIN) * _cost(model):
+            step, share = rolling.estimate(axis)
+            seconds += step
+    if readout is None and seconds**2 * share < LEAST_GAIN:
         return None
+    found = axis[0] * seconds, axis[1] * seconds
+    rolling.straighten(found)
+    focal_sd = adjust(rolling.model, refine_camera)
     rolling.straighten(NO_READOUT)
     return rolling.model, found, focal_sd
-
-
-def _cost(model: pycolmap.Reconstruction) -> float:
-    """Mean of Cauchy's loss over the observations."""
-    errors = reprojection_errors(model)
-    return float(np.log1p(np.where(np.isfinite(errors), errors, 10.0) ** 2).mean())

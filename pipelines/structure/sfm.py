@@ -79,6 +79,7 @@ class _Adjusted:
     mapper: str
     focal_sd: float
     score: float
+    readout: Readout
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,8 @@ class StructureFromMotion:
         xy = [f.xy for f in features]
         known_focal = self.camera.mean_focal_length() if self.camera.has_prior_focal_length else None
         require_parallax(pairs, xy, (self.camera.width, self.camera.height), known_focal)
-        found = self._adjusted(features, pairs, ("global", "incremental"))
+        times = np.array([self.time(k) for k in keyframe_ids])
+        found = self._adjusted(features, pairs, ("global", "incremental"), times)
         if found is None:
             raise InputError(
                 f"no structure could be found: {len(pairs)} pairs of {len(features)} views match. The views have too "
@@ -117,28 +119,34 @@ class StructureFromMotion:
             )
         if found.focal_sd > _UNSURE_FOCAL * found.model.cameras[1].mean_focal_length():
             # A lens that is bent before the poses stand can run away with the focal length.
-            again = self._adjusted(features, pairs, (LENS_HELD,))
+            again = self._adjusted(features, pairs, (LENS_HELD,), times)
             if again is not None and again.focal_sd < found.focal_sd and again.score >= _AS_GOOD * found.score:
                 found = again
-        found, pieces = self._largest_first(found, self._pieces(features, pairs, found.model))
-        found, pieces, readout = self._rolling(found, pieces, xy, np.array([self.time(k) for k in keyframe_ids]))
+        found, pieces = self._largest_first(found, self._pieces(features, pairs, found.model), xy, times)
         report = judge(found.model, pairs, xy, self._places(features), self.config.overlap)
         cut(found.model, report.parts, report.total)
         return Structure(
-            found.model, report, found.mapper, found.focal_sd, features, vocabulary, tried, pairs, pieces, readout
+            found.model, report, found.mapper, found.focal_sd, features, vocabulary, tried, pairs, pieces, found.readout
         )
 
     def _places(self, features: Sequence[Features]) -> int:
         return len(features) // len(self.cam_from_rig)
 
     def _adjusted(
-        self, features: Sequence[Features], pairs: Sequence[VerifiedPair], mappers: Sequence[str]
-    ) -> _Adjusted | None:
+        self, features: Sequence[Features], pairs: Sequence[VerifiedPair], mappers: Sequence[str],
+        times: NDArray[np.float64],
+    ) -> _Adjusted | None:  # fmt: skip
+        """The best model, its camera calibrated unless it is fixed; with the readout of a rolling shutter, where one is
+        given or the model shows it."""
         found = self._map(features, pairs, mappers)
         if found is None:
             return None
         model, mapper, report = found
-        return _Adjusted(model, mapper, adjust(model, refine_camera=not self.is_fixed), report.score)
+        readout = NO_READOUT if len(self.cam_from_rig) > 1 else read_readout(self.config.rolling_shutter)
+        rolling = adjust_rolling(model, [f.xy for f in features], times, readout, not self.is_fixed)
+        if rolling is not None:
+            return _Adjusted(rolling[0], mapper, rolling[2], report.score, rolling[1])
+        return _Adjusted(model, mapper, adjust(model, refine_camera=not self.is_fixed), report.score, NO_READOUT)
 
     def _pieces(
         self, features: Sequence[Features], pairs: Sequence[VerifiedPair], model: pycolmap.Reconstruction
@@ -175,15 +183,16 @@ class StructureFromMotion:
         return len(report.parts[0]) >= self.config.least_piece and report.is_consistent
 
     def _largest_first(
-        self, found: _Adjusted, pieces: list[pycolmap.Reconstruction]
-    ) -> tuple[_Adjusted, list[pycolmap.Reconstruction]]:
-        """The largest model, which calibrates the camera of all where it is surer of it, and the others."""
+        self, found: _Adjusted, pieces: list[pycolmap.Reconstruction], xy: Sequence[NDArray[np.float64]],
+        times: NDArray[np.float64],
+    ) -> tuple[_Adjusted, list[pycolmap.Reconstruction]]:  # fmt: skip
+        """The largest model, which calibrates the camera of all where it is surer of it, and the others; all with the
+        readout of the first."""
         models = [found.model, *pieces]
         largest = max(models, key=lambda m: m.num_reg_images())
-        if largest is found.model:
-            return found, pieces
+        done = largest if largest is found.model else None
         others = [m for m in models if m is not largest]
-        if not self.is_fixed:
+        if done is None and not self.is_fixed:
             again = pycolmap.Reconstruction(largest)
             set_lens(again.cameras[1], 1)
             if (focal_sd := adjust(again, refine_camera=True)) < found.focal_sd:
@@ -191,26 +200,14 @@ class StructureFromMotion:
                 for other in others:
                     other.cameras[1].params = again.cameras[1].params.tolist()
                     adjust(other, refine_camera=False)
-        return replace(found, model=largest), others
 
-    def _rolling(
-        self, found: _Adjusted, pieces: list[pycolmap.Reconstruction], xy: Sequence[NDArray[np.float64]],
-        times: NDArray[np.float64],
-    ) -> tuple[_Adjusted, list[pycolmap.Reconstruction], Readout]:  # fmt: skip
-        """All models adjusted with the readout of a rolling shutter, where one is given or the first model shows it."""
-        wanted = read_readout(self.config.rolling_shutter)
-        if len(self.cam_from_rig) > 1 or wanted == NO_READOUT:
-            return found, pieces, NO_READOUT
-        settled = adjust_rolling(found.model, xy, times, wanted, not self.is_fixed)
-        if settled is None:
-            return found, pieces, NO_READOUT
-        model, readout, focal_sd = settled
-        others = []
-        for piece in pieces:
-            piece.cameras[1].params = model.cameras[1].params.tolist()
-            again = adjust_rolling(piece, xy, times, readout, refine_camera=False)
-            others.append(piece if again is None else again[0])
-        return replace(found, model=model, focal_sd=focal_sd), others, readout
+        def rolled(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+            if model is done:
+                return model
+            again = adjust_rolling(model, xy, times, found.readout, refine_camera=False)
+            return model if again is None else again[0]
+
+        return replace(found, model=rolled(largest)), [rolled(m) for m in others]
 
     def _features(self, keyframe_ids: Sequence[int]) -> Streamed[Features]:
         def stored(frame_id: int) -> Features:

@@ -9,7 +9,7 @@ import numpy as np
 
 from formats.errors import InputError
 from pipelines.geometry.rig import Rig, rig_of
-from pipelines.run_folder import RunFolder, save_depth_fields, save_figures, save_sparse, save_trajectory
+from pipelines.run_folder import save_depth_fields, save_figures, save_sparse, save_trajectory
 from pipelines.stages import Stage, StageContext
 from pipelines.stopping import is_asked
 from pipelines.structure.rolling import Shutter
@@ -88,32 +88,23 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
         if state.done % every == 0 or is_asked():
             state.save(snapshot)
     settle_places(state)
-    add_pieces(state, context.run, context.config.frames.least_piece)
     # Frames before the first keyframe could not be followed from anywhere; now there are neighbours behind them.
     for frame_id in sorted(state.lost, reverse=True):
-        front_end.track(frame_id, may_start=False)
-    for frame_id in sorted(state.lost) if context.run.pieces("frames") else ():
         front_end.track(frame_id, may_start=False)
     join_segments(state, pictures, context.config.run.seed)
     settle_places(state)
     return state
 
 
-def add_pieces(state: TrackState, run: RunFolder, least: int) -> None:
-    """What structure from motion could place only among itself, and nothing has placed since, as further segments."""
-    for piece in run.pieces("frames"):
-        model = TrackState.from_backbone(run.load_sparse("frames", piece), FEATURE_SD)
-        if sum(k not in state.poses for k in model.keyframes) >= least:
-            state.add_segment(model)
-
-
 def start_state(context: StageContext, rig: Rig, shutter: Shutter) -> TrackState:
-    """The backbone, its parts as segments, or nothing yet."""
+    """The backbone, its parts and what structure from motion could place only among itself as segments, or nothing."""
     backbone = context.run.load_backbone()
     if backbone is None:
         return TrackState(rig=rig, shutter=shutter)
     state = TrackState.from_backbone(backbone, FEATURE_SD, rig, shutter)
     split_segments(state)
+    for piece in context.run.pieces("frames"):
+        state.add_segment(TrackState.from_backbone(context.run.load_sparse("frames", piece), FEATURE_SD))
     return state
 
 

@@ -99,13 +99,13 @@ def test_readout_is_found_in_closed_form_and_only_where_there_is_one() -> None:
     at_once, _ = seen_by(0.0)
     settled = adjust_bundle(at_once, CAMERA).bundle
     for axis in ((1.0, 0.0), (0.0, 1.0)):
-        seconds, gain = estimate(settled, settled.obs_xy, CAMERA, TIMES, axis)
+        seconds, share = estimate(settled, settled.obs_xy, CAMERA, TIMES, axis)
         assert abs(seconds) < 0.001
-        assert gain < LEAST_GAIN / 10
+        assert seconds**2 * share < LEAST_GAIN / 10
     rolling = adjust_bundle(seen_by(READOUT)[0], CAMERA).bundle
-    seconds, gain = estimate(rolling, rolling.obs_xy, CAMERA, TIMES, (0.0, 1.0))
+    seconds, share = estimate(rolling, rolling.obs_xy, CAMERA, TIMES, (0.0, 1.0))
     assert 0.6 * READOUT < seconds < 1.1 * READOUT
-    assert gain > 0.3
+    assert seconds**2 * share > 0.3
 
 
 def test_model_is_adjusted_with_the_readout_and_keeps_its_pixels() -> None:
