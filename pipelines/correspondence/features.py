@@ -19,6 +19,8 @@ _of_thread = threading.local()
 
 PEAK_THRESHOLD = 0.004
 """Contrast of the weakest feature; lower finds more on plain walls."""
+_SUPPORT = 2.0
+"""Of a feature's scale: nearer to a mask than this, what moves there has a part in where it lies."""
 
 
 def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -35,7 +37,8 @@ def extract_features(
     """SIFT features (Lowe 2004) of an (H, W) picture, at most about `count`, as RootSIFT (Arandjelović and Zisserman,
     CVPR 2012).
 
-    `threshold` is the least contrast, as a share of the range of grey. None lies in the mask `left_out` (H, W).
+    `threshold` is the least contrast, as a share of the range of grey. None lies in the mask `left_out` (H, W), nor
+    reaches into it.
     """
     require_shape("grey", grey, (None, None))
     keypoints, found = _extractor(count, threshold).extract_from_uint8_array(np.ascontiguousarray(grey))
@@ -44,7 +47,8 @@ def extract_features(
     table, descriptors = pycolmap.keypoints_to_matrix(keypoints), np.asarray(found.data, dtype=np.uint8)
     if left_out is not None:
         column, row = table[:, :2].astype(np.int64).T
-        kept = ~left_out[row.clip(0, left_out.shape[0] - 1), column.clip(0, left_out.shape[1] - 1)]
+        away = cv2.distanceTransform((~left_out).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        kept = away[row.clip(0, away.shape[0] - 1), column.clip(0, away.shape[1] - 1)] > _SUPPORT * table[:, 2]
         table, descriptors = table[kept], descriptors[kept]
     return Features(table, descriptors)
 

@@ -180,7 +180,10 @@ def test_features_are_one_a_place_and_none_is_in_the_mask() -> None:
     right = np.arange(WIDTH)[None].repeat(HEIGHT, 0) >= WIDTH // 2
     masked = extract_features(grey, 400, right)
     assert 50 < len(masked) < len(all_of_it)
-    assert masked.xy[:, 0].max() < WIDTH // 2
+    away = WIDTH // 2 - masked.xy[:, 0]
+    assert (away > 2 * masked.keypoints[:, 2] - 1).all(), "what moves has no part in where a feature lies"
+    near = (all_of_it.xy[:, 0] < WIDTH // 2) & (WIDTH // 2 - all_of_it.xy[:, 0] < 2 * all_of_it.keypoints[:, 2] - 1)
+    assert near.any(), "without that, some would lie there"
 
 
 def _sliding(step: float, count: int) -> list[tuple[np.ndarray, None]]:
