@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from pipelines.config import ArticleConfig, MappingConfig
-from pipelines.gaussians.adam import AdamTable
 from pipelines.gaussians.render import Rendering
 from pipelines.mapping import losses
 from pipelines.mapping.article.boundary_clip import clip_beside_boundary
@@ -21,7 +20,6 @@ SILHOUETTE_WEIGHT = 0.05
 """Of the pressure towards an opaque map."""
 LABEL_EVERY = 2
 """The semantic terms cost as much as all others together: they count at every second step, twice."""
-_EXPOSURE_PULL = 0.1
 
 
 @dataclass(frozen=True)
@@ -38,14 +36,14 @@ class Objective:
         wanted = max(self.settings.label_weight, self.article.edge_weight, self.article.symmetry_weight) > 0
         return self.classes > 0 and wanted and iteration % LABEL_EVERY == 0
 
-    def of(self, view: View, table: AdamTable, rendering: Rendering, log_radii: Tensor, with_labels: bool) -> Tensor:
-        """Scalar; `table` holds the view's exposure, `log_radii` (M,) the map's."""
+    def of(self, view: View, exposure: Tensor, rendering: Rendering, log_radii: Tensor, with_labels: bool) -> Tensor:
+        """Scalar; `exposure` (2, 3) is the view's, `log_radii` (M,) the map's."""
         s, article = self.settings, self.article
         if article.boundary_clip > 0:
             clip_beside_boundary(rendering.features, view.channels, article.boundary_clip)
         # split, not slices: the gradient of each slice would be a whole image of zeros around it.
         shown, logits = rendering.features.split([3, rendering.features.shape[-1] - 3], dim=-1)
-        loss = photo_loss(shown, table.values["log_gain"], table.values["offset"], view.image, view.scene)
+        loss = photo_loss(shown, exposure, view.image, view.scene)
         loss = loss + SILHOUETTE_WEIGHT * losses.silhouette_loss(view.of_scene(rendering.silhouette, 1.0))
         loss = loss + losses.size_loss(log_radii, self.unit)
         if s.depth_weight > 0 and s.use_proxy_depth:
@@ -55,9 +53,7 @@ class Objective:
             loss = loss + article.symmetry_weight * symmetry_loss(rendering.depth, view.mirrors, self.unit)
         if with_labels:
             loss = loss + LABEL_EVERY * self._semantic(view, rendering.depth, logits)
-        # Exposures are relative: without a pull to zero they and the colours drift together.
-        values = table.values
-        return loss + _EXPOSURE_PULL * (values["log_gain"].square().sum() + values["offset"].square().sum())
+        return loss
 
     def _semantic(self, view: View, depth: Tensor, logits: Tensor) -> Tensor:
         """Labels, and what the article has beside them."""

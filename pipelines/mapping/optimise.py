@@ -14,12 +14,13 @@ from pipelines.config import ArticleConfig, MappingConfig
 from pipelines.gaussian_map import GaussianMap
 from pipelines.gaussians.adam import AdamTable, gradients_of
 from pipelines.gaussians.render import Rendering, blending_weights, in_view, render
+from pipelines.mapping.exposure import SOLID, expose, fit_exposure
 from pipelines.mapping.growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
 from pipelines.mapping.objective import Objective
 from pipelines.mapping.parameters import COLOR_KEYS, KEYS
 from pipelines.mapping.schedule import Schedule, Seeding, Step
 from pipelines.mapping.splitting import Blame, blame
-from pipelines.mapping.state import Exposures, OptimisedMap, OptimiserState, expose
+from pipelines.mapping.state import Exposures, OptimisedMap, OptimiserState
 from pipelines.mapping.views import View, halved
 from pipelines.progress import Progress, SilentProgress
 from pipelines.stopping import is_asked
@@ -29,8 +30,8 @@ MAP_RATES = {"means": 0.1, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 
 """Learning rates of Adam, of positions in radii of the Gaussian: what is small has to be placed finely."""
 HALVES_ROOM = 250e6
 """Bytes of views at half the size that are kept; to halve one takes a hundredth of a visit."""
-POSE_RATE, EXPOSURE_RATE = 1e-4, 1e-2
-"""Of rotations (radians) and translations (times the median depth); of gains and offsets."""
+POSE_RATE = 1e-4
+"""Of rotations (radians) and translations (times the median depth)."""
 LOW_TRUST_STEP = 4.0
 """Steps of Gaussians of unreliable depth are so many times as large, of medium ones by its root."""
 
@@ -103,11 +104,15 @@ class MapOptimiser:
         rows = in_view(parameters["means"].detach(), radii, pose, view.intrinsics)
         values = {k: parameters[k].detach()[rows].requires_grad_() for k in (KEYS if with_classes else COLOR_KEYS)}
         rendering = self.draw(view, table, values)
-        loss = self.objective.of(view, table, rendering, values["log_radii"], with_labels) * step.weight
+        if self.settings.exposure:
+            self._expose(step.view, view, rendering)
+        exposure = self.state.exposures[step.view]
+        loss = self.objective.of(view, exposure, rendering, values["log_radii"], with_labels) * step.weight
         of_map, of_view = gradients_of(loss, (values, table.values))
         rates = {key: rate * step.rate for key, rate in MAP_RATES.items()}
         parameters.table.step(of_map, rates, self._shares(rows, values["log_radii"].detach()), rows)
-        table.step(of_view, self._view_rates(step))
+        refines = self.settings.refine_poses and step.refine_pose
+        table.step(of_view, {"twist": POSE_RATE * step.rate if refines else 0.0})
         if step.grow:
             self.growth.grow(step.view, Rendering(*(x.detach() for x in vars(rendering).values())))
         if step.split and self.settings.split_error > 0:
@@ -135,7 +140,13 @@ class MapOptimiser:
     def _color_errors(self, index: int, colors: Tensor) -> Tensor:
         """(H, W) mean difference between the view's photo and the (H, W, 3) colours of the map."""
         view = self.views[index]
-        return view.of_scene((expose(colors, self.state.view_tables[index]) - view.colors).abs().mean(-1))
+        return view.of_scene((expose(colors, self.state.exposures[index]) - view.colors).abs().mean(-1))
+
+    def _expose(self, index: int, view: View, rendering: Rendering) -> None:
+        """The view's exposure by what the map shows of it now."""
+        known, shown = view.of_scene(rendering.silhouette.detach()) > SOLID, rendering.features.detach()[..., :3]
+        exposure = self.state.exposures[index]
+        exposure.copy_(fit_exposure(shown, view.colors, known, exposure))
 
     def _blending_weights(self) -> Tensor:
         """(M,) the largest weight with which each Gaussian stands in any pixel of any view. What stands only where
@@ -176,15 +187,6 @@ class MapOptimiser:
         shares = torch.where(trust > LOW_RELIABILITY, math.sqrt(LOW_TRUST_STEP), LOW_TRUST_STEP)
         shares = torch.where(trust > HIGH_RELIABILITY, 1.0, shares)
         return {**dict.fromkeys(KEYS, shares), "means": shares * torch.exp(log_radii)}
-
-    def _view_rates(self, step: Step) -> dict[str, float]:
-        s = self.settings
-        poses = s.refine_poses and step.refine_pose
-        return {
-            "twist": POSE_RATE * step.rate if poses else 0.0,
-            "log_gain": EXPOSURE_RATE * step.rate if s.exposure else 0.0,
-            "offset": EXPOSURE_RATE * step.rate if s.exposure else 0.0,
-        }
 
 
 def scene_depth(views: Sequence[View]) -> float:

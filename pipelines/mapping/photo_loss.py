@@ -15,6 +15,7 @@ from pipelines.gaussians.render.jit import inner, kernel
 from pipelines.gaussians.render.lanes import counting, load, splat, store, total, where
 from pipelines.gaussians.render.threads import for_each
 from pipelines.gaussians.ssim import C1, C2, blur_array, ssim_map
+from pipelines.mapping.exposure import expose
 
 SSIM_WEIGHT = 0.2
 """Share of 1 - SSIM in eq. (20)."""
@@ -23,22 +24,22 @@ _ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
 _C1, _C2, _SHARE = np.float32(C1), np.float32(C2), np.float32(SSIM_WEIGHT)
 
 
-def photo_loss(shown: Tensor, log_gain: Tensor, offset: Tensor, photo: Tensor, scene: Tensor | None = None) -> Tensor:
-    """(1 - w) |C - I| + w (1 - SSIM), mean over the picture, with C = shown * exp(log_gain) + offset.
+def photo_loss(shown: Tensor, exposure: Tensor, photo: Tensor, scene: Tensor | None = None) -> Tensor:
+    """(1 - w) |C - I| + w (1 - SSIM), mean over the picture, with C = shown * exp(exposure[0]) + exposure[1].
 
-    shown (H, W, 3) 0..1, log_gain and offset (3,), photo (H, W, 3) uint8; differentiable in the first three. Where
+    shown (H, W, 3) 0..1, exposure (2, 3), photo (H, W, 3) uint8; differentiable in the first. Where
     scene (H, W) is False the photo is no part of the scene: there it looks as the map does, and asks for nothing.
     The article prints ω = 0.2 before the absolute difference; the weights of 3DGS, which has the same formula, are the
     other way round, and so are the ones here. float32 on a CPU takes compiled loops, everything else plain torch.
     """
     if shown.device.type == "cpu" and shown.dtype == torch.float32:
-        return _PhotoLoss.apply(shown, log_gain, offset, photo, scene)
-    return plain_photo_loss(shown, log_gain, offset, photo, scene)
+        return _PhotoLoss.apply(shown, exposure, photo, scene)
+    return plain_photo_loss(shown, exposure, photo, scene)
 
 
-def plain_photo_loss(shown: Tensor, log_gain: Tensor, offset: Tensor, photo: Tensor, scene: Tensor | None) -> Tensor:
+def plain_photo_loss(shown: Tensor, exposure: Tensor, photo: Tensor, scene: Tensor | None) -> Tensor:
     """The same by torch's own functions."""
-    colors, target = shown * torch.exp(log_gain) + offset, photo.to(shown.dtype) / 255
+    colors, target = expose(shown, exposure), photo.to(shown.dtype) / 255
     if scene is not None:
         beside = colors.detach()
         colors, target = (torch.where(scene[..., None], x, beside) for x in (colors, target))
@@ -54,17 +55,15 @@ def _room(planes: int, size: int) -> tuple[NDArray[np.float32], NDArray[np.float
 
 class _PhotoLoss(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, shown: Tensor, log_gain: Tensor, offset: Tensor, photo: Tensor, scene: Tensor | None
-    ) -> Tensor:
+    def forward(ctx: Any, shown: Tensor, exposure: Tensor, photo: Tensor, scene: Tensor | None) -> Tensor:
         # Rendered colours may be a slice of more features: the loops take them as they lie.
         picture, target = shown.detach().numpy(), photo.numpy()
         mask = None if scene is None else scene.numpy()
-        exposure = np.stack([np.exp(log_gain.detach().numpy()), offset.detach().numpy()]).astype(np.float32)
+        gain_offset = torch.stack([exposure[0].exp(), exposure[1]]).numpy()
         height, width = target.shape[:2]
         bands, shape = -(-height // _ROWS), target.shape
         planes, moments = _room(5, bands * _ROWS * width * 3)
-        sums = np.zeros((bands, 8))
+        sums = np.zeros((bands, 2))
 
         def blur(first: int) -> None:
             for k in range(first, 5):
@@ -80,7 +79,7 @@ class _PhotoLoss(torch.autograd.Function):
         def work(kernel_: Any, *arrays: NDArray) -> None:
             for_each(
                 lambda b: kernel_(
-                    picture[rows(b)], target[rows(b)], of_scene(b), exposure, b * _ROWS * width * 3, planes, *arrays,
+                    picture[rows(b)], target[rows(b)], of_scene(b), gain_offset, b * _ROWS * width * 3, planes, *arrays,
                     sums[b],
                 ),
                 bands,
@@ -92,16 +91,14 @@ class _PhotoLoss(torch.autograd.Function):
         gradient = np.empty(shape, np.float32)
         blur(2)
         work(_differentiate, moments, gradient)
-        difference, likeness, *by_exposure = sums.sum(0) / target.size
-        ctx.save_for_backward(torch.from_numpy(gradient), torch.tensor(by_exposure, dtype=torch.float32))
+        difference, likeness = sums.sum(0) / target.size
+        ctx.save_for_backward(torch.from_numpy(gradient))
         loss = (1 - SSIM_WEIGHT) * difference + SSIM_WEIGHT * (1 - likeness)
         return torch.tensor(loss, dtype=torch.float32)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        gradient, by_exposure = ctx.saved_tensors
-        by_gain, by_offset = (by_exposure * grads[0]).split(3)
-        return gradient * grads[0], by_gain, by_offset, None, None
+        return ctx.saved_tensors[0] * grads[0], None, None, None
 
 
 @kernel
@@ -172,28 +169,16 @@ def _differentiate(
     gradient: NDArray[np.float32],
     sums: NDArray[np.float64],
 ) -> None:
-    """A band's gradient by what was shown, and n times that by log gains and offsets."""
+    """A band's gradient by what was shown."""
     height, width, _ = shown.shape
     size, flat, blurs = planes.shape[1], planes.reshape(-1), blurred.reshape(-1)
     each, first = np.float32(1 / gradient.size), start // (3 * width)
-    red_gain, green_gain, blue_gain = exposure[0, 0], exposure[0, 1], exposure[0, 2]
     for y in range(height):
-        d_red, d_green, d_blue, o_red, o_green, o_blue = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
         for x in range(width):
-            if scene is not None and not scene[y, x]:
-                for c in range(3):
-                    gradient[first + y, x, c] = _ZERO
-                continue
-            i = start + 3 * (y * width + x)
-            red, green = _gradient_at(flat, blurs, i, size), _gradient_at(flat, blurs, i + 1, size)
-            blue = _gradient_at(flat, blurs, i + 2, size)
-            o_red, o_green, o_blue = o_red + red, o_green + green, o_blue + blue
-            red, green, blue = red * red_gain, green * green_gain, blue * blue_gain
-            row, out = shown[y, x], gradient[first + y, x]
-            d_red, d_green, d_blue = d_red + red * row[0], d_green + green * row[1], d_blue + blue * row[2]
-            out[0], out[1], out[2] = red * each, green * each, blue * each
-        for c, value in enumerate((d_red, d_green, d_blue, o_red, o_green, o_blue)):
-            sums[2 + c] += value
+            out, i = gradient[first + y, x], start + 3 * (y * width + x)
+            is_scene = scene is None or scene[y, x]
+            for c in range(3):
+                out[c] = _gradient_at(flat, blurs, i + c, size) * (exposure[0, c] * each) if is_scene else _ZERO
 
 
 @inner

@@ -18,7 +18,7 @@ from pipelines.geometry import se3
 from pipelines.mapping.parameters import MapParameters, empty_map
 from pipelines.mapping.views import View
 
-VIEW_KEYS = ("twist", "log_gain", "offset")
+VIEW_KEYS = ("twist",)
 
 Exposures = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Log gains and offsets, (N, 3) each."""
@@ -37,10 +37,11 @@ class OptimisedMap:
 
 @dataclass
 class OptimiserState:
-    """The map's parameters, each view's twist and exposure, and the number of steps done."""
+    """The map's parameters, each view's twist, the exposures (N, 2, 3) of all views, and the number of steps done."""
 
     parameters: MapParameters
     view_tables: list[AdamTable]
+    exposures: Tensor
     iteration: int = 0
 
     @staticmethod
@@ -49,18 +50,11 @@ class OptimiserState:
     ) -> OptimiserState:
         """No step done: the given map or an empty one, the views where they are."""
         device = views[0].image.device
-        gains, offsets = exposure or (np.zeros((len(views), 3), np.float32), np.zeros((len(views), 3), np.float32))
-        tables = [
-            AdamTable(
-                {
-                    "twist": torch.zeros(6, device=device),
-                    "log_gain": torch.as_tensor(g, dtype=torch.float32, device=device),
-                    "offset": torch.as_tensor(o, dtype=torch.float32, device=device),
-                }
-            )
-            for g, o in zip(gains, offsets, strict=True)
-        ]
-        return OptimiserState(MapParameters.from_map(initial or empty_map(classes, device)), tables)
+        exposures = torch.zeros(len(views), 2, 3, device=device)
+        if exposure is not None:
+            exposures = torch.as_tensor(np.stack(exposure, axis=1), dtype=torch.float32, device=device)
+        tables = [AdamTable({"twist": torch.zeros(6, device=device)}) for _ in views]
+        return OptimiserState(MapParameters.from_map(initial or empty_map(classes, device)), tables, exposures)
 
     @staticmethod
     def load(snapshot: Path | None, views: Sequence[View]) -> OptimiserState | None:
@@ -69,11 +63,12 @@ class OptimiserState:
             return None
         tensors = {k: v.to(views[0].image.device) for k, v in load_tensors(snapshot).items()}
         tables = [AdamTable.from_tensors(tensors, f"view{i}", VIEW_KEYS) for i in range(len(views))]
-        return OptimiserState(MapParameters.from_tensors(tensors), tables, int(tensors["iteration"]))
+        parameters, iteration = MapParameters.from_tensors(tensors), int(tensors["iteration"])
+        return OptimiserState(parameters, tables, tensors["exposures"], iteration)
 
     def save(self, snapshot: Path) -> None:
         """Into one file, whole or not at all."""
-        out = {**self.parameters.to_tensors(), "iteration": torch.tensor(self.iteration)}
+        out = {**self.parameters.to_tensors(), "exposures": self.exposures, "iteration": torch.tensor(self.iteration)}
         for i, table in enumerate(self.view_tables):
             out |= table.to_tensors(f"view{i}")
         save_tensors(snapshot, out)
@@ -85,12 +80,7 @@ class OptimiserState:
     def result(self, views: Sequence[View], iterations: int) -> OptimisedMap:
         """The values without the optimiser's own."""
         poses = [self.cam_from_world(i, v).cpu() for i, v in enumerate(views)]
-        gains, offsets = (
-            torch.stack([t.values[k].detach().cpu() for t in self.view_tables]).numpy() for k in VIEW_KEYS[1:]
+        gains, offsets = self.exposures.cpu().unbind(1)
+        return OptimisedMap(
+            self.parameters.to_map(), torch.stack(poses).numpy(), gains.numpy(), offsets.numpy(), iterations
         )
-        return OptimisedMap(self.parameters.to_map(), torch.stack(poses).numpy(), gains, offsets, iterations)
-
-
-def expose(colors: Tensor, table: AdamTable) -> Tensor:
-    """(H, W, 3) colours of the map as this view's exposure shows them."""
-    return colors * torch.exp(table.values["log_gain"]) + table.values["offset"]

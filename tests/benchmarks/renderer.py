@@ -183,7 +183,7 @@ class Iteration:
     def step(self) -> None:
         self.optimizer.zero_grad()
         seen = self.draw(POSE)
-        loss = photo_loss(seen.features[..., :3], *self.exposure, self.image)
+        loss = photo_loss(seen.features[..., :3], self.exposure, self.image)
         loss = loss + losses.depth_loss(seen.depth, self.depth, self.weight, 1.0)
         loss = loss + losses.label_loss(seen.features[..., 3:], self.labels, self.weight)
         loss.backward()

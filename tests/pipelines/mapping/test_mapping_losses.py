@@ -10,6 +10,7 @@ from pipelines.gaussians.ssim import ssim_map
 from pipelines.mapping import losses
 from pipelines.mapping.article.edge_term import edge_loss
 from pipelines.mapping.article.label_image import label_image_loss
+from pipelines.mapping.exposure import expose, fit_exposure
 from pipelines.mapping.photo_loss import photo_loss, plain_photo_loss
 from pipelines.types import VOID
 
@@ -43,10 +44,10 @@ def test_ssim_gradient() -> None:
 
 def test_photo_loss_weighs_its_two_parts() -> None:
     a, b = pictures()
-    photo, nothing = (255 * b).to(torch.uint8), torch.zeros(3)
+    photo, nothing = (255 * b).to(torch.uint8), torch.zeros(2, 3)
     expected = 0.8 * (a - photo / 255).abs().mean() + 0.2 * (1 - ssim_map(a, photo / 255).mean())
-    assert torch.isclose(photo_loss(a, nothing, nothing, photo), expected)
-    assert photo_loss(photo / 255, nothing, nothing, photo) < 1e-6
+    assert torch.isclose(photo_loss(a, nothing, photo), expected)
+    assert photo_loss(photo / 255, nothing, photo) < 1e-6
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -54,17 +55,40 @@ def test_compiled_photo_loss_is_the_plain_one(masked: bool) -> None:
     """Value and gradients; the colours may be some of more features, and the last band of rows may be short."""
     features, photo = torch.cat(pictures(), -1), (255 * pictures()[1]).to(torch.uint8)
     scene = torch.rand(photo.shape[:2], generator=torch.Generator().manual_seed(1)) > 0.3 if masked else None
-    exposure = [torch.tensor([0.1, -0.2, 0.05]), torch.tensor([0.01, 0.02, -0.1])]
+    exposure = torch.tensor([[0.1, -0.2, 0.05], [0.01, 0.02, -0.1]])
     found = []
     for loss, kind in ((photo_loss, torch.float32), (plain_photo_loss, torch.float64)):
-        values = [x.to(kind).requires_grad_() for x in (features, *exposure)]
-        value = loss(values[0][..., :3], *values[1:], photo, scene)
-        found.append([value, *torch.autograd.grad(3 * value, values)])
+        colors = features.to(kind).requires_grad_()
+        value = loss(colors[..., :3], exposure.to(kind), photo, scene)
+        found.append([value, *torch.autograd.grad(3 * value, [colors])])
     for mine, theirs in zip(*found, strict=True):
         assert theirs.abs().max() > 0
         assert (mine - theirs).abs().max() < 1e-5 * theirs.abs().max()
     if scene is not None:
         assert found[0][1][~scene].abs().max() == 0
+
+
+def test_an_exposure_is_fitted_past_what_is_wrong_in_the_map() -> None:
+    """Gain and offset of each colour, though a fifth of the picture shows something else; few pixels change nothing."""
+    generator = torch.Generator().manual_seed(2)
+    shown = torch.rand(120, 160, 3, generator=generator)
+    true = torch.tensor([[0.3, -0.2, 0.0], [0.02, -0.05, 0.1]])
+    photo = expose(shown, true) + 0.01 * torch.randn(shown.shape, generator=generator)
+    photo[:24] = torch.rand(24, 160, 3, generator=generator)
+    known, start = torch.ones(120, 160, dtype=torch.bool), torch.zeros(2, 3)
+    found = start
+    for _ in range(6):
+        found = fit_exposure(shown, photo, known, found)
+    assert (expose(shown, found) - expose(shown, true)).abs().mean() < 0.01
+    known[4:] = False
+    assert torch.equal(fit_exposure(shown, photo, known, start), start)
+
+
+def test_the_same_picture_moves_no_exposure() -> None:
+    """Nor does one of a single colour, where gain and offset cannot be told apart."""
+    known, start = torch.ones(80, 80, dtype=torch.bool), torch.zeros(2, 3)
+    for shown in (torch.full((80, 80, 3), 0.5), torch.rand(80, 80, 3, generator=torch.Generator().manual_seed(3))):
+        assert fit_exposure(shown, shown, known, start).abs().max() < 1e-6
 
 
 def test_depth_loss_has_no_unit_and_ignores_unknown_depth() -> None:

@@ -53,7 +53,8 @@ def test_the_map_is_sound(mapped: OptimisedMap, room: MappingInput) -> None:
 
 def test_splitting_sharpens_a_coarse_map(room: MappingInput, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(growth, "FINE_SHARE", 0.0)
-    coarse = replace(SETTINGS, seed_stride=4, passes=8.0)
+    # The room has no exposures to find, and so coarse a map mistakes its own blur for some.
+    coarse = replace(SETTINGS, seed_stride=4, passes=8.0, exposure=False)
     split, unsplit = (
         optimise_map(room.views, len(room.class_ids), replace(coarse, split_error=e), seed=0) for e in (0.1, 0.0)
     )
@@ -106,11 +107,10 @@ def test_labels_count_as_often_while_the_map_grows(room: MappingInput, iteration
 
 def test_the_edge_term_does_not_need_the_labels(room: MappingInput) -> None:
     view, losses = room.views[0], []
-    table = OptimiserState.fresh(room.views, 0, None, None).view_tables[0]
     drawn = Rendering(torch.zeros(*view.depth.shape, 5), view.depth + 0.3 * torch.rand(view.depth.shape), view.trust)
     for weight in (0.0, 1.0):
         terms = objective.Objective(replace(SETTINGS, label_weight=0.0), ArticleConfig(edge_weight=weight), 2, 1.0)
-        losses.append(terms.of(view, table, drawn, torch.zeros(1), terms.uses_labels(0)).item())
+        losses.append(terms.of(view, torch.zeros(2, 3), drawn, torch.zeros(1), terms.uses_labels(0)).item())
     assert losses[1] > losses[0] + 0.01
 
 
@@ -180,14 +180,11 @@ def test_exposure_is_found(room: MappingInput, mapped: OptimisedMap, monkeypatch
         replace(v, image=(v.image.float() * 0.7).round().to(torch.uint8)) if i == 5 else v
         for i, v in enumerate(room.views)
     ]
-    monkeypatch.setattr(optimise, "EXPOSURE_RATE", 4e-2)
-    monkeypatch.setitem(optimise.MAP_RATES, "colors", 1e-3)
     monkeypatch.setattr(schedule, "DENSIFY_UNTIL", 0.0)
-    settings = replace(SETTINGS, refine_poses=False)
-    result = optimise_map(dark, len(room.class_ids), settings, seed=0, initial=mapped.gaussian_map, passes=8.0)
+    result = optimise_map(dark, len(room.class_ids), SETTINGS, seed=0, initial=mapped.gaussian_map, passes=3.0)
     brightness = np.exp(result.log_gains).mean(1) + result.offsets.mean(1) / 0.4
-    others = np.delete(brightness, 5)
-    assert brightness[5] < 0.85 < others.min()
+    assert 0.65 < brightness[5] < 0.8
+    assert np.abs(np.delete(brightness, 5) - 1).max() < 0.1
 
 
 def test_views_without_classes_can_be_mapped(room: MappingInput) -> None:

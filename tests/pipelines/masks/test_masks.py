@@ -18,7 +18,6 @@ from pipelines.correspondence.flow import corners
 from pipelines.frames.keyframes import choose_keyframes
 from pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
 from pipelines.frames.source import open_source
-from pipelines.gaussians.adam import AdamTable
 from pipelines.gaussians.render import Rendering
 from pipelines.mapping.objective import Objective
 from pipelines.mapping.views import View, make_view
@@ -255,9 +254,8 @@ def a_view() -> tuple[View, Callable]:
     def loss_of(seen: View) -> tuple[float, torch.Tensor]:
         shown = (view.colors * 0.9 + 0.03).requires_grad_()
         rendering = Rendering(shown, torch.ones(60, 80), torch.full((60, 80), 0.9))
-        values = {"log_gain": torch.zeros(3), "offset": torch.zeros(3)}
         objective = Objective(MappingConfig(), ArticleConfig(), 0, 1.0)
-        loss = objective.of(seen, AdamTable(values), rendering, torch.zeros(4), False)
+        loss = objective.of(seen, torch.zeros(2, 3), rendering, torch.zeros(4), False)
         loss.backward()
         assert shown.grad is not None
         if seen.scene is not None:
