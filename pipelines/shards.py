@@ -8,6 +8,7 @@ in any order; one that is killed leaves its task, or its lead, to the others.
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -42,7 +43,7 @@ def work_on_run(
 ) -> dict[str, StageRecord]:
     """Lead or help until the run is done up to a stage; its records. Raises InputError as `resume` does, and for a node
     that cannot do a task (another version of the program, a full disk): the others go on."""
-    workers = SharedWorkers(shard, prepare, config.run.threads)
+    workers = SharedWorkers(shard, prepare, config.run.threads or os.cpu_count() or 1)
     log.info("shard %d of %d", shard.index, shard.count)
     while True:
         with suppress(RunBusyError):
@@ -144,7 +145,10 @@ class Posted:
                 while not take_lock(stream):
                     stop_if_asked()
                     time.sleep(_BETWEEN_LOOKS)
-        shutil.rmtree(self.folder, ignore_errors=True)
+        while self.folder.exists():  # whoever looks in at this moment may leave a lock
+            shutil.rmtree(self.folder, ignore_errors=True)
+        with suppress(OSError):
+            self.folder.parent.rmdir()
 
 
 def _posted(run: RunFolder) -> Iterator[Posted]:
@@ -156,4 +160,3 @@ def _withdraw_all(run: RunFolder) -> None:
     """What a leader before has left."""
     for posted in _posted(run):
         posted.withdraw()
-    shutil.rmtree(run.root / _TASKS, ignore_errors=True)

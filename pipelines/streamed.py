@@ -53,6 +53,12 @@ class Streamed(Sequence[T], Generic[T]):
             while self._used > self._room and len(self._kept) > 1:
                 self._used -= self._size_of(self._kept.popitem(last=False)[1])
 
+    def forget(self) -> None:
+        """Keep nothing until it is asked for again."""
+        with self._lock:
+            self._kept.clear()
+            self._used = 0
+
     def changed(self, function: Callable[[int, T], T]) -> Streamed[T]:
         """The same with `function` of number and value applied; takes over what is kept here, and the room."""
         make = self._make

@@ -129,11 +129,11 @@ class StructureFromMotion:
             found.model, report, found.mapper, found.focal_sd, features, vocabulary, tried, pairs, pieces, found.readout
         )
 
-    def _places(self, features: Sequence[Features]) -> int:
+    def _places(self, features: Streamed[Features]) -> int:
         return len(features) // len(self.cam_from_rig)
 
     def _adjusted(
-        self, features: Sequence[Features], pairs: Sequence[VerifiedPair], mappers: Sequence[str],
+        self, features: Streamed[Features], pairs: Sequence[VerifiedPair], mappers: Sequence[str],
         times: NDArray[np.float64],
     ) -> _Adjusted | None:  # fmt: skip
         """The best model, its camera calibrated unless it is fixed; with the readout of a rolling shutter, where one is
@@ -149,7 +149,7 @@ class StructureFromMotion:
         return _Adjusted(model, mapper, adjust(model, refine_camera=not self.is_fixed), report.score, NO_READOUT)
 
     def _pieces(
-        self, features: Sequence[Features], pairs: Sequence[VerifiedPair], model: pycolmap.Reconstruction
+        self, features: Streamed[Features], pairs: Sequence[VerifiedPair], model: pycolmap.Reconstruction
     ) -> list[pycolmap.Reconstruction]:
         """Sound models of the keyframes that `model` leaves, in its camera, until there is none of the least size."""
         camera, xy = model.cameras[1], [f.xy for f in features]
@@ -220,7 +220,7 @@ class StructureFromMotion:
             features.keep(k, value)
         return features
 
-    def _proposed(self, features: Sequence[Features], vocabulary: Vocabulary) -> list[tuple[int, int]]:
+    def _proposed(self, features: Streamed[Features], vocabulary: Vocabulary) -> list[tuple[int, int]]:
         looks, places = Looks((np.stack([describe(f, vocabulary) for f in features]),)), self._places(features)
         loops = loop_pairs(
             looks, far_apart(len(features), self.config.overlap + 1, places), self.config.loop_candidates
@@ -229,7 +229,7 @@ class StructureFromMotion:
         firsts = range(0, len(features), places)
         return sorted({*((n + i, n + j) for n in firsts for i, j in following), *loops})
 
-    def _pairs(self, features: Sequence[Features], proposed: Sequence[tuple[int, int]]) -> list[VerifiedPair]:
+    def _pairs(self, features: Streamed[Features], proposed: Sequence[tuple[int, int]]) -> list[VerifiedPair]:
         blocks = [proposed[i : i + _PAIRS_PER_BLOCK] for i in range(0, len(proposed), _PAIRS_PER_BLOCK)]
 
         def match(pair: tuple[int, int]) -> VerifiedPair | None:
@@ -244,7 +244,7 @@ class StructureFromMotion:
 
     def _map(
         self,
-        features: Sequence[Features],
+        features: Streamed[Features],
         pairs: Sequence[VerifiedPair],
         mappers: Sequence[str] = ("global", "incremental"),
     ) -> tuple[pycolmap.Reconstruction, str, ModelReport] | None:
@@ -268,11 +268,12 @@ class StructureFromMotion:
         return best
 
     def _run_mapper(
-        self, name: str, work: Path, features: Sequence[Features], pairs: Sequence[VerifiedPair]
+        self, name: str, work: Path, features: Streamed[Features], pairs: Sequence[VerifiedPair]
     ) -> pycolmap.Reconstruction | None:
         database = work / "database.db"
         names = [f"{i:06d}" for i in range(len(features))]
         write_database(database, self.camera, names, features, pairs, self.cam_from_rig)
+        features.forget()  # the mapper needs the memory, and no descriptor
         if not self.camera.has_prior_focal_length:
             calibrate_focal(database, self.seed)
         if name == "incremental":

@@ -62,7 +62,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--keyframes", type=int, default=0, help="of the recording; 0: those of RUN")
-    parser.add_argument("--proxy-share", type=float, default=0.8)
+    parser.add_argument("--proxy-share", type=float, default=0.76)
     parser.add_argument("--start", type=float, default=5.0)
     parser.add_argument("--each", type=float, default=1.0)
     parser.add_argument("--workers", type=int, nargs="*", default=[1, 2, 4, 8, 16, 32, 64, 128, 256])

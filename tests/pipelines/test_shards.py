@@ -56,8 +56,7 @@ def test_every_task_is_done_once_and_comes_back_in_order(folder: Path, helpers: 
     tasks = [(folder / f"{n}", 2 * n) for n in range(24)]
     assert shared(0, 4).each(engine_calls.halve_noted, tasks, folder) == list(range(24))
     assert [len(path.read_text()) for path, _ in tasks] == [1] * 24
-    assert sum(helpers) > 0
-    assert list((folder.parent / ".tasks").iterdir()) == []
+    assert not (folder.parent / ".tasks").exists()
 
 
 def test_one_alone_does_all_whatever_its_share(folder: Path) -> None:

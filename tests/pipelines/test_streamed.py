@@ -31,6 +31,9 @@ def test_what_was_used_last_stays_and_the_rest_is_made_again() -> None:
     assert values[1:3] == [bytes([1]) * 10, bytes([2]) * 10]
     with pytest.raises(IndexError):
         values[5]
+    values.forget()
+    assert values[1] == bytes([1]) * 10
+    assert made[7:] == [1, 2, 1]
 
 
 def test_one_value_is_kept_however_little_room_there_is() -> None:
