@@ -145,8 +145,11 @@ class Posted:
                 while not take_lock(stream):
                     stop_if_asked()
                     time.sleep(_BETWEEN_LOOKS)
-        while self.folder.exists():  # whoever looks in at this moment may leave a lock
+        for _ in range(20):  # whoever looks in at this moment may leave a lock; a disk may be slow to let go of one
             shutil.rmtree(self.folder, ignore_errors=True)
+            if not self.folder.exists():
+                break
+            time.sleep(_BETWEEN_LOOKS / 5)
         with suppress(OSError):
             self.folder.parent.rmdir()
 
