@@ -354,6 +354,8 @@ def _checked(value: Any, wanted: Any, choices: tuple[str, ...], where: str) -> A
         return tuple(_checked(v, element, (), where) for v in value)
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value) if abs(value) < 2**53 else math.inf
+    if wanted is str and not choices and isinstance(value, int | float) and not isinstance(value, bool):
+        value = str(value)  # strings need no quotes, and a file's name may be a number
     if not isinstance(value, wanted) or (wanted is int and isinstance(value, bool)):
         raise InputError(f"{where} expects {wanted.__name__}, got {value!r:.80}")
     if choices and value not in choices:
