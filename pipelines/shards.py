@@ -34,6 +34,8 @@ T = TypeVar("T")
 R = TypeVar("R")
 _TASKS = ".tasks"
 _READY = "ready.json"
+_WORKS = ("pipelines.mapping.submap_tasks", "pipelines.proxy.stage")
+"""Where what is done with tasks is written: a run from elsewhere could name any function of the program."""
 _BETWEEN_LOOKS = 0.5
 """Seconds."""
 
@@ -127,6 +129,8 @@ class Posted:
                 return False
             if self.done(number).exists() or not (self.folder / _READY).exists():
                 return False
+            if about["work"].partition(":")[0] not in _WORKS:
+                raise InputError(f"{self.folder / _READY}: {about['work']} is no work on a task. Delete the folder")
             work, folder = of_name(about["work"]), self.folder.parents[1] / about["folder"]
             name, task = f"{work.__name__} {number + 1}", load_value(self.task(number))
             refused, value = work_here(work, task, name, prepare, folder, about["threads"], about["code"])

@@ -40,11 +40,12 @@ def name_of(function: Callable[..., Any] | type) -> str:
 
 
 def of_name(name: str) -> Any:
-    """A function or class of this program's pipelines. Raises InputError for any other."""
+    """A function or class that this program's pipelines define. Raises InputError for any other."""
     module, _, attribute = name.partition(":")
-    if not module.startswith(_OURS):
+    found = getattr(import_module(module), attribute, None) if module.startswith(_OURS) else None
+    if getattr(found, "__module__", None) != module:  # what a module only imports, deleting folders for one
         raise InputError(f"{name} is not of this program")
-    return getattr(import_module(module), attribute)
+    return found
 
 
 def _plain(value: Any, arrays: dict[str, NDArray]) -> Any:

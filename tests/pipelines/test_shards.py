@@ -13,8 +13,8 @@ from pathlib import Path
 import engine_calls
 import pytest
 
-from formats.errors import RecoverableError
-from pipelines import travel, workers
+from formats.errors import InputError, RecoverableError
+from pipelines import shards, travel, workers
 from pipelines.batch import Shard
 from pipelines.run_folder import RunFolder
 from pipelines.shards import Posted, SharedWorkers, _posted
@@ -26,6 +26,7 @@ HOLDS = "import fcntl, sys; f = open(sys.argv[1], 'ab'); fcntl.flock(f, fcntl.LO
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Of an unfinished stage; the tasks are those of the tests."""
     monkeypatch.setattr(travel, "_OURS", "engine_calls")
+    monkeypatch.setattr(shards, "_WORKS", ("engine_calls",))
     (tmp_path / "proxy.partial").mkdir()
     return tmp_path / "proxy.partial"
 
@@ -109,3 +110,10 @@ def test_a_node_with_another_version_says_so_and_leaves_the_task(folder: Path, m
         with pytest.raises(RecoverableError, match="has another version of the program"):
             posted.do_one(Shard(), engine_calls.silent)
     assert posted.do_one(Shard(), engine_calls.silent)
+
+
+def test_a_run_cannot_name_other_work(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shards, "_WORKS", ("pipelines.proxy.stage",))
+    posted = Posted.post(engine_calls.halve, [4], folder, 1)
+    with pytest.raises(InputError, match="is no work on a task"):
+        posted.do_one(Shard(0, 1), engine_calls.silent)

@@ -49,6 +49,10 @@ def test_what_is_not_of_this_program_is_refused(tmp_path: Path) -> None:
         load_value(tmp_path / "foreign.npz")
     with pytest.raises(InputError, match="not of this program"):
         of_name("os:system")
+    with pytest.raises(InputError, match="not of this program"):
+        of_name("pipelines.shards:shutil")
+    with pytest.raises(InputError, match="not of this program"):
+        of_name("pipelines.travel:save_arrays")
     with pytest.raises(TypeError, match="does not travel"):
         save_value(tmp_path / "thing.npz", object())
     tree = np.frombuffer(b'{"pipelines.travel:save_value": {"path": "x", "value": 1}}', np.uint8)
