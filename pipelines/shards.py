@@ -159,8 +159,10 @@ class Posted:
 
 
 def _posted(run: RunFolder) -> Iterator[Posted]:
-    folder = run.root / _TASKS
-    yield from (Posted(p) for p in (sorted(folder.iterdir()) if folder.is_dir() else ()))
+    found: list[Path] = []
+    with suppress(FileNotFoundError):  # nothing is posted, or no longer
+        found = sorted((run.root / _TASKS).iterdir())
+    yield from map(Posted, found)
 
 
 def _withdraw_all(run: RunFolder) -> None:
