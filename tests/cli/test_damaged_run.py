@@ -83,7 +83,7 @@ def test_progress_and_errors_as_json_lines(copied_run: Callable[[str], Path]) ->
     lines = [json.loads(line) for line in done.stderr.splitlines()]
     assert {line["event"] for line in lines} == {"progress", "log"}
     ended = [line for line in lines if line.get("ended")]
-    assert {line["label"] for line in ended} >= {"depth views"}
+    assert {line["label"] for line in ended} >= {"drawing"}
     assert all(line["done"] == line["total"] for line in ended)
     (run / "run.toml").write_text("")
     refused = invoke("resume", run, "--log-format", "json")
