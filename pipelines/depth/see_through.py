@@ -36,7 +36,7 @@ def contradicted(views: Sequence[PosedDepth]) -> Iterator[NDArray[np.bool_]]:
 def _vote(view: PosedDepth, other: PosedDepth, votes: NDArray[np.int16]) -> None:
     """Add to votes (2, h, w), of the view's strided pixels: the other view confirms the depth; it sees through it."""
     relative = other.cam_from_world @ np.linalg.inv(view.cam_from_world)
-    cameras = np.array([[k.fx, k.fy, k.cx, k.cy] for k in (view.intrinsics, other.intrinsics)])
+    cameras = np.stack([view.intrinsics.numbers, other.intrinsics.numbers])
     _count(view.depth, other.depth, other.trust, relative, cameras, votes)
 
 

@@ -152,13 +152,11 @@ def fuse(grid: Grid, chunks: NDArray[np.int32], views: Iterable[PosedDepth], thr
     centers, radius = (blocks + 0.5) * (voxel * SIDE), voxel * SIDE * 0.87
     with ThreadPoolExecutor(threads) as pool:
         for view in views:
-            k = view.intrinsics
-            camera = np.array([k.fx, k.fy, k.cx, k.cy])
             rows = np.flatnonzero(Frustum.of(view).meets(centers, radius, truncation))
             jobs = [
                 pool.submit(
                     _integrate, part, blocks, distance, weight, view.depth, view.trust,
-                    np.ascontiguousarray(view.cam_from_world), camera, voxel, truncation,
+                    np.ascontiguousarray(view.cam_from_world), view.intrinsics.numbers, voxel, truncation,
                 )
                 for part in np.array_split(rows, threads)
             ]  # fmt: skip

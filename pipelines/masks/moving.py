@@ -110,7 +110,7 @@ def _evidence(
     one. Only depth of more than the confidence `least` accuses."""
     weight = np.array([0.6, 1, 1], np.float32)
     own, votes = np.ascontiguousarray(view.lab * weight), np.zeros((2, *view.depth.shape), np.int64)
-    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    lens = camera.numbers
     for other, moved in witnesses:
         view_from_other = view.cam_from_world @ np.linalg.inv(other.cam_from_world)
         depth = other.depth if moved is None else np.where(moved, np.float32(0), other.depth)
