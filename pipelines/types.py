@@ -121,6 +121,16 @@ class Intrinsics:
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
+    def every(self, stride: int) -> Intrinsics:
+        """The camera of an image's pixels [stride // 2 :: stride] along both sides.
+
+        Of an even stride these are not the middles of the squares that a smaller picture of the same view would have.
+        """
+        off = stride // 2 - (stride - 1) / 2
+        width, height = (len(range(stride // 2, side, stride)) for side in (self.width, self.height))
+        cx, cy = (self.cx - off) / stride, (self.cy - off) / stride
+        return Intrinsics(width, height, self.fx / stride, self.fy / stride, cx, cy)
+
 
 @dataclass(frozen=True)
 class Frame:

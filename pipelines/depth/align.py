@@ -74,8 +74,8 @@ def _posed(maps: ProxyMaps, intrinsics: Intrinsics, cam_from_world: Array) -> Po
     stride = max(round(max(maps.depth.shape) / SIDE), 1)
     picked = (slice(stride // 2, None, stride),) * 2
     depth, trust = maps.depth[picked].copy(), maps.confidence[picked].copy()
-    height, width = depth.shape
-    return PosedDepth(intrinsics.resized(width, height), cam_from_world, depth, trust * (depth > 0))
+    height, width = maps.depth.shape
+    return PosedDepth(intrinsics.resized(width, height).every(stride), cam_from_world, depth, trust * (depth > 0))
 
 
 def _anchors(model: SparseModel, k: int, full: Intrinsics, small: Intrinsics) -> Anchors:
@@ -83,7 +83,9 @@ def _anchors(model: SparseModel, k: int, full: Intrinsics, small: Intrinsics) ->
     mine = model.observations_of(k)
     points = model.points_in_world[model.obs_point[mine]]
     depth = points @ model.cam_from_world[k, 2, :3] + model.cam_from_world[k, 2, 3]
-    return Anchors(model.obs_xy[mine] * [small.width / full.width, small.height / full.height], depth)
+    (fx, fy, cx, cy), (small_fx, small_fy, small_cx, small_cy) = full.numbers, small.numbers
+    rays = (model.obs_xy[mine] - [cx, cy]) / [fx, fy]
+    return Anchors(rays * [small_fx, small_fy] + [small_cx, small_cy], depth)
 
 
 def fit_fields(views: Sequence[PosedDepth], anchors: Mapping[int, Anchors], expected: Array | None = None) -> Array:

@@ -14,7 +14,7 @@ from pipelines.depth.posed import CANDIDATES, PosedDepth, overlaps
 from pipelines.depth.see_through import contradicted
 from pipelines.mapping.load import MappingInput
 from pipelines.run_folder import RunFolder, save_depth_fields
-from pipelines.types import ProxyMaps, SparseModel
+from pipelines.types import Intrinsics, ProxyMaps, SparseModel
 
 Maps = dict[int, ProxyMaps]
 
@@ -80,6 +80,23 @@ def test_true_depth_is_left_alone(truth: Maps, align: Callable[..., DepthFields]
     assert relative_error(truth, truth, align(truth)) < 0.006
     one = dict(list(truth.items())[:1])
     assert relative_error(one, truth, align(one)) < 0.006
+
+
+def test_pixels_left_out_do_not_move_the_others() -> None:
+    """A floor that recedes, at twice the size at which depths are compared: half a pixel aside it is 0.3 % as far."""
+    camera, poses = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0), np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = 0.3 * np.arange(4)
+    height = np.arange(480)[:, None] + 0.5 - camera.cy
+    floor = np.where(height > 60, 500 * 1.5 / np.maximum(height, 1), 0) * np.ones((1, 640))
+    maps = ProxyMaps(floor.astype(np.float32), *[np.ones((480, 640), np.float32)] * 3)
+    xy = np.random.default_rng(0).uniform((100, 310), (400, 480), (2000, 2))
+    z = 500 * 1.5 / (xy[:, 1] - camera.cy)
+    points = np.stack([(xy[:, 0] - camera.cx) / 500 * z, np.full(2000, 1.5), z], 1)
+    seen = [(points[:, :2] + [0.3 * k, 0]) / z[:, None] * 500 + [camera.cx, camera.cy] for k in range(4)]
+    frame, point = np.repeat(np.arange(4), 2000), np.tile(np.arange(2000), 4)
+    model = SparseModel(np.arange(4), poses, points, np.zeros((2000, 3), np.uint8), frame, point, np.concatenate(seen))
+    fields = align_keyframes(model, camera, lambda _: maps, {})
+    assert np.mean([f[7:] for f in fields.of_frame.values()]) == pytest.approx(0, abs=2e-4)
 
 
 def test_wild_points_do_not_drag_the_depth(truth: Maps, small_run: RunFolder) -> None:
