@@ -142,53 +142,50 @@ def estimate(bundle: Bundle, xy: Array, camera: Intrinsics, times: Array, direct
 
 
 class RollingModel:
-    """A reconstruction, its keyframes' features xy (F, 2) in pixels and times (K,): image i + 1 is keyframe i."""
+    """A reconstruction, its keyframes' features xy (F, 2) in pixels and times (K,): image i + 1 is keyframe i. What sees
+    what is read once: an adjustment moves points, and takes none away."""
 
     def __init__(self, model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array) -> None:
         self.model = model
         self.images = sorted(model.reg_image_ids())
-        self.xy, self.times = xy, times[[i - 1 for i in self.images]]
-
-    def seen(self, image_id: int) -> list[int]:
-        """Features that see a point."""
-        return [k for k, p in enumerate(self.model.images[image_id].points2D) if p.has_point3D()]
+        self.times = times[[i - 1 for i in self.images]]
+        self.point_ids = sorted(model.point3D_ids())
+        row = {p: k for k, p in enumerate(self.point_ids)}
+        seen = [[p.point3D_id for p in model.images[i].points2D] for i in self.images]
+        self.features = [np.array([p in row for p in points], bool).nonzero()[0] for points in seen]
+        self.obs_cam = np.repeat(np.arange(len(seen)), [len(f) for f in self.features])
+        self.obs_point = np.array([row[p] for points in seen for p in points if p in row], np.int64)
+        plain = [xy[i - 1][f] for i, f in zip(self.images, self.features, strict=True)]
+        self.plain: Array = np.concatenate([np.zeros((0, 2)), *plain])
+        self.now = self.plain
 
     def bundle(self) -> tuple[Bundle, Array, Intrinsics]:
         """In a pinhole's pixels, its observations as they stand in the model; and (O, 2), as they are in the frames."""
-        model, camera = self.model, self.model.cameras[1]
+        model, camera, count = self.model, self.model.cameras[1], len(self.now)
         focal, half = camera.mean_focal_length(), np.array([camera.width, camera.height]) / 2
         pinhole = Intrinsics(camera.width, camera.height, focal, focal, *half)
-        points = {p: k for k, p in enumerate(sorted(model.point3D_ids()))}
-        seen = [[model.images[i].points2D[k] for k in self.seen(i)] for i in self.images]
-        now = np.array([p.xy for row in seen for p in row]).reshape(-1, 2)
-        plain = np.concatenate([self.xy[i - 1][self.seen(i)] for i in self.images])
-        count = len(now)
         bundle = Bundle(
             np.array([np.vstack([model.images[i].cam_from_world().matrix(), [0, 0, 0, 1]]) for i in self.images]),
-            np.array([model.points3D[p].xyz for p in points]),
-            np.repeat(np.arange(len(seen)), [len(row) for row in seen]),
-            np.array([points[p.point3D_id] for row in seen for p in row], np.int64),
-            camera.cam_from_img(now) * focal + half,
+            np.array([model.points3D[p].xyz for p in self.point_ids]),
+            self.obs_cam, self.obs_point, camera.cam_from_img(self.now) * focal + half,
             np.full(count, _FEATURE_SD), np.zeros(count), np.ones(count),
         )  # fmt: skip
-        return bundle, camera.cam_from_img(plain) * focal + half, pinhole
+        return bundle, camera.cam_from_img(self.plain) * focal + half, pinhole
 
-    def estimate(self, axis: Readout) -> tuple[float, float]:
-        """See `estimate`."""
-        bundle, xy, pinhole = self.bundle()
-        return estimate(bundle, xy, pinhole, self.times, axis)
-
-    def straighten(self, readout: Readout) -> None:
-        """Put the model's observations where they would be in frames taken at once; without a readout, as they are."""
-        bundle, xy, pinhole = self.bundle()
+    def straighten(self, bundle: Bundle, xy: Array, pinhole: Intrinsics, readout: Readout) -> None:
+        """Put the model's observations where they would be in frames taken at once, by `bundle`'s poses and points."""
         velocity = velocities(bundle.cam_from_world, self.times)
         now = straightened(bundle, xy, pinhole, velocity, readout).obs_xy
         rays = (now - [pinhole.cx, pinhole.cy]) / pinhole.fx
-        pixels = iter(np.asarray(self.model.cameras[1].img_from_cam(np.column_stack([rays, np.ones(len(rays))]))))
-        for i in self.images:
+        self.put(np.asarray(self.model.cameras[1].img_from_cam(np.column_stack([rays, np.ones(len(rays))]))))
+
+    def put(self, pixels: Array) -> None:
+        """Make (O, 2) `pixels` the model's observations."""
+        self.now, ordered = pixels, iter(pixels)
+        for i, features in zip(self.images, self.features, strict=True):
             points = self.model.images[i].points2D
-            for k in self.seen(i):
-                points[k].xy = next(pixels) if any(readout) else self.xy[i - 1][k]
+            for k in features.tolist():
+                points[k].xy = next(ordered)
 
 
 def adjust_rolling(
@@ -197,30 +194,31 @@ def adjust_rolling(
     """The model adjusted with the `readout` given, or found where it is None, and the standard deviation of its focal
     length; None where there is no readout, or where the one found explains too little. The model given stays as it is,
     and pixels are those in the frames before and after."""
-    axis, seconds = NO_READOUT, 0.0
-    rolling = RollingModel(model, xy, times)
+    if readout is not None and not any(readout):
+        return None
+    rolling = RollingModel(pycolmap.Reconstruction(model), xy, times)
+    seen = rolling.bundle()
     if readout is None:
         (seconds, share), axis = max(
-            ((rolling.estimate(axis), axis) for axis in ((1.0, 0.0), (0.0, 1.0))), key=lambda f: f[0][0] ** 2 * f[0][1]
+            ((estimate(*seen, rolling.times, axis), axis) for axis in ((1.0, 0.0), (0.0, 1.0))),
+            key=lambda f: f[0][0] ** 2 * f[0][1],
         )
         if seconds**2 * share < LEAST_GAIN:
             return None
-    elif any(readout):
+    else:
         seconds = math.hypot(*readout)
         axis = readout[0] / seconds, readout[1] / seconds
-    else:
-        return None
-    rolling = RollingModel(pycolmap.Reconstruction(model), xy, times)
     for _ in range(_ROUNDS):
-        rolling.straighten((axis[0] * seconds, axis[1] * seconds))
+        rolling.straighten(*seen, (axis[0] * seconds, axis[1] * seconds))
         solve(rolling.model, rolling.images, refine_camera)
+        seen = rolling.bundle()
         if readout is None:
-            step, share = rolling.estimate(axis)
+            step, share = estimate(*seen, rolling.times, axis)
             seconds += step
     if readout is None and seconds**2 * share < LEAST_GAIN:
         return None
     found = axis[0] * seconds, axis[1] * seconds
-    rolling.straighten(found)
+    rolling.straighten(*seen, found)
     focal_sd = adjust(rolling.model, refine_camera)
-    rolling.straighten(NO_READOUT)
+    rolling.put(rolling.plain)
     return rolling.model, found, focal_sd
