@@ -142,8 +142,10 @@ def estimate(bundle: Bundle, xy: Array, camera: Intrinsics, times: Array, direct
 
 
 class RollingModel:
-    """A reconstruction, its keyframes' features xy (F, 2) in pixels and times (K,): image i + 1 is keyframe i. What sees
-    what is read once: an adjustment moves points, and takes none away."""
+    """A reconstruction, its keyframes' features xy (F, 2) in pixels and times (K,): image i + 1 is keyframe i.
+
+    What sees what is read once: an adjustment moves points, and takes none away.
+    """
 
     def __init__(self, model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array) -> None:
         self.model = model
@@ -167,15 +169,15 @@ class RollingModel:
         bundle = Bundle(
             np.array([np.vstack([model.images[i].cam_from_world().matrix(), [0, 0, 0, 1]]) for i in self.images]),
             np.array([model.points3D[p].xyz for p in self.point_ids]),
-            self.obs_cam, self.obs_point, camera.cam_from_img(self.now) * focal + half,
+            self.obs_cam, self.obs_point, np.asarray(camera.cam_from_img(self.now)) * focal + half,
             np.full(count, _FEATURE_SD), np.zeros(count), np.ones(count),
         )  # fmt: skip
-        return bundle, camera.cam_from_img(self.plain) * focal + half, pinhole
+        return bundle, np.asarray(camera.cam_from_img(self.plain)) * focal + half, pinhole
 
     def straighten(self, bundle: Bundle, xy: Array, pinhole: Intrinsics, readout: Readout) -> None:
         """Put the model's observations where they would be in frames taken at once, by `bundle`'s poses and points."""
         velocity = velocities(bundle.cam_from_world, self.times)
-        now = straightened(bundle, xy, pinhole, velocity, readout).obs_xy
+        now: Array = straightened(bundle, xy, pinhole, velocity, readout).obs_xy
         rays = (now - [pinhole.cx, pinhole.cy]) / pinhole.fx
         self.put(np.asarray(self.model.cameras[1].img_from_cam(np.column_stack([rays, np.ones(len(rays))]))))
 
