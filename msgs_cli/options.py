@@ -126,6 +126,10 @@ _SOURCE_OPTIONS = {
         "proxy.semantics", "PROVIDER",
         "Semantics: auto, segments (needs no weights), files[:FOLDER] or onnx:CARD. Default: auto.",
     ),
+    "classes": (
+        "proxy.classes", "WORDS",
+        'What to look for, "radiator, bookshelf, lamp", by a --semantics network whose card names a text encoder.',
+    ),
     "intrinsics": (
         "frames.intrinsics", "FX,FY,CX,CY[,K1,K2,P1,P2]|FILE",
         "The camera, in pixels of the source (first pixel's centre at 0.5, 0.5). Default: the data set's, EXIF, else "

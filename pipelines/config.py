@@ -98,6 +98,7 @@ class ProxyConfig:
 
     depth: str = setting("auto", "depth provider: auto, multiview, files:FOLDER, files, onnx:CARD or onnx:MODEL")
     semantics: str = setting("auto", "semantics provider: auto, segments, files:FOLDER, files, onnx:CARD or onnx:MODEL")
+    classes: str = setting("", "words to look for, comma-separated, for a network that compares pictures with words")
     frames: str = setting("keyframes", "which frames get maps; all needs depth without poses", ("keyframes", "all"))
     max_side: int = setting(640, "the maps are at most this many pixels on the long side", within=(64, 8192))
     depth_scale: float = setting(0.001, "metres per unit of integer depth files", within=(1e-9, 1000))
@@ -149,9 +150,7 @@ class MappingConfig:
     passes: float = setting(9.0, "how often each keyframe is visited once all are seeded", within=(0, 1000))
     min_iterations: int = setting(400, "at least this many such visits in all", within=(0, 10_000_000))
     snapshot_every: int = setting(150, "steps between two snapshots", within=(1, 1_000_000))
-    max_gaussians: int = setting(
-        1000000, "the map, or each submap, stops growing at this many", within=(100, 50_000_000)
-    )
+    max_gaussians: int = setting(1000000, "the map, or each submap, grows to this many", within=(100, 50_000_000))
     submap: int = setting(
         250, "more keyframes are mapped in overlapping parts of about this many, joined at the end; 0 = never",
         within=(4, 1_000_000), or_zero=True,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 
@@ -22,6 +22,7 @@ from pipelines.proxy.networks.clusters_provider import OnnxClusters
 from pipelines.proxy.networks.depth_provider import OnnxDepth
 from pipelines.proxy.networks.labels_provider import OnnxLabels
 from pipelines.proxy.networks.network_pass import ResultCache, Workplace
+from pipelines.proxy.networks.words import with_words
 from pipelines.proxy.providers import DepthProvider, SemanticsProvider
 from pipelines.proxy.regions.provider import SegmentLabels
 from pipelines.proxy.scale import measure_scale
@@ -77,7 +78,15 @@ def choose_depth(config: ProxyConfig) -> Choice:
 
 def choose_semantics(config: ProxyConfig) -> Choice:
     """Raises InputError for a provider that does not exist or a card that is none."""
-    return _choose(config.semantics, "proxy.semantics", tuple(OWN_SEMANTICS), "segmentation")
+    choice = _choose(config.semantics, "proxy.semantics", tuple(OWN_SEMANTICS), "segmentation")
+    if choice.card is None or choice.card.text is None:
+        if config.classes:
+            raise InputError(
+                "proxy.classes: a network that compares pictures with words finds them, --semantics onnx:CARD.toml "
+                f"whose card has `text`; {choice.card.name if choice.card else choice.kind} does not"
+            )
+        return choice
+    return replace(choice, card=with_words(choice.card, config.classes))
 
 
 def _choose(text: str, setting: str, own: tuple[str, ...], task: str) -> Choice:

@@ -26,6 +26,8 @@ from onnx import TensorProto, helper
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from tiny_tflite import write_tflite
+from tokenizers import Tokenizer, normalizers, pre_tokenizers, trainers
+from tokenizers import models as tokenizer_models
 
 from formats.colmap import read_colmap_model, write_colmap_model
 from formats.compact_gaussians import write_compact
@@ -64,10 +66,11 @@ from pipelines.masks.files import open_masks
 from pipelines.proxy.files.classes import read_class_table
 from pipelines.proxy.files.depth import _read as read_depth_file
 from pipelines.proxy.models.registry import ModelStore
-from pipelines.proxy.networks.card import read_card
+from pipelines.proxy.networks.card import Card, read_card
 from pipelines.proxy.networks.head import load_linear_head
 from pipelines.proxy.networks.network_pass import ResultCache
 from pipelines.proxy.networks.session import Network
+from pipelines.proxy.networks.words import load_word_head, open_tokenizer, with_words
 from pipelines.structure.calibration import read_intrinsics
 from pipelines.viewer_scene import load_scenes
 
@@ -254,6 +257,17 @@ def head(path: Path) -> None:
     finite(found.bias, "bias")
 
 
+def words(path: Path) -> None:
+    card = Card("segmentation", path, "x", "y", kind="features", text=path, background=())
+    finite(load_word_head(with_words(card, "a lamp, sofa"), 1, "cpu").weight, "weight")
+
+
+def tokens(path: Path) -> None:
+    tokenizer = open_tokenizer(path)
+    for text in ("a photo of a lamp.", "", "\u00e9\ud7ff sofa"):
+        need(all(i >= 0 for i in tokenizer.encode(text).ids), "a token below 0")
+
+
 def store(folder: Path) -> None:
     opened = ModelStore.open(folder)
     opened.verify()
@@ -432,6 +446,16 @@ def make_head(folder: Path) -> None:
     torch.save({"state_dict": {f"decode_head.{k}": torch.ones(s) for k, s in shapes.items()}}, folder / "h.pth")
 
 
+def make_tokenizer(folder: Path) -> None:
+    """Byte-level BPE with CLIP's normaliser and end of words, which knows a few words."""
+    tokenizer = Tokenizer(tokenizer_models.BPE(unk_token="?", end_of_word_suffix="</w>"))
+    tokenizer.normalizer = normalizers.Sequence([normalizers.NFC(), normalizers.Lowercase()])
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    trainer = trainers.BpeTrainer(special_tokens=["?"], end_of_word_suffix="</w>", vocab_size=120, show_progress=False)
+    tokenizer.train_from_iterator(["a photo of a lamp and a sofa, a lamp"], trainer)
+    tokenizer.save(str(folder / "tokenizer.json"))
+
+
 def make_store(folder: Path) -> None:
     row = {"name": "mine", "family": "moge", "bytes": 3, "sha256": "ab", "licence": "own", "commercial": False}
     write_json(folder / "own.json", {"pinned": {"dinov2-vits14-ade20k": "00"}, "added": [row]})
@@ -501,6 +525,12 @@ DOORS: dict[str, Door] = {
     "ONNX": Door(make_onnx, network, damaged="net.onnx", weight=2),
     "TFLite": Door(make_tflite, network, damaged="net.tflite", weight=2),
     "head": Door(make_head, head, "h.pth"),
+    "table of words": Door(
+        lambda f: save_arrays(f / "w.npz", {"words": np.array(["sofa", "a lamp"]), "embeddings": np.eye(2)}),
+        words,
+        "w.npz",
+    ),
+    "tokenizer": Door(make_tokenizer, tokens, "tokenizer.json"),
     "model store": Door(make_store, store, damaged="own.json"),
     "kept network result": Door(
         lambda f: ResultCache(f, 1).save("k", {"depth": np.ones((6, 8))}), kept_result, mutate=in_zip

@@ -20,8 +20,16 @@ normals = "predicted_normal"      # an output of unit normals, and one of how su
 normal_confidence = "normal_confidence"
 metadata = true                   # mean and std stand in the file's own metadata and win over the card's
 classes = "labels.txt"            # segmentation: names, a file or a list
-kind = "logits"                   # segmentation: logits, probabilities, argmax, or tokens (of a transformer)
+kind = "logits"                   # segmentation: logits, probabilities, argmax, tokens (a transformer's), or features
 head = "head.pth"                 # tokens: a linear head for the classes; without one, alike features are a class
+text = "text.onnx"                # features, or tokens, in one space with texts: their encoder, or an .npz with
+                                  # `words` (K,) and `embeddings` (K, F); the classes are then words of the user's
+tokenizer = "tokenizer.json"      # of the library `tokenizers`; for an encoder
+text_input = "input_ids"
+text_output = "text_embeds"
+prompts = ["a photo of a {}."]    # what is encoded for a word: the mean over these
+background = ["object", "things", "stuff", "texture"]    # what fits these better than every word is "other"
+temperature = 0.01                # of the softmax over cosines
 """
 
 from __future__ import annotations
@@ -38,9 +46,10 @@ from pipelines.proxy.files.classes import read_class_table
 
 _MAX_CARD_BYTES = 1 << 20
 _MAX_SIDE = 8192
+_FILES = ("model", "head", "text", "tokenizer")
 _KINDS = {
     "depth": ("plane", "points"),
-    "segmentation": ("logits", "probabilities", "argmax", "tokens"),
+    "segmentation": ("logits", "probabilities", "argmax", "tokens", "features"),
     "person": ("probability",),
 }
 
@@ -80,6 +89,13 @@ class Card:
     mask: str = ""
     metric_scale: str = ""
     sha256: str = ""
+    text: Path | None = None
+    tokenizer: Path | None = None
+    text_input: str = "input_ids"
+    text_output: str = "text_embeds"
+    prompts: tuple[str, ...] = ("a photo of a {}.",)
+    background: tuple[str, ...] = ("object", "things", "stuff", "texture")
+    temperature: float = 0.01
 
     @property
     def name(self) -> str:
@@ -88,8 +104,8 @@ class Card:
 
     @property
     def is_clustered(self) -> bool:
-        """Features without a head: their clusters are the classes."""
-        return self.kind == "tokens" and self.head is None
+        """Features without a head or words: their clusters are the classes."""
+        return self.kind == "tokens" and self.head is None and self.text is None
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -107,9 +123,9 @@ def read_card(path: Path) -> Card:
     for key in ("task", "model", "input", "output"):
         if not isinstance(values.get(key), str):
             raise InputError(f'{path}: the card lacks {key} = "…"')
-    values["model"] = _beside(path, values["model"])
-    if isinstance(values.get("head"), str):
-        values["head"] = _beside(path, values["head"])
+    for key in _FILES:
+        if isinstance(values.get(key), str):
+            values[key] = _beside(path, values[key])
     if isinstance(values.get("classes"), str):
         table = read_class_table(_beside(path, values["classes"]))
         values["classes"] = [table[i].name if i in table else f"class {i}" for i in range(max(table) + 1)]
@@ -150,7 +166,9 @@ def _beside(path: Path, name: str) -> Path:
 
 
 def _converted(key: str, value: Any, kind: Any) -> Any:
-    if key in ("model", "head"):
+    if key in _FILES:
+        if not isinstance(value, Path):
+            raise ValueError(f"{key} is the name of a file, got {value!r}")
         return value
     if str(kind).startswith("tuple"):
         if not isinstance(value, list):
@@ -165,7 +183,8 @@ def _converted(key: str, value: Any, kind: Any) -> Any:
 
 
 def _check(card: Card, path: Path) -> None:
-    numbers = (card.white, card.canonical_focal, *card.mean, *card.std)
+    numbers = (card.white, card.canonical_focal, card.temperature, *card.mean, *card.std)
+    is_table = card.text is not None and card.text.suffix.lower() == ".npz"
     problems = {
         "numbers are finite and below a million": all(math.isfinite(n) and abs(n) < 1e6 for n in numbers),
         f"task is {', '.join(_KINDS)}": card.task in _KINDS,
@@ -181,9 +200,16 @@ def _check(card: Card, path: Path) -> None:
         "focal is [fx, fy], positive, and goes with size": card.focal == (0, 0)
         or (len(card.focal) == 2 and min(card.focal) > 0 and all(card.size)),
         "groups has one name for each class": len(card.groups) in (0, len(card.classes)),
+        "features need text": card.kind != "features" or card.text is not None,
         "segmentation needs classes": card.is_clustered
         or card.task != "segmentation"
+        or card.text is not None
         or 1 <= len(card.classes) <= 10_000,
+        "text goes with features or tokens, without classes or a head": card.text is None
+        or (card.kind in ("features", "tokens") and not card.classes and card.head is None),
+        "a text encoder needs a tokenizer": card.text is None or is_table or card.tokenizer is not None,
+        "prompts has a text or more, with {} for the word": card.prompts and all("{}" in p for p in card.prompts),
+        "temperature is positive": card.temperature > 0,
         "classes of tokens need a head": not (card.is_clustered and card.classes),
     }
     for rule, holds in problems.items():

@@ -18,6 +18,6 @@ def card_identity(card: Card) -> str:
     if not is_tflite(card.model):  # those carry all of their weights
         require_own_weights(card.model)
         beside = [card.model.parent / name for name in external_locations(card.model)]
-    files = [card.model, *([card.head] if card.head else []), *beside]
-    contract = repr(replace(card, model=Path(card.model.name), head=None))
+    files = [*filter(None, (card.model, card.head, card.text, card.tokenizer)), *beside]
+    contract = repr(replace(card, model=Path(card.model.name), head=None, text=None, tokenizer=None))
     return hashlib.sha256((contract + files_sha256((p.name, p) for p in files)).encode()).hexdigest()

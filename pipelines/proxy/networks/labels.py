@@ -66,18 +66,21 @@ def _scores(network: Network, output: NDArray, box: Letterbox) -> NDArray[np.flo
     card = network.card
     if card.kind == "tokens":
         return _token_scores(network, output, box)
-    if output.ndim != 3 or output.shape[0] != len(card.classes):
-        raise InputError(
-            f"{card.model}: gave {output.shape}; {len(card.classes)} classes by height by width are expected"
-        )
-    return np.asarray(output.astype(np.float32).transpose(1, 2, 0))
+    head = network.head
+    planes, what = (
+        (len(card.classes), "classes") if head is None else (head.weight.shape[1], "features, as of the words,")
+    )
+    if output.ndim != 3 or output.shape[0] != planes:
+        raise InputError(f"{card.model}: gave {output.shape}; {planes} {what} by height by width are expected")
+    values = np.asarray(output.astype(np.float32).transpose(1, 2, 0))
+    return values if head is None else head.scores(values)
 
 
 def _token_scores(network: Network, output: NDArray, box: Letterbox) -> NDArray[np.float32]:
     """(rows, columns, C) scores of the patches of a transformer."""
     head = network.head
     if head is None or output.ndim != 2 or output.shape[1] != head.weight.shape[1]:
-        raise InputError(f"{network.card.model}: gave {output.shape}, which does not fit the head")
+        raise InputError(f"{network.card.model}: gave {output.shape}, which does not fit the head or the words")
     return head.scores(patch_features(network, output, box.width, box.height))
 
 

@@ -51,6 +51,9 @@ class OnnxLabels:
         self._scene: NamedScene | None = None
         identity = f"{card_identity(card)} {place.sequence.intrinsics.width}x{place.sequence.intrinsics.height}"
         self._pass = NetworkPass(self.name, identity, place, self._compute)
+        if card.text is not None:  # no file says whether a picture's features are as long as a word's
+            camera = place.sequence.intrinsics
+            self._compute(np.full((camera.height, camera.width, 3), 128, np.uint8))
 
     def warnings(self) -> list[str]:
         """Nothing is ever amiss."""

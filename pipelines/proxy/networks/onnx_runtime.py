@@ -14,7 +14,9 @@ from pipelines.progress import log
 from pipelines.proxy.networks.onnx_file import require_own_weights
 from pipelines.proxy.networks.runtime import Port
 
-_TYPES: dict[str, type[np.generic]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+_TYPES: dict[str, type[np.generic]] = {
+    "tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(int64)": np.int64, "tensor(int32)": np.int32,
+}  # fmt: skip
 
 
 class OnnxRuntime:

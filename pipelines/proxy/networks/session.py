@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from formats.digest import file_sha256
 from formats.errors import InputError
 from pipelines.proxy.networks.card import Card
-from pipelines.proxy.networks.head import load_linear_head
+from pipelines.proxy.networks.head import LinearHead, load_linear_head
 from pipelines.proxy.networks.letterbox import Letterbox, choose_box
 from pipelines.proxy.networks.runtime import open_runtime
+from pipelines.proxy.networks.words import WordHead, load_word_head
 
 _MAX_OUTPUT_VALUES = 200_000_000
 _IMAGENET_MEAN = (123.675, 116.28, 103.53)
@@ -29,7 +30,11 @@ class Network:
         """Raises InputError for a file that is not what the card says, before anything is computed."""
         self.card = card
         _require_whole(card)
-        self.head = load_linear_head(card.head, len(card.classes)) if card.head is not None else None
+        self.head: LinearHead | WordHead | None = None
+        if card.head is not None:
+            self.head = load_linear_head(card.head, len(card.classes))
+        elif card.text is not None:
+            self.head = load_word_head(card, threads, device)
         wanted = list(_outputs(card).values())
         bonus = {k: n for k, n in (("normals", card.normals), ("kappa", card.normal_confidence)) if n}
         self._runtime = open_runtime(card.model, [*wanted, *bonus.values()], threads, device)
@@ -44,7 +49,7 @@ class Network:
             _require_bounded(card.model, name, outputs[name].shape)
         _require_fitting(card, outputs[card.output].shape)
         kind = inputs[card.input].dtype
-        if kind is None:
+        if kind is None or not issubclass(kind, np.floating):
             raise InputError(f"{card.model}: input {card.input} is not of float or float16. Correct the card")
         self._dtype = kind
         # A bonus: exports of the same family without them work as well.
@@ -133,7 +138,7 @@ def _require_bounded(path: Path, name: str, shape: Sequence[int | str | None]) -
 
 def _require_fitting(card: Card, shape: Sequence[int | str | None]) -> None:
     """What a file of fixed shapes tells of its output before it runs: 1 x channels x rows x columns."""
-    if card.kind in ("tokens", "points") or len(shape) != 4 or not isinstance(shape[1], int):
+    if card.kind in ("tokens", "points", "features") or len(shape) != 4 or not isinstance(shape[1], int):
         return
     planes = 1 if card.task != "segmentation" or card.kind == "argmax" else len(card.classes)
     if shape[1] != planes:
