@@ -14,7 +14,7 @@ from pipelines.mapping.covisibility import keyframe_weights
 from pipelines.mapping.load import MappingInput, load_views, split_frames
 from pipelines.mapping.poses import interpolate_rows, move_trajectory
 from pipelines.mapping.schedule import RATE_DECAY, Schedule, Seeding
-from pipelines.mapping.views import channel_table, halved, occurring_classes
+from pipelines.mapping.views import channel_table, halved, occurring_classes, reduced_depth
 from pipelines.run_folder import RunFolder
 from pipelines.types import VOID, Intrinsics, Trajectory
 
@@ -69,9 +69,25 @@ def test_half_a_view_sees_the_same(room: MappingInput) -> None:
     view = room.views[0]
     half = halved(view)
     assert half.depth.shape == (30, 40)
-    assert torch.equal(half.depth, view.depth[1::2, 1::2])
+    assert torch.equal(half.channels, view.channels[1::2, 1::2])
+    four = torch.stack([view.depth[i::2, j::2] for i in (0, 1) for j in (0, 1)])
+    assert ((half.depth >= four.amin(0) - 1e-5) & (half.depth <= four.amax(0) + 1e-5)).all()
     assert abs(half.colors.mean() - view.colors.mean()) < 0.01
     assert half.intrinsics.cx * 2 == view.intrinsics.cx
+
+
+@pytest.mark.parametrize(("width", "height"), [(64, 48), (43, 32)])
+def test_reduced_depth_lies_on_the_same_plane_and_between_no_surfaces(width: int, height: int) -> None:
+    rows = np.arange(96) + 0.5
+    floor = np.tile((750 / (rows + 30)).astype(np.float32)[:, None], (1, 128))
+    floor[:, 64:], floor[:8] = 40.0, 0
+    small = reduced_depth(floor, width, height)
+    rows = (np.arange(height) + 0.5) * 96 / height
+    truth = 750 / (rows[height // 8 :, None] + 30)
+    left, beside = small[height // 8 :, : width // 2 - 1], small[height // 8 :, width // 2 - 1 :]
+    assert np.allclose(left, truth, rtol=1e-3)
+    assert (np.isclose(beside, 40) | np.isclose(beside, truth, rtol=0.03)).all()
+    assert (small[: height // 12] == 0).all()
 
 
 def test_working_size_never_enlarges() -> None:
