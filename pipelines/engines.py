@@ -1,18 +1,21 @@
 """Where independent calls run: one after the other on this machine, or on the machines of a Ray cluster.
 
 Either way a call has a process of its own. What it returns comes back; a bug's traceback comes back as text; a process
-that is lost (killed, out of memory, its machine gone) costs its own call only, which is tried once more.
+that is lost (killed, out of memory) costs its own call only, which is tried once more, and one whose machine is gone is
+done elsewhere.
 """
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import platform
 import signal
 import socket
 import threading
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -22,9 +25,13 @@ from formats.errors import InputError
 from pipelines.progress import log
 from pipelines.stopping import Stopped, is_asked, soft_stop, stop_if_asked
 
-TRIES = 2
+TRIES, NODES = 2, 50
+"""How often a call is begun when its processes are lost, and when its nodes are: machines come and go."""
 _ANSWERS_WITHIN, _ENDS_WITHIN = 5.0, 20.0
 """Seconds: for an address to answer, for cancelled calls to end by themselves."""
+_SETTINGS = b"\x04"
+_HTTP2 = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + _SETTINGS + bytes(5)
+"""How gRPC, which Ray speaks, begins a connection, and the kind of frame it begins to answer with (RFC 9113, 3.4)."""
 
 
 @dataclass(frozen=True)
@@ -157,27 +164,42 @@ class RayEngine:
 
     def run(self, calls: Sequence[Call]) -> Iterator[Ended]:
         """As they end."""
-        ray = self._ray
-        task = ray.remote(_on_node)
-        options = {"max_retries": TRIES - 1, "retry_exceptions": False}
-        waiting = {
-            task.options(name=c.name, num_cpus=c.cpus, num_gpus=c.gpus, **options).remote(c.function, c.arguments): c
-            for c in calls
-        }
+        waiting = {self._begin(c): c for c in calls}
+        lost: Counter[tuple[str, str]] = Counter()
         try:
             while waiting:
                 stop_if_asked()
-                for ref in ray.wait(list(waiting), timeout=0.5)[0]:
-                    yield self._ended(ref, waiting.pop(ref))
+                for ref in self._ray.wait(list(waiting), timeout=0.5)[0]:
+                    call = waiting.pop(ref)
+                    ended, kind, why = self._ended(ref, call)
+                    if ended is None:
+                        lost[call.name, kind] += 1
+                        if lost[call.name, kind] < {"process": TRIES, "node": NODES}[kind]:
+                            log.warning("%s: its %s was lost, it is begun again (%s)", call.name, kind, why)
+                            waiting[self._begin(call)] = call
+                            continue
+                        ended = Ended(call, None, f"its {kind} was lost {lost[call.name, kind]} times: {why}")
+                    yield ended
         finally:
             self._cancel(list(waiting))
 
-    def _ended(self, ref: Any, call: Call) -> Ended:
+    def _begin(self, call: Call) -> Any:
+        options = {"name": call.name, "num_cpus": call.cpus, "num_gpus": call.gpus, "max_retries": 0}
+        return self._ray.remote(_on_node).options(**options).remote(call.function, call.arguments)
+
+    def _ended(self, ref: Any, call: Call) -> tuple[Ended | None, str, str]:
+        """None where a process or a node was lost, which of them, and Ray's reason."""
         try:
             kind, value = self._ray.get(ref)
+        except self._ray.exceptions.RayTaskError as error:  # before `_on_node` could begin
+            return Ended(call, None, (
+                f"on the node {error.ip}, which has no msgs-slam, or another version: {str(error.cause)[-300:]}\n"
+                "Install the same msgs-slam[cluster] on every node, in the Python that `ray start` runs in"
+            )), "", ""  # fmt: skip
         except self._ray.exceptions.RayError as error:
-            return Ended(call, None, f"its process was lost {TRIES} times: {str(error)[:500]}")
-        return Ended(call, value) if kind == "value" else Ended(call, None, value)
+            which = "node" if isinstance(error, self._ray.exceptions.NodeDiedError) else "process"
+            return None, which, " ".join(str(error).split())[:300]
+        return Ended(call, value) if kind == "value" else Ended(call, None, value), "", ""
 
     def _cancel(self, refs: list[Any]) -> None:
         for force in (False, True):
@@ -195,7 +217,7 @@ def _on_node(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[
     try:
         return "value", function(*arguments)
     except Exception:
-        return "failure", f"on {socket.gethostname()}:\n{traceback.format_exc()}"
+        return "failure", f"on the node {platform.node()}:\n{traceback.format_exc()}"
 
 
 def _import_ray() -> Any:
@@ -213,7 +235,10 @@ def _require_answer(address: str) -> None:
         raise InputError(f"--address {address}: expected HOST:PORT, as `ray start --head` prints it, or auto")
     started = time.monotonic()
     try:
-        socket.create_connection((host, int(port)), timeout=_ANSWERS_WITHIN).close()
+        with socket.create_connection((host, int(port)), timeout=_ANSWERS_WITHIN) as connection:
+            connection.sendall(_HTTP2)
+            if connection.recv(9)[3:4] != _SETTINGS:
+                raise OSError("another program does")
     except (OSError, OverflowError) as error:
         raise InputError(
             f"no Ray answers at {address} ({error}, after {time.monotonic() - started:.0f} s). Start one there with "

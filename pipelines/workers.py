@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -17,6 +19,7 @@ from pipelines.progress import Progress
 
 T = TypeVar("T")
 R = TypeVar("R")
+_COMPUTE = ("torch", "numpy", "scipy", "pycolmap", "numba", "opencv-python-headless", "scikit-image")
 
 
 class TaskWorkers(Protocol):
@@ -88,7 +91,7 @@ def work_here(
 
 
 def require_same_world(folders: Sequence[Path], code: str) -> None:
-    """Raise InputError unless this node sees the folders, and has the program that the others have."""
+    """Raise InputError unless this node sees the folders, and has what the others have (`code_identity`)."""
     node = platform.node()
     for folder in folders:
         if not folder.exists():
@@ -96,17 +99,29 @@ def require_same_world(folders: Sequence[Path], code: str) -> None:
                 f"the node {node} does not see {folder}: sources and runs must lie on a disk that all nodes have under "
                 "the same path"
             )
-    if code != (here := code_identity()):
-        raise InputError(
-            f"the node {node} has another version of the program ({here[:12]}, not {code[:12]}): install the same "
-            "on every node"
-        )
+    theirs, ours = (dict(part.partition("=")[::2] for part in c.split(" ")) for c in (code, code_identity()))
+    for name in {**ours, **theirs}:
+        if (found := ours.get(name, "none")) != (wanted := theirs.get(name, "none")):
+            raise InputError(
+                f"the node {node} has another version of {name} ({found[:12]}, not {wanted[:12]}), so that its results "
+                "would differ: install the same on every node"
+            )
 
 
 @functools.cache
 def code_identity() -> str:
-    """Of what the stages compute with."""
+    """Of what results depend on: the program's stages, Python, the libraries that compute; name=version of each."""
     from pipelines.reconstruct import all_stages
     from pipelines.stage_identity import stage_identity
 
-    return " ".join(stage_identity(stage.name, stage.file) for stage in all_stages())
+    stages = " ".join(stage_identity(stage.name, stage.file) for stage in all_stages())
+    program = hashlib.sha256(stages.encode()).hexdigest()
+    found = {"msgs-slam": program, "Python": platform.python_version(), **{name: _version(name) for name in _COMPUTE}}
+    return " ".join(f"{name}={value}" for name, value in found.items())
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package).partition("+")[0]  # +cpu, +cu128: the device is a setting
+    except PackageNotFoundError:
+        return "none"

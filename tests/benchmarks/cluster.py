@@ -3,9 +3,10 @@
     python tests/benchmarks/cluster.py --work DIR --nodes 2                       the same bytes as in one process?
     python tests/benchmarks/cluster.py --work DIR --nodes 2 --kills 8 --seed 0    nodes killed in every stage
     python tests/benchmarks/cluster.py --work DIR --nodes 2 --kill-head proxy     all of Ray killed once, then resume
+    python tests/benchmarks/cluster.py --work DIR --nodes 1 --bad folder          a node that is of no use, then resume
 
 Every node is a process of this machine with one CPU; the head has none, so that tasks run on the others. A killed node
-is replaced at once. Needs msgs-slam[cluster].
+is replaced at once. What is before the first tasks is done by one process. Needs msgs-slam[cluster].
 """
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
@@ -30,30 +31,61 @@ os.environ["RAY_memory_monitor_refresh_ms"] = "0"  # noqa: SIM112  Ray writes it
 
 from pipelines.demo import unpack_demo_clip
 from pipelines.run_folder_names import STAGES
-from tests.benchmarks.shards import SETTINGS, begin, contents, msgs_slam
+from tests.benchmarks.shards import begin, contents, msgs_slam
 
+WITH_TASKS, BETWEEN_KILLS = ("proxy", "mapping"), (1.0, 5.0)
+"""Stages that submit tasks here (global_ba does where there are loops), and seconds from a kill to the next."""
+BAD = {
+    "folder": "mount -t tmpfs none {run}",
+    "disk": "mount -t tmpfs -o size=60k none {run}/proxy.partial",
+    "program": "mount -t tmpfs none {root}",
+}
+"""What makes a node bad, in a shell of its own mount and host names (unshare, for which one has to be root)."""
 EXPORTS = {"trajectory": "export/trajectory.txt", "map": "export/point_cloud.ply", "mesh": "export/mesh.ply"}
 
 
-def by_cluster(cluster: Any, run: Path, video: Path, kills: int, rng: random.Random, kill_head: str) -> dict[str, Any]:
-    """One reconstruction while nodes are killed, in each stage as long as there are kills left; how it ended."""
-    chosen = [part for setting in SETTINGS for part in ("--set", setting)]
-    command = msgs_slam("reconstruct", video, "--out", run, "--engine", "ray", "--address", cluster.address, *chosen)
-    log = run.with_suffix(".log").open("wb")
-    process = subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log)
-    killed: dict[str, int] = {}
+def add_bad_node(cluster: Any, bad: str, run: Path) -> subprocess.Popen[bytes]:
+    """A node called node-b that does not see the run, has no room in it, or not the program."""
+    ray = Path(sys.executable).with_name("ray")
+    spoil = BAD[bad].format(run=run.resolve(), root=ROOT)
+    script = f"hostname node-b && {spoil} && cd / && exec {ray} start --address={cluster.address} --num-cpus=1 --block"
+    return subprocess.Popen(["unshare", "-m", "-u", "sh", "-c", script], stdout=subprocess.DEVNULL)
+
+
+def by_cluster(
+    cluster: Any, run: Path, kills: int, rng: random.Random, kill_head: str, bad: str
+) -> dict[str, Any]:  # fmt: skip
+    """The rest of one reconstruction while nodes are killed, in each stage as long as there are kills left; how it
+    ended, and how many tasks were begun again for it. A `bad` node joins when the first tasks are done."""
+    command = msgs_slam("resume", run, "--engine", "ray", "--address", cluster.address)[:-1]  # -q: it warns of losses
+    log, killed, due = run.with_suffix(".log"), dict.fromkeys(WITH_TASKS, 0), 0.0
+    with log.open("wb") as stream:
+        process = subprocess.Popen(command, cwd=ROOT, stdout=stream, stderr=stream)
+    spoilt = None
     while process.poll() is None:
-        stage = next((s for s in STAGES if (run / f"{s}.partial").exists()), "")
-        time.sleep(rng.uniform(0.5, 4))
-        if stage == kill_head and stage and (run / f"{stage}.partial" / "snapshot").exists():
+        time.sleep(0.1)
+        stage = next((s for s in WITH_TASKS if (run / f"{s}.partial").exists()), "")
+        if bad and stage and spoilt is None:
+            spoilt = add_bad_node(cluster, bad, run)
+        if not stage or time.monotonic() < due:
+            due = due if stage else time.monotonic() + rng.uniform(*BETWEEN_KILLS)
+            continue
+        due = time.monotonic() + rng.uniform(*BETWEEN_KILLS)
+        if stage == kill_head:
             killed["head"] = 1
             cluster.shutdown()
             break
-        if stage and sum(killed.values()) < kills and killed.get(stage, 0) < -(-kills // len(STAGES)) + 1:
-            cluster.remove_node(rng.choice(sorted(cluster.worker_nodes, key=id)), allow_graceful=False)
-            killed[stage] = killed.get(stage, 0) + 1
+        if killed[stage] < -(-kills // len(WITH_TASKS)):
+            cluster.remove_node(
+                rng.choice(sorted(cluster.worker_nodes, key=lambda node: node.node_id)), allow_graceful=False
+            )
+            killed[stage] += 1
             cluster.add_node(num_cpus=1)
-    return {"exit code": process.wait(), "killed": killed}
+    code, text = process.wait(), log.read_text(errors="replace")
+    if spoilt is not None:
+        spoilt.terminate()
+        spoilt.wait()
+    return {"exit code": code, "killed": killed, "begun again": text.count("it is begun again")}
 
 
 def main() -> None:
@@ -64,19 +96,24 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--nodes", type=int, default=2)
     parser.add_argument("--kills", type=int, default=0)
-    parser.add_argument("--kill-head", default="", choices=("", *STAGES))
+    parser.add_argument("--kill-head", default="", choices=("", *WITH_TASKS))
+    parser.add_argument("--bad", default="", choices=("", *BAD))
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     video, _ = unpack_demo_clip(arguments.work)
-    whole, shared = arguments.work / "whole.msgs", arguments.work / "cluster.msgs"
+    whole, first, shared = (arguments.work / f"{name}.msgs" for name in ("whole", "frames", "cluster"))
     begin(video, whole, STAGES[-1])
+    begin(video, first, "frames")
     shutil.rmtree(shared, ignore_errors=True)
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    shutil.copytree(first, shared)
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
     for _ in range(arguments.nodes):
         cluster.add_node(num_cpus=1)
     started = time.monotonic()
-    told = by_cluster(cluster, shared, video, arguments.kills, random.Random(arguments.seed), arguments.kill_head)
+    rng = random.Random(arguments.seed)
+    told = by_cluster(cluster, shared, arguments.kills, rng, arguments.kill_head, arguments.bad)
     if told["exit code"]:
+        print(shared.with_suffix(".log").read_text(errors="replace")[-1500:])
         subprocess.run(msgs_slam("resume", shared), check=True, cwd=ROOT)
         told["resumed"] = True
     seconds, (one, many) = time.monotonic() - started, (contents(r) for r in (whole, shared))

@@ -102,7 +102,7 @@ def test_a_node_that_sees_no_folder_or_has_another_program_is_named(
     assert "the node node-7 does not see" in elsewhere.failure_file.read_text()
     here = find_recordings(recordings, tmp_path)[1]
     assert work_on(job_of(here, code="another")) == FAILED
-    assert "the node node-7 has another version of the program" in here.failure_file.read_text()
+    assert "the node node-7 has another version of msgs-slam" in here.failure_file.read_text()
 
 
 def test_shards_are_disjoint_and_together_all() -> None:

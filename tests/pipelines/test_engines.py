@@ -5,12 +5,15 @@ from __future__ import annotations
 import importlib.util
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import engine_calls
 import pytest
@@ -107,3 +110,74 @@ def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"pip install 'msgs-slam\[cluster\]'"):
         RayEngine()
+
+
+class NotInstalled(OSError):
+    """As Ray tells of what goes wrong before a function begins."""
+
+    ip, cause = "10.0.0.7", ModuleNotFoundError("No module named 'pipelines'")
+
+
+class LosingRay:
+    """As much of Ray as an engine asks of it, on machines that go; a real cluster is what benchmarks/cluster.py has."""
+
+    def __init__(self, lost: list[str]) -> None:
+        self.lost, self.begun = lost, 0
+        self.exceptions = SimpleNamespace(RayError=OSError, NodeDiedError=ConnectionError, RayTaskError=NotInstalled)
+
+    def remote(self, function: Callable[..., Any]) -> LosingRay:
+        self.function = function
+        return self
+
+    def options(self, **options: Any) -> SimpleNamespace:
+        def begin(*arguments: Any) -> tuple[Any, ...]:
+            self.begun += 1
+            return *arguments, self.begun
+
+        return SimpleNamespace(remote=begin)
+
+    def wait(self, refs: list[Any], timeout: float) -> tuple[list[Any], list[Any]]:
+        return refs[:1], refs[1:]
+
+    def get(self, ref: tuple[Any, ...]) -> tuple[str, Any]:
+        if self.lost:
+            raise {"node": ConnectionError, "process": OSError, "bare": NotInstalled}[self.lost.pop(0)]("no pulse")
+        return self.function(*ref[:-1])
+
+
+@pytest.mark.parametrize(
+    ("lost", "value", "failure"),
+    [
+        (["node"] * 5 + ["process"] + ["node"] * 5, 14, ""),
+        (["process", "node", "process"], None, "its process was lost 2 times: no pulse"),
+        (["node"] * 50, None, "its node was lost 50 times: no pulse"),
+        (["node", "bare"], None, "on the node 10.0.0.7, which has no msgs-slam, or another version: No module named"),
+    ],
+)
+def test_lost_nodes_are_no_fault_of_the_call(lost: list[str], value: int | None, failure: str) -> None:
+    """A process that is lost may be lost again for the same reason; machines come and go."""
+    engine, begun = object.__new__(RayEngine), len(lost) + (value is not None)
+    engine._ray = LosingRay(lost)
+    (ended,) = engine.run([Call("seven", engine_calls.double, (7,))])
+    assert ended.value == value
+    assert ended.failure.startswith(failure)
+    assert bool(ended.failure) == bool(failure)
+    assert engine._ray.begun == begun
+
+
+@needs_ray
+def test_an_address_where_another_program_listens_is_told_of_at_once() -> None:
+    """Ray would wait for minutes."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer() -> None:
+            connection, _ = server.accept()
+            with connection:
+                connection.sendall(b"SSH-2.0-OpenSSH_9.2\r\n")
+                connection.recv(100)
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with pytest.raises(InputError, match=r"no Ray answers at .* \(another program does, after 0 s\)"):
+            RayEngine(f"127.0.0.1:{server.getsockname()[1]}")
+        thread.join()

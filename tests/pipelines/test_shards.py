@@ -106,8 +106,8 @@ def test_a_new_lead_waits_for_who_is_at_a_task_and_begins_anew(folder: Path) -> 
 def test_a_node_with_another_version_says_so_and_leaves_the_task(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     posted = Posted.post(engine_calls.halve, [4], folder, 1)
     with monkeypatch.context() as patch:
-        patch.setattr(workers, "code_identity", lambda: "another")
-        with pytest.raises(RecoverableError, match="has another version of the program"):
+        patch.setattr(workers, "code_identity", lambda: "msgs-slam=another")
+        with pytest.raises(RecoverableError, match="has another version of msgs-slam"):
             posted.do_one(Shard(), engine_calls.silent)
     assert posted.do_one(Shard(), engine_calls.silent)
 
