@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipelines.depth.posed import PosedDepth
+from pipelines.depth.resize import resize_depth, resize_maps
 from pipelines.mapping.article.mirrors import Mirrors
 from pipelines.types import VOID, Intrinsics, ProxyMaps
-
-_ONE_SURFACE = 0.02
-"""Relative standard deviation up to which depths side by side are of one surface."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +94,7 @@ def make_view(
     if maps is None:
         nothing = np.zeros((height, width), np.float32)
         maps = ProxyMaps(nothing, nothing, np.full((height, width), VOID, np.uint8), nothing)
-    elif maps.depth.shape != (height, width):
-        maps = resize_maps(maps, width, height)
+    maps = resize_maps(maps, height, width)
     arrays = (
         image,
         maps.depth.astype(np.float32),
@@ -127,7 +124,7 @@ def halved(view: View) -> View:
     """The view at half the size: colours averaged, classes sampled, depth averaged where that is across no edge."""
     size = (max(view.intrinsics.width // 2, 1), max(view.intrinsics.height // 2, 1))
     image = cv2.resize(view.image.cpu().numpy(), size, interpolation=cv2.INTER_AREA)
-    depth = reduced_depth(view.depth.cpu().numpy(), *size)
+    depth = resize_depth(view.depth.cpu().numpy(), size[1], size[0])
 
     def sampled(tensor: Tensor) -> Tensor:
         return tensor[1::2, 1::2][: size[1], : size[0]].contiguous()
@@ -158,28 +155,3 @@ def occurring_classes(all_labels: Iterable[NDArray[np.uint8]], least_share: floa
         counts += np.bincount(labels.reshape(-1), minlength=256)
     counts[VOID] = 0
     return tuple(int(i) for i in np.flatnonzero(counts > least_share * max(counts.sum(), 1)))
-
-
-def resize_maps(maps: ProxyMaps, width: int, height: int) -> ProxyMaps:
-    """Proxy maps at another resolution; nothing is averaged across an edge."""
-
-    def nearest(array: NDArray) -> NDArray:
-        return cv2.resize(array, (width, height), interpolation=cv2.INTER_NEAREST)
-
-    depth = nearest(maps.depth) if width > maps.depth.shape[1] else reduced_depth(maps.depth, width, height)
-    return ProxyMaps(depth, *(nearest(getattr(maps, n)) for n in ("confidence", "labels", "label_confidence")))
-
-
-def reduced_depth(depth: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
-    """(height, width) depth of a smaller picture: the mean of what each of its pixels covers where that is one surface,
-    else one of its pixels.
-
-    That of the inverse: it is linear on a plane. One pixel of four lies half a pixel aside, which is per cents of the
-    depth where a floor recedes.
-    """
-    nearest = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST)
-    with np.errstate(divide="ignore"):
-        inverse = np.where(depth > 0, 1 / depth, np.nan).astype(np.float32)
-    mean, square = (cv2.resize(x, (width, height), interpolation=cv2.INTER_AREA) for x in (inverse, inverse**2))
-    is_one = square < (1 + _ONE_SURFACE**2) * mean**2  # not so of what is not known whole
-    return np.where(is_one, 1 / mean, nearest).astype(np.float32)

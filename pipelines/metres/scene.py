@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.depth.resize import resize_maps
 from pipelines.geometry.camera import unproject_depth
 from pipelines.proxy.regions.structure import (
     CEILING,
@@ -19,7 +20,7 @@ from pipelines.proxy.regions.structure import (
     name_structure,
 )
 from pipelines.proxy.regions.voxels import Voxels, find, gather_frame, merge, select, voxel_keys
-from pipelines.proxy.sequence import resample_nearest, resize_area
+from pipelines.proxy.sequence import resize_area
 from pipelines.types import VOID, Intrinsics, ProxyMaps
 
 Array = NDArray[np.float64]
@@ -103,11 +104,9 @@ def _gather(
 ) -> tuple[NDArray[np.int64], Array, tuple[NDArray[np.int64], NDArray[np.uint8]]]:
     """The frame's voxels as `gather_frame` gives them, and (Q,) key and label of each of its reliable pixels."""
     rows, columns = camera.height, camera.width
-    depth = resample_nearest(frame.maps.depth, rows, columns)
-    confidence = resample_nearest(frame.maps.confidence, rows, columns)
-    labels = resample_nearest(frame.maps.labels, rows, columns)
-    sure = confidence >= LEAST_CONFIDENCE
-    weight = np.where(sure, confidence, 0).astype(np.float32)
+    maps = resize_maps(frame.maps, rows, columns)
+    depth, labels, sure = maps.depth, maps.labels, maps.confidence >= LEAST_CONFIDENCE
+    weight = np.where(sure, maps.confidence, 0).astype(np.float32)
     image = resize_area(frame.image, columns, rows)
     keys, values = gather_frame(depth, weight, image, camera, frame.world_from_cam, size)
     motion = frame.world_from_cam

@@ -52,13 +52,6 @@ def resize_area(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def resample_nearest(array: NDArray, height: int, width: int) -> NDArray:
-    """(H, W, ...) → (height, width, ...): each pixel takes the value under its centre (depth must not be averaged)."""
-    rows = ((np.arange(height) + 0.5) * array.shape[0] / height).astype(np.int64)
-    columns = ((np.arange(width) + 0.5) * array.shape[1] / width).astype(np.int64)
-    return np.ascontiguousarray(array[rows[:, None], columns[None, :]])
-
-
 def resample_linear(array: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
     """(H, W, C) → (height, width, C) by linear interpolation between the centres of the pixels."""
     out = cv2.resize(np.ascontiguousarray(array), (width, height), interpolation=cv2.INTER_LINEAR)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from formats.errors import InputError
 from pipelines.config import Config, ProxyConfig
 from pipelines.correspondence.features import extract_features, to_grey
+from pipelines.depth.resize import resample_nearest
 from pipelines.frames.recording import open_recording
 from pipelines.masks.moving import SIDE, MovingView, find_moving
 from pipelines.progress import Progress, log
@@ -25,7 +26,7 @@ from pipelines.proxy.reliability import reliability, semantic_agreement, theta, 
 from pipelines.proxy.scale import DepthScale, measure_scale
 from pipelines.proxy.scratch import load_scratch, save_scratch
 from pipelines.proxy.selection import Surroundings, open_depth, open_semantics
-from pipelines.proxy.sequence import Sequence, resample_nearest, resize_area
+from pipelines.proxy.sequence import Sequence, resize_area
 from pipelines.proxy.symmetry import find_mirror_planes, mirror_pairs
 from pipelines.run_folder import (
     RunFolder,

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pipelines.depth.resize import resize_maps
 from pipelines.depth.scales import scale_at_points
 from pipelines.gaussians.seeding import seed_gaussians, seed_grid
 from pipelines.proxy.palette import class_colors
@@ -64,11 +65,11 @@ def _seed_keyframe(keyframe: int, state: TrackState, pictures: Pictures) -> tupl
     if maps is None:
         return None
     small, motion = pictures.intrinsics.at_most(WORKING_SIDE), state.poses[keyframe]
-    depth = _resized(maps.depth, small) * np.float32(
-        proxy_scale(keyframe, motion, maps, state, pictures.intrinsics) or 1.0
-    )
+    scale = proxy_scale(keyframe, motion, maps, state, pictures.intrinsics) or 1.0
+    maps = resize_maps(maps, small.height, small.width)
+    depth = maps.depth * np.float32(scale)
     grid = torch.from_numpy(seed_grid(small.height, small.width, STRIDE))
-    channels = torch.from_numpy(_resized(maps.labels, small))
+    channels = torch.from_numpy(maps.labels)
     colors, pose = _picture(pictures.color(keyframe), small), torch.from_numpy(np.ascontiguousarray(motion))
     seeds = seed_gaussians(grid, torch.from_numpy(depth), colors, channels, STRIDE, 1, pose, small, keyframe)
     classes = channels[grid & torch.from_numpy(depth > 0)]
@@ -88,12 +89,11 @@ def view_of(frame_id: int, cam_from_world: Array, keyframes: list[int], state: T
         near = [(k, m) for k in keyframes if (m := pictures.proxy(k)) is not None]
         scales = [s for k, m in near if (s := proxy_scale(k, state.poses[k], m, state, camera)) is not None]
         scale = float(np.exp(np.mean(np.log(scales)))) if scales else 1.0
-    depth = _resized(maps.depth, small) * np.float32(scale)
+    maps = resize_maps(maps, small.height, small.width)
+    depth = maps.depth * np.float32(scale)
     unit = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
-    labels = _class_picture(torch.from_numpy(_resized(maps.labels, small)))
-    return View(
-        image, torch.from_numpy(depth), torch.from_numpy(_resized(maps.confidence, small)), unit, labels
-    )  # fmt: skip
+    labels = _class_picture(torch.from_numpy(maps.labels))
+    return View(image, torch.from_numpy(depth), torch.from_numpy(maps.confidence), unit, labels)
 
 
 def proxy_scale(
@@ -112,10 +112,6 @@ def _class_picture(labels: Tensor) -> Tensor:
     table = torch.zeros(VOID + 1, 3)
     table[:VOID] = torch.tensor(class_colors(VOID)) / 255
     return table[labels.long()]
-
-
-def _resized(values: NDArray, small: Intrinsics) -> NDArray:
-    return cv2.resize(values, (small.width, small.height), interpolation=cv2.INTER_NEAREST)
 
 
 def _picture(image: NDArray[np.uint8], small: Intrinsics) -> Tensor:

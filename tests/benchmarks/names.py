@@ -38,6 +38,7 @@ from formats.datasets import Sequence, open_sequence
 from formats.images import write_rgb
 from formats.mesh import read_mesh_ply
 from pipelines.config import ProxyConfig, load_config
+from pipelines.depth.resize import resample_nearest
 from pipelines.evaluation.class_map import Matching, match_classes
 from pipelines.evaluation.label_score import count_labels, score
 from pipelines.evaluation.measure import render_outcome
@@ -50,7 +51,6 @@ from pipelines.proxy.networks.labels import network_labels
 from pipelines.proxy.networks.session import Network
 from pipelines.proxy.palette import class_colors
 from pipelines.proxy.selection import choose_semantics
-from pipelines.proxy.sequence import resample_nearest
 from pipelines.reconstruct import reconstruct
 from pipelines.run_folder import RunFolder
 from pipelines.types import VOID, ClassTable

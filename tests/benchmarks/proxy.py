@@ -37,8 +37,8 @@ from tracking import write_noisy_depth
 
 from formats.images import natural_key, read_depth_png
 from pipelines.config import load_config
+from pipelines.depth.resize import resample_nearest
 from pipelines.geometry.camera import project, unproject_depth
-from pipelines.proxy.sequence import resample_nearest
 from pipelines.reconstruct import reconstruct
 from pipelines.run_folder import RunFolder
 from pipelines.types import VOID, Frame, ProxyMaps

@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 
 from formats.datasets import Sequence, open_sequence
 from pipelines.config import load_config
+from pipelines.depth.resize import resample_nearest
 from pipelines.evaluation.evaluate import evaluate_run
 from pipelines.evaluation.measure import render_outcome
 from pipelines.outcome import load_outcome
 from pipelines.progress import SilentProgress
-from pipelines.proxy.sequence import resample_nearest
 from pipelines.reconstruct import reconstruct
 from pipelines.run_folder import RunFolder
 from tests.world import ClipOptions, make_world, write_sequence

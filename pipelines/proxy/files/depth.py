@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from formats.errors import InputError
 from formats.images import MAX_IMAGE_PIXELS, image_size, read_depth_png, read_grey_png
 from formats.reading import parsing, reaching, require_file
+from pipelines.depth.resize import resample_nearest, resize_depth
 from pipelines.proxy.files.matching import find_folder, match_files
 from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.sequence import Sequence, resample_nearest
+from pipelines.proxy.sequence import Sequence
 from pipelines.types import Frame
 
 _SUFFIXES = (".png", ".npy", ".tif", ".tiff")
@@ -59,7 +60,7 @@ class FilesDepth:
         path = self._files[frame.id]
         depth, invalid = clean_depth(_read(path, self._unit))
         require_aspect(path, depth, self._sequence)
-        depth = resample_nearest(depth, camera.height, camera.width)
+        depth = resize_depth(depth, camera.height, camera.width)
         confidence = (depth > 0).astype(np.float32)
         if frame.id in self._confidences:
             given = read_grey_png(self._confidences[frame.id])

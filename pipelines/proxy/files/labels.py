@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from formats.errors import InputError
 from formats.images import read_label_png
+from pipelines.depth.resize import resample_nearest
 from pipelines.progress import Progress
 from pipelines.proxy.files.classes import MAX_ID, NamedClass, find_class_table, read_class_table
 from pipelines.proxy.files.depth import require_aspect
 from pipelines.proxy.files.matching import find_folder, match_files
 from pipelines.proxy.palette import class_colors
 from pipelines.proxy.providers import DepthEstimate, LabelEstimate
-from pipelines.proxy.sequence import Sequence, resample_nearest
+from pipelines.proxy.sequence import Sequence
 from pipelines.types import VOID, ClassTable, Frame
 
 _SUFFIXES = (".png", ".tif", ".tiff")

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
+from pipelines.depth.resize import resample_nearest
 from pipelines.geometry.camera import unproject_depth
 from pipelines.jit import kernel
 from pipelines.progress import Progress
@@ -29,7 +30,7 @@ from pipelines.proxy.regions.voxels import (
     select,
     voxel_keys,
 )
-from pipelines.proxy.sequence import Sequence, resample_nearest
+from pipelines.proxy.sequence import Sequence
 from pipelines.types import VOID, ClassTable, Frame
 
 _VOXELS_PER_DEPTH = 60

@@ -9,12 +9,13 @@ import pytest
 import torch
 
 from pipelines.config import MappingConfig
+from pipelines.depth.resize import resize_depth
 from pipelines.geometry import se3
 from pipelines.mapping.covisibility import keyframe_weights
 from pipelines.mapping.load import MappingInput, load_views, split_frames
 from pipelines.mapping.poses import interpolate_rows, move_trajectory
 from pipelines.mapping.schedule import RATE_DECAY, Schedule, Seeding
-from pipelines.mapping.views import channel_table, halved, occurring_classes, reduced_depth
+from pipelines.mapping.views import channel_table, halved, occurring_classes
 from pipelines.run_folder import RunFolder
 from pipelines.types import VOID, Intrinsics, Trajectory
 
@@ -81,7 +82,7 @@ def test_reduced_depth_lies_on_the_same_plane_and_between_no_surfaces(width: int
     rows = np.arange(96) + 0.5
     floor = np.tile((750 / (rows + 30)).astype(np.float32)[:, None], (1, 128))
     floor[:, 64:], floor[:8] = 40.0, 0
-    small = reduced_depth(floor, width, height)
+    small = resize_depth(floor, height, width)
     rows = (np.arange(height) + 0.5) * 96 / height
     truth = 750 / (rows[height // 8 :, None] + 30)
     left, beside = small[height // 8 :, : width // 2 - 1], small[height // 8 :, width // 2 - 1 :]

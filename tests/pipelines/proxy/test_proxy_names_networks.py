@@ -11,6 +11,7 @@ from tiny_tflite import write_tflite
 
 from formats.datasets import open_sequence
 from formats.images import read_depth_png, read_rgb
+from pipelines.depth.resize import resample_nearest
 from pipelines.evaluation.class_map import match_classes
 from pipelines.evaluation.label_score import count_labels, score
 from pipelines.progress import SilentProgress
@@ -21,7 +22,7 @@ from pipelines.proxy.networks.labels_provider import OnnxLabels
 from pipelines.proxy.networks.network_pass import ResultCache, Workplace
 from pipelines.proxy.networks.session import Network
 from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.sequence import Sequence, resample_nearest
+from pipelines.proxy.sequence import Sequence
 from pipelines.types import VOID, Calibration, Frame, Intrinsics, SparseModel
 from tests.world.room import CLASSES
 
