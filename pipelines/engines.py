@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
-from formats.errors import InputError
+from formats.errors import InputError, RecoverableError
 from pipelines.progress import log
 from pipelines.stopping import Stopped, is_asked, soft_stop, stop_if_asked
 
@@ -29,6 +29,9 @@ TRIES, NODES = 2, 50
 """How often a call is begun when its processes are lost, and when its nodes are: machines come and go."""
 _ANSWERS_WITHIN, _ENDS_WITHIN = 5.0, 20.0
 """Seconds: for an address to answer, for cancelled calls to end by themselves."""
+_BETWEEN_LOOKS, _HEAD_WITHIN = 5.0, 30.0
+"""Seconds from one look for Ray's head to the next, and after which it will not come back."""
+_GO_ON = "What the tasks have done is kept: type `msgs-slam resume RUN`, with --engine ray once it is back, or without"
 _SETTINGS = b"\x04"
 _HTTP2 = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + _SETTINGS + bytes(5)
 """How gRPC, which Ray speaks, begins a connection, and the kind of frame it begins to answer with (RFC 9113, 3.4)."""
@@ -164,11 +167,14 @@ class RayEngine:
 
     def run(self, calls: Sequence[Call]) -> Iterator[Ended]:
         """As they end."""
-        waiting = {self._begin(c): c for c in calls}
+        task = self._ray.remote(_on_node)  # once: it is sent to the head, which may be gone later
+        waiting = {_begin(task, c): c for c in calls}
         lost: Counter[tuple[str, str]] = Counter()
+        looks = self._head_is_there()
         try:
             while waiting:
                 stop_if_asked()
+                next(looks)
                 for ref in self._ray.wait(list(waiting), timeout=0.5)[0]:
                     call = waiting.pop(ref)
                     ended, kind, why = self._ended(ref, call)
@@ -176,16 +182,29 @@ class RayEngine:
                         lost[call.name, kind] += 1
                         if lost[call.name, kind] < {"process": TRIES, "node": NODES}[kind]:
                             log.warning("%s: its %s was lost, it is begun again (%s)", call.name, kind, why)
-                            waiting[self._begin(call)] = call
+                            waiting[_begin(task, call)] = call
                             continue
                         ended = Ended(call, None, f"its {kind} was lost {lost[call.name, kind]} times: {why}")
                     yield ended
         finally:
             self._cancel(list(waiting))
 
-    def _begin(self, call: Call) -> Any:
-        options = {"name": call.name, "num_cpus": call.cpus, "num_gpus": call.gpus, "max_retries": 0}
-        return self._ray.remote(_on_node).options(**options).remote(call.function, call.arguments)
+    def _head_is_there(self) -> Iterator[None]:
+        """Look now and then, whenever asked for the next: Ray itself waits for its head for good. Raises
+        RecoverableError where that has not answered several times."""
+        address, seen = self._ray.get_runtime_context().gcs_address, time.monotonic()
+        looked = seen
+        while True:
+            yield
+            if time.monotonic() - looked < _BETWEEN_LOOKS:
+                continue
+            try:
+                _require_answer(address)
+                seen = time.monotonic()
+            except InputError as error:
+                if time.monotonic() - seen > _HEAD_WITHIN:
+                    raise RecoverableError(f"the head of the Ray cluster has gone: {error}. {_GO_ON}") from error
+            looked = time.monotonic()
 
     def _ended(self, ref: Any, call: Call) -> tuple[Ended | None, str, str]:
         """None where a process or a node was lost, which of them, and Ray's reason."""
@@ -196,6 +215,8 @@ class RayEngine:
                 f"on the node {error.ip}, which has no msgs-slam, or another version: {str(error.cause)[-300:]}\n"
                 "Install the same msgs-slam[cluster] on every node, in the Python that `ray start` runs in"
             )), "", ""  # fmt: skip
+        except self._ray.exceptions.LocalRayletDiedError as error:
+            raise RecoverableError(f"Ray on this machine ({platform.node()}) has ended. {_GO_ON}") from error
         except self._ray.exceptions.RayError as error:
             which = "node" if isinstance(error, self._ray.exceptions.NodeDiedError) else "process"
             return None, which, " ".join(str(error).split())[:300]
@@ -211,6 +232,11 @@ class RayEngine:
     def close(self) -> None:
         """Leave the cluster; one that was started here ends."""
         self._ray.shutdown()
+
+
+def _begin(task: Any, call: Call) -> Any:
+    options = {"name": call.name, "num_cpus": call.cpus, "num_gpus": call.gpus, "max_retries": 0}
+    return task.options(**options).remote(call.function, call.arguments)
 
 
 def _on_node(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[str, Any]:

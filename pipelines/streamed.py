@@ -59,6 +59,10 @@ class Streamed(Sequence[T], Generic[T]):
             self._kept.clear()
             self._used = 0
 
+    def part(self, numbers: range) -> Streamed[T]:
+        """Those numbers of the same, counted from 0; keeps its own."""
+        return Streamed(len(numbers), lambda i: self._make(numbers[i]), self._size_of, self._room)
+
     def changed(self, function: Callable[[int, T], T]) -> Streamed[T]:
         """The same with `function` of number and value applied; takes over what is kept here, and the room."""
         make = self._make

@@ -39,7 +39,10 @@ def learn_vocabulary(features: Sequence[Features], seed: int) -> Vocabulary:
         return Vocabulary(np.zeros((1, 128)), np.zeros(128))
     start = np.unique(sample[rng.permutation(len(sample))[:_WORDS]], axis=0)
     words, _ = kmeans2(sample, start, iter=_ROUNDS, minit="matrix", missing="warn")
-    return Vocabulary(words, np.mean([_vlad(f, words) for f in features], axis=0))
+    total = np.zeros(words.size)
+    for f in features:
+        total += _vlad(f, words)
+    return Vocabulary(words, total / len(features))
 
 
 def _vlad(features: Features, words: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -73,6 +73,7 @@ class Snapshots:
                 write_bytes(path / file.name, file.read_bytes())
             write_json(listed, [file.name for file in files])
             shutil.rmtree(scratch)
+            del model  # not beside the one that is read
         return pycolmap.Reconstruction(path) if (path / "cameras.bin").exists() else None
 
     def _require_room(self) -> None:

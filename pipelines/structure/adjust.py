@@ -31,19 +31,19 @@ def adjust(model: pycolmap.Reconstruction, refine_camera: bool) -> float:
     """
     images = sorted(model.reg_image_ids())
     solve(model, images, refine_camera)
-    _remove_wild(model)
+    remove_wild(model)
     if not refine_camera:
         solve(model, images, refine_camera=False)
-        _remove_wild(model)
+        remove_wild(model)
         return 0.0
     solve(model, images, refine_camera)
     simple_focal = float(model.cameras[1].focal_length)
     set_lens(model.cameras[1], 2)
     solve(model, images, refine_camera)
-    _remove_wild(model)
+    remove_wild(model)
     # Before points are removed: the adjuster keeps pointers into the model.
     formal = _formal_sd(model, solve(model, images, refine_camera))
-    _remove_wild(model)
+    remove_wild(model)
     focal = float(model.cameras[1].focal_length)
     return math.hypot(formal, focal - simple_focal, _difference_of_halves(model, images) / 2)
 
@@ -87,7 +87,8 @@ def reprojection_errors(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
     return np.concatenate(errors) if errors else np.zeros(0)
 
 
-def _remove_wild(model: pycolmap.Reconstruction) -> None:
+def remove_wild(model: pycolmap.Reconstruction) -> None:
+    """Observations that the model contradicts, and points that are seen from one direction only, in place."""
     manager = pycolmap.ObservationManager(model)
     manager.filter_observations_with_negative_depth()
     manager.filter_all_points3D(_MAX_REPROJECTION_PX, _MIN_ANGLE_DEG)

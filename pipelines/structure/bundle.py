@@ -143,8 +143,8 @@ class Problem:
         self.data = (intrinsics.numbers, self.obs_cam, self.obs_point, b.obs_xy, 1 / b.obs_sd, log_depth, weight, width)
         self.starts = np.searchsorted(self.obs_point, np.arange(len(b.points) + 1))
         self.free = np.ones(len(b.cam_from_world), bool) if fixed is None else ~fixed
-        self.numbers, _ = kernels.number_blocks(self.starts, self.obs_cam, len(b.cam_from_world))
-        self.pairs = np.argwhere(self.numbers >= 0)
+        self.rows, columns = kernels.number_blocks(self.starts, self.obs_cam, len(b.cam_from_world))
+        self.pairs = np.column_stack([np.repeat(np.arange(len(b.cam_from_world)), np.diff(self.rows)), columns])
         self.dense_cameras = DENSE_CAMERAS
         self.ids, self.rig = np.arange(len(b.cam_from_world)) if ids is None else ids, rig
 
@@ -160,11 +160,13 @@ class Problem:
         n = len(cam_block)
         blocks, right = np.zeros((len(self.pairs), 6, 6)), cam_right.ravel().copy()
         diagonal = np.einsum("nii->ni", cam_block)
-        blocks[np.diag(self.numbers)] = cam_block
+        own = self.rows[:-1]
+        blocks[own] = cam_block
         for i in range(6):
-            blocks[np.diag(self.numbers), i, i] += damping * diagonal[:, i] + 1e-9
+            blocks[own, i, i] += damping * diagonal[:, i] + 1e-9
         inverse = kernels.invert_points(point_block, damping)
-        kernels.eliminate_points(self.starts, self.obs_cam, mixed, inverse, point_right, self.numbers, blocks, right)
+        index = self.rows, np.ascontiguousarray(self.pairs[:, 1])
+        kernels.eliminate_points(self.starts, self.obs_cam, mixed, inverse, point_right, *index, blocks, right)
         pairs, moving, turns, place = self.pairs, self.free, None, np.arange(n)
         if len(self.rig) > 1:
             blocks, pairs, right, place, turns = tie_cameras(blocks, pairs, right, self.ids, self.rig)

@@ -159,28 +159,40 @@ def invert_points(point_block, damping):  # type: ignore[no-untyped-def]
 
 @kernel
 def number_blocks(starts, obs_cam, count):  # type: ignore[no-untyped-def]
-    """numbers (N, N) of the pairs a <= b of cameras that share a point, row by row, -1 for others; their count."""
-    numbers = np.full((count, count), -1, np.int32)
-    for c in range(count):
-        numbers[c, c] = 0
+    """The pairs a <= b of cameras that share a point, row by row: those of camera a have the numbers from rows[a] to
+    rows[a + 1] (N + 1,), their second cameras, ascending, are columns (B,)."""
+    point = np.empty(len(obs_cam), np.int64)
     for q in range(len(starts) - 1):
-        for a in range(starts[q], starts[q + 1]):
-            for b in range(a + 1, starts[q + 1]):
-                numbers[obs_cam[a], obs_cam[b]] = 0
-    used = 0
+        point[starts[q] : starts[q + 1]] = q
+    order = np.argsort(obs_cam, kind="mergesort")
+    rows, columns = np.zeros(count + 1, np.int64), np.empty(16 * count, np.int64)
+    seen, place = np.full(count, -1, np.int64), 0
     for a in range(count):
-        for b in range(a, count):
-            if numbers[a, b] == 0:
-                numbers[a, b] = used
-                used += 1
-    return numbers, used
+        first = rows[a]
+        used = first
+        if used + count > len(columns):
+            columns = np.concatenate((columns, np.empty(len(columns) + count, np.int64)))
+        columns[used], seen[a] = a, a
+        used += 1
+        while place < len(order) and obs_cam[order[place]] == a:
+            o = order[place]
+            for other in range(o + 1, starts[point[o] + 1]):
+                b = obs_cam[other]
+                if seen[b] != a:
+                    columns[used], seen[b] = b, a
+                    used += 1
+            place += 1
+        columns[first:used] = np.sort(columns[first:used])
+        rows[a + 1] = used
+    return rows, columns[: rows[count]].copy()
 
 
 @kernel
-def eliminate_points(starts, obs_cam, mixed, inverse_block, point_right, numbers, blocks, right):  # type: ignore[no-untyped-def]
+def eliminate_points(starts, obs_cam, mixed, inverse_block, point_right, rows, columns, blocks, right):  # type: ignore[no-untyped-def]
     """Subtract the points' share from the blocks (B, 6, 6) of the reduced camera system and its right side (6N,).
 
-    Observations are sorted by point, then camera; starts (P + 1,) are their ranges; `numbers` as of `number_blocks`.
+    Observations are sorted by point, then camera; starts (P + 1,) are their ranges; `rows` and `columns` as of
+    `number_blocks`.
     """
     left = np.empty((6, 3))
     for q in range(len(starts) - 1):
@@ -196,8 +208,11 @@ def eliminate_points(starts, obs_cam, mixed, inverse_block, point_right, numbers
                     left[i, j] = value
                     total += value * point_right[q, j]
                 right[row + i] -= total
+            end = rows[obs_cam[a] + 1]
+            number = rows[obs_cam[a]]
             for b in range(a, last):
-                block = blocks[numbers[obs_cam[a], obs_cam[b]]]
+                number += np.searchsorted(columns[number:end], obs_cam[b])
+                block = blocks[number]
                 for i in range(6):
                     for j in range(6):
                         block[i, j] -= (

@@ -30,13 +30,14 @@ from pipelines.correspondence.snapshots import Snapshots
 from pipelines.geometry.rig import ONE_CAMERA
 from pipelines.progress import Progress
 from pipelines.streamed import Streamed
-from pipelines.structure.adjust import adjust
+from pipelines.structure.adjust import adjust, remove_wild
 from pipelines.structure.consistency import ModelReport, judge, without_misplaced
 from pipelines.structure.lens import set_lens
 from pipelines.structure.mappers import calibrate_focal, map_globally, map_incrementally
 from pipelines.structure.parallax import HOW_TO_FILM, require_parallax
 from pipelines.structure.rolling import NO_READOUT, Readout, adjust_rolling, read_readout
 from pipelines.structure.seams import cut, take_out
+from pipelines.structure.windows import WIDE, Joined, adjust_together, close_loops, windows_of
 from pipelines.types import Features, Vocabulary
 
 _PAIRS_PER_BLOCK = 64
@@ -74,6 +75,21 @@ class Structure:
 
 
 @dataclass(frozen=True)
+class _Views:
+    """What is known of the keyframes: features, their pixels (F, 2) again, which are needed when descriptors no longer
+    are, and times (K,) in seconds."""
+
+    features: Streamed[Features]
+    xy: list[NDArray[np.float64]]
+    times: NDArray[np.float64]
+
+    def part(self, window: range) -> _Views:
+        """Of the keyframes of a window, counted from 0."""
+        numbers = slice(window.start, window.stop)
+        return _Views(self.features.part(window), self.xy[numbers], self.times[numbers])
+
+
+@dataclass(frozen=True)
 class _Adjusted:
     model: pycolmap.Reconstruction
     mapper: str
@@ -107,54 +123,81 @@ class StructureFromMotion:
         vocabulary = learn_vocabulary(features, self.seed)
         tried = self._proposed(features, vocabulary)
         pairs = self._pairs(features, tried)
-        xy = [f.xy for f in features]
+        views = _Views(features, [f.xy for f in features], np.array([self.time(k) for k in keyframe_ids]))
         known_focal = self.camera.mean_focal_length() if self.camera.has_prior_focal_length else None
-        require_parallax(pairs, xy, (self.camera.width, self.camera.height), known_focal)
-        times = np.array([self.time(k) for k in keyframe_ids])
-        found = self._adjusted(features, pairs, ("global", "incremental"), times)
+        require_parallax(pairs, views.xy, (self.camera.width, self.camera.height), known_focal)
+        found = self._in_windows(views, pairs) or self._calibrated(views, pairs)
         if found is None:
             raise InputError(
                 f"no structure could be found: {len(pairs)} pairs of {len(features)} views match. The views have too "
                 f"little texture, blur or overlap. {HOW_TO_FILM}, slowly and in good light"
             )
-        if found.focal_sd > _UNSURE_FOCAL * found.model.cameras[1].mean_focal_length():
-            # A lens that is bent before the poses stand can run away with the focal length.
-            again = self._adjusted(features, pairs, (LENS_HELD,), times)
-            if again is not None and again.focal_sd < found.focal_sd and again.score >= _AS_GOOD * found.score:
-                found = again
-        found, pieces = self._largest_first(found, self._pieces(features, pairs, found.model), xy, times)
-        report = judge(found.model, pairs, xy, self._places(features), self.config.overlap)
+        found, pieces = self._largest_first(found, self._pieces(views, pairs, found.model), views)
+        report = judge(found.model, pairs, views.xy, self._places(features), self.config.overlap)
         cut(found.model, report.parts, report.total)
         return Structure(
             found.model, report, found.mapper, found.focal_sd, features, vocabulary, tried, pairs, pieces, found.readout
         )
 
-    def _places(self, features: Streamed[Features]) -> int:
-        return len(features) // len(self.cam_from_rig)
+    def _calibrated(self, views: _Views, pairs: Sequence[VerifiedPair]) -> _Adjusted | None:
+        """The best model; of two where the first is not sure of its camera."""
+        found = self._adjusted(views, pairs, ("global", "incremental"))
+        if found is not None and found.focal_sd > _UNSURE_FOCAL * found.model.cameras[1].mean_focal_length():
+            # A lens that is bent before the poses stand can run away with the focal length.
+            again = self._adjusted(views, pairs, (LENS_HELD,))
+            if again is not None and again.focal_sd < found.focal_sd and again.score >= _AS_GOOD * found.score:
+                return again
+        return found
 
-    def _adjusted(
-        self, features: Streamed[Features], pairs: Sequence[VerifiedPair], mappers: Sequence[str],
-        times: NDArray[np.float64],
-    ) -> _Adjusted | None:  # fmt: skip
+    def _in_windows(self, views: _Views, pairs: Sequence[VerifiedPair]) -> _Adjusted | None:
+        """Of a long recording the models of its windows, joined, in the camera of the window that is surest of it.
+        None of a shorter one, of panoramas, and where the windows do not hang together."""
+        windows = windows_of(len(views.xy))
+        if len(windows) == 1 or len(self.cam_from_rig) > 1:
+            return None
+        views.features.forget()
+        joined, surest = Joined(), None
+        for window in self.progress.track(windows, "windows", len(windows)):
+            inside = [replace(p, first=p.first - window.start, second=p.second - window.start)
+                      for p in pairs if p.first in window and p.second in window]  # fmt: skip
+            snapshots = Snapshots(self.snapshots.folder / f"window_{window.start:06d}")
+            snapshots.folder.mkdir(exist_ok=True)
+            found = replace(self, snapshots=snapshots)._calibrated(views.part(window), inside)
+            if found is None or not joined.add(found.model, window.start):
+                return None
+            surest = found if surest is None or found.focal_sd < surest.focal_sd else surest
+        assert surest is not None
+        model = joined.model(surest.model.cameras[1], views.xy)
+        adjust_together(model, views.xy, views.times, surest.readout)
+        if close_loops(model, pairs, windows, views.xy):
+            adjust_together(model, views.xy, views.times, surest.readout, WIDE)
+            adjust_together(model, views.xy, views.times, surest.readout)
+        remove_wild(model)
+        return replace(surest, model=model)
+
+    def _places(self, views: Sequence[object]) -> int:
+        return len(views) // len(self.cam_from_rig)
+
+    def _adjusted(self, views: _Views, pairs: Sequence[VerifiedPair], mappers: Sequence[str]) -> _Adjusted | None:
         """The best model, its camera calibrated unless it is fixed; with the readout of a rolling shutter, where one is
         given or the model shows it."""
-        found = self._map(features, pairs, mappers)
+        found = self._map(views, pairs, mappers)
         if found is None:
             return None
         model, mapper, report = found
         readout = NO_READOUT if len(self.cam_from_rig) > 1 else read_readout(self.config.rolling_shutter)
-        rolling = adjust_rolling(model, [f.xy for f in features], times, readout, not self.is_fixed)
+        rolling = adjust_rolling(model, views.xy, views.times, readout, not self.is_fixed)
         if rolling is not None:
             return _Adjusted(rolling[0], mapper, rolling[2], report.score, rolling[1])
         return _Adjusted(model, mapper, adjust(model, refine_camera=not self.is_fixed), report.score, NO_READOUT)
 
     def _pieces(
-        self, features: Streamed[Features], pairs: Sequence[VerifiedPair], model: pycolmap.Reconstruction
+        self, views: _Views, pairs: Sequence[VerifiedPair], model: pycolmap.Reconstruction
     ) -> list[pycolmap.Reconstruction]:
         """Sound models of the keyframes that `model` leaves, in its camera, until there is none of the least size."""
-        camera, xy = model.cameras[1], [f.xy for f in features]
+        camera = model.cameras[1]
         camera.has_prior_focal_length = True
-        left = set(range(len(features))) - {i - 1 for i in model.reg_image_ids()}
+        left = set(range(len(views.xy))) - {i - 1 for i in model.reg_image_ids()}
         pieces: list[pycolmap.Reconstruction] = []
         number = 1
         while True:
@@ -165,15 +208,15 @@ class StructureFromMotion:
             snapshots = Snapshots(self.snapshots.folder / f"piece_{number}")
             snapshots.folder.mkdir(exist_ok=True)
             alone = replace(self, camera=camera, is_fixed=True, snapshots=snapshots)
-            tried = [alone._map(features, rest, ("global",))]
+            tried = [alone._map(views, rest, ("global",))]
             if tried[0] is None or not self._is_piece(tried[0][2]):
-                tried.append(alone._map(features, rest, ("incremental",)))
+                tried.append(alone._map(views, rest, ("incremental",)))
             found = max(filter(None, tried), key=lambda f: (self._is_piece(f[2]), f[2].registered), default=None)
             if found is None or found[2].registered < self.config.least_piece:
                 return pieces
             piece = found[0]
             adjust(piece, refine_camera=False)
-            report = judge(piece, rest, xy, self._places(features), self.config.overlap)
+            report = judge(piece, rest, views.xy, self._places(views.xy), self.config.overlap)
             left -= {i - 1 for i in piece.reg_image_ids()}
             if self._is_piece(report):
                 take_out(piece, [k for part in report.parts[1:] for k in part])
@@ -183,9 +226,8 @@ class StructureFromMotion:
         return len(report.parts[0]) >= self.config.least_piece and report.is_consistent
 
     def _largest_first(
-        self, found: _Adjusted, pieces: list[pycolmap.Reconstruction], xy: Sequence[NDArray[np.float64]],
-        times: NDArray[np.float64],
-    ) -> tuple[_Adjusted, list[pycolmap.Reconstruction]]:  # fmt: skip
+        self, found: _Adjusted, pieces: list[pycolmap.Reconstruction], views: _Views
+    ) -> tuple[_Adjusted, list[pycolmap.Reconstruction]]:
         """The largest model, which calibrates the camera of all where it is surer of it, and the others; all with the
         readout of the first."""
         models = [found.model, *pieces]
@@ -204,7 +246,7 @@ class StructureFromMotion:
         def rolled(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
             if model is done:
                 return model
-            again = adjust_rolling(model, xy, times, found.readout, refine_camera=False)
+            again = adjust_rolling(model, views.xy, views.times, found.readout, refine_camera=False)
             return model if again is None else again[0]
 
         return replace(found, model=rolled(largest)), [rolled(m) for m in others]
@@ -221,10 +263,11 @@ class StructureFromMotion:
         return features
 
     def _proposed(self, features: Streamed[Features], vocabulary: Vocabulary) -> list[tuple[int, int]]:
-        looks, places = Looks((np.stack([describe(f, vocabulary) for f in features]),)), self._places(features)
-        loops = loop_pairs(
-            looks, far_apart(len(features), self.config.overlap + 1, places), self.config.loop_candidates
-        )
+        looks, places = np.empty((len(features), len(vocabulary.mean)), np.float32), self._places(features)
+        for row, f in zip(looks, features, strict=True):
+            row[:] = describe(f, vocabulary)
+        allowed = far_apart(len(features), self.config.overlap + 1, places)
+        loops = loop_pairs(Looks((looks,)), allowed, self.config.loop_candidates)
         following = sequential_pairs(places, self.config.overlap)
         firsts = range(0, len(features), places)
         return sorted({*((n + i, n + j) for n in firsts for i, j in following), *loops})
@@ -244,23 +287,23 @@ class StructureFromMotion:
 
     def _map(
         self,
-        features: Streamed[Features],
+        views: _Views,
         pairs: Sequence[VerifiedPair],
         mappers: Sequence[str] = ("global", "incremental"),
     ) -> tuple[pycolmap.Reconstruction, str, ModelReport] | None:
         """The best of the mappers' models, None where none is any; the next is only made when those before it are
         doubtful."""
-        xy = [f.xy for f in features]
+        places = self._places(views.xy)
         best: tuple[pycolmap.Reconstruction, str, ModelReport] | None = None
         wanted = [name for name in mappers if self.config.mapper in ("auto", name)]
         for name in self.progress.track(wanted, "mapping", len(wanted)):
             if best is not None and best[2].is_sound:
                 break
-            model = self.snapshots.model(name, lambda work, n=name: self._run_mapper(n, work, features, pairs))  # type: ignore[misc]
+            model = self.snapshots.model(name, lambda work, n=name: self._run_mapper(n, work, views.features, pairs))  # type: ignore[misc]
             if model is None:
                 continue
-            model = without_misplaced(model, pairs, xy, self._places(features), self.config.overlap)
-            report = judge(model, pairs, xy, self._places(features), self.config.overlap)
+            model = without_misplaced(model, pairs, views.xy, places, self.config.overlap)
+            report = judge(model, pairs, views.xy, places, self.config.overlap)
             if best is None or report.score > best[2].score:
                 best = model, name, report
         if best is None or best[2].registered < min(_MIN_KEYFRAMES, best[2].total) or best[2].points < _MIN_POINTS:

@@ -18,7 +18,8 @@ from typing import Any
 import engine_calls
 import pytest
 
-from formats.errors import InputError
+from formats.errors import InputError, RecoverableError
+from pipelines import engines
 from pipelines.engines import Call, Engine, LocalEngine, RayEngine
 from pipelines.stopping import Stopped, soft_stop
 
@@ -123,7 +124,12 @@ class LosingRay:
 
     def __init__(self, lost: list[str]) -> None:
         self.lost, self.begun = lost, 0
-        self.exceptions = SimpleNamespace(RayError=OSError, NodeDiedError=ConnectionError, RayTaskError=NotInstalled)
+        self.exceptions = SimpleNamespace(
+            RayError=OSError, NodeDiedError=ConnectionError, RayTaskError=NotInstalled, LocalRayletDiedError=EOFError
+        )
+
+    def get_runtime_context(self) -> SimpleNamespace:
+        return SimpleNamespace(gcs_address="127.0.0.1:1")
 
     def remote(self, function: Callable[..., Any]) -> LosingRay:
         self.function = function
@@ -141,7 +147,8 @@ class LosingRay:
 
     def get(self, ref: tuple[Any, ...]) -> tuple[str, Any]:
         if self.lost:
-            raise {"node": ConnectionError, "process": OSError, "bare": NotInstalled}[self.lost.pop(0)]("no pulse")
+            kinds = {"node": ConnectionError, "process": OSError, "bare": NotInstalled, "here": EOFError}
+            raise kinds[self.lost.pop(0)]("no pulse")
         return self.function(*ref[:-1])
 
 
@@ -163,6 +170,27 @@ def test_lost_nodes_are_no_fault_of_the_call(lost: list[str], value: int | None,
     assert ended.failure.startswith(failure)
     assert bool(ended.failure) == bool(failure)
     assert engine._ray.begun == begun
+
+
+def test_a_head_that_is_gone_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Silent(LosingRay):
+        def wait(self, refs: list[Any], timeout: float, num_returns: int = 1) -> tuple[list[Any], list[Any]]:
+            return [], refs
+
+        def cancel(self, ref: Any, force: bool) -> None:
+            pass
+
+    monkeypatch.setattr(engines, "_BETWEEN_LOOKS", 0.0)
+    monkeypatch.setattr(engines, "_HEAD_WITHIN", 0.1)
+    engine = object.__new__(RayEngine)
+    engine._ray = Silent([])
+    with pytest.raises(
+        RecoverableError, match=r"the head of the Ray cluster has gone: no Ray answers at 127\.0\.0\.1:1"
+    ):
+        list(engine.run([Call("seven", engine_calls.double, (7,))]))
+    engine._ray = LosingRay(["here"])
+    with pytest.raises(RecoverableError, match=r"Ray on this machine \(.*\) has ended.*`msgs-slam resume RUN`"):
+        list(engine.run([Call("seven", engine_calls.double, (7,))]))
 
 
 @needs_ray

@@ -1,0 +1,159 @@
+"""Structure from motion of a long recording in windows: each mapped by itself, then joined by what they share.
+
+A mapper's memory grows by half a megabyte to two a keyframe, nearly all of it in its adjustments, so that no more than
+one window is in work at any time. What is joined is adjusted by `pipelines.structure.bundle`, which needs a tenth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from pipelines.correspondence.matching import VerifiedPair
+from pipelines.geometry import se3
+from pipelines.geometry.alignment import Similarity, best_rotation
+from pipelines.structure.bundle import adjust_bundle
+from pipelines.structure.rolling import Readout, RollingModel, straightened, velocities
+
+Array = NDArray[np.float64]
+
+SIZE, SHARED = 500, 40
+"""Keyframes of a window, and those that it shares with the one before. All at once is surer (0.20 cm against 0.26 in
+windows of 32 of a walk of 77 keyframes, the one recording tried), while there is room for it."""
+_LEAST_SHARED = 30
+_LEAST_MATCHES, _NEAR, _OUTLIER = 12, 0.05, 3.0
+"""A loop between windows: its least matches, their median error as a share of the picture's width, from where it is
+left to `global_ba`, and how many medians a match may be off. On made-up walks only."""
+WIDE = 40.0
+"""Of the loss of the adjustment that pulls loops together: standard deviations."""
+
+
+def windows_of(count: int, size: int = SIZE, shared: int = SHARED) -> list[range]:
+    """All keyframes in windows of about that size; one window for less than half as much again."""
+    parts = max(1, round((count - shared) / (size - shared))) if count > 1.5 * size else 1
+    shared *= parts > 1
+    edges = np.linspace(0, count - shared, parts + 1).round().astype(int).tolist()
+    return [range(a, b + shared) for a, b in pairwise(edges)]
+
+
+@dataclass
+class Joined:
+    """Poses by image, points, observations (O, 3) of window after window: image, feature, point; and which point an
+    observation (image, feature) of the last window sees."""
+
+    poses: dict[int, Array] = field(default_factory=dict)
+    points: list[Array] = field(default_factory=list)
+    observations: list[NDArray[np.int32]] = field(default_factory=list)
+    seen: dict[tuple[int, int], int] = field(default_factory=dict)
+
+    def add(self, model: pycolmap.Reconstruction, first: int) -> bool:
+        """One more model, of images counted from `first`, moved by a similarity to where it shares images and points
+        with the one before; False where these are too few."""
+        points = {p: model.points3D[p] for p in sorted(model.point3D_ids())}
+        tracks = {p: [(first + e.image_id, e.point2D_idx) for e in q.track.elements] for p, q in points.items()}
+        known = {p: self.seen[o] for p, track in tracks.items() for o in reversed(track) if o in self.seen}
+        ids = sorted(model.reg_image_ids())
+        found = {first + i: _matrix(model.images[i].cam_from_world()) for i in ids}
+        both = [i for i in found if i in self.poses]
+        move = Similarity(1.0, np.eye(3), np.zeros(3))
+        if self.poses:
+            if not both or len(known) < _LEAST_SHARED:
+                return False
+            poses = np.array([found[i] for i in both]), np.array([self.poses[i] for i in both])
+            seen = np.array([points[p].xyz for p in known]), np.array([self.points[at] for at in known.values()])
+            move = align_views(*poses, *seen)
+        moved = move.apply_to_poses(np.array(list(found.values())))
+        self.poses = dict(zip(found, moved, strict=True)) | self.poses
+        before, self.seen, new = self.seen, {}, []
+        for p, track in tracks.items():
+            if p not in known:
+                known[p] = len(self.points)
+                self.points.append(move.apply(points[p].xyz))
+            self.seen.update(dict.fromkeys(track, known[p]))
+            new += [(*o, known[p]) for o in track if o not in before]
+        self.observations.append(np.array(new, np.int32).reshape(-1, 3))
+        return True
+
+    def model(self, camera: pycolmap.Camera, xy: Sequence[Array]) -> pycolmap.Reconstruction:
+        """Of all; image i + 1 has the pixels xy[i]."""
+        model = pycolmap.Reconstruction()
+        model.add_camera_with_trivial_rig(camera)
+        for i, pose in sorted(self.poses.items()):
+            pixels = pycolmap.Point2DList([pycolmap.Point2D(at) for at in xy[i - 1]])
+            image = pycolmap.Image(name=f"{i - 1:06d}", points2D=pixels, camera_id=camera.camera_id, image_id=i)
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+        observations = np.concatenate(self.observations)
+        observations = observations[np.argsort(observations[:, 2], kind="stable")]
+        starts = np.searchsorted(observations[:, 2], np.arange(len(self.points) + 1))
+        for xyz, a, b in zip(self.points, starts[:-1], starts[1:], strict=True):
+            elements = [pycolmap.TrackElement(int(i), int(f)) for i, f, _ in observations[a:b]]
+            model.add_point3D(xyz, pycolmap.Track(elements), np.zeros(3, np.uint8))
+        return model
+
+
+def align_views(source: Array, target: Array, source_points: Array, target_points: Array) -> Similarity:
+    """The similarity that takes cameras cam_from_source (N, 4, 4) and the points (P, 3) they see to cam_from_target and
+    where these points are there: rotation by all axes of the cameras, then medians, for points may be far off."""
+    rotation = best_rotation(source[:, :3, :3].reshape(-1, 3), target[:, :3, :3].reshape(-1, 3))
+    centers, wanted = se3.inverse(source)[:, :3, 3], se3.inverse(target)[:, :3, 3]
+    away, there = (
+        np.linalg.norm(p - c[:, None], axis=2) for p, c in ((source_points, centers), (target_points, wanted))
+    )
+    scale = float(np.median(there / np.maximum(away, 1e-12)))
+    return Similarity(scale, rotation, np.median(wanted - scale * centers @ rotation.T, axis=0))
+
+
+def _matrix(pose: pycolmap.Rigid3d) -> Array:
+    return np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]])
+
+
+def close_loops(
+    model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair], windows: Sequence[range], xy: Sequence[Array]
+) -> int:  # fmt: skip
+    """Make one of points that verified matches between windows say are one, where the windows lie nearly right, in
+    place; how many."""
+    camera, merged = model.cameras[1], 0
+    for pair in pairs:
+        if any(pair.first in w and pair.second in w for w in windows):
+            continue
+        if not all(model.exists_image(k + 1) for k in (pair.first, pair.second)):
+            continue
+        first, second = (model.images[k + 1] for k in (pair.first, pair.second))
+        rows = [(int(a), int(b)) for a, b in pair.matches
+                if first.points2D[int(a)].has_point3D() and second.points2D[int(b)].has_point3D()]  # fmt: skip
+        ids = [(first.points2D[a].point3D_id, second.points2D[b].point3D_id) for a, b in rows]
+        if len(rows) < _LEAST_MATCHES:
+            continue
+        points = np.array([model.points3D[p].xyz for p, _ in ids])
+        pose = _matrix(second.cam_from_world())
+        seen = points @ pose[:3, :3].T + pose[:3, 3]
+        error = np.linalg.norm(np.asarray(camera.img_from_cam(seen)) - xy[pair.second][[b for _, b in rows]], axis=1)
+        error = np.where((seen[:, 2] > 0) & np.isfinite(error), error, np.inf)
+        if not (middle := float(np.median(error))) <= _NEAR * camera.width:
+            continue
+        for (p, q), off in zip(ids, error, strict=True):
+            if p != q and off <= _OUTLIER * middle and model.exists_point3D(p) and model.exists_point3D(q):
+                model.merge_points3D(p, q)
+                merged += 1
+    return merged
+
+
+def adjust_together(
+    model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout, width: float = 2.0
+) -> None:  # fmt: skip
+    """Poses and points adjusted in place, with the camera as it is; see `adjust_bundle` for the width of the loss."""
+    rolling = RollingModel(model, xy, times)
+    bundle, plain, pinhole = rolling.bundle()
+    if any(readout):
+        velocity = velocities(bundle.cam_from_world, rolling.times)
+        bundle = straightened(bundle, plain, pinhole, velocity, readout)
+    adjusted = adjust_bundle(bundle, pinhole, width=width).bundle
+    for i, pose in zip(rolling.images, adjusted.cam_from_world, strict=True):
+        model.frames[model.images[i].frame_id].rig_from_world = pycolmap.Rigid3d(pose[:3])
+    for p, xyz in zip(sorted(model.point3D_ids()), adjusted.points, strict=True):
+        model.points3D[p].xyz = xyz

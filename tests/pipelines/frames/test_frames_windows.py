@@ -1,0 +1,143 @@
+"""A long recording's windows, joined to one model."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pycolmap
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.correspondence.matching import VerifiedPair
+from pipelines.geometry import se3
+from pipelines.geometry.alignment import Similarity, align_points
+from pipelines.geometry.camera import project
+from pipelines.structure.adjust import reprojection_errors
+from pipelines.structure.lens import unknown_camera
+from pipelines.structure.rolling import NO_READOUT
+from pipelines.structure.windows import SHARED, SIZE, WIDE, Joined, adjust_together, close_loops, windows_of
+from pipelines.types import Intrinsics
+from tests.world.paths import look_at
+
+Array = NDArray[np.float64]
+CAMERA = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0)
+COUNT = 40
+
+
+def path() -> Array:
+    """(N, 4, 4) cam_from_world of a walk along a wall."""
+    t = np.arange(COUNT) / 10
+    center = np.stack([1.5 * t, 0.2 * np.sin(3 * t), 0.2 * np.sin(2 * t)], axis=1)
+    ahead = np.stack([0.2 * np.sin(2 * t), np.ones_like(t), 0.1 * np.sin(t)], axis=1)
+    return np.linalg.inv(look_at(center, center + ahead, roll=0.05 * np.sin(t)))
+
+
+def seen() -> tuple[Array, list[list[tuple[int, Array]]]]:
+    """Points, and for each view which of them it sees where, half a pixel off."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-2, 1.5, -1.5], [8, 4, 1.5], (900, 3))
+    views = []
+    for pose in path():
+        xy, depth = project(points @ pose[:3, :3].T + pose[:3, 3], CAMERA)
+        inside = np.flatnonzero((depth > 0) & (xy > 0).all(1) & (xy < [CAMERA.width, CAMERA.height]).all(1))
+        views.append([(int(p), xy[p] + rng.normal(0, 0.5, 2)) for p in inside])
+    return points, views
+
+
+def model_of(window: range, move: Similarity, noise: float) -> tuple[pycolmap.Reconstruction, list[Array]]:
+    """A window as a mapper leaves it: in a world and a unit of its own, points and places a little off."""
+    points, views = seen()
+    rng, model = np.random.default_rng(window.start), pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(unknown_camera(CAMERA.width, CAMERA.height, CAMERA.fx, is_prior=True))
+    tracks: dict[int, list[pycolmap.TrackElement]] = {}
+    for n, (k, pose) in enumerate(zip(window, move.apply_to_poses(path()[window.start : window.stop]), strict=True), 1):
+        pixels = pycolmap.Point2DList([pycolmap.Point2D(xy) for _, xy in views[k]])
+        pose = se3.exp(rng.normal(0, noise, 6) * move.scale) @ pose
+        image = pycolmap.Image(name=str(n), points2D=pixels, camera_id=1, image_id=n)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+        for at, (p, _) in enumerate(views[k]):
+            tracks.setdefault(p, []).append(pycolmap.TrackElement(n, at))
+    for p, elements in tracks.items():
+        if len(elements) > 1:
+            xyz = move.apply(points[p]) + rng.normal(0, noise, 3)
+            model.add_point3D(xyz, pycolmap.Track(elements), np.zeros(3, np.uint8))
+    return model, [np.array([xy for _, xy in views[k]]) for k in range(COUNT)]
+
+
+def moves() -> list[Similarity]:
+    turns = se3.exp(np.array([[0, 0, 0, 0, 0, 0], [1, 2, 3, 0.3, -0.5, 1.0], [-5, 0, 1, 2.0, 0.1, 0.2]]))
+    return [Similarity(s, t[:3, :3], t[:3, 3]) for s, t in zip((1.0, 0.4, 2.5), turns, strict=True)]
+
+
+def test_windows_hold_all_keyframes_and_share_some() -> None:
+    assert windows_of(int(1.5 * SIZE)) == [range(int(1.5 * SIZE))]
+    for count in (751, 1000, 2000, 5601):
+        windows = windows_of(count)
+        assert windows[0].start == 0
+        assert windows[-1].stop == count
+        assert all(SIZE / 2 < len(w) <= 1.5 * SIZE for w in windows)
+        assert all(a.stop - b.start == SHARED for a, b in pairwise(windows))
+
+
+def test_windows_of_three_worlds_become_one_model() -> None:
+    joined, windows = Joined(), windows_of(COUNT, 17, 6)
+    assert len(windows) == 3
+    for window, move in zip(windows, moves(), strict=True):
+        model, xy = model_of(window, move, 1e-3)
+        assert joined.add(model, window.start)
+    whole = joined.model(model.cameras[1], xy)
+    points, views = seen()
+    twice = sum(sum(any(q == p for q, _ in v) for v in views) > 1 for p in range(len(points)))
+    assert twice <= whole.num_points3D() <= 1.05 * twice  # what leaves the picture and comes back is two points
+    adjust_together(whole, xy, np.arange(COUNT) / 10, NO_READOUT)
+    assert sorted(whole.reg_image_ids()) == list(range(1, COUNT + 1))
+    found = np.array([whole.images[i].projection_center() for i in range(1, COUNT + 1)])
+    wanted = se3.inverse(path())[:, :3, 3]
+    assert np.linalg.norm(align_points(found, wanted).apply(found) - wanted, axis=1).max() < 0.01
+    assert float(np.median(reprojection_errors(whole))) == pytest.approx(0.55, abs=0.1)
+
+
+def drifted() -> tuple[pycolmap.Reconstruction, list[Array]]:
+    """The walk and all its views once more in the other direction, where the second half has drifted by two per cent:
+    its points are others."""
+    model, xy = model_of(range(COUNT), moves()[0], 0.0)
+    again, _ = model_of(range(COUNT), Similarity(1.02, np.eye(3), np.array([0.05, 0.03, 0.0])), 0.0)
+    for k in range(COUNT):
+        image = again.images[k + 1]
+        pixels = pycolmap.Point2DList([pycolmap.Point2D(at) for at in xy[k]])
+        new = pycolmap.Image(name=str(COUNT + k + 1), points2D=pixels, camera_id=1, image_id=COUNT + k + 1)
+        model.add_image_with_trivial_frame(new, image.cam_from_world())
+    for point in again.points3D.values():
+        track = [pycolmap.TrackElement(COUNT + e.image_id, e.point2D_idx) for e in point.track.elements]
+        model.add_point3D(point.xyz, pycolmap.Track(track), np.zeros(3, np.uint8))
+    return model, xy + xy
+
+
+def test_a_loop_between_windows_is_closed() -> None:
+    """Nothing but the matches holds the two walks together."""
+    model, xy = drifted()
+    matches = [np.repeat(np.arange(len(xy[k]), dtype=np.uint32)[:, None], 2, 1) for k in range(COUNT)]
+    pairs = [
+        VerifiedPair(k, COUNT + k, matches[k], 2, np.zeros((3, 3, 3)), len(matches[k])) for k in range(0, COUNT, 4)
+    ]
+    apart = lambda: max(  # noqa: E731
+        np.linalg.norm(model.images[k].projection_center() - model.images[COUNT + k].projection_center())
+        for k in range(1, COUNT + 1)
+    )
+    assert apart() > 0.1
+    points = model.num_points3D()
+    merged = close_loops(model, pairs, [range(COUNT), range(COUNT, 2 * COUNT)], xy)
+    assert merged > 300
+    assert model.num_points3D() == points - merged
+    times = np.arange(2 * COUNT) / 10
+    adjust_together(model, xy, times, NO_READOUT, WIDE)
+    adjust_together(model, xy, times, NO_READOUT)
+    assert apart() < 0.005
+    assert close_loops(model, pairs, [range(2 * COUNT)], xy) == 0
+
+
+def test_windows_that_share_too_little_are_not_joined() -> None:
+    joined, first = Joined(), moves()[0]
+    assert joined.add(model_of(range(15), first, 1e-3)[0], 0)
+    assert not joined.add(model_of(range(20, 35), first, 1e-3)[0], 20)
