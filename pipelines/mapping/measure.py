@@ -41,8 +41,7 @@ def measure_view(
     colors = rendering.features[..., :3] * torch.exp(torch.as_tensor(log_gain)).to(view.image.device)
     colors = (colors + torch.as_tensor(offset).to(view.image.device)).clamp(0, 1)
     photo = view.of_scene(view.colors, colors)
-    shown = 1.0 if view.scene is None else view.scene.float().mean().clamp(min=1e-6)
-    error = ((colors - photo).square().mean() / shown).clamp(min=1e-10)
+    error = ((colors - photo).square().mean() / view.shown).clamp(min=1e-10)
     known = view.depth > 0
     depth_l1 = (rendering.depth - view.depth).abs()[known].mean() if known.any() else torch.tensor(float("nan"))
     return ViewFigures(

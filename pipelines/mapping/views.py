@@ -59,6 +59,11 @@ class View:
         """(H, W) float32 in 0..1."""
         return self.channel_confidence.float() / 255
 
+    @property
+    def shown(self) -> float:
+        """Share of the picture that shows the scene; above 0."""
+        return 1.0 if self.scene is None else max(float(self.scene.float().mean()), 1e-6)
+
     def of_scene(self, values: Tensor, elsewhere: Tensor | float = 0.0) -> Tensor:
         """(H, W) or (H, W, channels) `values` where the picture shows the scene."""
         if self.scene is None:

@@ -136,6 +136,22 @@ def test_schedule_visits_each_view_once_a_pass(room: MappingInput) -> None:
     assert [again.step(i) for i in (7, 40, 61)] == [steps[i] for i in (7, 40, 61)]
 
 
+def test_what_is_left_out_is_made_up_for_by_visits(room: MappingInput) -> None:
+    settings = MappingConfig(passes=6.0, min_iterations=0)
+    views = list(room.views)
+    scene = torch.ones(views[3].depth.shape, dtype=torch.bool)
+    scene[:, : scene.shape[1] // 2] = False
+    for i in (3, 5, 8, 9, 10, 11, 12):
+        views[i] = replace(views[i], scene=scene, depth=torch.where(scene, views[i].depth, 0.0))
+    assert views[3].shown == pytest.approx(0.5)
+    plain = Schedule.plan(room.views, settings, seed=1, seeding=True, passes=None)
+    masked = Schedule.plan(views, settings, seed=1, seeding=True, passes=None)
+    assert plain.visits == 6 * len(views)
+    assert masked.visits == pytest.approx(6 * len(views) / 0.75, abs=1)
+    hardly = [replace(v, scene=torch.zeros_like(scene)) for v in views]
+    assert Schedule.plan(hardly, settings, seed=1, seeding=False, passes=4.0).visits == 8 * len(views)
+
+
 def test_the_map_grows_by_whole_passes(room: MappingInput) -> None:
     n = len(room.views)
     settings = MappingConfig(passes=10.0, min_iterations=0)
