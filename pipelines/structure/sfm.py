@@ -31,7 +31,7 @@ from pipelines.geometry.rig import ONE_CAMERA
 from pipelines.progress import Progress
 from pipelines.streamed import Streamed
 from pipelines.structure.adjust import adjust, remove_wild
-from pipelines.structure.consistency import ModelReport, judge, without_misplaced
+from pipelines.structure.consistency import ModelReport, check_pairs, judge, without_misplaced
 from pipelines.structure.lens import set_lens
 from pipelines.structure.mappers import calibrate_focal, map_globally, map_incrementally
 from pipelines.structure.parallax import HOW_TO_FILM, require_parallax
@@ -45,10 +45,12 @@ _FEATURES_SHARE = 0.25
 """Of the memory that there is: what has no room there is read again from the snapshot."""
 _MIN_KEYFRAMES = 3
 _MIN_POINTS = 30
-LENS_HELD = "global-lens-held"
+LENS_HELD, NEIGHBOURS = "global-lens-held", "neighbours"
 _UNSURE_FOCAL = 0.03
 _AS_GOOD = 0.98
 """The second attempt's share of the first one's score, from which it is as good and its surer focal length decides."""
+_Tried = tuple[pycolmap.Reconstruction, str, ModelReport]
+"""A model, the mapper that made it, and how good it is."""
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -290,25 +292,49 @@ class StructureFromMotion:
         views: _Views,
         pairs: Sequence[VerifiedPair],
         mappers: Sequence[str] = ("global", "incremental"),
-    ) -> tuple[pycolmap.Reconstruction, str, ModelReport] | None:
+    ) -> _Tried | None:
         """The best of the mappers' models, None where none is any; the next is only made when those before it are
         doubtful."""
-        places = self._places(views.xy)
-        best: tuple[pycolmap.Reconstruction, str, ModelReport] | None = None
+        best: _Tried | None = None
         wanted = [name for name in mappers if self.config.mapper in ("auto", name)]
         for name in self.progress.track(wanted, "mapping", len(wanted)):
-            if best is not None and best[2].is_sound:
+            if best is not None and (best[2].is_sound or best[1].startswith(NEIGHBOURS)):
                 break
-            model = self.snapshots.model(name, lambda work, n=name: self._run_mapper(n, work, views.features, pairs))  # type: ignore[misc]
-            if model is None:
-                continue
-            model = without_misplaced(model, pairs, views.xy, places, self.config.overlap)
-            report = judge(model, pairs, views.xy, places, self.config.overlap)
-            if best is None or report.score > best[2].score:
-                best = model, name, report
+            found = self._tried(name, views, pairs, pairs)
+            unfolded = None if found is None or not found[2].contradicted else self._unfolded(views, pairs)
+            # Of two alike the one before.
+            best = max(filter(None, (best, found, unfolded)), key=lambda f: f[2].score, default=None)
         if best is None or best[2].registered < min(_MIN_KEYFRAMES, best[2].total) or best[2].points < _MIN_POINTS:
             return None
         return best
+
+    def _unfolded(self, views: _Views, pairs: Sequence[VerifiedPair]) -> _Tried | None:
+        """The model of a path that things which repeat have folded: made of what neighbours share, for little repeats
+        within so few pictures, and once more with the other pairs that agree with that, which close its loops."""
+        total, reach = self._places(views.xy), self.config.overlap
+
+        def among(places: set[tuple[int, int]]) -> list[VerifiedPair]:
+            return [p for p in pairs if (p.first % total, p.second % total) in places]
+
+        near = {(i, j) for i in range(total) for j in range(max(i - reach, 0), min(i + reach + 1, total))}
+        straight = self._tried(NEIGHBOURS, views, among(near), pairs)
+        if straight is None or straight[2].contradicted:
+            return straight
+        agreeing = {(c.first, c.second) for c in check_pairs(straight[0], pairs, views.xy, total) if c.agrees}
+        closing = near | agreeing | {(j, i) for i, j in agreeing}
+        closed = self._tried(f"{NEIGHBOURS}-closed", views, among(closing), pairs)
+        return straight if closed is None or closed[2].score < straight[2].score else closed
+
+    def _tried(
+        self, name: str, views: _Views, pairs: Sequence[VerifiedPair], every: Sequence[VerifiedPair]
+    ) -> _Tried | None:
+        """A mapper's model of these pairs, judged by `every` one."""
+        model = self.snapshots.model(name, lambda work: self._run_mapper(name, work, views.features, pairs))
+        if model is None:
+            return None
+        places = self._places(views.xy)
+        model = without_misplaced(model, every, views.xy, places, self.config.overlap)
+        return model, name, judge(model, every, views.xy, places, self.config.overlap)
 
     def _run_mapper(
         self, name: str, work: Path, features: Streamed[Features], pairs: Sequence[VerifiedPair]
