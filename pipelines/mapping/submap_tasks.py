@@ -14,13 +14,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from formats.tensors import load_tensors, save_tensors
+from formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
 from pipelines.config import Config
 from pipelines.depth.fields import DepthFields
 from pipelines.depth.posed import PosedDepth
 from pipelines.device import settle_device
 from pipelines.gaussian_map import GaussianMap
 from pipelines.gaussians.render import blending_weights, median_depth
+from pipelines.mapping.gauge import SeenExposures, common_exposure
 from pipelines.mapping.load import MappingInput, load_views
 from pipelines.mapping.measure import ViewFigures, measure_view
 from pipelines.mapping.optimise import optimise_map
@@ -70,6 +71,10 @@ class SubmapTask:
         """Of a result of this submap, or of another one."""
         return self.files / f"{kind}_{self.number if number is None else number:04d}.safetensors"
 
+    def exposures(self, number: int) -> Path:
+        """Of all views that a submap was made from."""
+        return self.files / f"exposures_{number:04d}.npz"
+
     def load(self, kind: str, number: int) -> SubmapResult:
         """A result of any submap."""
         tensors = load_tensors(self.file(kind, number))
@@ -109,7 +114,12 @@ def make_submap(task: SubmapTask, progress: Progress) -> None:
     """The map of its own and the bordering keyframes."""
     if not task.file(MADE).exists():
         given = task.views(task.trajectory)
-        result = _result(task, _optimise(task, given, progress, MADE), given.views)
+        made = _optimise(task, given, progress, MADE)
+        result = _result(task, made, given.views)
+        ids = np.array([v.frame_id for v in given.views])
+        save_arrays(
+            task.exposures(task.number), {"frame_ids": ids, "log_gains": made.log_gains, "offsets": made.offsets}
+        )
         task.save(MADE, replace(result, depths=_depths(result, task.camera)))
 
 
@@ -119,11 +129,24 @@ def join_submap(task: SubmapTask, progress: Progress) -> None:
         return
     all_results = [task.load(MADE, n) for n in (task.number, *task.submap.beside)]
     views, ids = _posed(all_results, task.camera), np.concatenate([r.frame_ids for r in all_results])
-    own = all_results[0]
+    own = _in_common_exposure(task, all_results[0])
     m = own.gaussian_map
     best = nearest_seeing(m.means.cpu().double().numpy(), progress.track(views, "joining", len(views)))
     anchors = np.where(best >= 0, ids[best], m.anchor_frame_ids.cpu().numpy())
     task.save(JOINED, replace(own, gaussian_map=belonging(m, anchors, task.submap), depths=own.depths[:0]))
+
+
+def _in_common_exposure(task: SubmapTask, result: SubmapResult) -> SubmapResult:
+    """The same with the colours, and the exposures of its keyframes, that all submaps have in common."""
+    count = len(list(task.files.glob(task.exposures(0).name.replace("0000", "*"))))
+    seen = [SeenExposures(**load_arrays(task.exposures(n))) for n in range(count)]
+    log_gain, offset = (values[task.number] for values in common_exposure(seen))
+    m = result.gaussian_map
+    gain, shift = (torch.from_numpy(x).to(m.colors) for x in (np.exp(log_gain), offset))
+    log_gains = (result.log_gains - log_gain).astype(np.float32)
+    offsets = (result.offsets - offset * np.exp(log_gains)).astype(np.float32)
+    colored = replace(m, colors=m.colors * gain + shift)
+    return replace(result, gaussian_map=colored, log_gains=log_gains, offsets=offsets)
 
 
 def refine_submap(task: SubmapTask, progress: Progress) -> None:

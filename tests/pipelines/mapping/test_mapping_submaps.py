@@ -21,6 +21,7 @@ from pipelines.geometry import se3
 from pipelines.mapping import stage as mapping_stage
 from pipelines.mapping import submaps
 from pipelines.mapping.divided import refine_divided
+from pipelines.mapping.gauge import SeenExposures, common_exposure
 from pipelines.mapping.submaps import BORDER, divide, nearest_seeing
 from pipelines.outcome import load_outcome
 from pipelines.progress import SilentProgress
@@ -205,3 +206,21 @@ def test_tiles_are_the_map_and_a_coarse_one(finished: RunFolder, tmp_path: Path)
     assert all(row["coarse_gaussians"] < 0.4 * row["gaussians"] for row in rows)
     assert float((shown[0].features - shown[1].features).abs().mean()) < 0.08
     assert float(shown[1].silhouette.mean()) > 0.9 * float(shown[0].silhouette.mean())
+
+
+def test_submaps_are_brought_to_one_exposure() -> None:
+    """Each was made with exposures relative to a gain and an offset of its own; all is told by what they share."""
+    rng = np.random.default_rng(0)
+    log_gains, offsets = rng.normal(0, 0.1, (2, 12, 3))
+    own_gain, own_offset = rng.normal(0, 0.1, (3, 3)), rng.normal(0, 0.02, (3, 3))
+    own_gain, own_offset = own_gain - own_gain.mean(0), own_offset - own_offset.mean(0)
+    seen = []
+    for gain, offset, ids in zip(own_gain, own_offset, (range(6), range(3, 9), range(7, 12)), strict=True):
+        mine = np.array(ids)
+        photo_offsets = offsets[mine] + offset * np.exp(log_gains[mine])
+        seen.append(SeenExposures(mine, log_gains[mine] + gain, photo_offsets))
+    found_gain, found_offset = common_exposure(seen)
+    assert found_gain == pytest.approx(own_gain, abs=1e-4)
+    assert found_offset == pytest.approx(own_offset, abs=1e-4)
+    alone, _ = common_exposure([*seen, SeenExposures(np.array([99]), np.ones((1, 3)), np.ones((1, 3)))])
+    assert alone[3] == pytest.approx(0)
