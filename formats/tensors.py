@@ -6,14 +6,13 @@ import json
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import safetensors.numpy
 from numpy.typing import NDArray
 from safetensors import safe_open
 
-from formats.atomic import atomic_path, write_bytes
+from formats.atomic import atomic_path
 from formats.errors import InputError
 from formats.reading import parsing, require_file
 
@@ -22,6 +21,11 @@ if TYPE_CHECKING:
 
 MAX_ARRAY_BYTES = 16 * 1024**3
 """A file of arrays as they lie in memory that is larger is refused."""
+
+_DTYPES = {
+    "float64": "F64", "float32": "F32", "float16": "F16", "int64": "I64", "int32": "I32", "int16": "I16", "int8": "I8",
+    "uint64": "U64", "uint32": "U32", "uint16": "U16", "uint8": "U8", "bool": "BOOL",
+}  # fmt: skip
 
 MAX_UNPACKED_BYTES = 1024**3
 """A packed file whose arrays would take more memory in total is refused: a few kilobytes can unpack to anything."""
@@ -66,11 +70,7 @@ def load_arrays(path: Path) -> dict[str, NDArray]:
 
 def save_tensors(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
     """Write a .safetensors file atomically; tensors are copied to the CPU. Raises InputError when the disk refuses."""
-    import safetensors.torch  # torch is slow to import, and most of this package does without
-
-    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    # Made in memory: the library's own file has other rights than its neighbours, and its own errors on a full disk.
-    write_bytes(path, safetensors.torch.save(contiguous))
+    save_safetensors(path, {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()})
 
 
 def load_tensors(path: Path) -> dict[str, torch.Tensor]:
@@ -87,8 +87,21 @@ def save_safetensors(path: Path, arrays: Mapping[str, NDArray], meta: Mapping[st
 
     Raises InputError when the disk refuses.
     """
-    contiguous = {name: np.ascontiguousarray(arrays[name]) for name in sorted(arrays)}
-    write_bytes(path, _with_sorted_metadata(safetensors.numpy.save(contiguous, metadata=dict(meta or {}))))
+    # The library holds all of it in memory twice before it writes, which were the peak of a mapping.
+    contiguous = {name: np.asarray(array, order="C") for name, array in arrays.items()}
+    names = sorted(contiguous, key=lambda name: (-contiguous[name].itemsize, name))  # so that each lies aligned
+    header: dict[str, Any] = {"__metadata__": dict(sorted(meta.items()))} if meta else {}
+    end = 0
+    for name in names:
+        array, begin = contiguous[name], end
+        end += array.nbytes
+        header[name] = {"dtype": _DTYPES[array.dtype.name], "shape": list(array.shape), "data_offsets": [begin, end]}
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text = text.ljust(-(-len(text) // 8) * 8)
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        for name in names:
+            file.write(contiguous[name].reshape(-1).view(np.uint8).data)
 
 
 def load_safetensors(path: Path) -> tuple[dict[str, NDArray], dict[str, str]]:
@@ -99,12 +112,3 @@ def load_safetensors(path: Path) -> tuple[dict[str, NDArray], dict[str, str]]:
     require_file(path, MAX_ARRAY_BYTES)
     with parsing(path, ".safetensors file", "make it again"), safe_open(str(path), framework="numpy") as file:
         return {name: file.get_tensor(name) for name in sorted(file.keys())}, dict(file.metadata() or {})
-
-
-def _with_sorted_metadata(data: bytes) -> bytes:
-    """safetensors writes its metadata in hash order, another in every process: put the header's keys in order."""
-    size = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + size])
-    header["__metadata__"] = dict(sorted(header.get("__metadata__", {}).items()))
-    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
-    return data[:8] + text.ljust(size) + data[8 + size :]
