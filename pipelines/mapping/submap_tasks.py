@@ -71,9 +71,10 @@ class SubmapTask:
         """Of a result of this submap, or of another one."""
         return self.files / f"{kind}_{self.number if number is None else number:04d}.safetensors"
 
-    def exposures(self, number: int) -> Path:
-        """Of all views that a submap was made from."""
-        return self.files / f"exposures_{number:04d}.npz"
+    @property
+    def exposures(self) -> Path:
+        """Of all views that it was made from."""
+        return self.files / f"exposures_{self.number:04d}.npz"
 
     def load(self, kind: str, number: int) -> SubmapResult:
         """A result of any submap."""
@@ -117,9 +118,7 @@ def make_submap(task: SubmapTask, progress: Progress) -> None:
         made = _optimise(task, given, progress, MADE)
         result = _result(task, made, given.views)
         ids = np.array([v.frame_id for v in given.views])
-        save_arrays(
-            task.exposures(task.number), {"frame_ids": ids, "log_gains": made.log_gains, "offsets": made.offsets}
-        )
+        save_arrays(task.exposures, {"frame_ids": ids, "log_gains": made.log_gains, "offsets": made.offsets})
         task.save(MADE, replace(result, depths=_depths(result, task.camera)))
 
 
@@ -138,8 +137,7 @@ def join_submap(task: SubmapTask, progress: Progress) -> None:
 
 def _in_common_exposure(task: SubmapTask, result: SubmapResult) -> SubmapResult:
     """The same with the colours, and the exposures of its keyframes, that all submaps have in common."""
-    count = len(list(task.files.glob(task.exposures(0).name.replace("0000", "*"))))
-    seen = [SeenExposures(**load_arrays(task.exposures(n))) for n in range(count)]
+    seen = [SeenExposures(**load_arrays(path)) for path in sorted(task.files.glob("exposures_*.npz"))]
     log_gain, offset = (values[task.number] for values in common_exposure(seen))
     m = result.gaussian_map
     gain, shift = (torch.from_numpy(x).to(m.colors) for x in (np.exp(log_gain), offset))

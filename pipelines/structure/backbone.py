@@ -25,7 +25,7 @@ def to_sparse_model(
     undistortion, one at a time.
     """
     image_ids = sorted(model.reg_image_ids())
-    poses = np.stack([_matrix(model.images[i]) for i in image_ids])
+    poses = np.stack([pose_of(model.images[i]) for i in image_ids])
     point_ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
     points = np.stack([model.points3D[int(p)].xyz for p in point_ids])
     row = {int(p): k for k, p in enumerate(point_ids)}
@@ -39,7 +39,8 @@ def to_sparse_model(
     return SparseModel(frame_ids, poses, points, colors, obs_frame, obs_point, obs_xy)
 
 
-def _matrix(image: pycolmap.Image) -> NDArray[np.float64]:
+def pose_of(image: pycolmap.Image) -> NDArray[np.float64]:
+    """(4, 4) camera from world."""
     return np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
 
 

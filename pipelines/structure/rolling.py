@@ -21,6 +21,7 @@ from formats.errors import InputError
 from pipelines.geometry import se3
 from pipelines.structure import bundle_kernels as kernels
 from pipelines.structure.adjust import adjust, solve
+from pipelines.structure.backbone import pose_of
 from pipelines.structure.bundle import Bundle, Problem
 from pipelines.types import Intrinsics
 
@@ -167,7 +168,7 @@ class RollingModel:
         focal, half = camera.mean_focal_length(), np.array([camera.width, camera.height]) / 2
         pinhole = Intrinsics(camera.width, camera.height, focal, focal, *half)
         bundle = Bundle(
-            np.array([np.vstack([model.images[i].cam_from_world().matrix(), [0, 0, 0, 1]]) for i in self.images]),
+            np.array([pose_of(model.images[i]) for i in self.images]),
             np.array([model.points3D[p].xyz for p in self.point_ids]),
             self.obs_cam, self.obs_point, np.asarray(camera.cam_from_img(self.now)) * focal + half,
             np.full(count, _FEATURE_SD), np.zeros(count), np.ones(count),

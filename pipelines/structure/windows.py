@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pipelines.correspondence.matching import VerifiedPair
 from pipelines.geometry import se3
 from pipelines.geometry.alignment import Similarity, best_rotation
+from pipelines.structure.backbone import pose_of
 from pipelines.structure.bundle import adjust_bundle
 from pipelines.structure.rolling import Readout, RollingModel, straightened, velocities
 
@@ -58,7 +59,7 @@ class Joined:
         tracks = {p: [(first + e.image_id, e.point2D_idx) for e in q.track.elements] for p, q in points.items()}
         known = {p: self.seen[o] for p, track in tracks.items() for o in reversed(track) if o in self.seen}
         ids = sorted(model.reg_image_ids())
-        found = {first + i: _matrix(model.images[i].cam_from_world()) for i in ids}
+        found = {first + i: pose_of(model.images[i]) for i in ids}
         both = [i for i in found if i in self.poses]
         move = Similarity(1.0, np.eye(3), np.zeros(3))
         if self.poses:
@@ -108,10 +109,6 @@ def align_views(source: Array, target: Array, source_points: Array, target_point
     return Similarity(scale, rotation, np.median(wanted - scale * centers @ rotation.T, axis=0))
 
 
-def _matrix(pose: pycolmap.Rigid3d) -> Array:
-    return np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]])
-
-
 def close_loops(
     model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair], windows: Sequence[range], xy: Sequence[Array]
 ) -> int:  # fmt: skip
@@ -130,7 +127,7 @@ def close_loops(
         if len(rows) < _LEAST_MATCHES:
             continue
         points = np.array([model.points3D[p].xyz for p, _ in ids])
-        pose = _matrix(second.cam_from_world())
+        pose = pose_of(second)
         seen = points @ pose[:3, :3].T + pose[:3, 3]
         error = np.linalg.norm(np.asarray(camera.img_from_cam(seen)) - xy[pair.second][[b for _, b in rows]], axis=1)
         error = np.where((seen[:, 2] > 0) & np.isfinite(error), error, np.inf)
@@ -155,5 +152,5 @@ def adjust_together(
     adjusted = adjust_bundle(bundle, pinhole, width=width).bundle
     for i, pose in zip(rolling.images, adjusted.cam_from_world, strict=True):
         model.frames[model.images[i].frame_id].rig_from_world = pycolmap.Rigid3d(pose[:3])
-    for p, xyz in zip(sorted(model.point3D_ids()), adjusted.points, strict=True):
+    for p, xyz in zip(rolling.point_ids, adjusted.points, strict=True):
         model.points3D[p].xyz = xyz
