@@ -3,8 +3,9 @@
     python tests/benchmarks/efficiency.py --work DIR [--set SECTION.KEY=VALUE ...]
 
 The clip of the demo's room until `mapping`, on one node and on two, each held to a core of its own, after the same was
-done there once. Seconds in which each kind of task was done; the efficiency; what it would be if tasks took as
-long on two nodes as on one (they are few, and not alike); and by how much longer they took. Needs msgs-slam[cluster].
+done there once. Seconds in which each kind of task was done; the efficiency; what it would be if tasks took as long on
+two nodes as on one (they are few, and not alike); how many tasks which core did; their CPU seconds, and for which part
+of their time they had the core. Needs msgs-slam[cluster] and a machine on which nothing else runs.
 """
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
@@ -17,10 +18,11 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
@@ -39,23 +41,46 @@ from tests.benchmarks.task_graph import makespan
 CORES = sorted(os.sched_getaffinity(0))
 
 
+@dataclass(frozen=True)
+class Done:
+    """One call: where (node, process, cores), its begin and end (of this machine's clock) and CPU time in seconds."""
+
+    node: str
+    pid: int
+    cores: str
+    began: float
+    ended: float
+    cpu: float
+
+    @staticmethod
+    def of(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, Done]:
+        """What the call returns, and how it was done."""
+        import ray
+
+        began, cpu = time.monotonic(), time.process_time()
+        value = function(*arguments)
+        node, cores = ray.get_runtime_context().get_node_id()[:6], sorted(os.sched_getaffinity(0))
+        return value, Done(node, os.getpid(), str(cores), began, time.monotonic(), time.process_time() - cpu)
+
+
 @dataclass
 class Timed:
-    """An engine, the seconds of each kind of call, and those between the ends of its calls."""
+    """An engine, the seconds of each kind of call, and how each call was done."""
 
     engine: Engine
     seconds: dict[str, float] = field(default_factory=dict)
-    each: dict[str, list[float]] = field(default_factory=dict)
+    done: dict[str, list[Done]] = field(default_factory=dict)
 
     def run(self, calls: Sequence[Call]) -> Iterator[Ended]:
         """All of them."""
         kind, started = calls[0].name.rpartition(" ")[0], time.monotonic()
-        ends = [started]
-        for ended in self.engine.run(calls):
-            ends.append(time.monotonic())
-            yield ended
-        self.seconds[kind] = ends[-1] - started
-        self.each[kind] = [b - a for a, b in pairwise(ends)]
+        done = self.done[kind] = []
+        recorded = [replace(c, function=Done.of, arguments=(c.function, c.arguments)) for c in calls]
+        for ended in self.engine.run(recorded):
+            value, how = ended.value
+            done.append(how)
+            yield replace(ended, value=value)
+        self.seconds[kind] = time.monotonic() - started
 
 
 def with_nodes(count: int, first: Path, run: Path) -> Timed:
@@ -90,16 +115,29 @@ def main() -> None:
     first, chosen = given.work / "frames.msgs", [p for s in (*SETTINGS, *given.settings) for p in ("--set", s)]
     subprocess.run(msgs_slam("reconstruct", video, "--out", first, "--until", "frames", *chosen), check=True, cwd=ROOT)
     one, two = (with_nodes(count, first, given.work / f"nodes_{count}.msgs") for count in (1, 2))
-    print("| tasks | number | 1 node, s | 2 nodes, s | efficiency | of equal tasks | longer by |\n|" + " --- |" * 7)
-    kinds = [*one.seconds, "all"]
+    print(
+        "| tasks | number | 1 node, s | 2 nodes, s | efficiency | of equal tasks | by node | CPU s | share of a core |"
+    )
+    print("|" + " --- |" * 9)
     for found in (one, two):
+        found.done["all"] = [d for done in found.done.values() for d in done]
         found.seconds["all"] = sum(found.seconds.values())
-    ideal = {kind: makespan(each, 2) for kind, each in one.each.items()}
-    ideal["all"] = sum(ideal.values())
-    for kind in kinds:
-        a, b, best = one.seconds[kind], two.seconds[kind], ideal[kind]
-        count = len(one.each[kind]) if kind != "all" else sum(map(len, one.each.values()))
-        print(f"| {kind} | {count} | {a:.1f} | {b:.1f} | {a / b / 2:.2f} | {a / best / 2:.2f} | {b / best - 1:.0%} |")
+    ideal = {kind: makespan([d.ended - d.began for d in done], 2) for kind, done in one.done.items()}
+    ideal["all"] = sum(seconds for kind, seconds in ideal.items() if kind != "all")
+    for kind, done in two.done.items():
+        a, b = one.seconds[kind], two.seconds[kind]
+        by_node = sorted(Counter((d.node, d.cores) for d in done).items())
+        nodes = ", ".join(f"{number} on {cores}" for (_, cores), number in by_node)
+        cpu, held = zip(*(shares(f.done[kind]) for f in (one, two)), strict=True)
+        print(f"| {kind} | {len(done)} | {a:.1f} | {b:.1f} | {a / b / 2:.2f} | {a / ideal[kind] / 2:.2f} | {nodes} | "
+              f"{cpu[0]:.1f}, {cpu[1]:.1f} | {held[0]:.0%}, {held[1]:.0%} |")  # fmt: skip
+
+
+def shares(done: Sequence[Done]) -> tuple[float, float]:
+    """CPU seconds of the calls, and which part of their time they had a core: far less than all of it tells that
+    something else ran there, so that the measurement says nothing."""
+    cpu = sum(d.cpu for d in done)
+    return cpu, cpu / sum(d.ended - d.began for d in done)
 
 
 if __name__ == "__main__":
