@@ -3,7 +3,7 @@
     python tests/benchmarks/long.py --work RUNS                        walks of 15, 30 and 60 seconds
     python tests/benchmarks/long.py --work RUNS 60 300 1200 --json rows.json
     python tests/benchmarks/long.py --work RUNS 60x10                  60 seconds of walk, ten times forth and back
-    python tests/benchmarks/long.py --work RUNS --fps 10 --size 640x480 --set mapping.passes=5
+    python tests/benchmarks/long.py --work RUNS --fps 10 --size 640x480 --focal 0.6 --set mapping.passes=5
 
 The walk leads through a building of rooms and corridors that is made as it is read (`tests/world/building.py`): exact
 poses, depth and classes. Every stage runs in a process of its own, so that its peak of memory is its own. What lies
@@ -34,14 +34,15 @@ from tests.world import ClipOptions, write_sequence
 from tests.world.building import Walk, around, frames
 
 
-def make_clip(folder: Path, walk: Walk, size: tuple[int, int], fps: float) -> tuple[Path, Path]:
-    """video.mkv, without loss, and truth/ with poses, depth and classes; holds one picture at a time."""
-    options = ClipOptions(frames=round(walk.seconds * fps), width=size[0], height=size[1], fps=fps)
-    stamp, done = {**asdict(walk), "size": list(size), "fps": fps}, folder / "clip.json"
+def make_clip(folder: Path, walk: Walk, camera: dict[str, Any]) -> tuple[Path, Path]:
+    """video.mkv, without loss, and truth/ with poses, depth and classes; holds one picture at a time. camera: its
+    width, height, fps and focal length in pixels."""
+    options = ClipOptions(frames=round(walk.seconds * camera["fps"]), **camera)
+    stamp, done = asdict(walk) | camera, folder / "clip.json"
     video, truth = folder / "video.mkv", folder / "truth"
     if not done.exists() or json.loads(done.read_text()) != stamp:
         write_sequence(truth, around(0, 0.01), options, frames(walk, options))
-        write_video(video, (read_rgb(p) for p in sorted((truth / "rgb").iterdir())), fps)
+        write_video(video, (read_rgb(p) for p in sorted((truth / "rgb").iterdir())), camera["fps"])
         done.write_text(json.dumps(stamp))
     return video, truth
 
@@ -51,11 +52,11 @@ def msgs_slam(*arguments: object) -> None:
     subprocess.run([sys.executable, "-m", "msgs_cli.main", *map(str, arguments)], check=True, stdout=sys.stderr)
 
 
-def run_walk(name: str, work: Path, size: tuple[int, int], fps: float, settings: list[str]) -> dict[str, Any]:
+def run_walk(name: str, work: Path, camera: dict[str, Any], settings: list[str]) -> dict[str, Any]:
     """One row: the walk made, reconstructed stage by stage, evaluated."""
     seconds, _, turns = name.partition("x")
-    folder = work / f"walk_{name}_{size[0]}"
-    video, truth = make_clip(folder, Walk(float(seconds), int(turns or 0)), size, fps)
+    folder = work / f"walk_{name}_{camera['width']}"
+    video, truth = make_clip(folder, Walk(float(seconds), int(turns or 0)), camera)
     run = folder / "video.msgs"
     chosen = [part for setting in settings for part in ("--set", setting)]
     for stage in STAGES:
@@ -112,12 +113,13 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("long_runs"))
     parser.add_argument("--size", default="240x180")
     parser.add_argument("--fps", type=float, default=5.0, help="of the video")
+    parser.add_argument("--focal", type=float, default=0.85, help="of the lens, as a share of the width")
     parser.add_argument("--set", dest="settings", action="append", default=[], metavar="SECTION.KEY=VALUE")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     width, height = (int(x) for x in arguments.size.split("x"))
-    where = arguments.work, (width, height), arguments.fps, arguments.settings
-    rows = [run_walk(name, *where) for name in arguments.walks]
+    camera = {"width": width, "height": height, "fps": arguments.fps, "focal": arguments.focal * width}
+    rows = [run_walk(name, arguments.work, camera, arguments.settings) for name in arguments.walks]
     print(table(rows))
     if arguments.json:
         arguments.json.write_text(json.dumps(rows, indent=1) + "\n")
