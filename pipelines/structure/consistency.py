@@ -85,7 +85,7 @@ def judge(
     matches, agreeing = sum(c.matches for c in checks), sum(c.agreeing for c in checks)
     placed, tracks = sorted({(i - 1) % total for i in model.reg_image_ids()}), tracks_of(model, total)
     seams = find_seams(placed, checks, tracks, reach)
-    parts = find_parts(placed, seams, tracks)
+    parts = find_parts(placed, seams, tracks, reach)
     return ModelReport(
         len(placed), total, model.num_points3D(), float(np.median(reprojection_errors(model))),
         agreeing / max(matches, 1), sum(c.agrees for c in checks) / max(len(checks), 1),

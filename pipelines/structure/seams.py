@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import groupby, pairwise
+from itertools import combinations, groupby, pairwise, product
 
 import numpy as np
 import pycolmap
@@ -39,9 +39,12 @@ class PairCheck:
 class Seam:
     """Between a placed keyframe and the next placed one (indices).
 
-    points: seen on both sides by keyframes near each other; pairs: of keyframes near each other, one on each side, that
-    match; agreement: the share of their matches in pairs that agree with the poses. Things that repeat match falsely,
-    but with fewer matches than what is truly seen twice: so that pairs are weighed.
+    points: seen on both sides by keyframes near each other; if fewer, those which hold the scale over the end that shares
+    more with its other neighbour: a point seen before a keyframe, behind it and by three or more in all. Two structures
+    that share a keyframe alone, and points of two views each, may be of any size beside each other, and no reprojection
+    error tells. pairs: of keyframes near each other, one on each side, that match; agreement: the share of their matches
+    in pairs that agree with the poses. Things that repeat match falsely, but with fewer matches than what is truly seen
+    twice: so that pairs are weighed.
     """
 
     before: int
@@ -69,17 +72,17 @@ def find_seams(
     `tracks` are the keyframes (sorted indices) that see a point, for every point.
     """
     place = {k: n for n, k in enumerate(placed)}
-    points, pairs, matches, agreeing = (np.zeros(len(placed) + 1, np.int64) for _ in range(4))
+    points, ties, pairs, matches, agreeing = (np.zeros(len(placed) + 1, np.int64) for _ in range(5))
 
     def cross(counts: NDArray[np.int64], first: int, last: int, weight: int = 1) -> None:
         counts[first] += weight
         counts[last] -= weight
 
     for track in tracks:
-        seen = [place[k] for k in track]
-        for a, b in pairwise(seen):
-            if b - a <= reach:
-                cross(points, a, b)
+        for near in _near(track, place, reach):
+            cross(points, near[0], near[-1])
+            if len(near) > 2:
+                cross(ties, near[0] + 1, near[-1])
     for check in checks:
         a, b = place[check.first], place[check.second]
         if b - a <= reach:
@@ -87,10 +90,21 @@ def find_seams(
             cross(matches, a, b, check.matches)
             if check.agrees:
                 cross(agreeing, a, b, check.matches)
-    points, pairs, matches, agreeing = (np.cumsum(c)[: len(placed) - 1] for c in (points, pairs, matches, agreeing))
+    points, ties, pairs, matches, agreeing = (
+        np.cumsum(c)[: len(placed) - 1] for c in (points, ties, pairs, matches, agreeing)
+    )
+    for k in range(1, len(placed) - 1):
+        weaker = k - (points[k - 1] <= points[k])  # the seam before k, or the one behind it
+        points[weaker] = min(points[weaker], ties[k])
     agreement = agreeing / np.maximum(matches, 1)
     crossing = points.tolist(), pairs.tolist(), agreement.tolist()
     return [Seam(*row) for row in zip(placed[:-1], placed[1:], *crossing, strict=True)]
+
+
+def _near(track: Sequence[int], place: dict[int, int], reach: int) -> list[NDArray[np.int64]]:
+    """A track's places in runs, within which no step is longer than `reach`."""
+    seen = np.array([place[k] for k in track])
+    return np.split(seen, np.flatnonzero(np.diff(seen) > reach) + 1)
 
 
 def worst_contradictions(seams: Iterable[Seam]) -> list[Seam]:
@@ -129,24 +143,26 @@ def take_out(model: pycolmap.Reconstruction, keyframes: Iterable[int]) -> None:
     model.tear_down()  # the covariance of an adjustment wants a pose of every image there is
 
 
-def find_parts(placed: Sequence[int], seams: Iterable[Seam], tracks: Iterable[Sequence[int]]) -> list[list[int]]:
-    """Placed keyframes in parts, largest first: runs between loose seams, joined where a loop holds them together."""
-    run = dict.fromkeys(placed, 0)
+def find_parts(
+    placed: Sequence[int], seams: Iterable[Seam], tracks: Iterable[Sequence[int]], reach: int
+) -> list[list[int]]:
+    """Placed keyframes in parts, largest first: runs between loose seams, joined where a loop, what is seen again more
+    than `reach` places later, holds them together."""
+    place = {k: n for n, k in enumerate(placed)}
     loose = {s.after for s in seams if s.is_loose}
-    number = 0
-    for k in placed:
-        number += k in loose
-        run[k] = number
+    run = np.cumsum([k in loose for k in placed])
+    number = int(run[-1])
     shared = np.zeros((number + 1, number + 1), np.int64)
     for track in tracks:
-        runs = sorted({run[k] for k in track})
-        shared[np.ix_(runs, runs)] += 1
+        for first, second in combinations([set(run[near].tolist()) for near in _near(track, place, reach)], 2):
+            for a, b in product(first, second):
+                shared[min(a, b), max(a, b)] += 1
     label = list(range(number + 1))
     for a, b in np.argwhere(np.triu(shared, 1) >= 2 * _LEAST_POINTS).tolist():
         label = [label[a] if x == label[b] else x for x in label]
     parts: dict[int, list[int]] = {}
     for k in placed:
-        parts.setdefault(label[run[k]], []).append(k)
+        parts.setdefault(label[run[place[k]]], []).append(k)
     return sorted(parts.values(), key=lambda p: (-len(p), p[0]))
 
 

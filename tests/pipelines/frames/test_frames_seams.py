@@ -107,13 +107,25 @@ def test_keyframes_that_were_not_placed_leave_a_gap() -> None:
     seams = find_seams(placed, checks, tracks, REACH)
     assert Seam(9, 13, 20, 4, 1.0) not in seams  # points of four neighbours reach 12 at most
     assert next(s for s in seams if s.before == 9).is_loose
-    assert find_parts(placed, seams, tracks) == [list(range(13, COUNT)), list(range(10))]
+    assert find_parts(placed, seams, tracks, REACH) == [list(range(13, COUNT)), list(range(10))]
+
+
+def test_where_two_structures_share_one_keyframe_alone_nothing_holds_their_sizes() -> None:
+    """Each side sees the keyframe's own points from itself and other keyframes, and no point is seen from both sides."""
+    row = [t for t in _tracks() if t[-1] <= 20 or t[0] >= 20]
+    seams = find_seams(range(COUNT), _checks(0), row, REACH)
+    assert [s.points for s in seams[19:21]] == [0, 20]  # before the keyframe, and behind it
+    assert [len(p) for p in find_parts(range(COUNT), seams, row, REACH)] == [20, 20]
+    tied = row + [[19, 20, 21]] * 12
+    assert not any(s.is_loose for s in find_seams(range(COUNT), _checks(0), tied, REACH))
+    skipping = row + [[19, 21]] * 50  # directions from one to the other, but no size
+    assert [s.before for s in find_seams(range(COUNT), _checks(0), skipping, REACH) if s.is_loose] == [19]
 
 
 def test_a_loop_holds_two_runs_together() -> None:
     for loop, parts in ((None, [25, 15]), ((2, 38), [COUNT])):
         tracks = _tracks(25, loop)
-        found = find_parts(range(COUNT), find_seams(range(COUNT), _checks(0), tracks, REACH), tracks)
+        found = find_parts(range(COUNT), find_seams(range(COUNT), _checks(0), tracks, REACH), tracks, REACH)
         assert [len(p) for p in found] == parts
 
 
