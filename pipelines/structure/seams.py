@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import combinations, groupby, pairwise, product
+from itertools import combinations, groupby, product
 
 import numpy as np
 import pycolmap
@@ -39,12 +39,12 @@ class PairCheck:
 class Seam:
     """Between a placed keyframe and the next placed one (indices).
 
-    points: seen on both sides by keyframes near each other; if fewer, those which hold the scale over the end that shares
+    points: seen on both sides by keyframes near each other; if fewer, those that hold the scale over the end that shares
     more with its other neighbour: a point seen before a keyframe, behind it and by three or more in all. Two structures
     that share a keyframe alone, and points of two views each, may be of any size beside each other, and no reprojection
-    error tells. pairs: of keyframes near each other, one on each side, that match; agreement: the share of their matches
-    in pairs that agree with the poses. Things that repeat match falsely, but with fewer matches than what is truly seen
-    twice: so that pairs are weighed.
+    error tells. pairs: of keyframes near each other, one on each side, that match; agreement: the share of their
+    matches in pairs that agree with the poses. Things that repeat match falsely, but with fewer matches than what is
+    truly seen twice: so that pairs are weighed.
     """
 
     before: int
@@ -80,9 +80,9 @@ def find_seams(
 
     for track in tracks:
         for near in _near(track, place, reach):
-            cross(points, near[0], near[-1])
+            cross(points, int(near[0]), int(near[-1]))
             if len(near) > 2:
-                cross(ties, near[0] + 1, near[-1])
+                cross(ties, int(near[0]) + 1, int(near[-1]))
     for check in checks:
         a, b = place[check.first], place[check.second]
         if b - a <= reach:

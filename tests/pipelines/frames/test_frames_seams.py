@@ -111,7 +111,7 @@ def test_keyframes_that_were_not_placed_leave_a_gap() -> None:
 
 
 def test_where_two_structures_share_one_keyframe_alone_nothing_holds_their_sizes() -> None:
-    """Each side sees the keyframe's own points from itself and other keyframes, and no point is seen from both sides."""
+    """Each side sees points of the keyframe from itself and other keyframes, and no point is seen from both sides."""
     row = [t for t in _tracks() if t[-1] <= 20 or t[0] >= 20]
     seams = find_seams(range(COUNT), _checks(0), row, REACH)
     assert [s.points for s in seams[19:21]] == [0, 20]  # before the keyframe, and behind it
