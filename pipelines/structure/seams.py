@@ -39,7 +39,7 @@ class PairCheck:
 class Seam:
     """Between a placed keyframe and the next placed one (indices).
 
-    points: seen on both sides by keyframes near each other; if fewer, those that hold the scale over the end that shares
+    points: seen on both sides by keyframes near each other; if fewer, those that hold the size over the end that shares
     more with its other neighbour: a point seen before a keyframe, behind it and by three or more in all. Two structures
     that share a keyframe alone, and points of two views each, may be of any size beside each other, and no reprojection
     error tells. pairs: of keyframes near each other, one on each side, that match; agreement: the share of their
