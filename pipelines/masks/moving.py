@@ -8,9 +8,10 @@ others too and explains itself, and over a surface of one colour nobody accuses 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -64,27 +65,41 @@ class MovingView:
 
 
 def find_moving(
-    poses: NDArray[np.float64], load: Callable[[int], MovingView], camera: Intrinsics, progress: Progress
+    poses: NDArray[np.float64],
+    load: Callable[[int], MovingView],
+    camera: Intrinsics,
+    progress: Progress,
+    first: dict[int, NDArray[np.bool_]] | None = None,
 ) -> dict[int, NDArray[np.bool_]]:
     """Index of a keyframe → (h, w) what of it moved, for those with any. `camera` has the size of the views, poses
-    (N, 4, 4) cam_from_world. A second and third round let what was found before speak neither for nor against."""
-    view = lru_cache(_KEPT)(load)
-    found: dict[int, NDArray[np.bool_]] = {}
-    for number in range(_ROUNDS):
-        before = dict(found)
-        asked = range(len(poses)) if number == 0 else sorted(before)
-        for k in progress.track(asked, "moving", len(asked)):
-            depth = view(k).depth
-            if not (depth > 0).any():
-                continue
-            others = _witnesses(poses, k, float(np.median(depth[depth > 0])))
-            rules = _AGAIN if number else _FIRST
-            witnesses = ((view(o), before.get(o)) for o in others)
-            new = _things(_evidence(view(k), witnesses, camera, rules.confidence), rules.gap, before.get(k))
-            if new.any():
-                found[k] = new
-        if not found:
-            break
+    (N, 4, 4) cam_from_world. A second and third round let what was found before speak neither for nor against; `first`:
+    what the first round has found, where that is done."""
+    found = look_once(range(len(poses)), poses, load, camera, progress) if first is None else first
+    for _ in range(_ROUNDS - 1 if found else 0):
+        found = {**found, **look_once(sorted(found), poses, load, camera, progress, found, _AGAIN)}
+    return found
+
+
+def look_once(
+    asked: Sequence[int],
+    poses: NDArray[np.float64],
+    load: Callable[[int], MovingView],
+    camera: Intrinsics,
+    progress: Progress,
+    before: Mapping[int, NDArray[np.bool_]] = MappingProxyType({}),
+    rules: Rules = _FIRST,
+) -> dict[int, NDArray[np.bool_]]:
+    """One round of `find_moving` over some of the keyframes, with what the one before has found."""
+    view, found = lru_cache(_KEPT)(load), {}
+    for k in progress.track(asked, "moving", len(asked)):
+        depth = view(k).depth
+        if not (depth > 0).any():
+            continue
+        others = _witnesses(poses, k, float(np.median(depth[depth > 0])))
+        witnesses = ((view(o), before.get(o)) for o in others)
+        new = _things(_evidence(view(k), witnesses, camera, rules.confidence), rules.gap, before.get(k))
+        if new.any():
+            found[k] = new
     return found
 
 

@@ -30,6 +30,7 @@ class AlignedDepth:
     """
 
     metric = False
+    of_all = ("_learned", "_fits")
 
     def __init__(self, learned: OnnxDepth, sequence: Sequence, relative: str) -> None:
         """Raises InputError without a backbone: nothing else tells the frames' scales."""

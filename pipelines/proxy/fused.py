@@ -35,6 +35,8 @@ class FusedDepth:
     bent to the geometry around it by a smooth scale field of the frame, together with what the geometry guesses there.
     """
 
+    of_all = ("_learned", "_stereo", "_scale")
+
     def __init__(self, learned: DepthProvider, stereo: MultiviewDepth, sequence: Sequence) -> None:
         self._learned, self._stereo, self._sequence = learned, stereo, sequence
         self.name = f"{learned.name}+multiview"

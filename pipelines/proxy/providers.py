@@ -63,7 +63,30 @@ class LabelEstimate:
         return LabelEstimate(labels, np.where(left_out, np.float32(0), self.confidence), self.descriptor)
 
 
-class DepthProvider(Protocol):
+class Provider(Protocol):
+    """What is asked for frames: first all of them together, then one after the other."""
+
+    @property
+    def of_all(self) -> tuple[str, ...]:
+        """The names of what `prepare` finds out of all frames together, and of the providers inside this one."""
+
+
+def prepared(provider: Provider) -> dict[str, Any]:
+    """What `prepare` has found out, to travel to where single frames are estimated."""
+    found = {name: getattr(provider, name) for name in provider.of_all}
+    return {name: prepared(v) if hasattr(v, "of_all") else v for name, v in found.items()}
+
+
+def take_prepared(provider: Provider, found: dict[str, Any]) -> None:
+    """As if `prepare` had been called here: `estimate` may be. Inverse of `prepared`."""
+    for name, value in found.items():
+        if hasattr(own := getattr(provider, name), "of_all"):
+            take_prepared(own, value)
+        else:
+            setattr(provider, name, value)
+
+
+class DepthProvider(Provider, Protocol):
     """Depth of every frame. What can be refused without slow work is refused when the provider is made."""
 
     name: str
@@ -83,13 +106,16 @@ class DepthProvider(Protocol):
         """What the report says of the pass, as plain values."""
 
 
-class SemanticsProvider(Protocol):
+class SemanticsProvider(Provider, Protocol):
     """Class of every pixel of every frame."""
 
     name: str
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames it will know nothing of."""
+
+    def look(self, frames: list[Frame]) -> None:
+        """What `prepare` does of each of these frames by itself; what is done stays."""
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Slow passes over all frames that `estimate` and `classes` build on."""

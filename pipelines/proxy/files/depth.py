@@ -31,6 +31,7 @@ class FilesDepth:
     """
 
     metric = True
+    of_all = ()
 
     def __init__(self, folder: str, source: Path, sequence: Sequence, unit: float) -> None:
         """Raises InputError unless the folder is there, frames find their files, and the first file fits the frames."""

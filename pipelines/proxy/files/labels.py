@@ -32,6 +32,8 @@ class FilesLabels:
     named by its number, except 255 (65535 in 16 bit), which is void.
     """
 
+    of_all = ("_label_of",)
+
     def __init__(self, folder: str, source: Path, sequence: Sequence, progress: Progress) -> None:
         """Raises InputError unless the folder is there, frames find their files, and the first file fits the frames."""
         path = find_folder(folder, source, _NAMES, _SUFFIXES)
@@ -44,6 +46,9 @@ class FilesLabels:
         self._classes = ClassTable((), ())
         self._outside: dict[int, int] = {}
         self._read(next(iter(self._files.values())))
+
+    def look(self, frames: list[Frame]) -> None:
+        """Nothing to do."""
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Count the ids of all frames and give labels to those that are classes. InputError for more than 254."""

@@ -41,6 +41,7 @@ class RecordingDepth(_RecordingMaps):
     """Metric depth, its unit, unknown values and camera as the data set's reader settles them; confidence 1."""
 
     metric = True
+    of_all = ()
 
     def __init__(self, recording: Recording, sequence: Sequence) -> None:
         """Raises InputError for a data set without depth."""
@@ -77,6 +78,8 @@ class RecordingDepth(_RecordingMaps):
 class RecordingLabels(_RecordingMaps):
     """The classes of the data set that occur in the frames, with its names and colours."""
 
+    of_all = ("_label_of",)
+
     def __init__(self, recording: Recording, sequence: Sequence, progress: Progress) -> None:
         """Raises InputError for a data set without labels."""
         if not recording.has_labels:
@@ -87,6 +90,9 @@ class RecordingLabels(_RecordingMaps):
         self._progress = progress
         self._label_of = np.full(256, VOID, np.uint8)
         self._classes = ClassTable((), ())
+
+    def look(self, frames: list[Frame]) -> None:
+        """Nothing to do."""
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Find the classes that occur. Raises InputError where there is none."""

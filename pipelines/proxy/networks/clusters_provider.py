@@ -22,6 +22,8 @@ _SOFTNESS = 0.1
 class OnnxClusters(OnnxLabels):
     """What looks alike to the network is one class, "cluster 1" the most frequent; spherical k-means, fixed seed."""
 
+    of_all = (*OnnxLabels.of_all, "_centres")
+
     def __init__(self, card: Card, place: Workplace, most: int) -> None:
         """`most` clusters at the most. Raises InputError as `OnnxLabels`."""
         super().__init__(card, place, most)

@@ -21,6 +21,7 @@ class OnnxDepth:
     """Depth in metres, frame by frame, whether or not the frame has a pose."""
 
     metric = True
+    of_all = ()
 
     def __init__(self, card: Card, place: Workplace) -> None:
         """Opens the network. Raises InputError when it cannot be what the card says."""

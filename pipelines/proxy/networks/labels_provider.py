@@ -33,6 +33,8 @@ _STEPS = 16
 class OnnxLabels:
     """Only the classes that occur in the video are kept."""
 
+    of_all: tuple[str, ...] = ("_label_of", "_scene")
+
     def __init__(self, card: Card, place: Workplace, most: int) -> None:
         """Opens the network; `most` numbered objects of what has no name. Raises InputError when the network cannot be
         what the card says."""
@@ -63,9 +65,13 @@ class OnnxLabels:
         """None: a network sees every frame."""
         return []
 
-    def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
-        """Run the network, let all frames vote on the names of the places they see, and settle the classes."""
+    def look(self, frames: list[Frame]) -> None:
+        """Run the network; what is on disk stays."""
         self._pass.run(frames)
+
+    def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
+        """Let the network look, let all frames vote on the names of the places they see, and settle the classes."""
+        self.look(frames)
         self._learn(frames)
         if self._has_world(frames, depth_of):
             segments = SegmentLabels(self._sequence, self._most, self._progress)
@@ -122,7 +128,7 @@ class OnnxLabels:
         """What all frames say of the places that this one shows; what it says itself where there is no world."""
         own = self._probabilities(frame)
         if self._scene is not None:
-            found = self._scene.estimate(frame, depth, own)
+            found = self._scene.estimate(self._sequence, frame, depth, own)
         else:
             ids, probability = best_classes(resample_linear(own, *depth.depth.shape), self._void)
             labels = self._label_of[ids + 1]

@@ -47,7 +47,6 @@ class NamedScene:
     """keys (V,) of voxels of `size`; share (V, K) probability of each of `names`; kept (K,) the network's class that
     each name is, -1 for a numbered object; of_place (C,) likelihood of the network's classes in such a place."""
 
-    sequence: Sequence
     size: float
     keys: NDArray[np.int64]
     share: NDArray[np.float32]
@@ -82,27 +81,29 @@ class NamedScene:
         share /= np.maximum(share.sum(1, keepdims=True), 1e-9)
         one_name_each(share, vocabulary.names, voxels)
         columns, names, kept = _settle(share, voxels, vocabulary, elsewhere * of_place)
-        return NamedScene(sequence, voxels.size, voxels.keys, columns, names, kept, of_place)
+        return NamedScene(voxels.size, voxels.keys, columns, names, kept, of_place)
 
-    def estimate(self, frame: Frame, depth: DepthEstimate, own: NDArray[np.float32]) -> LabelEstimate:
+    def estimate(
+        self, sequence: Sequence, frame: Frame, depth: DepthEstimate, own: NDArray[np.float32]
+    ) -> LabelEstimate:
         """Names of the places that the pixels (h, w) show, spread along like colours to where the depth is unsure.
 
         own (rows, columns, C): what the network says of this frame, for pixels that show no place that is known.
         """
-        at = self._places(frame, depth)
+        at = self._places(sequence, frame, depth)
         known = self.kept >= 0
         votes = np.zeros((*at.shape, len(self.names)), np.float32)
         votes[..., known] = resample_linear((own * self.of_place)[..., self.kept[known]], *at.shape)
         seen = at >= 0
         votes[seen] = self.share[at[seen]]
         trust = np.where(seen, depth.confidence, _ALONE).astype(np.float32)
-        return label_pixels(votes, trust, self.sequence.image(frame))
+        return label_pixels(votes, trust, sequence.image(frame))
 
-    def _places(self, frame: Frame, depth: DepthEstimate) -> NDArray[np.int64]:
+    def _places(self, sequence: Sequence, frame: Frame, depth: DepthEstimate) -> NDArray[np.int64]:
         """(h, w) index of the voxel that every pixel shows, or of one beside it; -1 for none."""
-        if frame.id not in self.sequence.cam_from_world:
+        if frame.id not in sequence.cam_from_world:
             return np.full(depth.depth.shape, -1, np.int64)
-        return find_near(self.keys, _keys(self.sequence, frame, depth.depth, self.size))
+        return find_near(self.keys, _keys(sequence, frame, depth.depth, self.size))
 
 
 def _vote(

@@ -47,6 +47,7 @@ class SegmentLabels:
     """Unsupervised regions; needs poses (a backbone), because they make the regions consistent over the video."""
 
     name = "segments"
+    of_all = ("_size", "_keys", "_label", "_classes")
 
     def __init__(self, sequence: Sequence, most: int, progress: Progress) -> None:
         """`most` classes at the most. Raises InputError without a backbone."""
@@ -70,6 +71,9 @@ class SegmentLabels:
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames without a pose."""
         return [f for f in frames if f.id not in self._world_from_cam]
+
+    def look(self, frames: list[Frame]) -> None:
+        """Nothing to do."""
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Gather all frames and cut the scene."""

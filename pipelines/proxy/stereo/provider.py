@@ -48,6 +48,7 @@ class MultiviewDepth:
 
     metric = False
     name = "multiview"
+    of_all = ()
 
     def __init__(
         self, sequence: Sequence, side: int, planes: int, folder: Callable[[], Path], threads: int, progress: Progress

@@ -60,7 +60,7 @@ def test_frames_together_name_the_room_better_than_each_alone(room: Room) -> Non
     index = np.array([*(NAMES.index(n) if n in NAMES else VOID for n in scene.names)] + [VOID] * 256, np.uint8)
     together, alone = {}, {}
     for frame in room.frames:
-        together[frame.id] = index[scene.estimate(frame, depth_of(room, frame), said[frame.id]).labels]
+        together[frame.id] = index[scene.estimate(room.sequence(), frame, depth_of(room, frame), said[frame.id]).labels]
         shape = room.views[frame.id].labels.shape
         alone[frame.id] = best_classes(resample_linear(said[frame.id], *shape), (0,))[0].astype(np.uint8)
     assert miou(room, alone) + 0.1 < miou(room, together) < 0.99
@@ -78,16 +78,16 @@ def test_what_has_no_name_becomes_numbered_objects(room: Room) -> None:
     assert scene.names[2:] == tuple(f"object {i + 1}" for i in range(4))
     assert (scene.kept[2:] == -1).all()
     assert (scene.kept[:2] == [NAMES.index(n) for n in scene.names[:2]]).all()
-    found = scene.estimate(room.frames[5], depth_of(room, room.frames[5]), said[5])
+    found = scene.estimate(room.sequence(), room.frames[5], depth_of(room, room.frames[5]), said[5])
     assert len(np.unique(found.labels[found.labels != VOID])) >= 4
 
 
 def test_a_frame_without_pose_keeps_what_it_said(room: Room) -> None:
     said = {f.id: coarse(room.views[f.id].labels, np.random.default_rng(1)) for f in room.frames}
     scene = gather(room, said, Vocabulary(NAMES, (0,), 16))
-    scene = replace(scene, sequence=replace(room.sequence(), read_image=lambda frame: room.views[0].rgb))
+    elsewhere = replace(room.sequence(), read_image=lambda frame: room.views[0].rgb)
     known = room.views[0].labels
-    found = scene.estimate(Frame(99, "lost.png", 9.9, 99, 1.0), depth_of(room, room.frames[0]), said[0])
+    found = scene.estimate(elsewhere, Frame(99, "lost.png", 9.9, 99, 1.0), depth_of(room, room.frames[0]), said[0])
     names = np.array([*scene.names, "void"])[np.minimum(found.labels, len(scene.names))]
     assert 0.7 < (names == np.array(NAMES)[known]).mean() < 0.99
     assert found.confidence.max() < 0.5
