@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,8 @@ from pipelines.config import ExportConfig
 from pipelines.depth.posed import PosedDepth
 from pipelines.export.depth_views import DrawnView, Shown, ViewsOnDisk, drawn_view
 from pipelines.export.paint import paint
-from pipelines.export.surface import EMPTY, extract_surface, join_faces, without_floaters
-from pipelines.export.volume import fuse, make_grid
+from pipelines.export.surface import EMPTY, Surface, extract_surface, join_faces, without_floaters
+from pipelines.export.volume import Grid, fuse, make_grid
 from pipelines.gaussians.render import get_threads
 from pipelines.outcome import Outcome
 from pipelines.progress import Progress
@@ -37,36 +38,79 @@ def keyframe_rows(outcome: Outcome) -> list[int]:
     return np.flatnonzero(outcome.trajectory.is_keyframe).tolist()
 
 
+def draw(outcome: Outcome, settings: ExportConfig, number: int) -> DrawnView:
+    """What the map shows in one of the `keyframe_rows`."""
+    pose = outcome.trajectory.cam_from_world[keyframe_rows(outcome)[number]]
+    return drawn_view(outcome.require_map(), pose, outcome.calibration.intrinsics.at_most(settings.mesh_side))
+
+
 def drawn_views(outcome: Outcome, settings: ExportConfig, progress: Progress, folder: Path) -> Sequence[DrawnView]:
     """What the map shows in each of the `keyframe_rows`, on disk in `folder` but for those used last."""
-    rows, gaussian_map = keyframe_rows(outcome), outcome.require_map()
-    camera = outcome.calibration.intrinsics.at_most(settings.mesh_side)
-    poses = outcome.trajectory.cam_from_world
-    drawn = ViewsOnDisk(folder)
-    for row in progress.track(rows, "drawing", len(rows)):
-        drawn.append(drawn_view(gaussian_map, poses[row], camera))
-    return Streamed(len(rows), drawn.load, lambda view: view.size, _KEPT_BYTES)
+    drawn, count = ViewsOnDisk(folder), len(keyframe_rows(outcome))
+    for number in progress.track(range(count), "drawing", count):
+        drawn.append(draw(outcome, settings, number))
+    return streamed_views(count, drawn.load)
 
 
-def make_mesh(outcome: Outcome, views: Sequence[DrawnView], settings: ExportConfig, progress: Progress) -> SemanticMesh:
-    """The surface of the map as the keyframes see it, a region of the grid after the other; without a vertex where
-    nothing is seen twice."""
+def streamed_views(count: int, load: Callable[[int], DrawnView]) -> Sequence[DrawnView]:
+    """Those used last are kept."""
+    return Streamed(count, load, lambda view: view.size, _KEPT_BYTES)
+
+
+@dataclass(frozen=True)
+class Region:
+    """A part of the mesh, with colors (V, 3) uint8 and labels (V,) uint8 of its vertices."""
+
+    surface: Surface
+    colors: NDArray[np.uint8]
+    labels: NDArray[np.uint8]
+
+
+_NO_REGION = Region(EMPTY, np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8))
+
+
+def make_mesh(
+    outcome: Outcome,
+    views: Sequence[DrawnView],
+    settings: ExportConfig,
+    progress: Progress,
+    regions_of: Callable[[Grid], list[Region]] | None = None,
+) -> SemanticMesh:
+    """The surface of the map as the keyframes see it, a region of the grid after the other (or as `regions_of` makes
+    them); without a vertex where nothing is seen twice."""
     shown = Shown(views)
     most = int(settings.max_blocks * max(len(views) / LONG, 1))
     grid = make_grid(shown, settings.voxel * _median_depth(shown), TRUNCATION, most)
-    least, class_ids = LEAST_WEIGHT if len(views) >= 4 else 0.5, tuple(outcome.label_of_channel.tolist())
-    surfaces, painted = [EMPTY], [(np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8))]
-    regions = list(grid.regions())
-    for number, chunks in enumerate(regions, 1):
-        near, of = grid.views_of(chunks), f", {number} of {len(regions)}" if len(regions) > 1 else ""
-        fusing = (views[n].shown for n in progress.track(near, "fusing" + of, len(near)))
-        surfaces.append(extract_surface(fuse(grid, chunks, fusing, get_threads()), chunks, least))
-        painting = (views[n] for n in progress.track(near, "painting" + of, len(near)))
-        painted.append(paint(surfaces[-1].vertices, painting, class_ids, 2 * grid.truncation))
+    parts = list(grid.regions())
+    regions = [_NO_REGION]
+    if regions_of is not None:
+        regions += regions_of(grid)
+    else:
+        for number, chunks in enumerate(parts, 1):
+            of = f", {number} of {len(parts)}" if len(parts) > 1 else ""
+            regions.append(make_region(outcome, views, grid, chunks, progress, of))
+    surfaces = [region.surface for region in regions]
     vertices = np.concatenate([surface.vertices for surface in surfaces])
     rows, faces = without_floaters(join_faces(surfaces), len(vertices), _LEAST_PIECE)
-    colors, labels = (np.concatenate(of_regions)[rows] for of_regions in zip(*painted, strict=True))
+    colors, labels = (np.concatenate([getattr(r, name) for r in regions])[rows] for name in ("colors", "labels"))
     return SemanticMesh(vertices[rows], faces, colors, labels)
+
+
+def make_region(
+    outcome: Outcome,
+    views: Sequence[DrawnView],
+    grid: Grid,
+    chunks: NDArray[np.int32],
+    progress: Progress,
+    of: str = "",
+) -> Region:
+    """One of the regions of the grid, from the views that see it; `of` tells progress which."""
+    near = grid.views_of(chunks)
+    least, class_ids = LEAST_WEIGHT if len(views) >= 4 else 0.5, tuple(outcome.label_of_channel.tolist())
+    fusing = (views[n].shown for n in progress.track(near, "fusing" + of, len(near)))
+    surface = extract_surface(fuse(grid, chunks, fusing, get_threads()), chunks, least)
+    painting = (views[n] for n in progress.track(near, "painting" + of, len(near)))
+    return Region(surface, *paint(surface.vertices, painting, class_ids, 2 * grid.truncation))
 
 
 def write_mesh(

@@ -14,6 +14,7 @@ from formats.mesh import read_mesh_ply
 from pipelines.config import Config, ExportConfig
 from pipelines.export.depth_views import Shown
 from pipelines.export.mesh import drawn_views, make_mesh, mesh_figures, write_mesh
+from pipelines.export.tasks import MeshTask, MeshWorkers
 from pipelines.export.textured import make_textured, write_textured
 from pipelines.export.tiles import write_tiles
 from pipelines.export.writers import (
@@ -56,7 +57,13 @@ def run(context: StageContext) -> dict[str, Any]:
     if world.earth is not None:
         save_metres(context.folder, found.metres)
     finished = _finished_mesh(context.folder)
-    mesh, _ = write_meshes(outcome, world, settings, mesh_kinds(settings), context.folder, context.progress, finished)
+    workers = None
+    if context.workers is not None:
+        move, place = world.exported_from_run, context.snapshot / "mesh"
+        workers = MeshWorkers(context, MeshTask(context.run, context.config.run.device, move, settings, place))
+    mesh, _ = write_meshes(
+        outcome, world, settings, mesh_kinds(settings), context.folder, context.progress, finished, workers
+    )
     if len(mesh.faces) == 0:
         context.warn("the mesh is empty: no surface is seen by enough keyframes")
     return {
@@ -77,15 +84,18 @@ def write_meshes(
     folder: Path,
     progress: Progress,
     finished: SemanticMesh | None = None,
+    workers: MeshWorkers | None = None,
 ) -> tuple[SemanticMesh, list[Path]]:
-    """Make the mesh, unless it is `finished`, and write those `kinds` of it ("mesh", "texture") that are not yet."""
+    """Make the mesh, unless it is `finished`, and write those `kinds` of it ("mesh", "texture") that are not yet.
+    `workers` draw and fuse."""
     if finished is not None and "texture" not in kinds:
         return finished, []
-    views, names = drawn_views(outcome, settings, progress, folder), outcome.classes.names
+    views = workers.views(outcome) if workers else drawn_views(outcome, settings, progress, folder)
+    names = outcome.classes.names
     axes = world.gltf_from_exported
     mesh, paths = finished, []
     if mesh is None:
-        mesh = make_mesh(outcome, views, settings, progress)
+        mesh = make_mesh(outcome, views, settings, progress, workers.regions if workers else None)
         paths += write_mesh(mesh, names, folder, axes) if "mesh" in kinds else []
     if "texture" in kinds and len(mesh.faces):
         paths += write_textured(make_textured(outcome, mesh, Shown(views), progress), names, folder, axes)

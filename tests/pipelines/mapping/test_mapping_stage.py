@@ -1,6 +1,7 @@
 """The stages mapping and export on a run folder, their files opened by other programs."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,9 @@ from formats.errors import InputError
 from formats.trajectory import read_tum
 from pipelines.config import Config, ExportConfig, MappingConfig, RunConfig
 from pipelines.export import stage as export_stage
+from pipelines.export import tasks
 from pipelines.export.stage import export_run
+from pipelines.export.volume import Grid
 from pipelines.geometry.alignment import Similarity
 from pipelines.mapping import stage as mapping_stage
 from pipelines.progress import SilentProgress
@@ -23,6 +26,7 @@ from pipelines.stages import StageContext
 from pipelines.types import VOID
 from pipelines.upright.world import read_world
 from tests.pipelines.mapping.small_run import make_run
+from tests.pipelines.travelling import Travelling
 
 CONFIG = Config(
     run=RunConfig(device="cpu"),
@@ -71,6 +75,23 @@ def test_colmap_takes_the_model(finished: tuple[RunFolder, dict, dict]) -> None:
     assert len(times) == 16
     first = model.images[min(model.images)].cam_from_world().inverse().matrix()
     assert np.abs(poses[0][:3] - first).max() < 1e-6
+
+
+def test_workers_leave_the_same_export(
+    finished: tuple[RunFolder, dict, dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Grid.regions, "__defaults__", (100,))  # blocks of a region
+    monkeypatch.setattr(tasks, "_PORTION", 4)
+    workers, made = Travelling(tmp_path, 2), []
+    for name, by in (("whole", None), ("divided", workers)):
+        (tmp_path / name).mkdir()
+        alike = replace(context(finished[0], "export"), folder=tmp_path / name, workers=by)
+        figures = export_stage.run(alike)
+        files = {p.name: p.read_bytes() for p in sorted(alike.folder.iterdir()) if p.is_file()}
+        made.append((figures, files))
+    assert made[0] == made[1]
+    assert workers.done["draw_views"] == 4
+    assert workers.done["fuse_region"] > 2
 
 
 def exported_from_run(run: RunFolder) -> Similarity:
