@@ -3,16 +3,17 @@
     python tests/benchmarks/truth_limit.py RUN.msgs=TRUTH ...
 
 TRUTH is a data set with poses, or a file with a row of 16 numbers, world from camera, for each frame of the source. The
-points of RUN's keyframes that four or more of them see are placed anew, from the run's poses, from the truth's, and from the truth's
-with the arm from the tracked body to the camera, the focal length and a radial distortion that suit it best. Pixels
-from where points are seen to where they then lie, medians: all, and by how many keyframes lie between a point's
-first and last view.
+points of RUN's keyframes that four or more of them see are placed anew: from the run's poses, from the truth's, and
+from the truth's with the arm from the tracked body to the camera, the focal length and a radial distortion that suit
+it best. Pixels from where points are seen to where they then lie, medians: all, and by how many keyframes lie between a
+point's first and last view.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,7 @@ class Sights:
         self.point = np.unique(point[kept], return_inverse=True)[1]
         self.view, self.xy = view[kept], xy[kept]
         starts = np.searchsorted(self.point, np.arange(self.point[-1] + 2))
-        spans = [np.ptp(self.view[a:b]) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+        spans = [np.ptp(self.view[a:b]) for a, b in pairwise(starts)]
         self.span = np.array(spans)[self.point]
 
     def errors(self, world_from_cam: Array, camera: Intrinsics, focal: float, radial: float) -> Array:
@@ -105,7 +106,7 @@ def main() -> None:
         best = least_squares(lambda p: np.sqrt(np.log1p((errors(p) / NOISE) ** 2)), np.zeros(8), max_nfev=25).x
         ours = sights.errors(se3.inverse(run.load_backbone().cam_from_world), camera, camera.fx, 0.0)
         for name, found in (("ours", ours), ("truth", errors(np.zeros(8))), ("truth, best arm and lens", errors(best))):
-            shares = [found[(sights.span >= a) & (sights.span < b)] for a, b in zip(SPANS[:-1], SPANS[1:], strict=True)]
+            shares = [found[(sights.span >= a) & (sights.span < b)] for a, b in pairwise(SPANS)]
             medians = [f"{np.median(s):.2f}" if len(s) else "" for s in (found, *shares)]
             print(f"| {run.root.name}: {name} | " + " | ".join(medians) + " |", flush=True)
 
