@@ -34,7 +34,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 _TASKS = ".tasks"
 _READY = "ready.json"
-_WORKS = ("pipelines.mapping.submap_tasks", "pipelines.proxy.tasks", "pipelines.export.tasks")
+_WORKS = ("pipelines.frames.begun", "pipelines.proxy.tasks", "pipelines.mapping.submap_tasks", "pipelines.export.tasks")
 """Where what is done with tasks is written: a run from elsewhere could name any function of the program."""
 _BETWEEN_LOOKS = 0.5
 """Seconds."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,24 +12,29 @@ import pycolmap
 from numpy.typing import NDArray
 
 from formats.atomic import copy_file
-from formats.datasets.camera import Camera
 from formats.errors import InputError, RecoverableError
 from formats.images import read_rgb, write_rgb
 from formats.jsonfile import read_json, write_json
 from formats.video import VideoFrame
 from pipelines.config import Config, FramesConfig
 from pipelines.correspondence.features import to_grey
-from pipelines.correspondence.matching import match_features
-from pipelines.correspondence.snapshots import Snapshots
+from pipelines.frames.begun import (
+    AHEAD,
+    AnySource,
+    known_camera,
+    masks_of,
+    picked,
+    structure_from_motion,
+)
 from pipelines.frames.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
 from pipelines.frames.keyframes import KeyframeChoice, choose_keyframes
-from pipelines.frames.learned import learned_inputs, open_learned, picture_features
+from pipelines.frames.learned import learned_inputs, open_learned
 from pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
 from pipelines.frames.pick import sharpest_of_windows
-from pipelines.frames.recording import RecordingSource
-from pipelines.frames.sharpness import reduce_image, reduced_size
-from pipelines.frames.source import FolderSource, VideoSource, open_source
+from pipelines.frames.sharpness import reduce_image
+from pipelines.frames.source import FolderSource, open_source
 from pipelines.geometry.rig import Rig, rig_of
+from pipelines.portions import in_portions
 from pipelines.run_folder import (
     save_backbone,
     save_calibration,
@@ -42,19 +46,16 @@ from pipelines.run_folder import (
 from pipelines.stages import Stage, StageContext
 from pipelines.structure.backbone import to_sparse_model
 from pipelines.structure.calibration import read_intrinsics
-from pipelines.structure.lens import Lens, distortion_of, make_lens, to_pycolmap, unknown_camera
+from pipelines.structure.lens import Lens, distortion_of, make_lens
 from pipelines.structure.parallax import require_motion
 from pipelines.structure.rolling import read_readout
-from pipelines.structure.sfm import Structure, StructureFromMotion, parallel_map
-from pipelines.types import Calibration, Features, Frame
+from pipelines.structure.sfm import Structure, parallel_map
+from pipelines.types import Calibration, Frame
 
 _SIGNIFICANT_SHIFT_PX = 0.3
 _FEW_KEYFRAMES = 12
-_FOCAL_GUESS = 1.2
 _UNSURE_FOCAL = 0.05
 _LEAST_PART = 3
-
-AnySource = VideoSource | FolderSource | RecordingSource
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -69,9 +70,7 @@ def run(context: StageContext) -> dict[str, Any]:
     _require_several(source)
     frames = _pick(context, source, faces)
     rig = rig_of(1 if faces is None else len(faces), len(frames))
-    masks = FrameMasks(
-        context.config, source, context.snapshot / "people", context.snapshot / "picked", context.threads, faces, rig
-    )
+    masks = masks_of(context, source, faces, rig)
     keyframes = _keyframes(context, frames, masks, rig)
     masks.find_people(frames, keyframes, context.progress)
     structure = _structure(context, camera, origin == "given", frames, keyframes, masks, rig)
@@ -85,27 +84,6 @@ def run(context: StageContext) -> dict[str, Any]:
     save_frames(context.folder, frames)
     panoramas = {"panoramas": rig.stations} if len(rig) > 1 else {}
     return _figures(frames, structure, calibration) | panoramas | masked
-
-
-def known_camera(context: StageContext, source: AnySource, faces: Faces | None) -> tuple[pycolmap.Camera, str]:
-    """The camera of the reduced frames as far as it is known before, and where from."""
-    config = context.config.frames
-    if faces is not None:
-        pinhole = Camera(**asdict(faces.pinhole))
-        return to_pycolmap(pinhole), "given"
-    width, height = reduced_size(source.width, source.height, config.max_side)
-    if config.intrinsics:
-        given = read_intrinsics(config.intrinsics, source.width, source.height)
-        return to_pycolmap(given.resized(width, height)), "given"
-    known = source.known_camera() if isinstance(source, RecordingSource) else None
-    if known is not None and not known.is_nominal and not known.fisheye:
-        return to_pycolmap(known.resized(width, height)), "given"
-    if known is not None:
-        return unknown_camera(width, height, known.fx * width / source.width, is_prior=True), "self-calibrated"
-    exif = source.exif_focal()
-    if exif is not None:
-        return unknown_camera(width, height, exif * width / source.width, is_prior=True), "exif"
-    return unknown_camera(width, height, _FOCAL_GUESS * max(width, height), is_prior=False), "self-calibrated"
 
 
 def check(source: Path, config: Config) -> None:
@@ -147,7 +125,7 @@ def _pick(context: StageContext, source: AnySource, faces: Faces | None) -> list
     if table.exists():
         stored = read_json(table)
         frames = [Frame(**row) for row in stored["frames"]]
-        if all(_picked(context, f.name).exists() for f in frames):
+        if all(picked(context, f.name).exists() for f in frames):
             for message in stored["warnings"]:
                 context.warn(message)
             return frames
@@ -161,7 +139,7 @@ def _pick(context: StageContext, source: AnySource, faces: Faces | None) -> list
         timestamp = picture.timestamp if source.has_times else _untimed(config, frame_id)
         name = source.name(frame_id, picture.source_index)
         frames.append(Frame(frame_id, name, timestamp, picture.source_index, score))
-        _save_picked(context, source, picture, name, faces)
+        _savepicked(context, source, picture, name, faces)
     context.same_source()
     if len(frames) < 2:
         raise InputError(f"{source.path} gives one frame only; a reconstruction needs several views of a scene")
@@ -181,22 +159,18 @@ def _untimed(config: FramesConfig, frame_id: int) -> float:
     return frame_id / (config.rate if config.rate > 0 else 1.0)
 
 
-def _save_picked(context: StageContext, source: AnySource, picture: VideoFrame, name: str, faces: Faces | None) -> None:
+def _savepicked(context: StageContext, source: AnySource, picture: VideoFrame, name: str, faces: Faces | None) -> None:
     if faces is not None:
         for face, rgb in zip(faces.names(name), faces.cut(picture.rgb), strict=True):
-            write_rgb(_picked(context, face), rgb)
+            write_rgb(picked(context, face), rgb)
         return
-    path = _picked(context, name)
+    path = picked(context, name)
     reduced = reduce_image(picture.rgb, context.config.frames.max_side)
     original = source.original(picture.source_index) if reduced is picture.rgb else None
     if original is None:
         write_rgb(path, reduced)
     else:
         copy_file(original, path)
-
-
-def _picked(context: StageContext, name: str) -> Path:
-    return context.snapshot / "picked" / name
 
 
 # keyframes and structure ----------------------------------------------------------------------------------------
@@ -239,7 +213,7 @@ def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks, rig: 
 
 
 def _gray(context: StageContext, frame: Frame) -> NDArray[np.uint8]:
-    return to_grey(read_rgb(_picked(context, frame.name)))
+    return to_grey(read_rgb(picked(context, frame.name)))
 
 
 def _structure(
@@ -251,27 +225,12 @@ def _structure(
     masks: FrameMasks,
     rig: Rig,
 ) -> Structure:
-    settings, size = context.config.frames, (camera.width, camera.height)
-    learned = open_learned(settings)
+    known = {"frames": frames, "keyframes": keyframes}
 
-    def extract(frame_id: int) -> Features:
-        rgb = read_rgb(_picked(context, frames[frame_id].name))
-        return picture_features(rgb, masks.left_out(frames[frame_id], *size), settings, learned)
+    def ahead(name: str, count: int, more: dict[str, NDArray]) -> None:
+        in_portions(context, AHEAD[name], count, **known, **more)
 
-    structure = StructureFromMotion(
-        config=settings,
-        camera=camera,
-        is_fixed=is_fixed,
-        extract=extract,
-        time=lambda frame_id: frames[frame_id].timestamp,
-        match=match_features if learned is None else partial(learned.match, size=size),
-        snapshots=Snapshots(context.snapshot),
-        progress=context.progress,
-        threads=context.threads,
-        seed=context.config.run.seed,
-        memory=context.memory_room,
-        cam_from_rig=rig.cam_from_rig,
-    ).run(keyframes)
+    structure = structure_from_motion(context, camera, is_fixed, frames, masks, rig, ahead).run(keyframes)
     warn_of_structure(context, structure, [frames[k].id for k in keyframes])
     return structure
 
@@ -336,7 +295,7 @@ def _write_backbone(
     context: StageContext, structure: Structure, keyframes: list[int], lens: Lens, frames: list[Frame]
 ) -> None:
     def load_rgb(frame_id: int) -> NDArray[np.uint8]:
-        return read_rgb(_picked(context, frames[frame_id].name))
+        return read_rgb(picked(context, frames[frame_id].name))
 
     model = to_sparse_model(structure.model, keyframes, lens, load_rgb)
     save_backbone(context.folder, model)
@@ -361,7 +320,7 @@ def _write_frames(context: StageContext, source: AnySource, frames: list[Frame],
     missing = [f for f in frames if not (context.folder / f.name).exists()]
     if lens.shift_px <= _SIGNIFICANT_SHIFT_PX:
         for frame in context.progress.track(missing, "frames", len(missing)):
-            copy_file(_picked(context, frame.name), context.folder / frame.name)
+            copy_file(picked(context, frame.name), context.folder / frame.name)
         return
     by_index = {f.source_index: f for f in missing}
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.config import Config
 from pipelines.depth.resize import resample_nearest
 from pipelines.frames.recording import open_recording
 from pipelines.masks.moving import SIDE, MovingView, look_once
+from pipelines.portions import Portion, in_portions
 from pipelines.progress import Progress
 from pipelines.proxy.compact import compact
 from pipelines.proxy.providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider, take_prepared
@@ -25,84 +23,63 @@ from pipelines.proxy.scale import DepthScale
 from pipelines.proxy.scratch import load_scratch, save_scratch
 from pipelines.proxy.selection import Surroundings, open_depth, open_semantics
 from pipelines.proxy.sequence import Sequence, resize_area
-from pipelines.run_folder import RunFolder, load_left_out, proxy_path, save_proxy_maps
+from pipelines.run_folder import load_left_out, proxy_path, save_proxy_maps
 from pipelines.stages import StageContext
-from pipelines.travel import load_value, save_value
 from pipelines.types import Frame, Intrinsics, ProxyMaps, any_of
 
 R = TypeVar("R")
-_PORTIONS = 3
-"""Tasks a worker, so that all end at about the same time."""
-
 
 MadeMaps = tuple[list[float], dict[int, NDArray[np.float32]]]
 """Semantic agreement m_t of each frame with the one before it, and what a network says of how frames look, by id."""
 
 
-@dataclass(frozen=True)
-class ProxyTask:
-    """Work on the frames first to last - 1 of those in the file `known`, which tells what is known of all of them; in
-    the unfinished folder of this stage."""
-
-    run: RunFolder
-    source: Path
-    config: Config
-    folder: Path
-    known: Path
-    first: int
-    last: int
-
-    def opened(self, progress: Progress) -> tuple[StageContext, Sequence, list[Frame], dict[str, Any]]:
-        """With all of the frames, and what is known of them."""
-        context, known = StageContext(self.run, self.source, self.config, self.folder, progress), load_value(self.known)
-        sequence, wanted = load_sequence(context), set(known["frame_ids"].tolist())
-        return context, sequence, [f for f in sequence.frames if f.id in wanted], known
+Opened = tuple[StageContext, Sequence, list[Frame], dict[str, Any]]
+"""The stage's context, its sequence, all frames that it is about, and what is known of them."""
 
 
 def by_workers(
-    context: StageContext, work: Callable[[ProxyTask, Progress], R], frames: list[Frame], **known: Any
+    context: StageContext, work: Callable[[Portion, Progress], R], frames: list[Frame], **known: Any
 ) -> list[R]:
-    """What `work` returns of each portion of the frames, with what is known of all; nothing where there are no workers:
-    then this process does it its own way, without going over the disk."""
-    if context.workers is None:
-        return []
-    file = context.snapshot / f"{work.__name__}.npz"
-    save_value(file, {"frame_ids": np.array([f.id for f in frames], np.int64), **known})
-    count = max(min(_PORTIONS * context.workers.at_once, len(frames)), 1)
-    ends = [len(frames) * n // count for n in range(count + 1)]
-    task = ProxyTask(context.run, context.source, context.config, context.folder, file, 0, 0)
-    return context.each(work, [replace(task, first=a, last=b) for a, b in pairwise(ends)])
+    """`in_portions` of the frames."""
+    ids = np.array([f.id for f in frames], np.int64)
+    return in_portions(context, work, len(frames), frame_ids=ids, **known)
 
 
-def prepare_depths(task: ProxyTask, progress: Progress) -> None:
+def _opened(task: Portion, progress: Progress) -> Opened:
+    context, known = task.context(progress), task.known
+    sequence, wanted = load_sequence(context), set(known["frame_ids"].tolist())
+    return context, sequence, [f for f in sequence.frames if f.id in wanted], known
+
+
+def prepare_depths(task: Portion, progress: Progress) -> None:
     """What each frame's depth needs of the others: the slow passes over the frames."""
-    context, sequence, frames, _ = task.opened(progress)
+    context, sequence, frames, _ = _opened(task, progress)
     open_depth(surroundings(context, sequence)).prepare(frames[task.first : task.last])
 
 
-def make_depths(task: ProxyTask, progress: Progress) -> None:
+def make_depths(task: Portion, progress: Progress) -> None:
     """The depths of the frames."""
-    context, sequence, frames, known = task.opened(progress)
+    context, sequence, frames, known = _opened(task, progress)
     depths = open_depth(surroundings(context, sequence))
     take_prepared(depths, known["depths"])
     depth_pass(context, sequence, frames[task.first : task.last], depths)
 
 
-def look_for_moving(task: ProxyTask, progress: Progress) -> dict[int, NDArray[np.bool_]]:
+def look_for_moving(task: Portion, progress: Progress) -> dict[int, NDArray[np.bool_]]:
     """The first round of `find_moving` over the frames."""
-    context, sequence, frames, known = task.opened(progress)
-    return look_once(range(task.first, task.last), *moving_views(context, sequence, frames, known["scale"]), progress)
+    context, sequence, frames, known = _opened(task, progress)
+    return look_once(task.numbers, *moving_views(context, sequence, frames, known["scale"]), progress)
 
 
-def look_at_pictures(task: ProxyTask, progress: Progress) -> None:
+def look_at_pictures(task: Portion, progress: Progress) -> None:
     """What a network says of each frame by itself."""
-    context, sequence, frames, _ = task.opened(progress)
+    context, sequence, frames, _ = _opened(task, progress)
     open_semantics(surroundings(context, sequence)).look(frames[task.first : task.last])
 
 
-def make_maps(task: ProxyTask, progress: Progress) -> MadeMaps:
+def make_maps(task: Portion, progress: Progress) -> MadeMaps:
     """The maps of the frames."""
-    context, sequence, frames, known = task.opened(progress)
+    context, sequence, frames, known = _opened(task, progress)
     semantics = open_semantics(surroundings(context, sequence))
     take_prepared(semantics, known["semantics"])
     previous = frames[task.first - 1] if task.first else None

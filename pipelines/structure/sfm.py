@@ -51,8 +51,13 @@ _AS_GOOD = 0.98
 """The second attempt's share of the first one's score, from which it is as good and its surer focal length decides."""
 _Tried = tuple[pycolmap.Reconstruction, str, ModelReport]
 """A model, the mapper that made it, and how good it is."""
+Ahead = Callable[[str, int, dict[str, NDArray]], None]
 T = TypeVar("T")
 R = TypeVar("R")
+
+
+def nothing_ahead(name: str, count: int, known: dict[str, NDArray]) -> None:
+    """All is done here."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +109,8 @@ class _Adjusted:
 class StructureFromMotion:
     """`extract(frame_id)` gives a frame's features, `match` the pairs of two frames' that are alike; `camera` is what
     is known of the camera before, and `is_fixed` says that it is known exactly. cam_from_rig (C, 3, 3): the keyframes
-    come direction by direction, as `Rig` counts frames. time(frame_id): seconds at which a frame was taken."""
+    come direction by direction, as `Rig` counts frames. time(frame_id): seconds at which a frame was taken.
+    ahead("features" | "pairs" | "windows", count, known) may have others leave those in the snapshots beforehand."""
 
     config: FramesConfig
     camera: pycolmap.Camera
@@ -117,14 +123,19 @@ class StructureFromMotion:
     threads: int
     seed: int
     memory: float = math.inf
+    ahead: Ahead = nothing_ahead
     cam_from_rig: NDArray[np.float64] = field(default_factory=lambda: ONE_CAMERA.cam_from_rig)
 
     def run(self, keyframe_ids: Sequence[int]) -> Structure:
         """Raises InputError when the keyframes have no parallax or too little in common."""
-        features = self._features(keyframe_ids)
+        self.ahead("features", len(keyframe_ids), {})
+        features = self.features_of(keyframe_ids)
         vocabulary = learn_vocabulary(features, self.seed)
         tried = self._proposed(features, vocabulary)
-        pairs = self._pairs(features, tried)
+        proposed = {"pairs": np.array(tried, np.int64).reshape(-1, 2)}
+        self.ahead("pairs", len(_blocks(tried)), proposed)
+        pairs = self.pairs_of(features, tried)
+        self.ahead("windows", self._windows(len(features)), proposed)
         views = _Views(features, [f.xy for f in features], np.array([self.time(k) for k in keyframe_ids]))
         known_focal = self.camera.mean_focal_length() if self.camera.has_prior_focal_length else None
         require_parallax(pairs, views.xy, (self.camera.width, self.camera.height), known_focal)
@@ -155,16 +166,12 @@ class StructureFromMotion:
         """Of a long recording the models of its windows, joined, in the camera of the window that is surest of it.
         None of a shorter one, of panoramas, and where the windows do not hang together."""
         windows = windows_of(len(views.xy))
-        if len(windows) == 1 or len(self.cam_from_rig) > 1:
+        if not self._windows(len(views.xy)):
             return None
         views.features.forget()
         joined, surest = Joined(), None
         for window in self.progress.track(windows, "windows", len(windows)):
-            inside = [replace(p, first=p.first - window.start, second=p.second - window.start)
-                      for p in pairs if p.first in window and p.second in window]  # fmt: skip
-            snapshots = Snapshots(self.snapshots.folder / f"window_{window.start:06d}")
-            snapshots.folder.mkdir(exist_ok=True)
-            found = replace(self, snapshots=snapshots)._calibrated(views.part(window), inside)
+            found = self._window(window, views.part(window), pairs)
             if found is None or not joined.add(found.model, window.start):
                 return None
             surest = found if surest is None or found.focal_sd < surest.focal_sd else surest
@@ -176,6 +183,26 @@ class StructureFromMotion:
             adjust_together(model, views.xy, views.times, surest.readout)
         remove_wild(model)
         return replace(surest, model=model)
+
+    def _windows(self, count: int) -> int:
+        """How many there are; 0 where all is made at once."""
+        windows = len(windows_of(count))
+        return windows if windows > 1 and len(self.cam_from_rig) == 1 else 0
+
+    def _window(self, window: range, views: _Views, pairs: Sequence[VerifiedPair]) -> _Adjusted | None:
+        inside = [replace(p, first=p.first - window.start, second=p.second - window.start)
+                  for p in pairs if p.first in window and p.second in window]  # fmt: skip
+        snapshots = Snapshots(self.snapshots.folder / f"window_{window.start:06d}")
+        snapshots.folder.mkdir(exist_ok=True)
+        return replace(self, snapshots=snapshots)._calibrated(views, inside)
+
+    def map_window(self, number: int, keyframe_ids: Sequence[int], proposed: Sequence[tuple[int, int]]) -> None:
+        """Leave the models of a window in the snapshots; all features and pairs are there."""
+        window, all_features = windows_of(len(keyframe_ids))[number], self.features_of(keyframe_ids, range(0))
+        features = all_features.part(window)
+        times = np.array([self.time(keyframe_ids[k]) for k in window])
+        views = _Views(features, [f.xy for f in features], times)
+        self._window(window, views, self.pairs_of(all_features, proposed))
 
     def _places(self, views: Sequence[object]) -> int:
         return len(views) // len(self.cam_from_rig)
@@ -253,14 +280,17 @@ class StructureFromMotion:
 
         return replace(found, model=rolled(largest)), [rolled(m) for m in others]
 
-    def _features(self, keyframe_ids: Sequence[int]) -> Streamed[Features]:
+    def features_of(self, keyframe_ids: Sequence[int], part: range | None = None) -> Streamed[Features]:
+        """Of all keyframes; those of a `part` of them (all) are made at once."""
+
         def stored(frame_id: int) -> Features:
             return self.snapshots.features(frame_id, lambda: self.extract(frame_id))
 
-        found = parallel_map(stored, keyframe_ids, self.threads)
+        numbers = range(len(keyframe_ids)) if part is None else part
+        found = parallel_map(stored, [keyframe_ids[k] for k in numbers], self.threads)
         room = _FEATURES_SHARE * self.memory
         features = Streamed(len(keyframe_ids), lambda k: stored(keyframe_ids[k]), lambda f: f.nbytes, room)
-        for k, value in enumerate(self.progress.track(found, "features", len(keyframe_ids))):
+        for k, value in zip(numbers, self.progress.track(found, "features", len(numbers)), strict=True):
             features.keep(k, value)
         return features
 
@@ -274,8 +304,12 @@ class StructureFromMotion:
         firsts = range(0, len(features), places)
         return sorted({*((n + i, n + j) for n in firsts for i, j in following), *loops})
 
-    def _pairs(self, features: Streamed[Features], proposed: Sequence[tuple[int, int]]) -> list[VerifiedPair]:
-        blocks = [proposed[i : i + _PAIRS_PER_BLOCK] for i in range(0, len(proposed), _PAIRS_PER_BLOCK)]
+    def pairs_of(
+        self, features: Streamed[Features], proposed: Sequence[tuple[int, int]], part: range | None = None
+    ) -> list[VerifiedPair]:
+        """Those of the proposed pairs that obey one geometry; of a `part` of their blocks (all)."""
+        blocks = _blocks(proposed)
+        wanted = range(len(blocks)) if part is None else part
 
         def match(pair: tuple[int, int]) -> VerifiedPair | None:
             return match_pair(pair, (features[pair[0]], features[pair[1]]), self.camera, self.seed, self.match)
@@ -283,8 +317,8 @@ class StructureFromMotion:
         def match_block(block: Sequence[tuple[int, int]]) -> list[VerifiedPair]:
             return [p for p in parallel_map(match, block, self.threads) if p is not None]
 
-        numbered = self.progress.track(enumerate(blocks), "matches", len(blocks))
-        found = (self.snapshots.pairs(i, lambda b=block: match_block(b)) for i, block in numbered)  # type: ignore[misc]
+        numbered = self.progress.track(wanted, "matches", len(wanted))
+        found = (self.snapshots.pairs(i, lambda b=blocks[i]: match_block(b)) for i in numbered)  # type: ignore[misc]
         return list(itertools.chain.from_iterable(found))
 
     def _map(
@@ -348,6 +382,10 @@ class StructureFromMotion:
         if name == "incremental":
             return map_incrementally(database, work, not self.is_fixed, self.seed)
         return map_globally(database, work, not self.is_fixed, self.seed, bend_lens=name != LENS_HELD)
+
+
+def _blocks(proposed: Sequence[tuple[int, int]]) -> list[Sequence[tuple[int, int]]]:
+    return [proposed[i : i + _PAIRS_PER_BLOCK] for i in range(0, len(proposed), _PAIRS_PER_BLOCK)]
 
 
 def parallel_map(function: Callable[[T], R], items: Iterable[T], threads: int) -> Iterator[R]:

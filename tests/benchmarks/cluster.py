@@ -6,7 +6,7 @@
     python tests/benchmarks/cluster.py --work DIR --nodes 1 --bad folder          a node that is of no use, then resume
 
 Every node is a process of this machine with one CPU; the head has none, so that tasks run on the others. A killed node
-is replaced at once. What is before the first tasks is done by one process. Needs msgs-slam[cluster].
+is replaced at once. Needs msgs-slam[cluster].
 """
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
@@ -31,10 +31,20 @@ os.environ["RAY_memory_monitor_refresh_ms"] = "0"  # noqa: SIM112  Ray writes it
 
 from pipelines.demo import unpack_demo_clip
 from pipelines.run_folder_names import STAGES
-from tests.benchmarks.shards import begin, contents, msgs_slam
+from tests.benchmarks.shards import begin, beginning, contents, msgs_slam
 
-WITH_TASKS, BETWEEN_KILLS = ("proxy", "mapping"), (1.0, 5.0)
-"""Stages that submit tasks here (global_ba does where there are loops), and seconds from a kill to the next."""
+WITH_TASKS = {
+    "frames": "snapshot/extract_features.npz",
+    "proxy": "snapshot",
+    "mapping": "snapshot/submaps",
+    "global_ba": "snapshot/submaps",
+    "export": "snapshot/mesh",
+}
+"""Stages that submit tasks, and what of their unfinished folder is there once they have."""
+SETTINGS = ("global_ba.joint=always", "global_ba.joint_passes=3")
+"""The clip has no loops, without which nothing would be refined by global_ba."""
+BETWEEN_KILLS = (1.0, 5.0)
+"""Seconds."""
 BAD = {
     "folder": "mount -t tmpfs none {run}",
     "disk": "mount -t tmpfs -o size=60k none {run}/proxy.partial",
@@ -53,19 +63,21 @@ def add_bad_node(cluster: Any, bad: str, run: Path) -> subprocess.Popen[bytes]:
 
 
 def by_cluster(
-    cluster: Any, run: Path, kills: int, rng: random.Random, kill_head: str, bad: str
+    cluster: Any, video: Path, run: Path, kills: int, rng: random.Random, kill_head: str, bad: str
 ) -> dict[str, Any]:  # fmt: skip
-    """The rest of one reconstruction while nodes are killed, in each stage as long as there are kills left; how it
-    ended, and how many tasks were begun again for it. A `bad` node joins when the first tasks are done."""
-    command = msgs_slam("resume", run, "--engine", "ray", "--address", cluster.address)[:-1]  # -q: it warns of losses
+    """One reconstruction while nodes are killed, in each stage as long as there are kills left; how it
+    ended, and how many tasks were begun again for it. A `bad` node joins in `proxy`."""
+    command = beginning(video, run, STAGES[-1], *SETTINGS)
+    command.remove("-q")  # it warns of losses
+    command += ["--engine", "ray", "--address", cluster.address]
     log, killed, due = run.with_suffix(".log"), dict.fromkeys(WITH_TASKS, 0), 0.0
     with log.open("wb") as stream:
         process = subprocess.Popen(command, cwd=ROOT, stdout=stream, stderr=stream)
     spoilt = None
     while process.poll() is None:
         time.sleep(0.1)
-        stage = next((s for s in WITH_TASKS if (run / f"{s}.partial").exists()), "")
-        if bad and stage and spoilt is None:
+        stage = next((s for s, begun in WITH_TASKS.items() if (run / f"{s}.partial" / begun).exists()), "")
+        if bad and stage == "proxy" and spoilt is None:
             spoilt = add_bad_node(cluster, bad, run)
         if not stage or time.monotonic() < due:
             due = due if stage else time.monotonic() + rng.uniform(*BETWEEN_KILLS)
@@ -101,17 +113,15 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     video, _ = unpack_demo_clip(arguments.work)
-    whole, first, shared = (arguments.work / f"{name}.msgs" for name in ("whole", "frames", "cluster"))
-    begin(video, whole, STAGES[-1])
-    begin(video, first, "frames")
+    whole, shared = (arguments.work / f"{name}.msgs" for name in ("whole", "cluster"))
+    begin(video, whole, STAGES[-1], *SETTINGS)
     shutil.rmtree(shared, ignore_errors=True)
-    shutil.copytree(first, shared)
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
     for _ in range(arguments.nodes):
         cluster.add_node(num_cpus=1)
     started = time.monotonic()
     rng = random.Random(arguments.seed)
-    told = by_cluster(cluster, shared, arguments.kills, rng, arguments.kill_head, arguments.bad)
+    told = by_cluster(cluster, video, shared, arguments.kills, rng, arguments.kill_head, arguments.bad)
     if told["exit code"]:
         print(shared.with_suffix(".log").read_text(errors="replace")[-1500:])
         subprocess.run(msgs_slam("resume", shared), check=True, cwd=ROOT)

@@ -38,10 +38,15 @@ def msgs_slam(*arguments: object) -> list[str]:
     return [sys.executable, "-m", "msgs_cli.main", *map(str, arguments), "-q"]
 
 
-def begin(video: Path, run: Path, until: str) -> None:
+def beginning(video: Path, run: Path, until: str, *more: str) -> list[str]:
+    """The command, with further settings."""
+    chosen = [part for setting in (*SETTINGS, *more) for part in ("--set", setting)]
+    return msgs_slam("reconstruct", video, "--out", run, "--until", until, *chosen)
+
+
+def begin(video: Path, run: Path, until: str, *more: str) -> None:
     """By one process."""
-    chosen = [part for setting in SETTINGS for part in ("--set", setting)]
-    subprocess.run(msgs_slam("reconstruct", video, "--out", run, "--until", until, *chosen), check=True, cwd=ROOT)
+    subprocess.run(beginning(video, run, until, *more), check=True, cwd=ROOT)
 
 
 def by_shards(run: Path, count: int, beside: int, kills: int, rng: random.Random) -> dict[str, int]:

@@ -14,10 +14,10 @@ from formats.errors import InputError
 from formats.images import write_rgb
 from pipelines.config import Config, load_config
 from pipelines.evaluation.evaluate import evaluate_run
+from pipelines.frames.begun import known_camera
 from pipelines.frames.recording import RecordingSource
 from pipelines.frames.source import FolderSource, open_source
 from pipelines.frames.source_pixels import FramePixels
-from pipelines.frames.stage import known_camera
 from pipelines.progress import SilentProgress
 from pipelines.proxy.files.recording import RecordingDepth, RecordingLabels
 from pipelines.proxy.inputs import proxy_inputs

@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -27,8 +29,10 @@ from pipelines.stages import StageContext
 from pipelines.stored import dataclass_from_json
 from pipelines.structure import sfm
 from pipelines.structure.adjust import adjust
+from pipelines.structure.windows import windows_of
 from pipelines.types import Calibration
 from tests.pipelines.frames.conftest import QUICK, WALK_FRAMES, Walk, render, sideways, turn, write_walk
+from tests.pipelines.travelling import Travelling
 
 T = TypeVar("T")
 
@@ -80,6 +84,20 @@ def test_the_walk_is_recovered(finished: tuple[StageContext, dict], bent_walk: W
     truth = bent_walk.centers[model.frame_ids]
     errors = np.linalg.norm(align_points(centers, truth).apply(centers) - truth, axis=1)
     assert 0 < np.sqrt((errors**2).mean()) < 0.01  # of a walk of 1.9 m
+
+
+def test_workers_leave_the_same_bytes(
+    bent_walk: Walk,
+    make_context: Callable[..., StageContext],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sfm, "windows_of", partial(windows_of, size=7, shared=3))
+    whole, workers = make_context(bent_walk.folder, name="whole"), Travelling(tmp_path, 2)
+    divided = replace(make_context(bent_walk.folder, name="divided"), workers=workers)
+    assert run(divided) == run(whole)
+    assert digests(divided.folder) == digests(whole.folder)
+    assert workers.done == {"extract_features": 6, "match_pairs": 1, "map_windows": 2}
 
 
 def test_points_reproject_into_the_undistorted_frames(finished: tuple[StageContext, dict]) -> None:

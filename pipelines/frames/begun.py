@@ -1,0 +1,139 @@
+"""What structure from motion starts from: the pictures that were picked, what is known of their camera, masks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from formats.datasets.camera import Camera
+from formats.images import read_rgb
+from pipelines.correspondence.matching import match_features
+from pipelines.correspondence.snapshots import Snapshots
+from pipelines.frames.faces import Faces, find_faces
+from pipelines.frames.learned import open_learned, picture_features
+from pipelines.frames.masks import FrameMasks
+from pipelines.frames.recording import RecordingSource
+from pipelines.frames.sharpness import reduced_size
+from pipelines.frames.source import FolderSource, VideoSource, open_source
+from pipelines.geometry.rig import Rig, rig_of
+from pipelines.portions import Portion
+from pipelines.progress import Progress
+from pipelines.stages import StageContext
+from pipelines.structure.calibration import read_intrinsics
+from pipelines.structure.lens import to_pycolmap, unknown_camera
+from pipelines.structure.sfm import Ahead, StructureFromMotion, nothing_ahead
+from pipelines.types import Features, Frame
+
+AnySource = VideoSource | FolderSource | RecordingSource
+_FOCAL_GUESS = 1.2
+
+
+def known_camera(context: StageContext, source: AnySource, faces: Faces | None) -> tuple[pycolmap.Camera, str]:
+    """The camera of the reduced frames as far as it is known before, and where from."""
+    config = context.config.frames
+    if faces is not None:
+        pinhole = Camera(**asdict(faces.pinhole))
+        return to_pycolmap(pinhole), "given"
+    width, height = reduced_size(source.width, source.height, config.max_side)
+    if config.intrinsics:
+        given = read_intrinsics(config.intrinsics, source.width, source.height)
+        return to_pycolmap(given.resized(width, height)), "given"
+    known = source.known_camera() if isinstance(source, RecordingSource) else None
+    if known is not None and not known.is_nominal and not known.fisheye:
+        return to_pycolmap(known.resized(width, height)), "given"
+    if known is not None:
+        return unknown_camera(width, height, known.fx * width / source.width, is_prior=True), "self-calibrated"
+    exif = source.exif_focal()
+    if exif is not None:
+        return unknown_camera(width, height, exif * width / source.width, is_prior=True), "exif"
+    return unknown_camera(width, height, _FOCAL_GUESS * max(width, height), is_prior=False), "self-calibrated"
+
+
+def picked(context: StageContext, name: str) -> Path:
+    """The file of a picture."""
+    return context.snapshot / "picked" / name
+
+
+def masks_of(context: StageContext, source: AnySource, faces: Faces | None, rig: Rig) -> FrameMasks:
+    """Of all frames; people in those in which they have been looked for."""
+    places = context.snapshot / "people", context.snapshot / "picked"
+    return FrameMasks(context.config, source, *places, context.threads, faces, rig)
+
+
+def structure_from_motion(
+    context: StageContext,
+    camera: pycolmap.Camera,
+    is_fixed: bool,
+    frames: list[Frame],
+    masks: FrameMasks,
+    rig: Rig,
+    ahead: Ahead = nothing_ahead,
+) -> StructureFromMotion:
+    """Of these frames."""
+    settings, size = context.config.frames, (camera.width, camera.height)
+    learned = open_learned(settings)
+
+    def extract(frame_id: int) -> Features:
+        rgb = read_rgb(picked(context, frames[frame_id].name))
+        return picture_features(rgb, masks.left_out(frames[frame_id], *size), settings, learned)
+
+    return StructureFromMotion(
+        config=settings,
+        camera=camera,
+        is_fixed=is_fixed,
+        extract=extract,
+        time=lambda frame_id: frames[frame_id].timestamp,
+        match=match_features if learned is None else partial(learned.match, size=size),
+        snapshots=Snapshots(context.snapshot),
+        progress=context.progress,
+        threads=context.threads,
+        seed=context.config.run.seed,
+        memory=context.memory_room,
+        cam_from_rig=rig.cam_from_rig,
+        ahead=ahead,
+    )
+
+
+# by workers -----------------------------------------------------------------------------------------------------
+
+
+def _begun(task: Portion, progress: Progress) -> tuple[StructureFromMotion, dict[str, Any]]:
+    context, known = task.context(progress), task.known
+    source, frames = open_source(context.source, context.config.run.format), known["frames"]
+    faces = find_faces(source, context.config.frames)
+    camera, origin = known_camera(context, source, faces)
+    rig = rig_of(1 if faces is None else len(faces), len(frames))
+    masks = masks_of(context, source, faces, rig)
+    if "pairs" in known:
+        known["pairs"] = [(i, j) for i, j in known["pairs"].tolist()]
+    return structure_from_motion(context, camera, origin == "given", frames, masks, rig), known
+
+
+def extract_features(task: Portion, progress: Progress) -> None:
+    """Of some keyframes."""
+    structure, known = _begun(task, progress)
+    structure.features_of(known["keyframes"], task.numbers)
+
+
+def match_pairs(task: Portion, progress: Progress) -> None:
+    """Some blocks of the pairs."""
+    structure, known = _begun(task, progress)
+    structure.pairs_of(structure.features_of(known["keyframes"], range(0)), known["pairs"], task.numbers)
+
+
+def map_windows(task: Portion, progress: Progress) -> None:
+    """Some windows."""
+    structure, known = _begun(task, progress)
+    for number in task.numbers:
+        structure.map_window(number, known["keyframes"], known["pairs"])
+
+
+AHEAD: dict[str, Callable[[Portion, Progress], None]] = {
+    "features": extract_features, "pairs": match_pairs, "windows": map_windows,
+}  # fmt: skip
+"""What workers may leave in the snapshots before structure from motion asks for it."""
