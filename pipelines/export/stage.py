@@ -14,7 +14,7 @@ from formats.mesh import read_mesh_ply
 from pipelines.config import Config, ExportConfig
 from pipelines.export.depth_views import Shown
 from pipelines.export.mesh import drawn_views, make_mesh, mesh_figures, write_mesh
-from pipelines.export.tasks import MeshTask, MeshWorkers
+from pipelines.export.tasks import MeshWorkers
 from pipelines.export.textured import make_textured, write_textured
 from pipelines.export.tiles import write_tiles
 from pipelines.export.writers import (
@@ -57,10 +57,7 @@ def run(context: StageContext) -> dict[str, Any]:
     if world.earth is not None:
         save_metres(context.folder, found.metres)
     finished = _finished_mesh(context.folder)
-    workers = None
-    if context.workers is not None:
-        move, place = world.exported_from_run, context.snapshot / "mesh"
-        workers = MeshWorkers(context, MeshTask(context.run, context.config.run.device, move, settings, place))
+    workers = MeshWorkers(context, world.exported_from_run) if context.workers is not None else None
     mesh, _ = write_meshes(
         outcome, world, settings, mesh_kinds(settings), context.folder, context.progress, finished, workers
     )

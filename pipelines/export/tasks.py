@@ -3,88 +3,68 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-from pipelines.config import ExportConfig
 from pipelines.export.depth_views import DrawnView
 from pipelines.export.mesh import Region, draw, keyframe_rows, make_region, streamed_views
 from pipelines.export.volume import Grid
 from pipelines.geometry.alignment import Similarity
 from pipelines.outcome import Outcome, load_outcome
+from pipelines.portions import Portion, in_portions
 from pipelines.progress import Progress
-from pipelines.run_folder import RunFolder
 from pipelines.stages import StageContext
 from pipelines.travel import load_value, save_value
 
-_PORTION = 20
-"""Keyframes that a task draws: each loads the map first."""
 
-
-@dataclass(frozen=True)
-class MeshTask:
-    """One part of the work (keyframes to draw, or a region) on the mesh of a run that is moved; results in `folder`."""
-
-    run: RunFolder
-    device: str
-    move: Similarity
-    settings: ExportConfig
-    folder: Path
-    number: int = 0
-
-    @property
-    def outcome(self) -> Outcome:
-        """Of the run, in the world of the mesh."""
-        return load_outcome(self.run, self.device).moved(self.move)
-
-    @property
-    def grid(self) -> Path:
-        """The file of what the regions are of."""
-        return self.folder / "grid.npz"
-
-    def file(self, kind: str, number: int) -> Path:
-        """A result."""
-        return self.folder / f"{kind}_{number:06d}.npz"
-
-    def views(self, count: int) -> Sequence[DrawnView]:
-        """What has been drawn."""
-        return streamed_views(count, lambda number: load_value(self.file("view", number)))
-
-
-def draw_views(task: MeshTask, progress: Progress) -> None:
+def draw_views(task: Portion, progress: Progress) -> None:
     """What the map shows in some of the keyframes."""
-    outcome = task.outcome
-    numbers = range(len(keyframe_rows(outcome)))[task.number * _PORTION :][:_PORTION]
-    for number in progress.track(numbers, "drawing", len(numbers)):
-        if not (file := task.file("view", number)).exists():
-            save_value(file, draw(outcome, task.settings, number))
+    outcome = _outcome(task, progress)
+    for number in progress.track(task.numbers, "drawing", len(task.numbers)):
+        if not (file := _view(task.context(progress), number)).exists():
+            save_value(file, draw(outcome, task.config.export, number))
 
 
-def fuse_region(task: MeshTask, progress: Progress) -> None:
-    """One region of the grid."""
-    if not (file := task.file("region", task.number)).exists():
-        outcome = task.outcome
-        views = task.views(len(keyframe_rows(outcome)))
-        grid: Grid = load_value(task.grid)
-        save_value(file, make_region(outcome, views, grid, list(grid.regions())[task.number], progress))
+def fuse_regions(task: Portion, progress: Progress) -> None:
+    """Some regions of the grid."""
+    context, outcome, grid = task.context(progress), _outcome(task, progress), task.known["grid"]
+    views, regions = _views(context, outcome), list(grid.regions())
+    for number in task.numbers:
+        if not (file := _region(context, number)).exists():
+            of = f", {number + 1} of {len(regions)}"
+            save_value(file, make_region(outcome, views, grid, regions[number], progress, of))
 
 
 @dataclass(frozen=True)
 class MeshWorkers:
-    """Those of a stage, and what is to be done."""
+    """Those of a stage; the mesh stands in a world where the run is moved to."""
 
     context: StageContext
-    task: MeshTask
+    move: Similarity
 
     def views(self, outcome: Outcome) -> Sequence[DrawnView]:
         """As `drawn_views`."""
-        count = len(keyframe_rows(outcome))
-        self.context.each(draw_views, [replace(self.task, number=n) for n in range(-(-count // _PORTION))])
-        return self.task.views(count)
+        in_portions(self.context, draw_views, len(keyframe_rows(outcome)), move=self.move)
+        return _views(self.context, outcome)
 
     def regions(self, grid: Grid) -> list[Region]:
         """All of the grid's."""
-        save_value(self.task.grid, grid)
-        numbers = range(len(list(grid.regions())))
-        self.context.each(fuse_region, [replace(self.task, number=n) for n in numbers])
-        return [load_value(self.task.file("region", n)) for n in numbers]
+        count = len(list(grid.regions()))
+        in_portions(self.context, fuse_regions, count, move=self.move, grid=grid)
+        return [load_value(_region(self.context, n)) for n in range(count)]
+
+
+def _outcome(task: Portion, progress: Progress) -> Outcome:
+    return load_outcome(task.run, task.context(progress).device).moved(task.known["move"])
+
+
+def _views(context: StageContext, outcome: Outcome) -> Sequence[DrawnView]:
+    return streamed_views(len(keyframe_rows(outcome)), lambda number: load_value(_view(context, number)))
+
+
+def _view(context: StageContext, number: int) -> Path:
+    return context.snapshot / "mesh" / f"view_{number:06d}.npz"
+
+
+def _region(context: StageContext, number: int) -> Path:
+    return context.snapshot / "mesh" / f"region_{number:06d}.npz"
