@@ -36,14 +36,14 @@ from tests.benchmarks.shards import begin, beginning, contents, msgs_slam
 WITH_TASKS = {
     "frames": "snapshot/extract_features.npz",
     "proxy": "snapshot",
-    "mapping": "snapshot/submaps",
+    "mapping": "snapshot",
     "global_ba": "snapshot/submaps",
-    "export": "snapshot/mesh",
+    "export": "snapshot/draw_views.npz",
 }
 """Stages that submit tasks, and what of their unfinished folder is there once they have."""
 SETTINGS = ("global_ba.joint=always", "global_ba.joint_passes=3")
 """The clip has no loops, without which nothing would be refined by global_ba."""
-BETWEEN_KILLS = (1.0, 5.0)
+BETWEEN_KILLS = (0.2, 2.0)
 """Seconds."""
 BAD = {
     "folder": "mount -t tmpfs none {run}",

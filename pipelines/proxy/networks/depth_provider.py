@@ -30,7 +30,8 @@ class OnnxDepth:
         self._network = Network(card, place.threads, place.device)
         self._sequence = place.sequence
         self.name = card.name
-        self._focals: dict[int, float] = {}
+        self._tells_focal = card.kind == "points"
+        self._frames: list[Frame] = []
         identity = f"{card_identity(card)} {place.sequence.intrinsics}"
         self._pass = NetworkPass(self.name, identity, place, self._compute)
 
@@ -41,6 +42,7 @@ class OnnxDepth:
     def prepare(self, frames: list[Frame]) -> None:
         """Run the network; what is on disk stays."""
         self._pass.run(frames)
+        self._frames = frames
 
     def _compute(self, image: NDArray[np.uint8]) -> Arrays:
         found = network_depth(self._network, image, self._sequence.intrinsics)
@@ -57,8 +59,6 @@ class OnnxDepth:
                 f"{self.name}: frame {frame.name} got no valid depth ({int(stored['invalid'])} of the network's values "
                 "are NaN or negative). Check the card, or choose another --depth provider"
             )
-        if "focal" in stored:
-            self._focals[frame.id] = float(stored["focal"])
         return DepthEstimate(stored["depth"], stored["confidence"], int(stored["invalid"]), stored.get("normals"))
 
     def figures(self) -> dict[str, Any]:
@@ -68,7 +68,8 @@ class OnnxDepth:
         """
         box = self._network.box(self._sequence.intrinsics.width, self._sequence.intrinsics.height)
         figures: dict[str, Any] = {"network_size": [box.box_width, box.box_height]}
-        if self._focals:
+        if self._tells_focal and self._frames:
+            focals = [float(self._pass.load(f)["focal"]) for f in self._frames]
             enlarge = self._sequence.calibration.intrinsics.width / self._sequence.intrinsics.width
-            figures["network_focal_px"] = round(float(np.median(list(self._focals.values()))) * enlarge, 1)
+            figures["network_focal_px"] = round(float(np.median(focals)) * enlarge, 1)
         return figures

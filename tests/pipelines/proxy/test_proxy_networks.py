@@ -14,14 +14,18 @@ from onnx import TensorProto, helper, numpy_helper
 
 from formats.errors import InputError
 from formats.images import read_rgb
+from pipelines.progress import SilentProgress
 from pipelines.proxy.networks.card import Card, read_card
 from pipelines.proxy.networks.depth import network_depth, solve_shift, solve_shift_and_focal
+from pipelines.proxy.networks.depth_provider import OnnxDepth
 from pipelines.proxy.networks.head import load_linear_head
 from pipelines.proxy.networks.labels import class_token, network_labels
 from pipelines.proxy.networks.letterbox import choose_box
+from pipelines.proxy.networks.network_pass import ResultCache, Workplace
 from pipelines.proxy.networks.onnx_file import external_locations, require_own_weights
 from pipelines.proxy.networks.session import Network
-from pipelines.types import Intrinsics
+from pipelines.proxy.sequence import Sequence
+from pipelines.types import Calibration, Frame, Intrinsics
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 NEAREST, SPAN = 1.5, 2.0
@@ -428,6 +432,13 @@ def test_the_point_map_family_comes_back_as_metres(tmp_path: Path) -> None:
     known = depth > 0
     assert 0.85 < known.mean() < 0.95
     assert np.abs(depth / truth - 1)[known].max() < 1e-3
+    frames, calibration = [Frame(0, "a.png", 0.0, 0, 1.0)], Calibration(camera, "given", 0.0, (0.0,) * 4)
+    sequence = Sequence(frames, calibration, camera, None, lambda f: np.zeros((480, 640, 3), np.uint8))
+    place = Workplace(sequence, lambda: tmp_path, 1, "cpu", SilentProgress(), ResultCache(tmp_path, 0))
+    for _ in range(2):  # the second finds what the first, or a worker, has left
+        provider = OnnxDepth(card, place)
+        provider.prepare(frames)
+        assert provider.figures()["network_focal_px"] == round(found.focal, 1)
 
 
 def linear_head(path: Path, classes: int, features: int) -> torch.nn.Sequential:
