@@ -29,14 +29,16 @@ JOIN, REFINE, MEASURE = 0.05, 0.25, 0.05
 DIVIDED = {
     "frames": {"features": 0.30, "pairs": 0.19},
     "proxy": {"depths": 0.76, "networks": 0.09, "moving": 0.03, "maps": 0.09},
-    "export": {"drawing": 0.63},
+    "export": {"drawing": 0.34},
 }
 """Shares of a stage's time that are done in portions (whiteroom, 81 keyframes, one thread, cProfile)."""
 WINDOWS, WINDOW, AGAIN = 0.30, 460, 0.12
 """Share of `frames` that makes the models of windows of so many new keyframes; how much of it is done again by the one
 process that joins them, which finds the mapper's models but adjusts them itself."""
-REGIONS, REGION = 0.16, 80
+REGIONS, REGION = 0.13, 80
 """Share of `export` that fuses and paints regions, and keyframes a region: 400 blocks a keyframe, 32,000 at a time."""
+ONCE = 0.37
+"""Share of `export` that does not grow: up and metres are told by 24 views however many there are."""
 
 
 def makespan(tasks: Sequence[float], workers: int) -> float:
@@ -47,8 +49,8 @@ def makespan(tasks: Sequence[float], workers: int) -> float:
     return max(free)
 
 
-def phases(per_keyframe: dict[str, float], keyframes: int, workers: int) -> dict[str, list[float]]:
-    """Tasks of each kind; what one process does of a stage bears its name."""
+def phases(per_keyframe: dict[str, float], found: int, keyframes: int, workers: int) -> dict[str, list[float]]:
+    """Seconds of the tasks of each kind, for so many keyframes, by a run with `found`."""
     whole = {stage: seconds * keyframes for stage, seconds in per_keyframe.items()}
     portions, parts = min(PORTIONS * workers, keyframes), max(1, round(keyframes / SUBMAP))
     out = {
@@ -62,7 +64,7 @@ def phases(per_keyframe: dict[str, float], keyframes: int, workers: int) -> dict
         out["frames, windows"] = [whole["frames"] * WINDOWS / windows] * windows
         alone["frames"] -= WINDOWS - AGAIN
     out["export, regions"] = [whole["export"] * REGIONS / regions] * regions
-    alone["export"] -= REGIONS
+    alone["export"] -= REGIONS + ONCE * (1 - found / keyframes)
     made = whole["mapping"] / parts * (1 + (BORDER * parts / keyframes if parts > 1 else 0))
     out["mapping"] = [made] * parts
     if parts > 1:
@@ -84,9 +86,9 @@ def main() -> None:
     found = stages["tracking"]["figures"]["keyframes"]
     per_keyframe = {name: stage["seconds"] / found for name, stage in stages.items()}
     print("| workers | hours | speed-up | efficiency | longest |\n|" + " --- |" * 5)
-    alone = sum(sum(t) for t in phases(per_keyframe, given.keyframes or found, 1).values())
+    alone = sum(sum(t) for t in phases(per_keyframe, found, given.keyframes or found, 1).values())
     for workers in given.workers:
-        of = phases(per_keyframe, given.keyframes or found, workers)
+        of = phases(per_keyframe, found, given.keyframes or found, workers)
         dear = given.each if workers > 1 else 1.0
         spans = {name: makespan([t * (dear if len(t_) > 1 else 1) for t in t_], workers) for name, t_ in of.items()}
         total = sum(spans.values()) + (given.start if workers > 1 else 0)
