@@ -47,7 +47,7 @@ def learn_vocabulary(features: Sequence[Features], seed: int) -> Vocabulary:
 
 def _vlad(features: Features, words: NDArray[np.float64]) -> NDArray[np.float64]:
     total = np.zeros(words.shape)
-    descriptors = features.descriptors.astype(np.float64)
+    descriptors = features.descriptors[features.descriptors.any(1)].astype(np.float64)  # corners have none
     if len(descriptors):
         nearest, _ = vq(descriptors, words)
         for word in np.unique(nearest):

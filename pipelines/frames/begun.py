@@ -12,6 +12,8 @@ import pycolmap
 
 from formats.datasets.camera import Camera
 from formats.images import read_rgb
+from pipelines.correspondence.bridges import Picture
+from pipelines.correspondence.features import to_grey
 from pipelines.correspondence.matching import match_features
 from pipelines.correspondence.snapshots import Snapshots
 from pipelines.frames.faces import Faces, find_faces
@@ -59,6 +61,12 @@ def picked(context: StageContext, name: str) -> Path:
     return context.snapshot / "picked" / name
 
 
+def picture(context: StageContext, masks: FrameMasks, frame: Frame) -> Picture:
+    """In grey, and what is left out of it."""
+    gray = to_grey(read_rgb(picked(context, frame.name)))
+    return gray, masks.left_out(frame, gray.shape[1], gray.shape[0])
+
+
 def masks_of(context: StageContext, source: AnySource, faces: Faces | None, rig: Rig) -> FrameMasks:
     """Of all frames; people in those in which they have been looked for."""
     places = context.snapshot / "people", context.snapshot / "picked"
@@ -87,6 +95,7 @@ def structure_from_motion(
         camera=camera,
         is_fixed=is_fixed,
         extract=extract,
+        picture=lambda frame_id: picture(context, masks, frames[frame_id]),
         time=lambda frame_id: frames[frame_id].timestamp,
         match=match_features if learned is None else partial(learned.match, size=size),
         snapshots=Snapshots(context.snapshot),

@@ -17,13 +17,14 @@ from formats.images import read_rgb, write_rgb
 from formats.jsonfile import read_json, write_json
 from formats.video import VideoFrame
 from pipelines.config import Config, FramesConfig
-from pipelines.correspondence.features import to_grey
+from pipelines.correspondence.bridges import Picture
 from pipelines.frames.begun import (
     AHEAD,
     AnySource,
     known_camera,
     masks_of,
     picked,
+    picture,
     structure_from_motion,
 )
 from pipelines.frames.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
@@ -190,16 +191,12 @@ def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks, rig: 
     across = 2 if len(rig) > 1 else 1
     places = frames[: rig.stations]
 
-    def picture(frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-        gray = _gray(context, frame)
-        return gray, masks.left_out(frame, gray.shape[1], gray.shape[0])
-
-    def pictures() -> Iterator[tuple[NDArray[np.uint8], NDArray[np.bool_] | None]]:
+    def pictures() -> Iterator[Picture]:
         for frame in context.progress.track(places, "keyframes", len(places)):
             if across == 1:
-                yield picture(frame)
+                yield picture(context, masks, frame)
                 continue
-            sides = [picture(frames[i]) for i in rig.frames_of([frame.id])]
+            sides = [picture(context, masks, frames[i]) for i in rig.frames_of([frame.id])]
             hidden = [np.zeros(gray.shape, np.bool_) if mask is None else mask for gray, mask in sides]
             yield level_mosaic([gray for gray, _ in sides]), level_mosaic(hidden)
 
@@ -210,10 +207,6 @@ def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks, rig: 
         if len(choice.keyframes) >= min(_FEW_KEYFRAMES, len(places)) or parallax < context.config.frames.parallax / 3:
             return choice
         parallax /= 2
-
-
-def _gray(context: StageContext, frame: Frame) -> NDArray[np.uint8]:
-    return to_grey(read_rgb(picked(context, frame.name)))
 
 
 def _structure(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from formats.errors import InputError
 from pipelines.config import FramesConfig
+from pipelines.correspondence.bridges import Picture, weak_keyframes, with_bridges
 from pipelines.correspondence.database import write_database
 from pipelines.correspondence.matching import VerifiedPair, match_pair
 from pipelines.correspondence.retrieval import (
@@ -107,15 +108,17 @@ class _Adjusted:
 
 @dataclass(frozen=True)
 class StructureFromMotion:
-    """`extract(frame_id)` gives a frame's features, `match` the pairs of two frames' that are alike; `camera` is what
-    is known of the camera before, and `is_fixed` says that it is known exactly. cam_from_rig (C, 3, 3): the keyframes
-    come direction by direction, as `Rig` counts frames. time(frame_id): seconds at which a frame was taken.
-    ahead("features" | "pairs" | "windows", count, known) may have others leave those in the snapshots beforehand."""
+    """`extract(frame_id)` gives a frame's features, `picture` what they are of, `match` the pairs of two frames' that
+    are alike; `camera` is what is known of the camera before, and `is_fixed` says that it is known exactly.
+    cam_from_rig (C, 3, 3): the keyframes come direction by direction, as `Rig` counts frames. time(frame_id): seconds
+    at which a frame was taken. ahead("features" | "pairs" | "windows", count, known) may have others leave those in the
+    snapshots beforehand."""
 
     config: FramesConfig
     camera: pycolmap.Camera
     is_fixed: bool
     extract: Callable[[int], Features]
+    picture: Callable[[int], Picture]
     time: Callable[[int], float]
     match: Callable[[Features, Features], NDArray[np.uint32]]
     snapshots: Snapshots
@@ -134,7 +137,7 @@ class StructureFromMotion:
         tried = self._proposed(features, vocabulary)
         proposed = {"pairs": np.array(tried, np.int64).reshape(-1, 2)}
         self.ahead("pairs", len(_blocks(tried)), proposed)
-        pairs = self.pairs_of(features, tried)
+        features, pairs = self._bridged(keyframe_ids, features, self.pairs_of(features, tried))
         self.ahead("windows", self._windows(len(features)), proposed)
         views = _Views(features, [f.xy for f in features], np.array([self.time(k) for k in keyframe_ids]))
         known_focal = self.camera.mean_focal_length() if self.camera.has_prior_focal_length else None
@@ -199,10 +202,11 @@ class StructureFromMotion:
     def map_window(self, number: int, keyframe_ids: Sequence[int], proposed: Sequence[tuple[int, int]]) -> None:
         """Leave the models of a window in the snapshots; all features and pairs are there."""
         window, all_features = windows_of(len(keyframe_ids))[number], self.features_of(keyframe_ids, range(0))
+        all_features, pairs = self._bridged(keyframe_ids, all_features, self.pairs_of(all_features, proposed))
         features = all_features.part(window)
         times = np.array([self.time(keyframe_ids[k]) for k in window])
         views = _Views(features, [f.xy for f in features], times)
-        self._window(window, views, self.pairs_of(all_features, proposed))
+        self._window(window, views, pairs)
 
     def _places(self, views: Sequence[object]) -> int:
         return len(views) // len(self.cam_from_rig)
@@ -320,6 +324,15 @@ class StructureFromMotion:
         numbered = self.progress.track(wanted, "matches", len(wanted))
         found = (self.snapshots.pairs(i, lambda b=blocks[i]: match_block(b)) for i in numbered)  # type: ignore[misc]
         return list(itertools.chain.from_iterable(found))
+
+    def _bridged(
+        self, keyframe_ids: Sequence[int], features: Streamed[Features], pairs: list[VerifiedPair]
+    ) -> tuple[Streamed[Features], list[VerifiedPair]]:
+        """With points followed through keyframes that hold the path's size badly."""
+        weak = weak_keyframes(pairs, len(features), self.config.overlap) if len(self.cam_from_rig) == 1 else []
+        told = self.progress.track(weak, "weak keyframes", len(weak))
+        more, pairs = with_bridges(features, pairs, list(told), lambda k: self.picture(keyframe_ids[k]))
+        return features.changed(lambda k, f: more.get(k, f)) if more else features, pairs
 
     def _map(
         self,

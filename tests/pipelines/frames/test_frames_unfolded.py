@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.config import FramesConfig
+from pipelines.correspondence.bridges import Picture
 from pipelines.correspondence.matching import VerifiedPair, verify_matches
 from pipelines.correspondence.snapshots import Snapshots
 from pipelines.geometry.alignment import align_points
@@ -59,13 +60,17 @@ def matched(features: list[Features], seen: list[NDArray[np.int64]]) -> list[Ver
     return pairs
 
 
+def no_picture(frame_id: int) -> Picture:
+    raise AssertionError(f"nobody needs the picture of frame {frame_id}")
+
+
 def test_sides_that_look_alike_do_not_fold_the_path(tmp_path: Path) -> None:
     centers, features, seen = round_room()
     pairs = matched(features, seen)
     assert sum(p.second - p.first > VIEWS // SIDES - 1 for p in pairs) > 50
     structure = StructureFromMotion(
-        FramesConfig(overlap=REACH), CAMERA, False, features.__getitem__, float, lambda *_: np.zeros((0, 2), np.uint32),
-        Snapshots(tmp_path), SilentProgress(), threads=1, seed=0,
+        FramesConfig(overlap=REACH), CAMERA, False, features.__getitem__, no_picture, float,
+        lambda *_: np.zeros((0, 2), np.uint32), Snapshots(tmp_path), SilentProgress(), threads=1, seed=0,
     )  # fmt: skip
     streamed = Streamed(VIEWS, features.__getitem__, lambda f: f.nbytes, 1e9)
     given = _Views(streamed, [f.xy for f in features], np.arange(VIEWS, dtype=float))

@@ -1,0 +1,93 @@
+"""Corners are followed through keyframes whose features hold the path's size badly."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.correspondence.bridges import LEAST, weak_keyframes, with_bridges
+from pipelines.correspondence.matching import VerifiedPair, match_features
+from pipelines.correspondence.retrieval import describe, learn_vocabulary
+from pipelines.types import Features
+
+STEP = np.array([9.0, -4.0])
+"""Pixels by which the scene moves from one picture to the next."""
+SIZE = (160, 120)
+
+
+def _pair(first: int, second: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> VerifiedPair:
+    matches = np.stack([a, b], 1).astype(np.uint32)
+    return VerifiedPair(first, second, matches, 3, np.zeros((3, 3, 3)), len(matches))
+
+
+def _picture(k: int) -> NDArray[np.uint8]:
+    rng = np.random.default_rng(0)
+    scene = cv2.GaussianBlur(rng.integers(0, 256, (240, 320)).astype(np.float32), (0, 0), 2.5)
+    scene = (scene - scene.min()) / np.ptp(scene) * 255
+    shift = np.float32([[1, 0, STEP[0] * k - 60], [0, 1, STEP[1] * k - 60]])
+    return np.round(cv2.warpAffine(scene, shift, SIZE)).astype(np.uint8)
+
+
+def _features(k: int, seen: NDArray[np.float64]) -> Features:
+    """Of points given in the first picture, with descriptors of their own."""
+    rng = np.random.default_rng(1)
+    descriptors = rng.exponential(1, (len(seen), 128))
+    descriptors = (descriptors * Features.NORM / np.linalg.norm(descriptors, axis=1, keepdims=True)).astype(np.uint8)
+    return Features(np.c_[seen + k * STEP, np.ones((len(seen), 2))].astype(np.float32), descriptors)
+
+
+@pytest.fixture
+def weak() -> tuple[list[Features], list[VerifiedPair]]:
+    """Three pictures; twenty points match in the first two, and twenty others in the last two."""
+    seen = np.random.default_rng(2).uniform([30, 30], [120, 100], (40, 2))
+    rows = np.arange(20)
+    return [_features(k, seen) for k in range(3)], [_pair(0, 1, rows, rows), _pair(1, 2, rows + 20, rows + 20)]
+
+
+def test_a_keyframe_is_weak_where_few_features_match_before_and_behind_it() -> None:
+    many, few = np.arange(2 * LEAST), np.arange(10)
+    pairs = [_pair(k, k + 1, many, many if k != 3 else many[::-1] + 5000) for k in range(6)]
+    assert weak_keyframes(pairs, 7, reach=8) == [4]
+    skipping = [*pairs, _pair(2, 4, many, many)]  # from further off they match
+    assert weak_keyframes(skipping, 7, reach=8) == []
+    assert weak_keyframes(skipping, 7, reach=1) == [4]
+    assert weak_keyframes([_pair(0, 1, few, few), _pair(2, 3, few, few)], 4, reach=8) == []  # nothing to follow along
+
+
+def test_corners_join_what_features_do_not(weak: tuple[list[Features], list[VerifiedPair]]) -> None:
+    features, pairs = weak
+    assert weak_keyframes(pairs, 3, reach=8) == [1]
+    found, bridged = with_bridges(features, pairs, [1], lambda k: (_picture(k), None))
+    count = len(found[1]) - 40
+    assert count > 40
+    assert [len(found[k]) for k in range(3)] == [40 + count] * 3
+    for k, pair in enumerate(bridged):
+        assert np.array_equal(pair.matches[:20], pairs[k].matches)
+        moved = found[k + 1].xy[pair.matches[20:, 1]] - found[k].xy[pair.matches[20:, 0]]
+        assert np.quantile(np.linalg.norm(moved - STEP, axis=1), 0.95) < 0.1  # at the rim a corner may be worse off
+    assert set(bridged[0].matches[20:, 1]) == set(bridged[1].matches[20:, 0])
+
+
+def test_no_corner_lies_on_what_is_left_out(weak: tuple[list[Features], list[VerifiedPair]]) -> None:
+    hidden = np.zeros(SIZE[::-1], np.bool_)
+    hidden[:, 80:] = True
+    found, _ = with_bridges(*weak, [1], lambda k: (_picture(k), hidden))
+    assert len(found[1]) > 50
+    assert all((found[k].xy[40:, 0] < 81).all() for k in range(3))
+
+
+def test_a_corner_is_like_nothing(weak: tuple[list[Features], list[VerifiedPair]]) -> None:
+    features, pairs = weak
+    found, _ = with_bridges(features, pairs, [1], lambda k: (_picture(k), None))
+    assert match_features(found[0], found[1]).max() < 40
+    vocabulary = learn_vocabulary(features, 0)
+    assert np.array_equal(describe(found[1], vocabulary), describe(features[1], vocabulary))
+
+
+def test_pictures_without_corners_change_nothing(weak: tuple[list[Features], list[VerifiedPair]]) -> None:
+    features, pairs = weak
+    found, bridged = with_bridges(features, pairs, [1], lambda k: (np.full(SIZE[::-1], 90, np.uint8), None))
+    assert [len(f) for f in found.values()] == [40] * 3
+    assert all(np.array_equal(a.matches, b.matches) for a, b in zip(bridged, pairs, strict=True))
