@@ -61,7 +61,7 @@ def picked(context: StageContext, name: str) -> Path:
     return context.snapshot / "picked" / name
 
 
-def picture(context: StageContext, masks: FrameMasks, frame: Frame) -> Picture:
+def grey_of(context: StageContext, masks: FrameMasks, frame: Frame) -> Picture:
     """In grey, and what is left out of it."""
     gray = to_grey(read_rgb(picked(context, frame.name)))
     return gray, masks.left_out(frame, gray.shape[1], gray.shape[0])
@@ -95,7 +95,7 @@ def structure_from_motion(
         camera=camera,
         is_fixed=is_fixed,
         extract=extract,
-        picture=lambda frame_id: picture(context, masks, frames[frame_id]),
+        picture=lambda frame_id: grey_of(context, masks, frames[frame_id]),
         time=lambda frame_id: frames[frame_id].timestamp,
         match=match_features if learned is None else partial(learned.match, size=size),
         snapshots=Snapshots(context.snapshot),

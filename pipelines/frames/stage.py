@@ -21,10 +21,10 @@ from pipelines.correspondence.bridges import Picture
 from pipelines.frames.begun import (
     AHEAD,
     AnySource,
+    grey_of,
     known_camera,
     masks_of,
     picked,
-    picture,
     structure_from_motion,
 )
 from pipelines.frames.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
@@ -194,9 +194,9 @@ def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks, rig: 
     def pictures() -> Iterator[Picture]:
         for frame in context.progress.track(places, "keyframes", len(places)):
             if across == 1:
-                yield picture(context, masks, frame)
+                yield grey_of(context, masks, frame)
                 continue
-            sides = [picture(context, masks, frames[i]) for i in rig.frames_of([frame.id])]
+            sides = [grey_of(context, masks, frames[i]) for i in rig.frames_of([frame.id])]
             hidden = [np.zeros(gray.shape, np.bool_) if mask is None else mask for gray, mask in sides]
             yield level_mosaic([gray for gray, _ in sides]), level_mosaic(hidden)
 
