@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from pipelines.proxy.regions.voxels import Voxels, find, neighbour_keys
+from pipelines.proxy.regions.voxels import Voxels, touching
 
 _ALIKE = (
     frozenset({"bed", "seating", "sofa", "armchair", "chair", "seat", "swivel chair", "bench", "ottoman", "stool"}),
@@ -51,7 +51,6 @@ def one_name_each(share: NDArray[np.float32], names: tuple[str, ...], voxels: Vo
 
 def _touching(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     """(V,) number of the connected piece of each of the sorted keys."""
-    around = find(keys, neighbour_keys(keys))
-    a, k = np.nonzero(around >= 0)
-    links = csr_matrix((np.ones(len(a), bool), (a, around[a, k])), (len(keys), len(keys)))
+    a, b = touching(keys)
+    links = csr_matrix((np.ones(len(a), bool), (a, b)), (len(keys), len(keys)))
     return np.asarray(connected_components(links, directed=False)[1], np.int64)

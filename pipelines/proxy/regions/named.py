@@ -123,14 +123,13 @@ def _vote(
     at = find(voxels.keys, _keys(sequence, frame, resample_nearest(depth.depth, rows, columns), voxels.size))
     confidence = resample_nearest(depth.confidence, rows, columns)
     use = (at >= 0) & (confidence >= _LEAST_CONFIDENCE) & (probabilities.sum(-1) > 0)
-    weight, place = confidence[use], at[use]
-    heard = np.bincount(place, weight, len(voxels)).astype(np.float32)
-    shape = (len(voxels), len(place))
-    said = csr_matrix((weight, (place, np.arange(len(place)))), shape=shape) @ probabilities[use]
-    some = heard > 0
-    loudness = np.minimum(heard[some], 1.0)
-    votes[some, :classes] += said[some] * (loudness / heard[some])[:, None]
-    votes[some, classes] += loudness
+    seen, place = np.unique(at[use], return_inverse=True)
+    weight = confidence[use]
+    heard = np.bincount(place, weight, len(seen)).astype(np.float32)
+    said = csr_matrix((weight, (place, np.arange(len(place)))), (len(seen), len(place))) @ probabilities[use]
+    loudness = np.minimum(heard, 1.0)
+    votes[seen, :classes] += said * (loudness / heard)[:, None]
+    votes[seen, classes] += loudness
     return np.bincount(probabilities[at < 0].argmax(-1), None, classes) / at.size
 
 

@@ -6,10 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.proxy.graph_cut import cut_graph
-from pipelines.proxy.regions.voxels import Voxels, find, neighbour_keys
+from pipelines.proxy.regions.voxels import Voxels, touching
 
 _COLOR_UNIT = 12.0
 """Difference in CIE Lab that counts as much as a right angle between the normals."""
+_BLOCK = 500_000
+"""Edges that are weighed together."""
 _SCALE = 20.0
 _PATCH_SCALE = 3.0
 """Of 1 to 20 that which, with the votes of a network averaged in each patch, named rooms best (two recordings)."""
@@ -36,15 +38,21 @@ def cut_patches(voxels: Voxels) -> NDArray[np.int64]:
 
 
 def _edges(voxels: Voxels) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    around = find(voxels.keys, neighbour_keys(voxels.keys))
-    a, k = np.nonzero(around > np.arange(len(voxels))[:, None])
-    b = around[a, k]
+    a, b = touching(voxels.keys)
+    cost = np.empty(len(a))
+    for start in range(0, len(a), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        cost[block] = _costs(voxels, a[block], b[block])
+    return a, b, cost
+
+
+def _costs(voxels: Voxels, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.float64]:
     between = voxels.position[b] - voxels.position[a]
     between /= np.maximum(np.linalg.norm(between, axis=1, keepdims=True), 1e-12)
     bend = 1 - (voxels.normal[a] * voxels.normal[b]).sum(1)
     concave = (between * (voxels.normal[b] - voxels.normal[a])).sum(1) < 0
     color = np.linalg.norm((voxels.color[a] - voxels.color[b]) * [0.5, 1.0, 1.0], axis=1) / _COLOR_UNIT
-    return a, b, color + np.where(concave, 1.0, 0.3) * bend
+    return np.asarray(color + np.where(concave, 1.0, 0.3) * bend)
 
 
 def _absorb_small(
