@@ -16,10 +16,11 @@ from pipelines.mapping.measure import ViewFigures
 from pipelines.mapping.poses import interpolate_rows, move_trajectory
 from pipelines.mapping.state import Exposures, OptimisedMap
 from pipelines.mapping.submap_tasks import (
+    AGREED,
     JOINED,
-    REFINED,
     SubmapResult,
     SubmapTask,
+    agree_submap,
     belonging,
     in_order,
     join_submap,
@@ -50,17 +51,17 @@ class Mapped:
 
 
 def map_divided(context: StageContext, trajectory: Trajectory, class_ids: tuple[int, ...]) -> Mapped:
-    """Every submap made, then all joined, refined and measured: each kind of work once the one before is all done."""
+    """Every submap made, joined, refined, agreed upon and measured: each kind of work once the one before is done."""
     run, settings = context.run, context.config.mapping
     kept, _ = split_frames(trajectory, settings.hold_out)
     fields = run.load_depth_fields("tracking")
     submaps = divide(np.array(kept), overlaps(_depths(run, trajectory, fields, kept)), settings.submap)
     tasks = submap_tasks(context, submaps, trajectory, fields, class_ids)
-    for work in (make_submap, join_submap, refine_submap):
+    for work in (make_submap, join_submap, refine_submap, agree_submap):
         context.each(work, tasks)
-    result, ids = all_together(tasks, REFINED)
+    result, ids = all_together(tasks, AGREED)
     moved = move_trajectory(trajectory, ids, result.cam_from_world)
-    keyframes, held_out = measure(context, tasks, moved, ids, (result.log_gains, result.offsets), REFINED, fields)
+    keyframes, held_out = measure(context, tasks, moved, ids, (result.log_gains, result.offsets), AGREED, fields)
     return Mapped(result, ids, tasks[0].class_ids, moved, keyframes, held_out, submaps)
 
 
@@ -84,11 +85,12 @@ def refine_divided(
         own = belonging(gaussian_map, anchors, task.submap)
         nothing = np.zeros((0, 1, 1), np.float32), np.zeros(1, np.int64)
         task.save(JOINED, SubmapResult(own, ids[rows], poses, exposure[0][rows], exposure[1][rows], *nothing))
-    context.each(refine_submap, [replace(task, passes=passes, first_rate=1.0) for task in tasks])
-    result, _ = all_together(tasks, REFINED)
+    for work in (refine_submap, agree_submap):
+        context.each(work, [replace(task, passes=passes) for task in tasks])
+    result, _ = all_together(tasks, AGREED)
     before, _ = measure(context, tasks, trajectory, ids, exposure, JOINED, fields)
     moved = move_trajectory(trajectory, ids, result.cam_from_world)
-    after, _ = measure(context, tasks, moved, ids, (result.log_gains, result.offsets), REFINED, fields)
+    after, _ = measure(context, tasks, moved, ids, (result.log_gains, result.offsets), AGREED, fields)
     return _mean_psnr(before), result, _mean_psnr(after)
 
 

@@ -68,7 +68,8 @@ def optimise_map(
         state.iteration = iteration + 1
         if snapshot is not None and (state.iteration % every == 0 or is_asked()):
             state.save(snapshot)
-    optimiser.growth.prune()
+    if schedule.grows:
+        optimiser.growth.prune()
     return state.result(views, schedule.total)
 
 

@@ -86,7 +86,7 @@ class Schedule:
     ) -> Schedule:
         """The schedule for these views; `passes` overrides that of the settings, which also have a least count;
         `keyframe_miou` is T_sem of eq. (12), 0 leaves it away; `first_rate`: learning rates of the first visit; below 1
-        the map only settles, and does not grow."""
+        the map only settles, and keeps its Gaussians."""
         # Read once: views may lie on disk.
         reliability, shares = np.array([(float(v.trust.mean()), v.shown) for v in views]).T
         shown = max(float(shares.mean()), LEAST_SHOWN)
@@ -98,6 +98,11 @@ class Schedule:
         if keyframe_miou > 0:
             overlap = overlap.multiply(label_likeness(views) < keyframe_miou).tocsr()
         return Schedule(seed, len(views), steps, visits, overlap, reliability, first_rate)
+
+    @property
+    def grows(self) -> bool:
+        """Whether Gaussians come and go, rather than only settle."""
+        return self.first_rate == 1
 
     @property
     def total(self) -> int:
@@ -143,7 +148,7 @@ class Schedule:
         if number < coarse_passes:
             return True, False
         turn = (number - coarse_passes) % DENSIFY_EVERY == 0
-        return False, turn and number < DENSIFY_UNTIL * passes and self.first_rate == 1
+        return False, turn and number < DENSIFY_UNTIL * passes and self.grows
 
     def _follows_new_ones(self, number: int) -> bool:
         """Whether the pass before this one added to the map: pruned any sooner, the new ones would go while they are

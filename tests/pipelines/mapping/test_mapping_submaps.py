@@ -13,6 +13,7 @@ from finished import note_finished
 from scipy import sparse
 
 from formats.gaussian_ply import read_gaussian_ply
+from formats.tensors import load_tensors
 from pipelines.config import Config, MappingConfig, RunConfig
 from pipelines.depth.posed import PosedDepth
 from pipelines.export.tiles import write_tiles
@@ -151,8 +152,8 @@ def test_broken_off_anywhere_it_ends_with_the_same_bytes(
     small_run: RunFolder, divided: tuple[Path, dict], tmp_path: Path
 ) -> None:
     config = replace(CONFIG, mapping=replace(CONFIG.mapping, snapshot_every=20))
-    steps = divided[1]["iterations"]
-    for number, after in enumerate((int(0.4 * steps), int(2.6 * steps))):
+    steps = divided[1]["iterations"]  # of the refinement; the making takes as many
+    for number, after in enumerate((int(0.4 * steps), int(1.8 * steps))):
         folder = tmp_path / str(number)
         with pytest.raises(Killed):
             mapped(small_run, folder, config, KillAfter(after))
@@ -160,6 +161,28 @@ def test_broken_off_anywhere_it_ends_with_the_same_bytes(
         assert figures == divided[1]
         for name in ("map.safetensors", "trajectory.npz", "exposure.npz", "mapping.json"):
             assert (folder / name).read_bytes() == (divided[0] / name).read_bytes()
+
+
+def test_what_several_submaps_show_is_the_mean_of_what_they_say(divided: tuple[Path, dict]) -> None:
+    """Weighed by the pixels that each Gaussian fills in their views; none is lost, and colours do come to differ."""
+    files = divided[0] / "snapshot" / "submaps"
+    joined, agreed = (load_tensors(files / f"{kind}_0000.safetensors") for kind in ("joined", "agreed"))
+    total, mean, told = torch.zeros(len(joined["means"])), torch.zeros_like(joined["colors"]), []
+    for path in sorted(files.glob("refined_*.safetensors")):
+        refined = load_tensors(path)
+        mine = torch.isin(refined["anchor_frame_ids"], joined["anchor_frame_ids"])
+        rows, weights = refined["rows"][mine], refined["weights"][mine]
+        assert torch.equal(refined["anchor_frame_ids"][mine], joined["anchor_frame_ids"][rows])
+        mean[rows] += weights[:, None] * refined["colors"][mine]
+        total[rows] += weights
+        told.append(torch.full((len(total), 3), torch.nan).index_put((rows,), refined["colors"][mine]))
+    shown = total > 0
+    assert float(shown.float().mean()) > 0.9
+    assert torch.allclose(agreed["colors"][shown], mean[shown] / total[shown, None], atol=1e-5)
+    assert torch.equal(agreed["colors"][~shown], joined["colors"][~shown])
+    apart = (told[0] - told[1]).abs()
+    assert int(apart.isfinite().sum()) > 1000
+    assert float(apart[apart.isfinite()].mean()) > 0.005
 
 
 @pytest.fixture(scope="module")
