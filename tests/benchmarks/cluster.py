@@ -28,6 +28,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 os.environ["PYTHONPATH"] = str(ROOT)  # of the nodes, as an installed program is found
 os.environ["RAY_memory_monitor_refresh_ms"] = "0"  # noqa: SIM112  Ray writes it so
+os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112  with its 15 anything else starves the tasks
 
 from pipelines.demo import unpack_demo_clip
 from pipelines.run_folder_names import STAGES
