@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipelines.depth.fields import FINE, Basis, DepthFields
 from pipelines.depth.posed import PosedDepth, neighbours
 from pipelines.depth.solve import Equations, Prior, solve_fields
+from pipelines.streamed import Streamed
 from pipelines.types import Intrinsics, ProxyMaps, SparseModel
 
 Array = NDArray[np.float64]
@@ -32,6 +33,10 @@ GROSS = 0.15
 SHARE = 0.25
 """Neighbouring samples err alike: a picture's worth of them counts as a few per node."""
 ROUNDS = 4
+TOGETHER = 400
+"""Fields that are solved for at once: their equations take 0.4 MB each."""
+_ROOM = 150_000_000
+"""Bytes of depths, and of samples of them, that are kept; what has no room is read again."""
 
 
 @dataclass(frozen=True)
@@ -53,17 +58,22 @@ def align_keyframes(
     `expected`: by frame id, log scales at FINE's nodes (108,) as the keyframe's own points alone give them; a keyframe
     without takes the middle of the others.
     """
-    views: list[PosedDepth] = []
-    ids: list[int] = []
+
+    def view_of(row: int) -> PosedDepth:
+        maps = load_maps(int(model.frame_ids[row]))
+        assert maps is not None, "there was one before"
+        return _posed(maps, intrinsics, model.cam_from_world[row])
+
+    rows: list[int] = []
     anchors: dict[int, Anchors] = {}
     for k, frame_id in enumerate(model.frame_ids.tolist()):
         maps = load_maps(frame_id)
-        if maps is None or not (maps.depth > 0).any():
-            continue
-        view = _posed(maps, intrinsics, model.cam_from_world[k])
-        anchors[len(views)] = _anchors(model, k, intrinsics, view.intrinsics)
-        views.append(view)
-        ids.append(frame_id)
+        if maps is not None and (maps.depth > 0).any():
+            camera = _posed(maps, intrinsics, model.cam_from_world[k]).intrinsics
+            anchors[len(rows)] = _anchors(model, k, intrinsics, camera)
+            rows.append(k)
+    ids = [int(model.frame_ids[k]) for k in rows]
+    views = Streamed(len(rows), lambda n: view_of(rows[n]), lambda v: v.depth.nbytes + v.trust.nbytes, _ROOM)
     middle = float(np.median([np.median(e) for e in expected.values()])) if expected else 0.0
     start = np.array([expected.get(i, np.full(FINE.size, middle)) for i in ids]).reshape(len(ids), FINE.size)
     fields = fit_fields(views, anchors, start)
@@ -89,15 +99,21 @@ def _anchors(model: SparseModel, k: int, full: Intrinsics, small: Intrinsics) ->
 
 
 def fit_fields(views: Sequence[PosedDepth], anchors: Mapping[int, Anchors], expected: Array | None = None) -> Array:
-    """(N, nodes) log scales by robust least squares, re-linearised at every round; `anchors` by index of the view."""
+    """(N, nodes) log scales by robust least squares, re-linearised at every round; `anchors` by index of the view. Of a
+    long recording a window of views at a time, the others as they stand."""
     start = np.zeros((len(views), FINE.size)) if expected is None else expected
-    fields = start
-    samples = [_Samples.of(v) for v in views]
+    fields = start.copy()
+    samples = Streamed(len(views), lambda n: _Samples.of(views[n]), lambda s: s.nbytes, _ROOM)
     near = neighbours(views)
-    for _ in range(ROUNDS if views else 0):
-        points = (_point_equations(n, views[n], found, fields) for n, found in sorted(anchors.items()))
-        pairs = (_pair_equations(i, j, samples[i], views[j], fields) for i, j in near)
-        fields = solve_fields(chain(points, pairs), fields, start, PRIOR)
+    windows = np.array_split(np.arange(len(views)), -(-len(views) // TOGETHER)) if len(views) else []
+    for window in windows * ROUNDS:
+        first, last = int(window[0]), int(window[-1])
+        points = (_point_equations(n, views[n], anchors[n], fields) for n in window.tolist() if n in anchors)
+        touching = [(i, j) for i, j in near if first <= i <= last or first <= j <= last]
+        pairs = (_pair_equations(i, j, samples[i], views[j], fields) for i, j in touching)
+        own = range(first * FINE.size, (last + 1) * FINE.size)
+        parts = (equations.within(own) for equations in chain(points, pairs))
+        fields[window] = solve_fields(parts, fields[window], start[window], PRIOR)
     return fields
 
 
@@ -110,6 +126,11 @@ class _Samples:
     rays: Array
     center: Array
     basis: Basis
+
+    @property
+    def nbytes(self) -> int:
+        """Memory they take."""
+        return sum(a.nbytes for a in (self.depth, self.trust, self.rays, self.basis.nodes, self.basis.weights))
 
     @staticmethod
     def of(view: PosedDepth) -> _Samples:

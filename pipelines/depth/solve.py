@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
@@ -58,6 +58,12 @@ class Equations:
         """One place of one field each: field (Q,) or a number, `size` nodes a field."""
         columns = basis.nodes + np.reshape(np.asarray(field), (-1, 1)) * size
         return Equations(columns, basis.weights, residual, sd, share)
+
+    def within(self, own: range) -> Equations:
+        """With nodes of some fields as the unknowns, counted from the first of them: the others stay as they are."""
+        inside = (self.columns >= own.start) & (self.columns < own.stop)
+        columns, weights = np.where(inside, self.columns - own.start, 0), np.where(inside, self.weights, 0.0)
+        return replace(self, columns=columns, weights=weights)
 
 
 def solve_fields(parts: Iterable[Equations], fields: Array, expected: Array, prior: Prior) -> Array:

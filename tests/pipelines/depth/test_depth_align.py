@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pipelines.depth import align as alignment
 from pipelines.depth import solve
 from pipelines.depth.align import align_keyframes, fit_fields
 from pipelines.depth.fields import FINE, DepthFields, field_scales
@@ -168,6 +169,18 @@ def test_equations_in_parts_have_the_same_solution(room: MappingInput, monkeypat
     in_parts = fit_fields(posed, {})
     assert np.abs(at_once).max() > 1e-4
     assert in_parts == pytest.approx(at_once, abs=1e-9)
+
+
+def test_windows_of_a_long_recording_agree_with_all_at_once(
+    room: MappingInput, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posed = [v.posed_depth() for v in room.views[:9]]
+    tilted = [replace(p, depth=p.depth * np.float32(1 + 0.04 * (-1) ** n)) for n, p in enumerate(posed)]
+    at_once = fit_fields(tilted, {})
+    monkeypatch.setattr(alignment, "TOGETHER", 4)
+    in_windows = fit_fields(tilted, {})
+    assert np.abs(at_once).mean() > 0.02
+    assert np.abs(in_windows - at_once).mean() < 0.01  # windows of three views, which share most of what they see
 
 
 def test_depth_that_others_see_through_is_found(room: MappingInput) -> None:
