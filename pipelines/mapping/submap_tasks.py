@@ -182,7 +182,7 @@ def agree_submap(task: SubmapTask, progress: Progress) -> None:
         return
     agreed = task.load(JOINED, task.number).gaussian_map
     total = torch.zeros(len(agreed), device=agreed.means.device)
-    for number in (*task.submap.beside, task.number):
+    for number in (*task.submap.beside, task.number):  # itself last: its keyframes are kept
         told = task.load(REFINED, number)
         mine = np.isin(told.gaussian_map.anchor_frame_ids.cpu().numpy(), task.submap.own)
         rows, weights = (torch.from_numpy(a[mine]).to(total.device) for a in (told.rows, told.weights))
