@@ -122,8 +122,8 @@ def _vote(voxels: Voxels, votes: Sequence[tuple[NDArray[np.int64], NDArray[np.ui
         return label
     at = find(voxels.keys, np.concatenate([keys for keys, _ in votes]))
     given = np.concatenate([labels for _, labels in votes])
-    counts = np.zeros((len(voxels), 256), np.int32)
-    np.add.at(counts, (at[at >= 0], given[at >= 0]), 1)
-    found = counts.any(1)
-    label[found] = counts[found].argmax(1)
+    said, counts = np.unique(at[at >= 0] * 256 + given[at >= 0], return_counts=True)
+    # The most last, of as many the first label.
+    order = np.lexsort((-said, counts))
+    label[said[order] // 256] = said[order] % 256
     return label
