@@ -22,6 +22,8 @@ _NEEDS = {
 """MB that a stage needs at its peak: at least, for each million pixels of a frame, each keyframe, each million
 Gaussians. Fitted to the peaks of 63 runs of 10 to 219 keyframes and 0.01 to 0.7 million pixels: half of them lie within
 15 % (global_ba 26), nine of ten within 40 %."""
+_AT_ONCE, _BEYOND = {"frames": 500, "tracking": 400}, 0.3
+"""Keyframes that these stages have in work at any time, and MB for each of the others: walks of 115 to 2,272."""
 DONE, DAMAGED, INTERRUPTED, OUTDATED, NOT_YET = "done", "damaged", "interrupted", "outdated", "not yet"
 
 
@@ -127,7 +129,9 @@ def expected_mb(stage: str, run: RunFolder, config: Config) -> float | None:
     least, a_million_pixels, a_keyframe, a_million_gaussians = _NEEDS[stage]
     gaussians = of_part * (1 if stage == "mapping" else parts) / 1e6
     pixels = camera.width * camera.height / 1e6
-    return round(least + a_million_pixels * pixels + a_keyframe * keyframes + a_million_gaussians * gaussians)
+    inside = min(keyframes, _AT_ONCE.get(stage, keyframes))
+    by_keyframes = a_keyframe * inside + _BEYOND * (keyframes - inside)
+    return round(least + a_million_pixels * pixels + by_keyframes + a_million_gaussians * gaussians)
 
 
 def _state(run: RunFolder, name: str, record: StageRecord | None, damaged: tuple[str, ...]) -> str:
