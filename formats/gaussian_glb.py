@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.atomic import write_bytes
 from formats.errors import InputError
 from formats.gaussian_ply import SH_C0
 from formats.gaussians import GaussianCloud, unit_quaternions
-from formats.glb import glb_bytes, glb_parts
+from formats.glb import glb_parts, write_glb
 from formats.reading import parsing, read_bytes
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -50,12 +49,14 @@ def write_gaussian_glb(path: Path, cloud: GaussianCloud, class_names: tuple[str,
     }
     if cloud.class_ids is not None:
         arrays[_LABEL] = cloud.class_ids.astype(np.float32)
-    chunks = [np.ascontiguousarray(a, "<u1" if a.dtype == np.uint8 else "<f4").tobytes() for a in arrays.values()]
-    write_bytes(path, glb_bytes(_document(arrays, chunks, class_names), b"".join(chunks)))
+    chunks = [np.ascontiguousarray(a, "<u1" if a.dtype == np.uint8 else "<f4") for a in arrays.values()]
+    write_glb(path, _document(arrays, chunks, class_names), chunks)
 
 
-def _document(arrays: dict[str, NDArray[Any]], chunks: list[bytes], class_names: tuple[str, ...]) -> dict[str, Any]:
-    starts = np.cumsum([0, *(len(c) for c in chunks)]).tolist()
+def _document(
+    arrays: dict[str, NDArray[Any]], chunks: list[NDArray[Any]], class_names: tuple[str, ...]
+) -> dict[str, Any]:
+    starts = np.cumsum([0, *(c.nbytes for c in chunks)]).tolist()
     accessors: list[dict[str, Any]] = []
     for i, (name, array) in enumerate(arrays.items()):
         kind = next(k for k, w in _WIDTHS.items() if w == (1 if array.ndim == 1 else array.shape[1]))
@@ -80,7 +81,7 @@ def _document(arrays: dict[str, NDArray[Any]], chunks: list[bytes], class_names:
         "meshes": [{"primitives": [primitive], "extras": {"classes": list(class_names)}}],
         "accessors": accessors,
         "bufferViews": [
-            {"buffer": 0, "byteOffset": s, "byteLength": len(c), "target": 34962}
+            {"buffer": 0, "byteOffset": s, "byteLength": c.nbytes, "target": 34962}
             for s, c in zip(starts, chunks, strict=False)
         ],
         "buffers": [{"byteLength": starts[-1]}],

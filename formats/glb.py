@@ -4,24 +4,36 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formats.atomic import atomic_path
 
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 
 
-def glb_bytes(document: dict[str, Any], binary: bytes) -> bytes:
-    """The GLB of a document and its one buffer; both chunks padded to four bytes."""
+def write_glb(path: Path, document: dict[str, Any], parts: Sequence[bytes | NDArray[Any]]) -> None:
+    """A document and its one buffer, the parts one after the other, without a copy of them, atomically; both chunks are
+    padded to four bytes. Raises InputError when the disk refuses."""
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
-    binary += b"\0" * (-len(binary) % 4)
-    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
-    return b"".join(
-        [head, struct.pack("<II", len(text), _JSON), text, struct.pack("<II", len(binary), _BINARY), binary]
-    )
+    length = sum(len(part) if isinstance(part, bytes) else part.nbytes for part in parts)
+    padding = b"\0" * (-length % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + length + len(padding))
+    with atomic_path(Path(path)) as temporary, temporary.open("wb") as file:
+        file.write(head + struct.pack("<II", len(text), _JSON) + text)
+        file.write(struct.pack("<II", length + len(padding), _BINARY))
+        for part in (*parts, padding):
+            file.write(part if isinstance(part, bytes) else np.ascontiguousarray(part).data)
 
 
 def glb_parts(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Inverse of `glb_bytes`. Raises ValueError, or what comes of missing bytes and keys, for another file."""
+    """Inverse of `write_glb`, of a file's bytes. Raises ValueError, or what comes of missing bytes and keys, for
+    another file."""
     magic, version, _ = struct.unpack_from("<4sII", data)
     if magic != b"glTF" or version != 2:
         raise ValueError("it does not begin like a GLB of version 2")

@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.atomic import write_bytes
 from formats.errors import InputError
+from formats.glb import write_glb
 from formats.ply_table import columns, read_ply, write_ply
 from formats.reading import parsing, read_bytes
 from formats.trajectory import FARTHEST
 
 _LABEL_ATTRIBUTE = "_LABEL"
 _MAX_GLB_BYTES = 4 * 1024**3
+_BYTE, _UNSIGNED, _FLOAT = 5121, 5125, 5126
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,27 +108,36 @@ def write_mesh_glb(
 
     Arguments and errors as `write_mesh_ply`. glTF wants y up: the caller turns the vertices.
     """
-    import trimesh  # slow to import, and only the export needs it
-
     mesh = MeshArrays(vertices, faces, colors, labels)
     if not len(mesh.faces):
         raise ValueError("write_mesh_glb: glTF has no way to store a mesh without faces")
     opaque = np.column_stack([mesh.colors, np.full(len(mesh.colors), 255, dtype=np.uint8)])
-    scene = trimesh.Scene()
-    scene.add_geometry(
-        trimesh.Trimesh(
-            mesh.vertices,
-            mesh.faces,
-            vertex_colors=opaque,
-            # glTF wants every vertex at a multiple of 4 bytes: a float per label instead of a byte
-            vertex_attributes={_LABEL_ATTRIBUTE: mesh.labels.astype(np.float32)},
-            metadata={"classes": list(class_names)},
-            process=False,
-        ),
-        geom_name="mesh",
-        node_name="mesh",
-    )
-    write_bytes(path, scene.export(file_type="glb"))
+    low, high = mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()
+    parts: list[tuple[str, NDArray[Any], int, dict[str, Any]]] = [
+        ("POSITION", mesh.vertices.astype("<f4", copy=False), _FLOAT, {"type": "VEC3", "min": low, "max": high}),
+        ("COLOR_0", opaque, _BYTE, {"type": "VEC4", "normalized": True}),
+        # glTF wants every vertex at a multiple of 4 bytes: a float per label instead of a byte
+        (_LABEL_ATTRIBUTE, mesh.labels.astype("<f4"), _FLOAT, {"type": "SCALAR"}),
+        ("", mesh.faces.astype("<u4", copy=False), _UNSIGNED, {"type": "SCALAR"}),
+    ]
+    views, accessors, start = [], [], 0
+    for i, (name, array, kind, more) in enumerate(parts):
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": 34962 if name else 34963})
+        count = len(array) if name else array.size
+        accessors.append({"bufferView": i, "componentType": kind, "count": count} | more)
+        start += array.nbytes
+    primitive = {"attributes": {name: i for i, (name, *_) in enumerate(parts) if name}, "indices": 3, "mode": 4}
+    document = {
+        "asset": {"version": "2.0", "generator": "msgs-slam"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "mesh"}],
+        "meshes": [{"primitives": [primitive], "name": "mesh", "extras": {"classes": list(class_names)}}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": start}],
+    }
+    write_glb(path, document, [array for _, array, *_ in parts])
 
 
 def read_mesh_glb(path: Path) -> MeshArrays:

@@ -14,6 +14,8 @@ from formats.errors import InputError
 from formats.reading import opened, parsing
 
 _MAX_HEADER_BYTES = 1 << 20
+_ROWS = 1 << 18
+"""That are written at once."""
 _MIN_BYTES_PER_ASCII_VALUE = 2
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -48,7 +50,8 @@ def write_ply(path: Path, elements: dict[str, NDArray[Any]], comments: list[str]
     with atomic_path(Path(path)) as temporary, temporary.open("wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode("ascii", errors="replace"))
         for array in elements.values():
-            file.write(_packed(array).tobytes())
+            for start in range(0, len(array), _ROWS):  # a copy of a building's mesh would take gigabytes
+                file.write(_packed(array[start : start + _ROWS]).data)
 
 
 def _property_lines(dtype: np.dtype) -> list[str]:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.atomic import write_bytes, write_text
-from formats.glb import glb_bytes
+from formats.atomic import write_text
+from formats.glb import write_glb
 from formats.images import jpeg_bytes, write_rgb
 
 _BYTES, _INDICES, _FLOAT = 34962, 34963, 5126
@@ -120,4 +120,4 @@ def write_textured_glb(path: Path, mesh: TexturedMesh, class_names: tuple[str, .
         "bufferViews": views,
         "buffers": [{"byteLength": starts[-1]}],
     }
-    write_bytes(path, glb_bytes(document, b"".join(chunks)))
+    write_glb(path, document, chunks)
