@@ -91,9 +91,11 @@ def make_mesh(
             regions.append(make_region(outcome, views, grid, chunks, progress, of))
     surfaces = [region.surface for region in regions]
     vertices = np.concatenate([surface.vertices for surface in surfaces])
-    rows, faces = without_floaters(join_faces(surfaces), len(vertices), _LEAST_PIECE)
-    colors, labels = (np.concatenate([getattr(r, name) for r in regions])[rows] for name in ("colors", "labels"))
-    return SemanticMesh(vertices[rows], faces, colors, labels)
+    joined = join_faces(surfaces)
+    colors, labels = (np.concatenate([getattr(r, name) for r in regions]) for name in ("colors", "labels"))
+    del surfaces, regions  # of a building, a gigabyte
+    rows, faces = without_floaters(joined, len(vertices), _LEAST_PIECE)
+    return SemanticMesh(vertices[rows], faces, colors[rows], labels[rows])
 
 
 def make_region(

@@ -100,7 +100,11 @@ def join_faces(surfaces: Sequence[Surface]) -> NDArray[np.int32]:
     )
     stands_for = np.arange(starts[-1], dtype=np.int32)
     stands_for[rows] = rows[first][inverse.reshape(-1)]
-    return stands_for[np.concatenate([s.faces + np.int32(start) for s, start in together])]
+    faces, done = np.empty((sum(len(s.faces) for s in surfaces), 3), np.int32), 0
+    for s, start in together:
+        faces[done : done + len(s.faces)] = stands_for[start:][s.faces]
+        done += len(s.faces)
+    return faces
 
 
 def without_floaters(
