@@ -20,7 +20,7 @@ from pipelines.types import Features
 
 LEAST = 100
 """Features matched on both sides below which a keyframe is a weak one. On a made-up walk, steps beyond keyframes with
-15 to 45 of them change by 1 to 8 %; the weakest of eleven recordings of cameras have 330 and more, or next to none."""
+15 to 45 of them change by 1 to 8 %; the weakest of six recordings have 330 and more, of two others next to none."""
 _MOST, _DISTANCE = 1000, 3.0
 """Corners of a picture, and pixels between them."""
 _LEAST_GUESS, _GUESS_ERROR = 8, 0.03
