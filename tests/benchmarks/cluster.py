@@ -44,7 +44,7 @@ WITH_TASKS = {
 """Stages that submit tasks, and what of their unfinished folder is there once they have."""
 SETTINGS = ("global_ba.joint=always", "global_ba.joint_passes=3")
 """The clip has no loops, without which nothing would be refined by global_ba."""
-BETWEEN_KILLS = (0.2, 2.0)
+BETWEEN_KILLS = (0.05, 0.6)
 """Seconds."""
 BAD = {
     "folder": "mount -t tmpfs none {run}",
