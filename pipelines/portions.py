@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
@@ -36,7 +37,7 @@ class Portion:
         """Which they are."""
         return range(self.first, self.last)
 
-    @property
+    @cached_property
     def known(self) -> dict[str, Any]:
         """Of all of them."""
         return load_value(self.file)

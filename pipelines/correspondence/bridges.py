@@ -61,7 +61,7 @@ def with_bridges(
     found: dict[int, Features] = {}
     for k in weak:
         numbers, sides = (k - 1, k, k + 1), (steps[k - 1, k], steps[k, k + 1])
-        around = [found.get(n, features[n]) for n in numbers]
+        around = [found[n] if n in found else features[n] for n in numbers]
         followed = _followed([picture(n) for n in numbers], around, *sides)
         rows = np.arange(len(followed[0]), dtype=np.uint32)
         for i, pair in enumerate(sides):

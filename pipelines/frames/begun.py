@@ -119,7 +119,7 @@ def _begun(task: Portion, progress: Progress) -> tuple[StructureFromMotion, dict
     rig = rig_of(1 if faces is None else len(faces), len(frames))
     masks = masks_of(context, source, faces, rig)
     if "pairs" in known:
-        known["pairs"] = [(i, j) for i, j in known["pairs"].tolist()]
+        known = known | {"pairs": [(i, j) for i, j in known["pairs"].tolist()]}
     return structure_from_motion(context, camera, origin == "given", frames, masks, rig), known
 
 

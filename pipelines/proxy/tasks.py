@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,8 +34,20 @@ MadeMaps = tuple[list[float], dict[int, NDArray[np.float32]]]
 """Semantic agreement m_t of each frame with the one before it, and what a network says of how frames look, by id."""
 
 
-Opened = tuple[StageContext, Sequence, list[Frame], dict[str, Any]]
-"""The stage's context, its sequence, all frames that it is about, and what is known of them."""
+@dataclass(frozen=True)
+class _Opened:
+    """The stage's context, its sequence, all frames that it is about, those of the portion, what is known of all."""
+
+    context: StageContext
+    sequence: Sequence
+    frames: list[Frame]
+    part: list[Frame]
+    known: dict[str, Any]
+
+    @property
+    def around(self) -> Surroundings:
+        """What the providers are made from."""
+        return surroundings(self.context, self.sequence)
 
 
 def by_workers(
@@ -45,46 +58,46 @@ def by_workers(
     return in_portions(context, work, len(frames), frame_ids=ids, **known)
 
 
-def _opened(task: Portion, progress: Progress) -> Opened:
+def _opened(task: Portion, progress: Progress) -> _Opened:
     context, known = task.context(progress), task.known
     sequence, wanted = load_sequence(context), set(known["frame_ids"].tolist())
-    return context, sequence, [f for f in sequence.frames if f.id in wanted], known
+    frames = [f for f in sequence.frames if f.id in wanted]
+    return _Opened(context, sequence, frames, frames[task.first : task.last], known)
 
 
 def prepare_depths(task: Portion, progress: Progress) -> None:
     """What each frame's depth needs of the others: the slow passes over the frames."""
-    context, sequence, frames, _ = _opened(task, progress)
-    open_depth(surroundings(context, sequence)).prepare(frames[task.first : task.last])
+    o = _opened(task, progress)
+    open_depth(o.around).prepare(o.part)
 
 
 def make_depths(task: Portion, progress: Progress) -> None:
     """The depths of the frames."""
-    context, sequence, frames, known = _opened(task, progress)
-    depths = open_depth(surroundings(context, sequence))
-    take_prepared(depths, known["depths"])
-    depth_pass(context, sequence, frames[task.first : task.last], depths)
+    o = _opened(task, progress)
+    depths = open_depth(o.around)
+    take_prepared(depths, o.known["depths"])
+    depth_pass(o.context, o.sequence, o.part, depths)
 
 
 def look_for_moving(task: Portion, progress: Progress) -> dict[int, NDArray[np.bool_]]:
     """The first round of `find_moving` over the frames."""
-    context, sequence, frames, known = _opened(task, progress)
-    return look_once(task.numbers, *moving_views(context, sequence, frames, known["scale"]), progress)
+    o = _opened(task, progress)
+    return look_once(task.numbers, *moving_views(o.context, o.sequence, o.frames, o.known["scale"]), progress)
 
 
 def look_at_pictures(task: Portion, progress: Progress) -> None:
     """What a network says of each frame by itself."""
-    context, sequence, frames, _ = _opened(task, progress)
-    open_semantics(surroundings(context, sequence)).look(frames[task.first : task.last])
+    o = _opened(task, progress)
+    open_semantics(o.around).look(o.part)
 
 
 def make_maps(task: Portion, progress: Progress) -> MadeMaps:
     """The maps of the frames."""
-    context, sequence, frames, known = _opened(task, progress)
-    semantics = open_semantics(surroundings(context, sequence))
-    take_prepared(semantics, known["semantics"])
-    previous = frames[task.first - 1] if task.first else None
-    part = frames[task.first : task.last]
-    return maps_pass(context, sequence, part, previous, semantics, known["scale"], known["metres"])
+    o = _opened(task, progress)
+    semantics = open_semantics(o.around)
+    take_prepared(semantics, o.known["semantics"])
+    previous = o.frames[task.first - 1] if task.first else None
+    return maps_pass(o.context, o.sequence, o.part, previous, semantics, o.known["scale"], o.known["metres"])
 
 
 def surroundings(context: StageContext, sequence: Sequence) -> Surroundings:
