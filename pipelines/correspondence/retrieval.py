@@ -7,7 +7,7 @@ them where there are any.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,14 @@ def describe(features: Features, vocabulary: Vocabulary) -> NDArray[np.float32]:
     if len(features) == 0:
         return np.zeros(len(vocabulary.mean), np.float32)
     return unit(_vlad(features, vocabulary.words) - vocabulary.mean).astype(np.float32)
+
+
+def describe_all(all_features: Iterable[Features], count: int, vocabulary: Vocabulary) -> NDArray[np.float32]:
+    """(count, W * 128) of as many frames, one of which at a time is in memory."""
+    looks = np.empty((count, len(vocabulary.mean)), np.float32)
+    for row, features in zip(looks, all_features, strict=True):
+        row[:] = describe(features, vocabulary)
+    return looks
 
 
 def learn_vocabulary(features: Sequence[Features], seed: int) -> Vocabulary:

@@ -37,16 +37,19 @@ class FoundLoops:
 def find_loops(
     pairs: Iterable[tuple[int, int]],
     views: Sequence[KeyframeView],
+    cam_from_world: Array,
     intrinsics: Intrinsics,
     seed: int,
 ) -> FoundLoops:
-    """Verify candidate pairs of keyframe indices.
+    """Verify candidate pairs of keyframe indices; `views`, which may be made as they are asked for, stand at
+    cam_from_world (N, 4, 4).
 
     A verified pair is still refused when the drift it claims is more than the path between its keyframes can have
     collected, or when no neighbouring pair says the same and it has not many inliers itself: two equal posters on a
     wall match perfectly, but contradict the path between them.
     """
-    path = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(_centres(views), axis=0), axis=1))])
+    centres = se3.inverse(cam_from_world)[:, :3, 3]
+    path = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
     verified: dict[tuple[int, int], Loop] = {}
     tried = implausible = unverified = 0
     for first, second in pairs:
@@ -64,10 +67,6 @@ def find_loops(
         if loop.edge.inliers >= SURE_INLIERS or _has_support(pair, loop, verified, views, intrinsics, seed)
     }
     return FoundLoops(list(supported.values()), tried, unverified, implausible, len(verified) - len(supported))
-
-
-def _centres(views: Sequence[KeyframeView]) -> Array:
-    return se3.inverse(np.array([v.cam_from_world for v in views]))[:, :3, 3]
 
 
 def claimed_drift(loop: Loop, first: KeyframeView, second: KeyframeView) -> tuple[float, float]:

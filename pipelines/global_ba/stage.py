@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.correspondence.retrieval import Looks, unit
+from pipelines.correspondence.retrieval import Looks, describe_all, unit
 from pipelines.depth.fields import DepthFields
 from pipelines.depth.scales import sample_proxy
 from pipelines.gaussian_map import GaussianMap
@@ -35,6 +35,7 @@ from pipelines.run_folder import (
     save_trajectory,
 )
 from pipelines.stages import Stage, StageContext
+from pipelines.streamed import Streamed
 from pipelines.structure.bundle import reprojection_errors
 from pipelines.tracking.adjust import align_depths, without_dependent_depth
 from pipelines.tracking.pictures import Pictures, load_shutter
@@ -48,6 +49,8 @@ DRIFT_PX = 6.0
 """A loop that is off by more pixels starts a pose graph."""
 JOINT_PX = 0.5
 """What counts as moved."""
+_VIEWS_ROOM = 100e6
+"""Bytes of features of keyframes that are kept for the next pair."""
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -55,7 +58,6 @@ def run(context: StageContext) -> dict[str, Any]:
     context = with_rigid_panoramas(context)
     model = context.run.load_sparse("tracking")
     trajectory = context.run.load_trajectory("mapping")
-    gaussian_map = context.run.load_map("mapping", context.device)
     fields = context.run.load_depth_fields("tracking")
     settings = context.config.global_ba
 
@@ -63,6 +65,7 @@ def run(context: StageContext) -> dict[str, Any]:
     is_rig = context.run.load_calibration().directions > 1
     found = search(context, model) if settings.use_loops and not is_rig else FoundLoops([], 0, 0, 0, 0)
     closed = adjust(context, model, found)
+    gaussian_map = context.run.load_map("mapping", context.device)
     moved_px = 0.0
     if closed is not None:
         before = poses_of(trajectory, model.frame_ids)
@@ -85,9 +88,10 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
         return load_found(snapshot)
     run, settings, seed = context.run, context.config.global_ba, context.config.run.seed
     pictures = Pictures(run, context.config.frames)
-    views = load_keyframe_views(context, model, pictures)
+    views = keyframe_views(context, model, pictures)
     ids = model.frame_ids.tolist()
-    kinds = [np.stack([pictures.descriptor(i) for i in ids])]
+    all_features = map(pictures.features, context.progress.track(ids, "features", len(ids)))
+    kinds = [describe_all(all_features, len(ids), pictures.vocabulary)]
     learned = run.load_descriptors()
     if all(i in learned for i in ids):  # the article's DINOSim counts half
         seen = np.stack([learned[i] for i in ids])
@@ -95,26 +99,28 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
     refused = {pair for pair, matches in run.load_tried().items() if matches == 0}
     pairs = loop_candidates(model, Looks(tuple(kinds)), load_summaries(run, model), refused, settings)
     tracked = context.progress.track(pairs, "loops", len(pairs))
-    found = find_loops(tracked, views, run.load_calibration().intrinsics, seed)
+    found = find_loops(tracked, views, model.cam_from_world, run.load_calibration().intrinsics, seed)
     save_found(snapshot, found)
     return found
 
 
-def load_keyframe_views(context: StageContext, model: SparseModel, pictures: Pictures) -> list[KeyframeView]:
-    """Features of every keyframe, with what is known of their depth."""
+def keyframe_views(context: StageContext, model: SparseModel, pictures: Pictures) -> Streamed[KeyframeView]:
+    """Features of every keyframe, with what is known of their depth; those asked for last are kept."""
     run = context.run
     intrinsics = run.load_calibration().intrinsics
     fields = run.load_depth_fields("tracking")
     state = TrackState.from_backbone(model, 1.0)
-    views = []
-    for k, frame_id in enumerate(context.progress.track(model.frame_ids.tolist(), "features", len(model.frame_ids))):
+
+    def load(k: int) -> KeyframeView:
+        frame_id = int(model.frame_ids[k])
         features = pictures.features(frame_id)
         depth = np.zeros(len(features.xy))
         if run.has_proxy(frame_id):
             depth, _ = sample_proxy(fields.in_world(frame_id, run.load_proxy(frame_id)), features.xy, intrinsics)
         pose, seen = model.cam_from_world[k], state.sightings[frame_id]
-        views.append(make_view(frame_id, pose, features, seen, model.points_in_world, depth, intrinsics))
-    return views
+        return make_view(frame_id, pose, features, seen, model.points_in_world, depth, intrinsics)
+
+    return Streamed(len(model.frame_ids), load, lambda view: view.features.nbytes, _VIEWS_ROOM)
 
 
 def load_summaries(run: RunFolder, model: SparseModel) -> list[LabelSummary]:

@@ -148,10 +148,11 @@ def _only(fields: DepthFields, frame_ids: NDArray[np.int64]) -> DepthFields:
 
 def all_together(tasks: Sequence[SubmapTask], kind: str) -> tuple[OptimisedMap, NDArray[np.int64]]:
     """The whole map with all keyframes in order, and their ids."""
-    results = [task.load(kind, task.number) for task in tasks]
+    results = [task.load(kind, task.number).without_map for task in tasks]
     ids, poses, (gains, offsets) = in_order(results)
     steps = sum(int(r.steps.sum()) for r in results)
-    return OptimisedMap(together([r.gaussian_map for r in results]), poses, gains, offsets, steps), ids
+    whole = together(task.load(kind, task.number).gaussian_map for task in tasks)
+    return OptimisedMap(whole, poses, gains, offsets, steps), ids
 
 
 def measure(

@@ -38,10 +38,11 @@ from pipelines.types import Intrinsics, Trajectory
 
 MADE, JOINED, REFINED, AGREED = "made", "joined", "refined", "agreed"
 _ARRAYS = ("frame_ids", "cam_from_world", "log_gains", "offsets", "depths", "steps", "rows", "weights")
-REFINING_PASSES, REFINING_RATE = 5.0, 0.9
-"""Visits of each view once the maps are joined, and the learning rates of the first of them, which are higher the more
-submaps agree on a mean of what they say. Chosen on one walk through a kitchen in thirds (made whole 27.5 dB): 2 visits
-from 0.3 26.9, from 0.9 27.0; 4 from 0.9 27.2, 5 27.3. Seen on another kitchen and on one made-up walk."""
+REFINING_SHARE, REFINING_RATE = 5 / 9, 0.9
+"""Visits of each view once the maps are joined, as a share of those that made them, and the learning rates of the first
+of them, which are higher the more submaps agree on a mean of what they say. Chosen on one walk through a kitchen in
+thirds (made whole 27.5 dB, 9 visits): 2 visits from 0.3 26.9, from 0.9 27.0; 4 from 0.9 27.2, 5 27.3. Seen on another
+kitchen and on one made-up walk."""
 _DEPTH_SIDE = 160
 """Pixels on the long side of the depths by which Gaussians are given to views."""
 
@@ -50,7 +51,7 @@ _DEPTH_SIDE = 160
 class SubmapTask:
     """What it takes to work on submap `number`: `trajectory` holds its views (to measure it: its own keyframes, and
     what is held out), `exposure` theirs, `fields` brings their depths into the world, `files` is the folder of all
-    submaps' results; `passes` of the refinement; `measured`: kind of result."""
+    submaps' results; `passes` of the refinement where they are not a share of making's; `measured`: kind of result."""
 
     run: RunFolder
     config: Config
@@ -62,7 +63,7 @@ class SubmapTask:
     class_ids: tuple[int, ...]
     camera: Intrinsics
     exposure: Exposures | None = None
-    passes: float = REFINING_PASSES
+    passes: float | None = None
     measured: str = AGREED
 
     @property
@@ -117,6 +118,11 @@ class SubmapResult:
     steps: NDArray[np.int64]
     rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     weights: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+
+    @property
+    def without_map(self) -> SubmapResult:
+        """The same with no Gaussian."""
+        return replace(self, gaussian_map=self.gaussian_map.only(torch.arange(0)))
 
 
 def make_submap(task: SubmapTask, progress: Progress) -> None:
@@ -228,7 +234,8 @@ def _optimise(
 ) -> OptimisedMap:  # fmt: skip
     """From a snapshot where there is one, which goes when the result is written."""
     settings, seed = replace(task.config.mapping, hold_out=0), task.config.run.seed
-    passes, rate = (None, 1.0) if initial is None else (task.passes, REFINING_RATE)
+    visits = REFINING_SHARE * settings.passes if task.passes is None else task.passes
+    passes, rate = (None, 1.0) if initial is None else (visits, REFINING_RATE)
     return optimise_map(
         given.views, len(task.class_ids), settings, seed, initial, passes,
         progress=progress, snapshot=task.file(f"{kind}_state"), label=f"submap {task.number + 1}, {kind}",
@@ -279,6 +286,7 @@ def _pixels(gaussian_map: GaussianMap, views: Iterable[View]) -> Tensor:
     return filled
 
 
-def together(maps: Sequence[GaussianMap]) -> GaussianMap:
-    """One map of all."""
-    return GaussianMap(**{name: torch.cat([getattr(m, name) for m in maps]) for name in vars(maps[0])})
+def together(maps: Iterable[GaussianMap]) -> GaussianMap:
+    """One map of all, which are not held longer than they are needed where nobody else does."""
+    parts = [dict(vars(m)) for m in maps]
+    return GaussianMap(**{name: torch.cat([part.pop(name) for part in parts]) for name in list(parts[0])})

@@ -21,7 +21,7 @@ from pipelines.correspondence.database import write_database
 from pipelines.correspondence.matching import VerifiedPair, match_pair
 from pipelines.correspondence.retrieval import (
     Looks,
-    describe,
+    describe_all,
     far_apart,
     learn_vocabulary,
     loop_pairs,
@@ -299,9 +299,7 @@ class StructureFromMotion:
         return features
 
     def _proposed(self, features: Streamed[Features], vocabulary: Vocabulary) -> list[tuple[int, int]]:
-        looks, places = np.empty((len(features), len(vocabulary.mean)), np.float32), self._places(features)
-        for row, f in zip(looks, features, strict=True):
-            row[:] = describe(f, vocabulary)
+        looks, places = describe_all(features, len(features), vocabulary), self._places(features)
         allowed = far_apart(len(features), self.config.overlap + 1, places)
         loops = loop_pairs(Looks((looks,)), allowed, self.config.loop_candidates)
         following = sequential_pairs(places, self.config.overlap)

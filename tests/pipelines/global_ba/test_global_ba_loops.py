@@ -50,7 +50,7 @@ class Walk:
         return loop_candidates(self.model, looks, nothing, refused, SETTINGS)
 
     def find(self) -> FoundLoops:
-        return find_loops(self.pairs(), self.views(), CAMERA, 0)
+        return find_loops(self.pairs(), self.views(), self.model.cam_from_world, CAMERA, 0)
 
 
 def circle_poses(count: int, laps: float) -> Array:
@@ -173,7 +173,7 @@ def test_equal_texture_on_the_far_side_is_no_loop() -> None:
     trap = verify_loop(views[2], views[20], CAMERA, 0)
     assert trap is not None
     assert trap.edge.inliers > 50
-    found = find_loops([(2, 20), (3, 21), (4, 22), (2, 37), (3, 38)], views, CAMERA, 0)
+    found = find_loops([(2, 20), (3, 21), (4, 22), (2, 37), (3, 38)], views, walk.model.cam_from_world, CAMERA, 0)
     assert found.implausible == 3
     assert {(x.edge.frame1_id, x.edge.frame2_id) for x in found.loops} == {(2, 37), (3, 38)}
 
@@ -181,10 +181,10 @@ def test_equal_texture_on_the_far_side_is_no_loop() -> None:
 def test_a_weak_loop_needs_a_neighbour_that_agrees(monkeypatch: pytest.MonkeyPatch) -> None:
     walk = make_walk()
     monkeypatch.setattr(loops, "SURE_INLIERS", 10**6)
-    assert len(find_loops([(2, 37)], walk.views(), CAMERA, 0).loops) == 1
+    assert len(find_loops([(2, 37)], walk.views(), walk.model.cam_from_world, CAMERA, 0).loops) == 1
     monkeypatch.setattr(loops, "ROTATION", 1e-4)
     monkeypatch.setattr(loops, "TRANSLATION", 1e-5)
-    found = find_loops([(2, 37)], walk.views(), CAMERA, 0)
+    found = find_loops([(2, 37)], walk.views(), walk.model.cam_from_world, CAMERA, 0)
     assert (len(found.loops), found.unsupported) == (0, 1)
 
 
