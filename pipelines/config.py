@@ -42,7 +42,7 @@ class RunConfig:
     format: str = setting("auto", "layout of the source: a data set's; images = a video or plain images; auto looks")
     device: str = setting("auto", "where dense work runs; auto takes a GPU if there is one", ("auto", "cpu", "cuda"))
     memory_mb: int = setting(
-        0, "plan with this much memory; less makes long recordings slower, nothing else. 0 = half of the machine's",
+        0, "plan with this much memory: given, long recordings are made in parts that fit. 0 = half of the machine's",
         within=(100, 10_000_000), or_zero=True,
     )  # fmt: skip
     cache_mb: int = setting(
@@ -152,7 +152,7 @@ class MappingConfig:
     snapshot_every: int = setting(150, "steps between two snapshots", within=(1, 1_000_000))
     max_gaussians: int = setting(1000000, "the map, or each submap, grows to this many", within=(100, 50_000_000))
     submap: int = setting(
-        250, "more keyframes are mapped in overlapping parts of about this many, joined at the end; 0 = never",
+        250, "more keyframes, or than run.memory_mb has room for, are mapped in overlapping parts of so many. 0: never",
         within=(4, 1_000_000), or_zero=True,
     )  # fmt: skip
     depth_weight: float = setting(4.8, "λ_D of eq. (18); 0 = no depth loss", within=(0, 1000))

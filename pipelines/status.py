@@ -7,21 +7,13 @@ from typing import Any
 
 from formats.errors import InputError
 from pipelines.config import Config
+from pipelines.memory import GAUSSIANS, NEEDS, submap_size
 from pipelines.records import StageRecord, differing_settings, load_records, load_source
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
 from pipelines.settings_file import load_settings
 from pipelines.streamed import memory_room
 
-_GAUSSIANS = 22_000
-"""A map has about so many for each keyframe and million pixels of it."""
-_NEEDS = {
-    "frames": (380, 640, 1.7, 0), "proxy": (405, 730, 1.8, 0), "tracking": (460, 450, 1.9, 0),
-    "mapping": (445, 350, 0, 1970), "global_ba": (490, 450, 0, 500), "export": (510, 610, 0, 1310),
-}  # fmt: skip
-"""MB that a stage needs at its peak: at least, for each million pixels of a frame, each keyframe, each million
-Gaussians. Fitted to the peaks of 63 runs of 10 to 219 keyframes and 0.01 to 0.7 million pixels: half of them lie within
-15 % (global_ba 26), nine of ten within 40 %."""
 _AT_ONCE, _BEYOND = {"frames": 500, "tracking": 400}, 0.3
 """Keyframes that these stages have in work at any time, and MB for each of the others: walks of 115 to 2,272."""
 DONE, DAMAGED, INTERRUPTED, OUTDATED, NOT_YET = "done", "damaged", "interrupted", "outdated", "not yet"
@@ -124,9 +116,9 @@ def expected_mb(stage: str, run: RunFolder, config: Config) -> float | None:
     except InputError:  # damaged, which is told elsewhere
         return None
     keyframes, small = int(found.get("keyframes", found["frames"])), camera.at_most(config.mapping.max_side)
-    parts = submap_count(keyframes, config.mapping.submap)
-    of_part = min(_GAUSSIANS * keyframes / parts * small.width * small.height / 1e6, config.mapping.max_gaussians)
-    least, a_million_pixels, a_keyframe, a_million_gaussians = _NEEDS[stage]
+    parts = submap_count(keyframes, submap_size(config, camera))
+    of_part = min(GAUSSIANS * keyframes / parts * small.width * small.height / 1e6, config.mapping.max_gaussians)
+    least, a_million_pixels, a_keyframe, a_million_gaussians = NEEDS[stage]
     gaussians = of_part * (1 if stage == "mapping" else parts) / 1e6
     pixels = camera.width * camera.height / 1e6
     inside = min(keyframes, _AT_ONCE.get(stage, keyframes))

@@ -30,6 +30,7 @@ from pipelines.mapping.submap_tasks import (
     together,
 )
 from pipelines.mapping.submaps import Submap, divide
+from pipelines.memory import submap_size
 from pipelines.run_folder import RunFolder
 from pipelines.stages import StageContext
 from pipelines.types import Trajectory
@@ -52,10 +53,11 @@ class Mapped:
 
 def map_divided(context: StageContext, trajectory: Trajectory, class_ids: tuple[int, ...]) -> Mapped:
     """Every submap made, joined, refined, agreed upon and measured: each kind of work once the one before is done."""
-    run, settings = context.run, context.config.mapping
-    kept, _ = split_frames(trajectory, settings.hold_out)
+    run = context.run
+    kept, _ = split_frames(trajectory, context.config.mapping.hold_out)
     fields = run.load_depth_fields("tracking")
-    submaps = divide(np.array(kept), overlaps(_depths(run, trajectory, fields, kept)), settings.submap)
+    size = submap_size(context.config, run.load_calibration().intrinsics)
+    submaps = divide(np.array(kept), overlaps(_depths(run, trajectory, fields, kept)), size)
     tasks = submap_tasks(context, submaps, trajectory, fields, class_ids)
     for work in (make_submap, join_submap, refine_submap, agree_submap):
         context.each(work, tasks)
@@ -106,7 +108,8 @@ def submap_tasks(
     class_ids: tuple[int, ...],
 ) -> list[SubmapTask]:
     """One for each submap, of its own and bordering keyframes."""
-    files, camera = context.snapshot / "submaps", context.run.load_calibration().intrinsics
+    # Parts of another size, as of a run that goes on with other memory, are others.
+    files, camera = context.snapshot / f"submaps_{len(submaps)}", context.run.load_calibration().intrinsics
     return [
         SubmapTask(
             context.run, context.config, files, number, submap, rows_of(trajectory, submap.views),

@@ -15,13 +15,11 @@ from pipelines.depth.fields import DepthFields
 from pipelines.depth.see_through import contradicted
 from pipelines.mapping.article.mirrors import Mirrors
 from pipelines.mapping.views import View, make_view, occurring_classes
+from pipelines.memory import VIEWS_SHARE
 from pipelines.run_folder import RunFolder
 from pipelines.stages import StageContext
 from pipelines.streamed import Streamed
 from pipelines.types import Frame, Intrinsics, ProxyMaps, Trajectory
-
-VIEWS_SHARE = 0.25
-"""Of the memory that there is: as much again takes the map with its optimiser, and half of it the program itself."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from pipelines.mapping.optimise import OptimisedMap, optimise_map
 from pipelines.mapping.poses import interpolate_rows, move_trajectory
 from pipelines.mapping.submaps import submap_count
 from pipelines.mapping.views import View
+from pipelines.memory import submap_size
 from pipelines.run_folder import save_exposure, save_figures, save_map, save_trajectory
 from pipelines.stages import Stage, StageContext
 from pipelines.types import Trajectory
@@ -26,7 +27,8 @@ def run(context: StageContext) -> dict[str, Any]:
     trajectory = context.run.load_trajectory("tracking")
     kept, _ = split_frames(trajectory, context.config.mapping.hold_out)
     class_ids = _require_views(context, kept)
-    divided = submap_count(len(kept), context.config.mapping.submap) > 1
+    size = submap_size(context.config, context.run.load_calibration().intrinsics)
+    divided = submap_count(len(kept), size) > 1
     mapped = (map_divided if divided else map_whole)(context, trajectory, class_ids)
     result, ids = mapped.result, mapped.keyframe_ids
     save_map(context.folder, result.gaussian_map)

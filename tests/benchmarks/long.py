@@ -6,8 +6,9 @@
     python tests/benchmarks/long.py --work RUNS --fps 10 --size 640x480 --focal 0.6 --set mapping.passes=5
 
 The walk leads through a building of rooms and corridors that is made as it is read (`tests/world/building.py`): exact
-poses, depth and classes. Every stage runs in a process of its own, so that its peak of memory is its own. What lies
-finished in RUNS is not done again, so that a longer walk can be added to a table later.
+poses, depth and classes. Every stage runs in a process of its own, so that its peak of memory is its own, and its CPU
+seconds, which a crowded machine changes least. What lies finished in RUNS is not done again, so that a longer walk can
+be added to a table later.
 """
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import resource
 import subprocess
 import sys
 from dataclasses import asdict
@@ -52,6 +54,12 @@ def msgs_slam(*arguments: object) -> None:
     subprocess.run([sys.executable, "-m", "msgs_cli.main", *map(str, arguments)], check=True, stdout=sys.stderr)
 
 
+def cpu_seconds() -> float:
+    """Of all processes that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 def run_walk(name: str, work: Path, camera: dict[str, Any], settings: list[str]) -> dict[str, Any]:
     """One row: the walk made, reconstructed stage by stage, evaluated."""
     seconds, _, turns = name.partition("x")
@@ -60,7 +68,10 @@ def run_walk(name: str, work: Path, camera: dict[str, Any], settings: list[str])
     run = folder / "video.msgs"
     chosen = [part for setting in settings for part in ("--set", setting)]
     for stage in STAGES:
+        before, cpu = cpu_seconds(), run.with_suffix(f".{stage}.cpu")
         msgs_slam("reconstruct", video, "--out", run, "--until", stage, "-q", *chosen)
+        if not cpu.exists():
+            cpu.write_text(f"{cpu_seconds() - before:.2f}")
     if not (run / "evaluation" / "evaluation.json").exists():
         msgs_slam("evaluate", run, "--truth", truth, "-q")
     return row_of(name, run, truth)
@@ -82,6 +93,9 @@ def row_of(name: str, run: Path, truth: Path) -> dict[str, Any]:
         "posed": stages["tracking"]["figures"]["posed"],
         "keyframes": keyframes,
         "seconds_a_keyframe": {s: round(stages[s]["seconds"] / keyframes, 3) for s in STAGES},
+        "cpu_seconds_a_keyframe": {
+            s: round(float(run.with_suffix(f".{s}.cpu").read_text()) / keyframes, 3) for s in STAGES
+        },
         "peak_mb": {s: round(stages[s]["peak_memory_mb"]) for s in STAGES},
         "run_mb": round(sum(f.stat().st_size for f in run.rglob("*") if f.is_file()) / 1e6, 1),
         "ate_cm": None if ate is None else round(100 * ate, 2),
@@ -94,14 +108,15 @@ def row_of(name: str, run: Path, truth: Path) -> dict[str, Any]:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown: one row a walk, then seconds a keyframe and peak memory of every stage."""
-    plain = [k for k in rows[0] if k not in ("seconds_a_keyframe", "peak_mb")]
+    by_stage = ("seconds_a_keyframe", "cpu_seconds_a_keyframe", "peak_mb")
+    plain = [k for k in rows[0] if k not in by_stage]
     lines = ["| " + " | ".join(plain) + " |", "|" + " --- |" * len(plain)]
     lines += ["| " + " | ".join(str(row[k]) for k in plain) + " |" for row in rows]
-    for key in ("seconds_a_keyframe", "peak_mb"):
+    for key in by_stage:
         lines += ["", f"| {key} | " + " | ".join(STAGES) + " | all |", "|" + " --- |" * (len(STAGES) + 2)]
         for row in rows:
             values = row[key].values()
-            together = round(sum(values), 3) if key == "seconds_a_keyframe" else max(values)
+            together = max(values) if key == "peak_mb" else round(sum(values), 3)
             lines.append(f"| {row['walk']} | " + " | ".join(map(str, [*values, together])) + " |")
     return "\n".join(lines)
 

@@ -24,6 +24,7 @@ from pipelines.mapping import submaps
 from pipelines.mapping.divided import refine_divided
 from pipelines.mapping.gauge import SeenExposures, common_exposure
 from pipelines.mapping.submaps import BORDER, divide, nearest_seeing
+from pipelines.memory import LEAST_SUBMAP, submap_size
 from pipelines.outcome import load_outcome
 from pipelines.progress import SilentProgress
 from pipelines.run_folder import RunFolder
@@ -55,6 +56,17 @@ def test_a_walk_is_cut_where_it_shares_least() -> None:
     assert second.beside == (0,)
     assert len(first.border) == BORDER
     assert set(first.border) <= set(second.own)
+
+
+def test_submaps_are_as_large_as_the_memory_that_is_given_allows() -> None:
+    camera = Intrinsics(500.0, 500.0, 320.0, 240.0, 640, 480)
+
+    def size(memory_mb: int, most: int = 250) -> int:
+        return submap_size(Config(run=RunConfig(memory_mb=memory_mb), mapping=MappingConfig(submap=most)), camera)
+
+    assert size(0) == 250  # the same on every machine
+    assert LEAST_SUBMAP < size(2000) < size(3000) < 250
+    assert (size(100), size(100_000), size(100, most=0), size(100, most=20)) == (LEAST_SUBMAP, 250, 0, 20)
 
 
 def test_what_is_seen_again_stays_together() -> None:
@@ -165,7 +177,7 @@ def test_broken_off_anywhere_it_ends_with_the_same_bytes(
 
 def test_what_several_submaps_show_is_the_mean_of_what_they_say(divided: tuple[Path, dict]) -> None:
     """Weighed by the pixels that each Gaussian fills in their views; none is lost, and colours do come to differ."""
-    files = divided[0] / "snapshot" / "submaps"
+    files = divided[0] / "snapshot" / "submaps_3"
     joined, agreed = (load_tensors(files / f"{kind}_0000.safetensors") for kind in ("joined", "agreed"))
     total, mean, told = torch.zeros(len(joined["means"])), torch.zeros_like(joined["colors"]), []
     for path in sorted(files.glob("refined_*.safetensors")):
