@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 from formats.errors import InputError
 from formats.gaussian_ply import SH_C0
 from formats.gaussians import GaussianCloud, unit_quaternions
-from formats.glb import glb_parts, write_glb
+from formats.glb import FLOAT, WIDTHS, Part, glb_parts, write_primitive
 from formats.reading import parsing, read_bytes
 
 EXTENSION = "KHR_gaussian_splatting"
-_BYTE, _FLOAT = 5121, 5126
-_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _LABEL = "_LABEL"
 # glTF's y is up and its z comes towards the viewer; splats have x right, y down, z forward.
 _FLIP = np.array([1, -1, -1], dtype=np.float32)
@@ -49,43 +47,12 @@ def write_gaussian_glb(path: Path, cloud: GaussianCloud, class_names: tuple[str,
     }
     if cloud.class_ids is not None:
         arrays[_LABEL] = cloud.class_ids.astype(np.float32)
-    chunks = [np.ascontiguousarray(a, "<u1" if a.dtype == np.uint8 else "<f4") for a in arrays.values()]
-    write_glb(path, _document(arrays, chunks, class_names), chunks)
-
-
-def _document(
-    arrays: dict[str, NDArray[Any]], chunks: list[NDArray[Any]], class_names: tuple[str, ...]
-) -> dict[str, Any]:
-    starts = np.cumsum([0, *(c.nbytes for c in chunks)]).tolist()
-    accessors: list[dict[str, Any]] = []
-    for i, (name, array) in enumerate(arrays.items()):
-        kind = next(k for k, w in _WIDTHS.items() if w == (1 if array.ndim == 1 else array.shape[1]))
-        accessor = {"bufferView": i, "componentType": _FLOAT, "count": len(array), "type": kind}
-        if array.dtype == np.uint8:
-            accessor |= {"componentType": _BYTE, "normalized": True}
-        if name == "POSITION":
-            accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
-        accessors.append(accessor)
+    parts = [
+        Part.of(name, array, **({"normalized": True} if name == "COLOR_0" else {})) for name, array in arrays.items()
+    ]
     properties = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    primitive = {
-        "attributes": {name: i for i, name in enumerate(arrays)},
-        "mode": 0,
-        "extensions": {EXTENSION: properties},
-    }
-    return {
-        "asset": {"version": "2.0", "generator": "msgs-slam"},
-        "extensionsUsed": [EXTENSION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive], "extras": {"classes": list(class_names)}}],
-        "accessors": accessors,
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": s, "byteLength": c.nbytes, "target": 34962}
-            for s, c in zip(starts, chunks, strict=False)
-        ],
-        "buffers": [{"byteLength": starts[-1]}],
-    }
+    primitive = {"mode": 0, "extensions": {EXTENSION: properties}}
+    write_primitive(path, parts, primitive, class_names, {}, extensions=[EXTENSION])
 
 
 def read_gaussian_glb(path: Path) -> GaussianCloud:
@@ -107,10 +74,10 @@ def read_gaussian_glb(path: Path) -> GaussianCloud:
 
 def _accessor(document: dict[str, Any], binary: bytes, index: int) -> NDArray[np.float32]:
     accessor = document["accessors"][index]
-    if accessor["componentType"] != _FLOAT or "sparse" in accessor:
+    if accessor["componentType"] != FLOAT or "sparse" in accessor:
         raise ValueError("an attribute is packed")
     view = document["bufferViews"][accessor["bufferView"]]
-    width, count = _WIDTHS[accessor["type"]], int(accessor["count"])
+    width, count = WIDTHS[accessor["type"]], int(accessor["count"])
     if view.get("byteStride", 4 * width) != 4 * width:
         raise ValueError("its attributes are interleaved")
     start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))

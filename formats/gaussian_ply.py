@@ -13,7 +13,7 @@ from plyfile import PlyData
 
 from formats.errors import InputError
 from formats.gaussians import GaussianCloud, unit_quaternions
-from formats.ply_table import columns, read_ply, write_ply
+from formats.ply_table import Rows, columns, read_ply, slices, write_ply
 from formats.reading import parsing
 
 SH_C0 = 0.28209479177387814
@@ -47,17 +47,23 @@ def write_gaussian_ply(
         dtype.append(("class_id", "u1"))
     occurring = [] if cloud.class_probs is None else np.flatnonzero((cloud.class_probs != 0).any(axis=0)).tolist()
     dtype += [(f"{_PROB}{i}", "<f4") for i in occurring]
-    vertex = np.zeros(len(cloud), dtype=dtype)
-    _fill(vertex, _MEANS, cloud.means)
-    _fill(vertex, _DC, (cloud.colors - np.float32(0.5)) / np.float32(SH_C0))
-    _fill(vertex, ["opacity"], cloud.opacity_logits[:, None])
-    _fill(vertex, _SCALES, cloud.log_scales)
-    _fill(vertex, _ROTATION, cloud.quat_wxyz)
+    blocks = (_rows(cloud, rows, np.dtype(dtype), occurring) for rows in slices(len(cloud)))
+    comments = [f"class {i} {name}" for i, name in enumerate(class_names)]
+    write_ply(path, {"vertex": Rows(np.dtype(dtype), len(cloud), blocks)}, comments)
+
+
+def _rows(cloud: GaussianCloud, rows: slice, dtype: np.dtype, occurring: list[int]) -> NDArray[Any]:
+    vertex = np.zeros(rows.stop - rows.start, dtype=dtype)
+    _fill(vertex, _MEANS, cloud.means[rows])
+    _fill(vertex, _DC, (cloud.colors[rows] - np.float32(0.5)) / np.float32(SH_C0))
+    _fill(vertex, ["opacity"], cloud.opacity_logits[rows, None])
+    _fill(vertex, _SCALES, cloud.log_scales[rows])
+    _fill(vertex, _ROTATION, cloud.quat_wxyz[rows])
     if cloud.class_ids is not None:
-        vertex["class_id"] = cloud.class_ids
+        vertex["class_id"] = cloud.class_ids[rows]
     if cloud.class_probs is not None:
-        _fill(vertex, [f"{_PROB}{i}" for i in occurring], cloud.class_probs[:, occurring])
-    write_ply(path, {"vertex": vertex}, [f"class {i} {name}" for i, name in enumerate(class_names)])
+        _fill(vertex, [f"{_PROB}{i}" for i in occurring], cloud.class_probs[rows][:, occurring])
+    return vertex
 
 
 def read_gaussian_ply(path: Path) -> GaussianCloud:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,14 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
-from formats.glb import write_glb
-from formats.ply_table import columns, read_ply, write_ply
+from formats.glb import Part, write_primitive
+from formats.ply_table import Rows, columns, read_ply, read_rows, write_ply
 from formats.reading import parsing, read_bytes
 from formats.trajectory import FARTHEST
 
 _LABEL_ATTRIBUTE = "_LABEL"
 _MAX_GLB_BYTES = 4 * 1024**3
-_BYTE, _UNSIGNED, _FLOAT = 5121, 5125, 5126
+_PLACE, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
+_VERTEX = np.dtype([*((n, "<f4") for n in _PLACE), *((n, "u1") for n in (*_COLOR, "label"))])
+_FACE = np.dtype([("vertex_indices", "<i4", (3,))])
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,31 +46,59 @@ class MeshArrays:
             raise ValueError("MeshArrays: a vertex is not finite, or too far away")
 
 
-def write_mesh_ply(
-    path: Path,
-    vertices: NDArray[np.float32],
-    faces: NDArray[np.int32],
-    colors: NDArray[np.uint8],
-    labels: NDArray[np.uint8],
-    class_names: tuple[str, ...] = (),
-) -> None:
+@dataclass(frozen=True)
+class MeshBlocks:
+    """A mesh of which only a part is in memory at a time. `vertices` and `faces` go over it anew whenever they are
+    called: blocks of positions (n, 3) float32, colors (n, 3) uint8, labels (n,) uint8; and of faces (n, 3) int32."""
+
+    vertex_count: int
+    face_count: int
+    vertices: Callable[[], Iterable[tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]]]
+    faces: Callable[[], Iterable[NDArray[np.int32]]]
+
+
+def write_mesh_ply(path: Path, mesh: MeshBlocks, class_names: tuple[str, ...] = ()) -> None:
     """Write a binary PLY with x y z, red green blue and the extra property label (uchar) at each vertex.
 
-    vertices (V, 3), faces (F, 3), colors (V, 3) uint8, labels (V,) uint8; class names go to comments. Raises
-    ValueError for other shapes, InputError when the disk refuses.
+    Class names go to comments. Raises ValueError for blocks that do not fit, InputError when the disk refuses.
     """
-    mesh = MeshArrays(vertices, faces, colors, labels)
-    fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("label", "u1")]
-    vertex = np.empty(len(vertices), dtype=fields)
-    for i, name in enumerate(("x", "y", "z")):
-        vertex[name] = mesh.vertices[:, i]
-    for i, name in enumerate(("red", "green", "blue")):
-        vertex[name] = mesh.colors[:, i]
-    vertex["label"] = mesh.labels
-    face = np.empty(len(faces), dtype=[("vertex_indices", "<i4", (3,))])
-    face["vertex_indices"] = mesh.faces
-    comments = [f"class {i} {name}" for i, name in enumerate(class_names)]
-    write_ply(path, {"vertex": vertex, "face": face}, comments)
+    count, no_faces = mesh.vertex_count, np.zeros((0, 3), np.int32)
+    vertices = (_vertex_rows(MeshArrays(points, no_faces, *rest)) for points, *rest in mesh.vertices())
+    elements = {
+        "vertex": Rows(_VERTEX, count, vertices),
+        "face": Rows(_FACE, mesh.face_count, (_face_rows(faces, count) for faces in mesh.faces())),
+    }
+    write_ply(path, elements, [f"class {i} {name}" for i, name in enumerate(class_names)])
+
+
+def _vertex_rows(mesh: MeshArrays) -> NDArray[Any]:
+    rows = np.empty(len(mesh.vertices), _VERTEX)
+    for names, values in ((_PLACE, mesh.vertices), (_COLOR, mesh.colors)):
+        for i, name in enumerate(names):
+            rows[name] = values[:, i]
+    rows["label"] = mesh.labels
+    return rows
+
+
+def _face_rows(faces: NDArray[np.int32], count: int) -> NDArray[Any]:
+    if faces.shape[1:] != (3,) or (len(faces) and not 0 <= faces.min() <= faces.max() < count):
+        raise ValueError(f"MeshBlocks: a face is no triangle, or points outside the {count} vertices")
+    rows = np.empty(len(faces), _FACE)
+    rows["vertex_indices"] = faces
+    return rows
+
+
+def mesh_blocks(path: Path) -> MeshBlocks:
+    """The mesh of a PLY by `write_mesh_ply`. Raises InputError for another file."""
+    listed = np.dtype([("length", "u1"), *_FACE.descr])
+    vertex, face = read_rows(path, {"vertex": _VERTEX, "face": listed}).values()
+
+    def vertices() -> Iterator[tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]]:
+        for rows in vertex.blocks:
+            points, colors = (np.stack([rows[n] for n in names], 1) for names in (_PLACE, _COLOR))
+            yield points, colors, rows["label"]
+
+    return MeshBlocks(vertex.count, face.count, vertices, lambda: (rows["vertex_indices"] for rows in face.blocks))
 
 
 def read_mesh_ply(path: Path) -> MeshArrays:
@@ -97,47 +128,30 @@ def read_mesh_ply(path: Path) -> MeshArrays:
 
 
 def write_mesh_glb(
-    path: Path,
-    vertices: NDArray[np.float32],
-    faces: NDArray[np.int32],
-    colors: NDArray[np.uint8],
-    labels: NDArray[np.uint8],
-    class_names: tuple[str, ...] = (),
+    path: Path, mesh: MeshBlocks, class_names: tuple[str, ...] = (), gltf_from_world: NDArray[np.float64] | None = None
 ) -> None:
     """Write a GLB with vertex colours, the labels as vertex attribute _LABEL, class names in the mesh's extras.
 
-    Arguments and errors as `write_mesh_ply`. glTF wants y up: the caller turns the vertices.
+    gltf_from_world (3, 3) turns the vertices: glTF wants y up. Errors as `write_mesh_ply`, ValueError for no faces.
     """
-    mesh = MeshArrays(vertices, faces, colors, labels)
-    if not len(mesh.faces):
+    if not mesh.face_count:
         raise ValueError("write_mesh_glb: glTF has no way to store a mesh without faces")
-    opaque = np.column_stack([mesh.colors, np.full(len(mesh.colors), 255, dtype=np.uint8)])
-    low, high = mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()
-    parts: list[tuple[str, NDArray[Any], int, dict[str, Any]]] = [
-        ("POSITION", mesh.vertices.astype("<f4", copy=False), _FLOAT, {"type": "VEC3", "min": low, "max": high}),
-        ("COLOR_0", opaque, _BYTE, {"type": "VEC4", "normalized": True}),
+    turn = np.eye(3) if gltf_from_world is None else gltf_from_world.T
+
+    def positions() -> Iterator[NDArray[np.float32]]:
+        return ((points @ turn).astype(np.float32) for points, _, _ in mesh.vertices() if len(points))
+
+    ends = np.array([(points.min(0), points.max(0)) for points in positions()])
+    box = {"min": ends[:, 0].min(0).tolist(), "max": ends[:, 1].max(0).tolist()}
+    colors = (np.insert(colors, 3, 255, axis=1) for _, colors, _ in mesh.vertices())
+    parts = [
+        Part("POSITION", mesh.vertex_count, 3, "<f4", positions(), box),
+        Part("COLOR_0", mesh.vertex_count, 4, "|u1", colors, {"normalized": True}),
         # glTF wants every vertex at a multiple of 4 bytes: a float per label instead of a byte
-        (_LABEL_ATTRIBUTE, mesh.labels.astype("<f4"), _FLOAT, {"type": "SCALAR"}),
-        ("", mesh.faces.astype("<u4", copy=False), _UNSIGNED, {"type": "SCALAR"}),
+        Part(_LABEL_ATTRIBUTE, mesh.vertex_count, 1, "<f4", (labels for _, _, labels in mesh.vertices())),
+        Part("", 3 * mesh.face_count, 1, "<u4", mesh.faces()),
     ]
-    views, accessors, start = [], [], 0
-    for i, (name, array, kind, more) in enumerate(parts):
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": 34962 if name else 34963})
-        count = len(array) if name else array.size
-        accessors.append({"bufferView": i, "componentType": kind, "count": count} | more)
-        start += array.nbytes
-    primitive = {"attributes": {name: i for i, (name, *_) in enumerate(parts) if name}, "indices": 3, "mode": 4}
-    document = {
-        "asset": {"version": "2.0", "generator": "msgs-slam"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "mesh"}],
-        "meshes": [{"primitives": [primitive], "name": "mesh", "extras": {"classes": list(class_names)}}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": start}],
-    }
-    write_glb(path, document, [array for _, array, *_ in parts])
+    write_primitive(path, parts, {"mode": 4}, class_names, {"name": "mesh"})
 
 
 def read_mesh_glb(path: Path) -> MeshArrays:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,19 +42,71 @@ def _parsed(path: Path) -> PlyData:
         return PlyData.read(str(path), mmap=False)  # not all faces are triangles
 
 
-def write_ply(path: Path, elements: dict[str, NDArray[Any]], comments: list[str]) -> None:
-    """Write structured arrays as a binary little-endian PLY, atomically. A field (n,) per row becomes a list property.
+@dataclass(frozen=True)
+class Rows:
+    """`count` rows of a structured `dtype`, of which no more than one of the `blocks` needs to be in memory. A field
+    (n,) per row becomes a list property."""
 
-    Raises InputError when the disk refuses.
+    dtype: np.dtype
+    count: int
+    blocks: Iterable[NDArray[Any]]
+
+
+def write_ply(path: Path, elements: dict[str, Rows], comments: list[str]) -> None:
+    """Write a binary little-endian PLY, atomically.
+
+    Raises ValueError where there are more or fewer rows than `count`, InputError when the disk refuses.
     """
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {' '.join(text.split())}" for text in comments)]
-    for name, array in elements.items():
-        header += [f"element {name} {len(array)}", *_property_lines(array.dtype)]
+    for name, rows in elements.items():
+        header += [f"element {name} {rows.count}", *_property_lines(rows.dtype)]
     with atomic_path(Path(path)) as temporary, temporary.open("wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode("ascii", errors="replace"))
-        for array in elements.values():
-            for start in range(0, len(array), _ROWS):  # a copy of a building's mesh would take gigabytes
-                file.write(_packed(array[start : start + _ROWS]).data)
+        for name, rows in elements.items():
+            left = rows.count
+            for block in rows.blocks:
+                file.write(_packed(block).data)
+                left -= len(block)
+            if left:
+                raise ValueError(f"write_ply: {name}: {left} of {rows.count} rows are missing")
+
+
+def slices(count: int) -> Iterator[slice]:
+    """Of so many rows those that are written or read at once."""
+    return (slice(start, min(start + _ROWS, count)) for start in range(0, count, _ROWS))
+
+
+def read_rows(path: Path, elements: dict[str, np.dtype]) -> dict[str, Rows]:
+    """The elements of a PLY by `write_ply`, of which nothing is read before their blocks are.
+
+    `elements`: all of them in their order, a list as its length and its values. Raises InputError for a file that is
+    missing or has others.
+    """
+    with opened(path) as file:
+        head = file.read(_MAX_HEADER_BYTES)
+    end = head.find(b"end_header\n") + len(b"end_header\n")
+    counts = {m[1].decode(): int(m[2]) for m in re.finditer(rb"element (\w+) (\d+)\n", head[:end])}
+    rows = {}
+    for name, dtype in elements.items():
+        rows[name] = Rows(dtype, counts.get(name, 0), _Blocks(path, dtype, counts.get(name, 0), end))
+        end += dtype.itemsize * rows[name].count
+    if list(counts) != list(elements) or end != Path(path).stat().st_size:
+        raise InputError(f"{path} is not as this program writes it: export it again")
+    return rows
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    path: Path
+    dtype: np.dtype
+    count: int
+    start: int
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        with opened(self.path) as file:
+            file.seek(self.start)
+            for rows in slices(self.count):
+                yield np.fromfile(file, self.dtype, rows.stop - rows.start)
 
 
 def _property_lines(dtype: np.dtype) -> list[str]:

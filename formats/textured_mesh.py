@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from formats.atomic import write_text
-from formats.glb import write_glb
+from formats.glb import Part, write_primitive
 from formats.images import jpeg_bytes, write_rgb
 
-_BYTES, _INDICES, _FLOAT = 34962, 34963, 5126
-_UNSIGNED = 5125
+_UNLIT = "KHR_materials_unlit"
 _LINEAR, _MIPMAPPED, _CLAMPED = 9729, 9987, 33071
 
 
@@ -75,49 +73,18 @@ def write_textured_glb(path: Path, mesh: TexturedMesh, class_names: tuple[str, .
     glTF wants y up: the caller turns the vertices. The same mesh gives the same bytes. Raises InputError when the disk
     refuses.
     """
-    points = mesh.vertices[mesh.corner_vertex]
-    labels = mesh.labels[mesh.corner_vertex]
-    arrays: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
-        (
-            "POSITION",
-            points.astype("<f4"),
-            {"type": "VEC3", "min": points.min(0).tolist(), "max": points.max(0).tolist()},
-        ),
-        ("TEXCOORD_0", mesh.corner_uv.astype("<f4"), {"type": "VEC2"}),
-        ("_LABEL", labels.astype("<f4"), {"type": "SCALAR"}),
-        ("", mesh.faces.astype("<u4"), {"type": "SCALAR", "componentType": _UNSIGNED, "count": mesh.faces.size}),
+    parts = [
+        Part.of("POSITION", mesh.vertices[mesh.corner_vertex]),
+        Part.of("TEXCOORD_0", mesh.corner_uv),
+        Part.of("_LABEL", mesh.labels[mesh.corner_vertex].astype(np.float32)),
+        Part.of("", mesh.faces.reshape(-1).astype(np.uint32)),
     ]
-    chunks = [array.tobytes() for _, array, _ in arrays]
-    chunks.append(jpeg_bytes(mesh.texture))
-    starts = np.cumsum([0, *(len(c) for c in chunks)]).tolist()
-    views: list[dict[str, Any]] = [
-        {"buffer": 0, "byteOffset": s, "byteLength": len(c)} for s, c in zip(starts, chunks, strict=False)
-    ]
-    for view, target in zip(views, (_BYTES, _BYTES, _BYTES, _INDICES), strict=False):
-        view["target"] = target
-    accessors = [
-        {"bufferView": i, "componentType": _FLOAT, "count": len(array)} | more
-        for i, (_, array, more) in enumerate(arrays)
-    ]
-    primitive = {"attributes": {n: i for i, (n, _, _) in enumerate(arrays) if n}, "indices": 3, "material": 0}
-    document = {
-        "asset": {"version": "2.0", "generator": "msgs-slam"},
-        "extensionsUsed": ["KHR_materials_unlit"],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "mesh"}],
-        "meshes": [{"primitives": [primitive], "name": "mesh", "extras": {"classes": list(class_names)}}],
-        "materials": [
-            {
-                "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": 1},
-                "extensions": {"KHR_materials_unlit": {}},
-            }
-        ],
+    shown = {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": 1}
+    extras = {
+        "materials": [{"pbrMetallicRoughness": shown, "extensions": {_UNLIT: {}}}],
         "textures": [{"source": 0, "sampler": 0}],
         "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPPED, "wrapS": _CLAMPED, "wrapT": _CLAMPED}],
-        "images": [{"bufferView": len(arrays), "mimeType": "image/jpeg"}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": starts[-1]}],
+        "images": [{"bufferView": len(parts), "mimeType": "image/jpeg"}],
     }
-    write_glb(path, document, chunks)
+    picture = jpeg_bytes(mesh.texture)
+    write_primitive(path, parts, {"material": 0}, class_names, {"name": "mesh"}, extras, [_UNLIT], picture)

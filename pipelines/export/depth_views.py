@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import prod
-from pathlib import Path
-from tempfile import TemporaryFile
 
 import numpy as np
 import torch
@@ -49,32 +45,6 @@ class Shown(Sequence[PosedDepth]):
 
     def __getitem__(self, index: int) -> PosedDepth:  # type: ignore[override]
         return self._views[index].shown
-
-
-class ViewsOnDisk:
-    """Views in a file of `folder` that has no name and goes with this process, however that ends."""
-
-    def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        self._file = TemporaryFile(dir=folder)  # noqa: SIM115  as long as the views are needed
-        self._views: list[tuple[int, PosedDepth, list[tuple[np.dtype, tuple[int, ...]]]]] = []
-
-    def append(self, view: DrawnView) -> None:
-        """One more."""
-        start = self._file.seek(0, os.SEEK_END)
-        nothing = np.zeros((0, 0), np.float32)
-        shapes = [(a.dtype, a.shape) for a in view.arrays]
-        self._views.append((start, replace(view.shown, depth=nothing, trust=nothing), shapes))
-        for array in view.arrays:
-            self._file.write(np.ascontiguousarray(array).data)
-
-    def load(self, index: int) -> DrawnView:
-        """As it was."""
-        start, shown, shapes = self._views[index]
-        self._file.seek(start)
-        arrays = [np.frombuffer(self._file.read(t.itemsize * prod(shape)), t).reshape(shape) for t, shape in shapes]
-        depth, trust, colors = arrays[:3]
-        return DrawnView(replace(shown, depth=depth, trust=trust), colors, arrays[3] if len(arrays) > 3 else None)
 
 
 @torch.no_grad()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,12 @@ from typing import Any
 from formats.atomic import copy_file
 from formats.digest import file_sha256
 from formats.gps import read_track
-from formats.mesh import read_mesh_ply
+from formats.mesh import mesh_blocks, read_mesh_ply, write_mesh_glb, write_mesh_ply
 from pipelines.config import Config, ExportConfig
-from pipelines.export.depth_views import Shown
-from pipelines.export.mesh import drawn_views, make_mesh, mesh_figures, write_mesh
-from pipelines.export.tasks import MeshWorkers
+from pipelines.export.depth_views import DrawnView, Shown
+from pipelines.export.joined import joined
+from pipelines.export.mesh import drawn_views, fused_regions, make_grid_of, mesh_figures
+from pipelines.export.tasks import MeshWorkers, scratch_of
 from pipelines.export.textured import make_textured, write_textured
 from pipelines.export.tiles import write_tiles
 from pipelines.export.writers import (
@@ -27,6 +29,7 @@ from pipelines.export.writers import (
     write_trajectory,
     write_world,
 )
+from pipelines.journal import empty
 from pipelines.metres.files import save_metres
 from pipelines.metres.find import Machine, find_metres
 from pipelines.outcome import Outcome, load_outcome
@@ -56,12 +59,11 @@ def run(context: StageContext) -> dict[str, Any]:
     write_all_but_mesh(outcome, world, settings, context.folder)
     if world.earth is not None:
         save_metres(context.folder, found.metres)
-    finished = _finished_mesh(context.folder)
     workers = MeshWorkers(context, world.exported_from_run) if context.workers is not None else None
-    mesh, _ = write_meshes(
-        outcome, world, settings, mesh_kinds(settings), context.folder, context.progress, finished, workers
-    )
-    if len(mesh.faces) == 0:
+    kinds, scratch = mesh_kinds(settings), scratch_of(context)
+    write_meshes(outcome, world, settings, kinds, context.folder, scratch, context.progress, workers, keep=True)
+    mesh = mesh_blocks(context.folder / "mesh.ply")
+    if mesh.face_count == 0:
         context.warn("the mesh is empty: no surface is seen by enough keyframes")
     return {
         "images": int(outcome.trajectory.is_placed.sum()),
@@ -79,24 +81,34 @@ def write_meshes(
     settings: ExportConfig,
     kinds: tuple[str, ...],
     folder: Path,
+    scratch: Path,
     progress: Progress,
-    finished: SemanticMesh | None = None,
     workers: MeshWorkers | None = None,
-) -> tuple[SemanticMesh, list[Path]]:
-    """Make the mesh, unless it is `finished`, and write those `kinds` of it ("mesh", "texture") that are not yet.
-    `workers` draw and fuse."""
-    if finished is not None and "texture" not in kinds:
-        return finished, []
-    views = workers.views(outcome) if workers else drawn_views(outcome, settings, progress, folder)
-    names = outcome.classes.names
-    axes = world.gltf_from_exported
-    mesh, paths = finished, []
-    if mesh is None:
-        mesh = make_mesh(outcome, views, settings, progress, workers.regions if workers else None)
-        paths += write_mesh(mesh, names, folder, axes) if "mesh" in kinds else []
-    if "texture" in kinds and len(mesh.faces):
-        paths += write_textured(make_textured(outcome, mesh, Shown(views), progress), names, folder, axes)
-    return mesh, paths
+    keep: bool = False,
+) -> list[Path]:
+    """Write those `kinds` of the mesh ("mesh", "texture") into a folder, but for mesh.ply and mesh.glb that are there
+    to `keep`. What does not fit into memory lies in `scratch`; `workers` draw and fuse."""
+    names, axes = outcome.classes.names, world.gltf_from_exported
+    ply, glb = (folder if "mesh" in kinds else scratch) / "mesh.ply", folder / "mesh.glb"
+    is_made = keep and ply.exists()
+    views: Sequence[DrawnView] = ()
+    if not is_made or "texture" in kinds:
+        if workers:
+            workers.draw(outcome)
+        views = drawn_views(outcome, settings, scratch, progress)
+    if not is_made:
+        grid = make_grid_of(views, settings)
+        if workers:
+            workers.fuse(grid)
+        write_mesh_ply(ply, joined(fused_regions(outcome, views, grid, scratch, progress)), names)
+    mesh = mesh_blocks(ply)
+    if "mesh" in kinds and mesh.face_count and not (keep and glb.exists()):
+        write_mesh_glb(glb, mesh, names, axes)
+    paths = [ply, glb][: 1 + (mesh.face_count > 0)] if "mesh" in kinds else []
+    if "texture" in kinds and mesh.face_count:
+        whole = SemanticMesh(**vars(read_mesh_ply(ply)))
+        paths += write_textured(make_textured(outcome, whole, Shown(views), progress), names, folder, axes)
+    return paths
 
 
 def mesh_kinds(settings: ExportConfig) -> tuple[str, ...]:
@@ -185,13 +197,6 @@ def write_all_but_mesh(outcome: Outcome, world: World, settings: ExportConfig, f
     return paths + write_trajectory(outcome, folder) + write_notes(outcome, world, folder)
 
 
-def _finished_mesh(folder: Path) -> SemanticMesh | None:
-    # The GLB is written last: where it is, the PLY is whole.
-    if not (folder / "mesh.glb").exists() or not (folder / "mesh.ply").exists():
-        return None
-    return SemanticMesh(**vars(read_mesh_ply(folder / "mesh.ply")))
-
-
 def export_run(
     run: RunFolder,
     folder: Path,
@@ -212,7 +217,11 @@ def export_run(
         outcome = replace(outcome, metres=None)
 
     def mesh(*kinds: str) -> list[Path]:
-        return write_meshes(outcome, world, settings, kinds, folder, progress or SilentProgress())[1]
+        empty(scratch := folder / ".mesh")  # what a killed export has left
+        try:
+            return write_meshes(outcome, world, settings, kinds, folder, scratch, progress or SilentProgress())
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
 
     writers: dict[str, Callable[[], list[Path]]] = {
         "colmap": lambda: write_colmap(outcome, folder),

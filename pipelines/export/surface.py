@@ -1,7 +1,8 @@
-"""The zero surface of a sparse distance field as triangles: marching cubes chunk by chunk, welded, without floaters."""
+"""The zero surface of a sparse distance field as triangles: marching cubes chunk by chunk, welded."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
-from pipelines.export.volume import CHUNK, SIDE, Volume
+from pipelines.export.volume import CHUNK, SIDE, Volume, chunk_keys
 from pipelines.jit import kernel
 
 _STEPS = 1000
@@ -18,33 +19,31 @@ _STEPS = 1000
 
 @dataclass(frozen=True)
 class Surface:
-    """vertices (V, 3) in the world, faces (F, 3); the vertices `border` (N,) on the sides of chunks, which those of the
-    next region may be, have the places `border_places` (N, 3) in thousandths of a voxel."""
+    """vertices (V, 3) in the world, faces (F, 3); pieces (V,), which connected piece each vertex belongs to, -1 without
+    a face. The vertices `border` (N,), which those of other regions may be, have the places `border_places` (N, 3) in
+    thousandths of a voxel."""
 
     vertices: NDArray[np.float32]
     faces: NDArray[np.int32]
+    pieces: NDArray[np.int32]
     border: NDArray[np.int64]
     border_places: NDArray[np.int64]
 
 
-EMPTY = Surface(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros(0, int), np.zeros((0, 3), int))
+Triangles = tuple[NDArray[np.float64], NDArray[np.int32]]
+"""Places (V, 3) and faces (F, 3)."""
 
 
-def extract_surface(volume: Volume, chunks: NDArray[np.int32], least_weight: float) -> Surface:
-    """The surface in these chunks; only where all eight corners of a cell were seen."""
+def chunk_surfaces(volume: Volume, chunks: NDArray[np.int32], least_weight: float) -> list[Triangles]:
+    """The surface in each of these chunks; only where all eight corners of a cell were seen."""
     index = {tuple(b): n for n, b in enumerate(volume.blocks.tolist())}
-    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
-    for chunk in chunks[np.lexsort(chunks.T[::-1])]:
-        points, triangles = _chunk_surface(volume, index, chunk * CHUNK, least_weight)
-        vertices.append(points)
-        faces.append(triangles + count)
-        count += len(points)
-    return _weld(np.concatenate(vertices), np.concatenate(faces), volume.voxel)
+    ordered = chunks[np.lexsort(chunks.T[::-1])]
+    return [_chunk_surface(volume, index, chunk * CHUNK, least_weight) for chunk in ordered]
 
 
 def _chunk_surface(
     volume: Volume, index: dict[tuple[int, ...], int], first: NDArray[np.int32], least_weight: float
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+) -> Triangles:
     """The surface in one chunk; its last layer of voxels is its neighbours' first, so that no cell is left out."""
     size = CHUNK * SIDE + 1
     distance = np.ones((size, size, size), np.float32)
@@ -61,14 +60,14 @@ def _chunk_surface(
                 seen[place] = volume.weight[n][cut] >= least_weight
     distance[~seen] = 1
     if distance.min() >= 0:
-        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int32)
     # Free space is positive: "descent" makes the faces look that way.
     points, triangles, _, _ = marching_cubes(distance, 0.0, gradient_direction="descent")
     whole = _whole_cells(seen)
     cell = np.floor(points[triangles].mean(1)).astype(int).clip(0, size - 2)
     kept = triangles[whole[cell[:, 0], cell[:, 1], cell[:, 2]]]
     used = np.unique(kept)
-    renumber = np.zeros(len(points), np.int64)
+    renumber = np.zeros(len(points), np.int32)
     renumber[used] = np.arange(len(used))
     return (points[used] + first * SIDE) * volume.voxel, renumber[kept]
 
@@ -80,51 +79,51 @@ def _whole_cells(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return out[:, :, :-1] & out[:, :, 1:]
 
 
-def _weld(points: NDArray[np.float64], faces: NDArray[np.int64], voxel: float) -> Surface:
-    """Vertices that neighbouring chunks both have become one; triangles that thereby lose their area go."""
+def weld(parts: Sequence[Triangles], chunks: NDArray[np.int32], voxel: float) -> Surface:
+    """The surface in a region of chunks. Vertices that neighbouring ones both have become one; triangles that thereby
+    lose their area go."""
+    firsts = np.cumsum([0, *(len(points) for points, _ in parts)], dtype=np.int32)
+    points = np.concatenate([np.zeros((0, 3)), *(points for points, _ in parts)])
     keys = np.round(points / (voxel / _STEPS)).astype(np.int64)
-    keys, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    faces = inverse.reshape(-1)[faces]
-    real = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    border = np.flatnonzero((keys % (CHUNK * SIDE * _STEPS) == 0).any(1))
-    return Surface(points[first].astype(np.float32), faces[real].astype(np.int32), border, keys[border])
+    order = np.lexsort(keys.T[::-1])  # that of rows; np.unique's needs ten times the time and twice the memory
+    is_new = np.ones(len(keys), bool)
+    is_new[1:] = (keys[order[1:]] != keys[order[:-1]]).any(1)
+    one = np.empty(len(keys), np.int32)
+    one[order] = np.cumsum(is_new, dtype=np.int32) - np.int32(1)
+    first = order[is_new]
+    vertices, keys = points[first].astype(np.float32), keys[first]
+    del points, order
+    no_faces = np.zeros((0, 3), np.int32)
+    faces = one[np.concatenate([no_faces, *(f + start for (_, f), start in zip(parts, firsts, strict=False))])]
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    border = _border(keys, chunks)
+    return Surface(vertices, faces, _pieces(faces, len(vertices)), border, keys[border])
 
 
-def join_faces(surfaces: Sequence[Surface]) -> NDArray[np.int32]:
-    """(F, 3) all faces, as rows of all vertices one after the other; of vertices that several have one is used."""
-    starts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
-    together = list(zip(surfaces, starts.tolist(), strict=False))
-    rows = np.concatenate([s.border + start for s, start in together])
-    _, first, inverse = np.unique(
-        np.concatenate([s.border_places for s in surfaces]), axis=0, return_index=True, return_inverse=True
-    )
-    stands_for = np.arange(starts[-1], dtype=np.int32)
-    stands_for[rows] = rows[first][inverse.reshape(-1)]
-    faces, done = np.empty((sum(len(s.faces) for s in surfaces), 3), np.int32), 0
-    for s, start in together:
-        faces[done : done + len(s.faces)] = stands_for[start:][s.faces]
-        done += len(s.faces)
-    return faces
+def _border(places: NDArray[np.int64], chunks: NDArray[np.int32]) -> NDArray[np.int64]:
+    """The rows of places that lie on a side of a chunk which is not among these: the others know them too."""
+    chunk, inside = np.divmod(places, CHUNK * SIDE * _STEPS)
+    rows = np.flatnonzero((inside == 0).any(1))
+    chunk, is_side, own = chunk[rows], inside[rows] == 0, chunk_keys(chunks)
+    shared = np.zeros(len(rows), bool)
+    for back in itertools.product((0, 1), repeat=3):
+        shared |= is_side[:, np.flatnonzero(back)].all(1) & ~np.isin(chunk_keys(chunk - np.array(back)), own)
+    return rows[shared]
 
 
-def without_floaters(
-    faces: NDArray[np.int32], count: int, least_share: float
-) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Of the connected pieces that have at least `least_share` of the faces of the largest one: the rows (V,) that they
-    use of `count` vertices, and their faces (F, 3) as rows of those."""
-    if len(faces) == 0:
-        return np.zeros(0, np.int64), faces
-    piece = _pieces(faces, count)[faces[:, 0]]
-    sizes = np.bincount(piece)
-    kept = faces[sizes[piece] >= least_share * sizes.max()]
-    is_used = np.zeros(count, bool)
-    is_used[kept.reshape(-1)] = True
-    renumber = np.cumsum(is_used, dtype=np.int32) - np.int32(1)
-    return np.flatnonzero(is_used), renumber[kept]
+def _pieces(faces: NDArray[np.int32], count: int) -> NDArray[np.int32]:
+    """(count,) numbers from 0 of the connected pieces, -1 for a vertex without a face."""
+    first = _firsts(faces, count)
+    has_face = np.zeros(count, bool)
+    has_face[faces.reshape(-1)] = True
+    number = np.full(count, -1, np.int32)
+    firsts = np.flatnonzero(has_face & (first == np.arange(count)))
+    number[firsts] = np.arange(len(firsts))
+    return np.where(has_face, number[first], np.int32(-1))
 
 
 @kernel
-def _pieces(faces, count):  # type: ignore[no-untyped-def]
+def _firsts(faces, count):  # type: ignore[no-untyped-def]
     """(count,) the first vertex of the piece that each belongs to."""
     first = np.arange(count).astype(np.int32)
     for f in range(len(faces)):

@@ -85,11 +85,11 @@ class Grid:
 
     def blocks_of(self, chunks: NDArray[np.int32]) -> NDArray[np.int32]:
         """Those in the chunks, and the layer after them, without which their last cells would have no corners."""
-        wanted, home = np.sort(_keys(chunks)), self.blocks // CHUNK
+        wanted, home = np.sort(chunk_keys(chunks)), self.blocks // CHUNK
         first = self.blocks % CHUNK == 0
         inside = np.zeros(len(self.blocks), bool)
         for back in itertools.product((0, 1), repeat=3):
-            inside |= first[:, np.flatnonzero(back)].all(1) & np.isin(_keys(home - np.array(back)), wanted)
+            inside |= first[:, np.flatnonzero(back)].all(1) & np.isin(chunk_keys(home - np.array(back)), wanted)
         return self.blocks[inside]
 
     def views_of(self, chunks: NDArray[np.int32]) -> list[int]:
@@ -130,7 +130,8 @@ def touched_blocks(views: Iterable[PosedDepth], voxel: float, truncation: float)
     return cells_of(found[found >= 0]).astype(np.int32)
 
 
-def _keys(cells: NDArray[np.int32]) -> NDArray[np.int64]:
+def chunk_keys(cells: NDArray[np.integer]) -> NDArray[np.int64]:
+    """(N, 3) coordinates of chunks → (N,) a number for each."""
     return voxel_keys(cells.astype(np.float64), 1.0)
 
 

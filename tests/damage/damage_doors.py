@@ -54,7 +54,7 @@ from formats.images import (
     write_rgb,
 )  # fmt: skip
 from formats.jsonfile import read_toml, write_json
-from formats.mesh import MeshArrays, read_mesh_glb, read_mesh_ply, write_mesh_glb, write_mesh_ply
+from formats.mesh import MeshArrays, MeshBlocks, read_mesh_glb, read_mesh_ply, write_mesh_glb, write_mesh_ply
 from formats.spz import write_spz
 from formats.tensors import load_arrays, load_safetensors, load_tensors, save_arrays, save_tensors
 from formats.trajectory import read_matrices, read_tum, write_matrices, write_tum
@@ -306,10 +306,11 @@ def _cloud() -> GaussianCloud:
     )  # fmt: skip
 
 
-def _mesh() -> tuple[np.ndarray, ...]:
+def _mesh() -> MeshBlocks:
     g = np.random.default_rng(4)
     vertices, faces = g.normal(size=(8, 3)).astype(np.float32), g.integers(0, 8, (12, 3)).astype(np.int32)
-    return vertices, faces, g.integers(0, 255, (8, 3)).astype(np.uint8), np.arange(8).astype(np.uint8)
+    colors = g.integers(0, 255, (8, 3)).astype(np.uint8)
+    return MeshBlocks(8, 12, lambda: [(vertices, colors, np.arange(8).astype(np.uint8))], lambda: [faces])
 
 
 def _rgb(seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
@@ -484,8 +485,8 @@ DOORS: dict[str, Door] = {
     ),
     "class map": Door(text("a.toml", CLASS_MAP), read_class_map, "a.toml"),
     "masks": Door(make_masks, masks, damaged="0.png"),
-    "mesh PLY": Door(lambda f: write_mesh_ply(f / "a.ply", *_mesh()), mesh(read_mesh_ply), "a.ply", in_ply),
-    "mesh GLB": Door(lambda f: write_mesh_glb(f / "a.glb", *_mesh()), mesh(read_mesh_glb), "a.glb", with_json_head(12)),
+    "mesh PLY": Door(lambda f: write_mesh_ply(f / "a.ply", _mesh()), mesh(read_mesh_ply), "a.ply", in_ply),
+    "mesh GLB": Door(lambda f: write_mesh_glb(f / "a.glb", _mesh()), mesh(read_mesh_glb), "a.glb", with_json_head(12)),
     "npz": Door(lambda f: save_arrays(f / "a.npz", ARRAYS), load_arrays, "a.npz"),
     "safetensors": Door(
         lambda f: save_tensors(f / "a.safetensors", {"a": torch.zeros(3, 4)}),

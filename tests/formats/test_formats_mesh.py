@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,9 @@ import plyfile
 import pytest
 import trimesh
 
+from formats import ply_table
 from formats.errors import InputError
-from formats.mesh import read_mesh_glb, read_mesh_ply, write_mesh_glb, write_mesh_ply
+from formats.mesh import MeshBlocks, mesh_blocks, read_mesh_glb, read_mesh_ply, write_mesh_glb, write_mesh_ply
 
 
 @pytest.fixture
@@ -24,10 +26,22 @@ def sphere() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     return mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32), colors, labels
 
 
+def blocks(vertices: np.ndarray, faces: np.ndarray, *rest: np.ndarray, at_once: int = 10**9) -> MeshBlocks:
+    """The arrays in blocks of so many rows."""
+
+    def cut(array: np.ndarray) -> list[np.ndarray]:
+        return [array[start : start + at_once] for start in range(0, len(array), at_once)]
+
+    def parts() -> Iterator[tuple[np.ndarray, ...]]:
+        return zip(*map(cut, (vertices, *rest)), strict=True)
+
+    return MeshBlocks(len(vertices), len(faces), parts, lambda: cut(faces))
+
+
 def test_ply_round_trip_and_foreign_readers(tmp_path: Path, sphere: tuple) -> None:
     vertices, faces, colors, labels = sphere
     path = tmp_path / "mesh.ply"
-    write_mesh_ply(path, *sphere, class_names=("wall", "two words"))
+    write_mesh_ply(path, blocks(*sphere), class_names=("wall", "two words"))
     ours = read_mesh_ply(path)
     for got, expected in zip((ours.vertices, ours.faces, ours.colors, ours.labels), sphere, strict=True):
         assert (got == expected).all()
@@ -45,7 +59,7 @@ def test_ply_round_trip_and_foreign_readers(tmp_path: Path, sphere: tuple) -> No
 def test_glb_round_trip_and_foreign_reader(tmp_path: Path, sphere: tuple) -> None:
     vertices, faces, colors, labels = sphere
     path = tmp_path / "mesh.glb"
-    write_mesh_glb(path, *sphere, class_names=("wall", "floor"))
+    write_mesh_glb(path, blocks(*sphere), class_names=("wall", "floor"))
     scene = trimesh.load_scene(str(path), process=False)
     (mesh,) = scene.geometry.values()
     assert (mesh.faces == faces).all()
@@ -58,10 +72,10 @@ def test_glb_round_trip_and_foreign_reader(tmp_path: Path, sphere: tuple) -> Non
         assert (got == expected).all()
 
 
-def test_the_same_mesh_gives_the_same_bytes(tmp_path: Path, sphere: tuple) -> None:
+def test_the_same_mesh_gives_the_same_bytes_in_blocks_of_any_size(tmp_path: Path, sphere: tuple) -> None:
     for write, name in ((write_mesh_ply, "m.ply"), (write_mesh_glb, "m.glb")):
-        write(tmp_path / "a" / name, *sphere)
-        write(tmp_path / "b" / name, *sphere)
+        write(tmp_path / "a" / name, blocks(*sphere))
+        write(tmp_path / "b" / name, blocks(*sphere, at_once=100))
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
@@ -94,13 +108,13 @@ def test_bad_meshes_are_explained(tmp_path: Path, shared_data: Path, sphere: tup
         read_mesh_ply(shared_data / "format_cases" / "ply_other_writers" / "inria_3dgs_output" / "input.ply")
     with pytest.raises(InputError, match="git lfs pull"):
         read_mesh_ply(shared_data / "format_cases" / "lfs_pointer" / "point_cloud.ply")
-    write_mesh_ply(tmp_path / "whole.ply", *sphere)
+    write_mesh_ply(tmp_path / "whole.ply", blocks(*sphere))
     data = (tmp_path / "whole.ply").read_bytes()
     for keep in (2, 40, 300, len(data) - 1):
         (tmp_path / "cut.ply").write_bytes(data[:keep])
         with pytest.raises(InputError):
             read_mesh_ply(tmp_path / "cut.ply")
-    write_mesh_glb(tmp_path / "whole.glb", *sphere)
+    write_mesh_glb(tmp_path / "whole.glb", blocks(*sphere))
     data = (tmp_path / "whole.glb").read_bytes()
     for keep in (0, 10, len(data) // 2):
         (tmp_path / "cut.glb").write_bytes(data[:keep])
@@ -116,14 +130,35 @@ def test_bad_meshes_are_explained(tmp_path: Path, shared_data: Path, sphere: tup
 
 def test_arrays_that_do_not_fit_are_refused(tmp_path: Path, sphere: tuple) -> None:
     vertices, faces, colors, labels = sphere
-    for arguments in [
-        (vertices, faces, colors[:-1], labels),
-        (vertices, faces + 1, colors, labels),
-        (vertices, faces, colors, labels[:, None]),
-    ]:
+    for arguments in [(vertices, faces, colors[:-1], labels), (vertices, faces, colors, labels[:, None])]:
         with pytest.raises(ValueError, match="MeshArrays"):
-            write_mesh_ply(tmp_path / "m.ply", *arguments)
+            write_mesh_ply(tmp_path / "m.ply", blocks(*arguments))
+    with pytest.raises(ValueError, match="outside"):
+        write_mesh_ply(tmp_path / "m.ply", blocks(vertices, faces + 1, colors, labels))
+    for counts in ((len(vertices) - 1, len(faces)), (len(vertices), len(faces) + 1)):
+        short = MeshBlocks(*counts, lambda: [(vertices, colors, labels)], lambda: [faces[:-1]])
+        for write in (write_mesh_ply, write_mesh_glb):
+            with pytest.raises(ValueError, match=r"missing|outside|bytes"):
+                write(tmp_path / "m", short)
+    assert list(tmp_path.iterdir()) == []
     with pytest.raises(ValueError, match="without faces"):
-        write_mesh_glb(tmp_path / "m.glb", vertices, faces[:0], colors, labels)
-    write_mesh_ply(tmp_path / "empty.ply", vertices[:0], faces[:0], colors[:0], labels[:0])
+        write_mesh_glb(tmp_path / "m.glb", blocks(vertices, faces[:0], colors, labels))
+    write_mesh_ply(tmp_path / "empty.ply", blocks(vertices[:0], faces[:0], colors[:0], labels[:0]))
     assert len(read_mesh_ply(tmp_path / "empty.ply").faces) == 0
+    assert list(mesh_blocks(tmp_path / "empty.ply").vertices()) == []
+
+
+def test_a_mesh_goes_from_ply_to_glb_in_blocks(tmp_path: Path, sphere: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ply_table, "_ROWS", 100)
+    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    write_mesh_ply(tmp_path / "m.ply", blocks(*sphere), ("wall",))
+    mesh = mesh_blocks(tmp_path / "m.ply")
+    assert [len(faces) for faces in mesh.faces()] == [100] * 12 + [80]
+    write_mesh_glb(tmp_path / "m.glb", mesh, ("wall",), turn)
+    found = read_mesh_glb(tmp_path / "m.glb")
+    np.testing.assert_array_equal(found.vertices, sphere[0] @ turn.T)
+    for name, wanted in zip(("faces", "colors", "labels"), sphere[1:], strict=True):
+        np.testing.assert_array_equal(getattr(found, name), wanted)
+    (tmp_path / "m.ply").write_bytes((tmp_path / "m.ply").read_bytes()[:-1])
+    with pytest.raises(InputError, match="export it again"):
+        mesh_blocks(tmp_path / "m.ply")

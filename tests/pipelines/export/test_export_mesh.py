@@ -9,11 +9,14 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+from formats.mesh import read_mesh_ply, write_mesh_ply
 from pipelines.depth.posed import PosedDepth
-from pipelines.export.depth_views import DrawnView, ViewsOnDisk
+from pipelines.export.depth_views import DrawnView
+from pipelines.export.joined import Region, joined
 from pipelines.export.paint import paint
-from pipelines.export.surface import EMPTY, extract_surface, join_faces, without_floaters
+from pipelines.export.surface import Surface, chunk_surfaces, weld
 from pipelines.export.volume import CHUNK, Grid, Volume, fuse, make_grid
+from pipelines.travel import load_value, save_value
 from pipelines.types import VOID, Intrinsics
 
 CAMERA = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
@@ -89,20 +92,36 @@ def all_chunks(grid: Grid) -> NDArray[np.int32]:
 def extracted(views: Sequence[PosedDepth], voxel: float, at_once: int, least: float = 1.5) -> trimesh.Trimesh:
     """The surface, made region by region."""
     grid = make_grid(views, voxel, 4.0, 10_000_000)
-    surfaces = [
-        extract_surface(fuse(grid, chunks, (views[n] for n in grid.views_of(chunks)), 1), chunks, least)
-        for chunks in grid.regions(at_once)
-    ]
-    vertices = np.concatenate([s.vertices for s in surfaces])
-    rows, faces = without_floaters(join_faces(surfaces), len(vertices), 0.0)
-    return trimesh.Trimesh(vertices[rows], faces, process=False)
+    surfaces = [surface_of(grid, views, chunks, least) for chunks in grid.regions(at_once)]
+    return whole(surfaces, 0.0)
+
+
+def surface_of(grid: Grid, views: Sequence[PosedDepth], chunks: NDArray[np.int32], least: float) -> Surface:
+    volume = fuse(grid, chunks, (views[n] for n in grid.views_of(chunks)), 1)
+    return weld(chunk_surfaces(volume, chunks, least), chunks, grid.voxel)
+
+
+def whole(surfaces: Sequence[Surface], least_share: float) -> trimesh.Trimesh:
+    """The regions joined; each vertex has its region as label and its row there as colour."""
+    rows = [np.stack([np.arange(len(s.vertices)) >> bits & 255 for bits in (0, 8, 16)], 1) for s in surfaces]
+    labels = [np.full(len(s.vertices), n, np.uint8) for n, s in enumerate(surfaces)]
+    regions = [Region(s, r.astype(np.uint8), n) for s, r, n in zip(surfaces, rows, labels, strict=True)]
+    blocks = joined(lambda: regions, least_share)
+    for points, colors, numbers in blocks.vertices():
+        own = surfaces[numbers[0]].vertices[colors @ np.array([1, 256, 65536])] if len(points) else points
+        np.testing.assert_array_equal(points, own)
+    points = np.concatenate([np.zeros((0, 3), np.float32), *(points for points, _, _ in blocks.vertices())])
+    faces = np.concatenate([np.zeros((0, 3), np.int32), *blocks.faces()])
+    assert (blocks.vertex_count, blocks.face_count) == (len(points), len(faces))
+    return trimesh.Trimesh(points, faces, process=False)
 
 
 @pytest.fixture(scope="module")
 def surface() -> trimesh.Trimesh:
     volume = fused()
-    whole = extract_surface(volume, np.unique(volume.blocks // CHUNK, axis=0), 1.5)
-    return trimesh.Trimesh(whole.vertices, whole.faces, process=False)
+    chunks = np.unique(volume.blocks // CHUNK, axis=0)
+    made = weld(chunk_surfaces(volume, chunks, 1.5), chunks, volume.voxel)
+    return trimesh.Trimesh(made.vertices, made.faces, process=False)
 
 
 def test_sphere_comes_back(surface: trimesh.Trimesh) -> None:
@@ -162,17 +181,30 @@ def test_nothing_seen_gives_an_empty_surface() -> None:
     grid = make_grid([nothing, nothing], VOXEL, 4.0, 1000)
     assert list(grid.regions()) == []
     assert len(fuse(grid, all_chunks(grid), [nothing], 1).blocks) == 0
-    assert join_faces([EMPTY]).shape == (0, 3)
+    assert len(whole([], 0.01).faces) == 0
+    assert len(whole([weld([], np.zeros((0, 3), np.int32), VOXEL)], 0.01).faces) == 0
 
 
-def test_small_pieces_go() -> None:
-    plane = trimesh.creation.icosphere(subdivisions=3)
-    speck = trimesh.creation.icosahedron()
-    both = trimesh.util.concatenate([plane, speck.apply_translation([9, 9, 9])])
-    rows, faces = without_floaters(both.faces.astype(np.int32), len(both.vertices), 0.05)
-    assert (len(rows), len(faces)) == (len(plane.vertices), len(plane.faces))
-    assert np.abs(both.vertices[rows]).max() < 2
-    np.testing.assert_array_equal(both.vertices[rows][faces], plane.triangles)
+def test_small_pieces_go_and_are_counted_over_all_regions() -> None:
+    """Strips of unit squares along x; the second chunk begins at 64."""
+
+    def strips(*ends: tuple[int, int, int]) -> list[tuple[NDArray[np.float64], NDArray[np.int32]]]:
+        parts = []
+        for first, last, y in ends:
+            points = np.array([(x, y + side, 1.5) for x in range(first, last + 1) for side in (0, 1)], float)
+            corners = 2 * np.arange(last - first)[:, None, None] + [[0, 2, 1], [1, 2, 3]]
+            parts.append((points, corners.reshape(-1, 3).astype(np.int32)))
+        return parts
+
+    first = weld(strips((1, 64, 5), (56, 64, 8), (10, 18, 20)), np.array([[0, 0, 0]], np.int32), 1.0)
+    second = weld(strips((64, 127, 5), (64, 72, 8)), np.array([[1, 0, 0]], np.int32), 1.0)
+    assert (len(first.border), len(second.border)) == (4, 4)
+    sizes = {share: len(whole([first, second], share).faces) for share in (0.06, 0.1, 0.13)}
+    assert sizes == {0.06: 252 + 32 + 16, 0.1: 252 + 32, 0.13: 252}
+    kept = whole([first, second], 0.1)
+    assert len(kept.vertices) == 2 * 127 + 2 * 17
+    assert kept.area == pytest.approx(126 + 16)
+    assert len(trimesh.graph.connected_components(kept.edges)) == 2
 
 
 @pytest.mark.parametrize("at_once", [1, 40])
@@ -200,30 +232,21 @@ def test_a_view_is_fused_wherever_it_sees_anything() -> None:
     assert left_away > 10
 
 
-def test_memory_of_fusing_does_not_grow_with_the_length() -> None:
+def test_memory_of_a_mesh_does_not_grow_with_the_length(tmp_path: Path) -> None:
     def peak(count: int) -> float:
         tracemalloc.start()
-        mesh = extracted(Corridor(count), 0.1, 12, least=0.5)
+        views, files = Corridor(count), []
+        grid = make_grid(views, 0.1, 4.0, 10_000_000)
+        for number, chunks in enumerate(grid.regions(12)):
+            surface = surface_of(grid, views, chunks, 0.5)
+            grey = np.full((len(surface.vertices), 3), 128, np.uint8)
+            files.append(tmp_path / f"{number}.npz")
+            save_value(files[-1], Region(surface, grey, grey[:, 0]))
+        write_mesh_ply(tmp_path / "mesh.ply", joined(lambda: map(load_value, files)))
         found = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        assert np.ptp(mesh.vertices[:, 2]) > 0.45 * count
-        return found - 3 * (mesh.vertices.nbytes + mesh.faces.nbytes)  # the mesh itself does
+        assert np.ptp(read_mesh_ply(tmp_path / "mesh.ply").vertices[:, 2]) > 0.45 * count
+        return found
 
-    extracted(Corridor(2), 0.1, 12)
+    peak(2)
     assert peak(36) < 1.2 * peak(12)
-
-
-def test_views_come_back_from_disk(tmp_path: Path) -> None:
-    rng, kept = np.random.default_rng(0), ViewsOnDisk(tmp_path)
-    shown = sphere(orbit(1)[0])
-    colors = rng.integers(0, 255, (3, 120, 160, 3)).astype(np.uint8)
-    channels = [None, rng.integers(-1, 4, (120, 160)).astype(np.int16), None]
-    for color, channel in zip(colors, channels, strict=True):
-        kept.append(DrawnView(shown, color, channel))
-    assert list(tmp_path.iterdir()) == []
-    for n in (2, 0, 1):
-        view = kept.load(n)
-        assert (view.shown.intrinsics, view.shown.cam_from_world.tolist()) == (CAMERA, shown.cam_from_world.tolist())
-        for found, wanted in zip(view.arrays, DrawnView(shown, colors[n], channels[n]).arrays, strict=True):
-            assert found.dtype == wanted.dtype
-            np.testing.assert_array_equal(found, wanted)
