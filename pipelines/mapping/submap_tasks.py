@@ -165,16 +165,24 @@ def refine_submap(task: SubmapTask, progress: Progress) -> None:
     """Its views visited again with all that they show, its own and what lies beside it; none comes or goes."""
     if task.file(REFINED).exists():
         return
-    joined = [task.load(JOINED, n) for n in (task.number, *task.submap.beside)]
-    ids, poses, (gains, offsets) = in_order(joined)
+    beside = (task.number, *task.submap.beside)
+    ids, poses, (gains, offsets) = in_order([task.load(JOINED, n).without_map for n in beside])
     rows = np.searchsorted(ids, task.trajectory.frame_ids)
     given = task.views(replace(task.trajectory, cam_from_world=poses[rows]))
-    whole = together([r.gaussian_map for r in joined])
-    weights, places = _pixels(whole, given.views), torch.cat([torch.arange(len(r.gaussian_map)) for r in joined])
+    shown, places, weights = _shown(given.views, [task.load(JOINED, n).gaussian_map for n in beside])
+    refined = _optimise(task, given, progress, REFINED, shown, (gains[rows], offsets[rows]))
+    task.save(REFINED, replace(_result(task, refined, given.views), rows=places, weights=weights))
+
+
+def _shown(
+    views: Iterable[View], maps: Sequence[GaussianMap]
+) -> tuple[GaussianMap, NDArray[np.int64], NDArray[np.float32]]:
+    """What the views show of the maps, as one: its Gaussians, their rows in the maps they are from (M,), and how many
+    pixels each fills (M,)."""
+    whole, places = together(maps), torch.cat([torch.arange(len(m)) for m in maps])
+    weights = _pixels(whole, views)
     shown = weights > 0
-    refined = _optimise(task, given, progress, REFINED, whole.only(shown), (gains[rows], offsets[rows]))
-    result = replace(_result(task, refined, given.views), rows=places[shown.cpu()].numpy())
-    task.save(REFINED, replace(result, weights=weights[shown].cpu().numpy()))
+    return whole.only(shown), places[shown.cpu()].numpy(), weights[shown].cpu().numpy()
 
 
 def agree_submap(task: SubmapTask, progress: Progress) -> None:
