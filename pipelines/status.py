@@ -13,9 +13,10 @@ from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
 from pipelines.settings_file import load_settings
 from pipelines.streamed import memory_room
+from pipelines.structure.window_size import window_size, windows_of
 
-_AT_ONCE, _BEYOND = {"frames": 500, "tracking": 400}, 0.3
-"""Keyframes that these stages have in work at any time, and MB for each of the others: walks of 115 to 2,272."""
+_TRACKED_AT_ONCE, _BEYOND = 200, 0.3
+"""Keyframes that tracking has in work at any time, and MB for each one that it or `frames` has not."""
 DONE, DAMAGED, INTERRUPTED, OUTDATED, NOT_YET = "done", "damaged", "interrupted", "outdated", "not yet"
 
 
@@ -121,7 +122,9 @@ def expected_mb(stage: str, run: RunFolder, config: Config) -> float | None:
     least, a_million_pixels, a_keyframe, a_million_gaussians = NEEDS[stage]
     gaussians = of_part * (1 if stage == "mapping" else parts) / 1e6
     pixels = camera.width * camera.height / 1e6
-    inside = min(keyframes, _AT_ONCE.get(stage, keyframes))
+    window = windows_of(keyframes, window_size(config.run.memory_mb, camera.width * camera.height))[0]
+    at_once = {"frames": len(window), "tracking": _TRACKED_AT_ONCE}
+    inside = min(keyframes, at_once.get(stage, keyframes))
     by_keyframes = a_keyframe * inside + _BEYOND * (keyframes - inside)
     return round(least + a_million_pixels * pixels + by_keyframes + a_million_gaussians * gaussians)
 

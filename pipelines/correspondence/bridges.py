@@ -7,7 +7,7 @@ few points or on none. Corners followed by optical flow need less of a picture t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import cv2
@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from pipelines.correspondence.flow import corners, follow
 from pipelines.correspondence.matching import VerifiedPair
+from pipelines.correspondence.snapshots import Snapshots
+from pipelines.streamed import Streamed
 from pipelines.types import Features
 
 LEAST = 100
@@ -49,17 +51,43 @@ def weak_keyframes(pairs: Sequence[VerifiedPair], count: int, reach: int) -> lis
 
 
 def with_bridges(
-    features: Sequence[Features], pairs: Sequence[VerifiedPair], weak: Sequence[int], picture: Callable[[int], Picture]
-) -> tuple[dict[int, Features], list[VerifiedPair]]:
-    """Corners of weak keyframes (numbers k) that are found in k - 1 and k + 1 too, as features without a descriptor
-    (zeros) behind the others: keyframes that have more features, and all pairs.
+    features: Streamed[Features],
+    pairs: Sequence[VerifiedPair],
+    weak: Iterable[int],
+    picture: Callable[[int], Picture],
+    stored: Snapshots,
+) -> tuple[Streamed[Features], list[VerifiedPair]]:
+    """What `bridged` finds, made once and read from where it is stored: of all keyframes it would fill the memory."""
+
+    def save(k: int, found: Features) -> None:
+        stored.features(k, lambda: found)
+
+    more = {(p.first, p.second): p for p in stored.pairs(0, lambda: bridged(features, pairs, weak, picture, save))}
+    touched = {k for pair in more for k in pair}
+    changed = features.changed(lambda k, f: stored.features(k, lambda: f) if k in touched else f)
+    return changed, [more.get((p.first, p.second), p) for p in pairs]
+
+
+def bridged(
+    features: Sequence[Features],
+    pairs: Sequence[VerifiedPair],
+    weak: Iterable[int],
+    picture: Callable[[int], Picture],
+    save: Callable[[int, Features], object],
+) -> list[VerifiedPair]:
+    """Corners of weak keyframes (numbers k, ascending) that are found in k - 1 and k + 1 too, as features without a
+    descriptor (zeros) behind the others: keyframes that have more features are saved one after the other, pairs that
+    have more matches returned.
 
     The pairs keep their geometry: verified again with the corners, a wall that fills the view takes it over; and where
     it comes from few matches, half of the corners that are right do not obey it.
     """
     steps = {(p.first, p.second): p for p in pairs if p.second == p.first + 1}
+    more: set[tuple[int, int]] = set()
     found: dict[int, Features] = {}
     for k in weak:
+        for n in [n for n in found if n < k - 1]:
+            save(n, found.pop(n))
         numbers, sides = (k - 1, k, k + 1), (steps[k - 1, k], steps[k, k + 1])
         around = [found[n] if n in found else features[n] for n in numbers]
         followed = _followed([picture(n) for n in numbers], around, *sides)
@@ -67,8 +95,11 @@ def with_bridges(
         for i, pair in enumerate(sides):
             new = np.stack([rows + np.uint32(len(around[i])), rows + np.uint32(len(around[i + 1]))], axis=1)
             steps[pair.first, pair.second] = replace(pair, matches=np.concatenate([pair.matches, new]))
+        more |= {(k - 1, k), (k, k + 1)}
         found.update({n: _more(f, xy) for n, f, xy in zip(numbers, around, followed, strict=True)})
-    return found, [steps.get((p.first, p.second), p) for p in pairs]
+    for n in list(found):
+        save(n, found.pop(n))
+    return [steps[at] for at in sorted(more)]
 
 
 def _followed(

@@ -29,6 +29,7 @@ from pipelines.stages import StageContext
 from pipelines.structure.calibration import read_intrinsics
 from pipelines.structure.lens import to_pycolmap, unknown_camera
 from pipelines.structure.sfm import Ahead, StructureFromMotion, nothing_ahead
+from pipelines.structure.window_size import window_size
 from pipelines.types import Features, Frame
 
 AnySource = VideoSource | FolderSource | RecordingSource
@@ -103,6 +104,7 @@ def structure_from_motion(
         threads=context.threads,
         seed=context.config.run.seed,
         memory=context.memory_room,
+        window=window_size(context.config.run.memory_mb, camera.width * camera.height),
         cam_from_rig=rig.cam_from_rig,
         ahead=ahead,
     )

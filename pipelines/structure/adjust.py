@@ -18,8 +18,11 @@ _MIN_KEYFRAMES_TO_SPLIT = 8
 _SPLIT_VIEWS = 60
 
 
-def adjust(model: pycolmap.Reconstruction, refine_camera: bool) -> float:
+def adjust(model: pycolmap.Reconstruction, refine_camera: bool, narrowly: bool = False) -> float:
     """Robust bundle adjustment of poses, points and, if asked, the camera, in place; wild observations removed.
+
+    `narrowly`: poses and points once more, under a loss as wide as the median error. Where few points hold the path,
+    those that are a pixel off must not have a say.
 
     A camera to be calibrated gets a second radial coefficient here: one is enough to find the structure, and too few
     to tell the focal length of a real lens.
@@ -29,13 +32,23 @@ def adjust(model: pycolmap.Reconstruction, refine_camera: bool) -> float:
     and how far its values from the first and the second half of the views are apart. The first alone is too sure of
     itself several times over, because rolling shutter and blur are no noise.
     """
+    focal_sd = _calibrated(model) if refine_camera else 0.0
     images = sorted(model.reg_image_ids())
+    if not refine_camera:
+        for _ in range(2):
+            solve(model, images, refine_camera=False)
+            remove_wild(model)
+    if narrowly:
+        solve(model, images, refine_camera=False, width=min(median_error(model), _CAUCHY_PX))
+        remove_wild(model)
+    return focal_sd
+
+
+def _calibrated(model: pycolmap.Reconstruction) -> float:
+    """See `adjust`."""
+    images, refine_camera = sorted(model.reg_image_ids()), True
     solve(model, images, refine_camera)
     remove_wild(model)
-    if not refine_camera:
-        solve(model, images, refine_camera=False)
-        remove_wild(model)
-        return 0.0
     solve(model, images, refine_camera)
     simple_focal = float(model.cameras[1].focal_length)
     set_lens(model.cameras[1], 2)
@@ -48,14 +61,16 @@ def adjust(model: pycolmap.Reconstruction, refine_camera: bool) -> float:
     return math.hypot(formal, focal - simple_focal, _difference_of_halves(model, images) / 2)
 
 
-def solve(model: pycolmap.Reconstruction, images: Sequence[int], refine_camera: bool) -> pycolmap.CeresBundleAdjuster:
-    """Robust adjustment of these images, in place; deterministic."""
+def solve(
+    model: pycolmap.Reconstruction, images: Sequence[int], refine_camera: bool, width: float = _CAUCHY_PX
+) -> pycolmap.CeresBundleAdjuster:
+    """Robust adjustment of these images, in place, under Cauchy's loss of so many pixels; deterministic."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_extra_params = refine_camera
     options.refine_sensor_from_rig = options.print_summary = False
     options.min_track_length = 2
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = _CAUCHY_PX
+    options.ceres.loss_function_scale = width
     options.ceres.use_gpu = False
     solver = options.ceres.solver_options
     # Ceres adds up in the order its threads finish; one thread gives the same bytes every time.
@@ -87,6 +102,11 @@ def reprojection_errors(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
     return np.concatenate(errors) if errors else np.zeros(0)
 
 
+def median_error(model: pycolmap.Reconstruction) -> float:
+    """Of all observations, in pixels."""
+    return float(np.median(reprojection_errors(model)))
+
+
 def remove_wild(model: pycolmap.Reconstruction) -> None:
     """Observations that the model contradicts, and points that are seen from one direction only, in place."""
     manager = pycolmap.ObservationManager(model)
@@ -104,7 +124,7 @@ def _formal_sd(model: pycolmap.Reconstruction, adjuster: pycolmap.CeresBundleAdj
         # A problem that does not determine the focal length: say that it may be anything.
         return float(camera.focal_length)
     # The adjustment counts with residuals of one pixel a coordinate; the median norm of two is 1.18 of them.
-    noise = float(np.median(reprojection_errors(model))) / 1.1774
+    noise = median_error(model) / 1.1774
     return math.sqrt(max(float(block[0, 0]), 0.0)) * noise
 
 

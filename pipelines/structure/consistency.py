@@ -11,7 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from pipelines.correspondence.matching import VerifiedPair
-from pipelines.structure.adjust import reprojection_errors
+from pipelines.structure.adjust import median_error
 from pipelines.structure.seams import (
     PairCheck,
     Seam,
@@ -87,7 +87,7 @@ def judge(
     seams = find_seams(placed, checks, tracks, reach)
     parts = find_parts(placed, seams, tracks, reach)
     return ModelReport(
-        len(placed), total, model.num_points3D(), float(np.median(reprojection_errors(model))),
+        len(placed), total, model.num_points3D(), median_error(model),
         agreeing / max(matches, 1), sum(c.agrees for c in checks) / max(len(checks), 1),
         tuple(seams), tuple(map(tuple, parts)),
     )  # fmt: skip

@@ -38,7 +38,7 @@ LEAST_GAIN = 0.01
 0.00002, of a phone that holds still 0.001; of a Kinect 0.03 at first and 0.054 in the end."""
 REACH = (-2, -1, 1, 2)
 _ROUNDS = 3
-_FEATURE_SD = 0.5
+FEATURE_SD = 0.5
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ class RollingModel:
             np.array([pose_of(model.images[i]) for i in self.images]),
             np.array([model.points3D[p].xyz for p in self.point_ids]),
             self.obs_cam, self.obs_point, np.asarray(camera.cam_from_img(self.now)) * focal + half,
-            np.full(count, _FEATURE_SD), np.zeros(count), np.ones(count),
+            np.full(count, FEATURE_SD), np.zeros(count), np.ones(count),
         )  # fmt: skip
         return bundle, np.asarray(camera.cam_from_img(self.plain)) * focal + half, pinhole
 
@@ -192,8 +192,9 @@ class RollingModel:
 
 
 def adjust_rolling(
-    model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout | None, refine_camera: bool
-) -> tuple[pycolmap.Reconstruction, Readout, float] | None:
+    model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout | None, refine_camera: bool,
+    narrowly: bool = False,
+) -> tuple[pycolmap.Reconstruction, Readout, float] | None:  # fmt: skip
     """The model adjusted with the `readout` given, or found where it is None, and the standard deviation of its focal
     length; None where there is no readout, or where the one found explains too little. The model given stays as it is,
     and pixels are those in the frames before and after."""
@@ -222,6 +223,6 @@ def adjust_rolling(
         return None
     found = axis[0] * seconds, axis[1] * seconds
     rolling.straighten(*seen, found)
-    focal_sd = adjust(rolling.model, refine_camera)
+    focal_sd = adjust(rolling.model, refine_camera, narrowly)
     rolling.put(rolling.plain)
     return rolling.model, found, focal_sd

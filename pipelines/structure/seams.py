@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-_LEAST_POINTS = 12
+LEAST_POINTS = 12
 _LEAST_PAIRS = 3
 _PAIR_AGREES = 0.5
 
@@ -56,7 +56,7 @@ class Seam:
     @property
     def is_loose(self) -> bool:
         """Too few points for a pose and a scale of one side from the other."""
-        return self.points < _LEAST_POINTS
+        return self.points < LEAST_POINTS
 
     @property
     def is_contradicted(self) -> bool:
@@ -158,7 +158,7 @@ def find_parts(
             for a, b in product(first, second):
                 shared[min(a, b), max(a, b)] += 1
     label = list(range(number + 1))
-    for a, b in np.argwhere(np.triu(shared, 1) >= 2 * _LEAST_POINTS).tolist():
+    for a, b in np.argwhere(np.triu(shared, 1) >= 2 * LEAST_POINTS).tolist():
         label = [label[a] if x == label[b] else x for x in label]
     parts: dict[int, list[int]] = {}
     for k in placed:

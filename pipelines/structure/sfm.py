@@ -31,14 +31,16 @@ from pipelines.correspondence.snapshots import Snapshots
 from pipelines.geometry.rig import ONE_CAMERA
 from pipelines.progress import Progress
 from pipelines.streamed import Streamed
-from pipelines.structure.adjust import adjust, remove_wild
+from pipelines.structure.adjust import adjust, median_error, remove_wild
 from pipelines.structure.consistency import ModelReport, check_pairs, judge, without_misplaced
 from pipelines.structure.lens import set_lens
 from pipelines.structure.mappers import calibrate_focal, map_globally, map_incrementally
+from pipelines.structure.mend import mended
 from pipelines.structure.parallax import HOW_TO_FILM, require_parallax
-from pipelines.structure.rolling import NO_READOUT, Readout, adjust_rolling, read_readout
+from pipelines.structure.rolling import FEATURE_SD, NO_READOUT, Readout, adjust_rolling, read_readout
 from pipelines.structure.seams import cut, take_out
-from pipelines.structure.windows import WIDE, Joined, adjust_together, close_loops, windows_of
+from pipelines.structure.window_size import SIZE, windows_of
+from pipelines.structure.windows import WIDE, Joined, adjust_together, close_loops
 from pipelines.types import Features, Vocabulary
 
 _PAIRS_PER_BLOCK = 64
@@ -85,16 +87,18 @@ class Structure:
 @dataclass(frozen=True)
 class _Views:
     """What is known of the keyframes: features, their pixels (F, 2) again, which are needed when descriptors no longer
-    are, and times (K,) in seconds."""
+    are, times (K,) in seconds, and the numbers of those that hold the path's size badly."""
 
     features: Streamed[Features]
     xy: list[NDArray[np.float64]]
     times: NDArray[np.float64]
+    weak: list[int]
 
     def part(self, window: range) -> _Views:
         """Of the keyframes of a window, counted from 0."""
         numbers = slice(window.start, window.stop)
-        return _Views(self.features.part(window), self.xy[numbers], self.times[numbers])
+        weak = [k - window.start for k in self.weak if k in window]
+        return _Views(self.features.part(window), self.xy[numbers], self.times[numbers], weak)
 
 
 @dataclass(frozen=True)
@@ -126,6 +130,7 @@ class StructureFromMotion:
     threads: int
     seed: int
     memory: float = math.inf
+    window: int = SIZE
     ahead: Ahead = nothing_ahead
     cam_from_rig: NDArray[np.float64] = field(default_factory=lambda: ONE_CAMERA.cam_from_rig)
 
@@ -137,9 +142,9 @@ class StructureFromMotion:
         tried = self._proposed(features, vocabulary)
         proposed = {"pairs": np.array(tried, np.int64).reshape(-1, 2)}
         self.ahead("pairs", len(_blocks(tried)), proposed)
-        features, pairs = self._bridged(keyframe_ids, features, self.pairs_of(features, tried))
+        views, pairs = self._bridged(keyframe_ids, features, self.pairs_of(features, tried))
+        features = views.features
         self.ahead("windows", self._windows(len(features)), proposed)
-        views = _Views(features, [f.xy for f in features], np.array([self.time(k) for k in keyframe_ids]))
         known_focal = self.camera.mean_focal_length() if self.camera.has_prior_focal_length else None
         require_parallax(pairs, views.xy, (self.camera.width, self.camera.height), known_focal)
         found = self._in_windows(views, pairs) or self._calibrated(views, pairs)
@@ -168,7 +173,7 @@ class StructureFromMotion:
     def _in_windows(self, views: _Views, pairs: Sequence[VerifiedPair]) -> _Adjusted | None:
         """Of a long recording the models of its windows, joined, in the camera of the window that is surest of it.
         None of a shorter one, of panoramas, and where the windows do not hang together."""
-        windows = windows_of(len(views.xy))
+        windows = windows_of(len(views.xy), self.window)
         if not self._windows(len(views.xy)):
             return None
         views.features.forget()
@@ -184,29 +189,28 @@ class StructureFromMotion:
         if close_loops(model, pairs, windows, views.xy):
             adjust_together(model, views.xy, views.times, surest.readout, WIDE)
             adjust_together(model, views.xy, views.times, surest.readout)
+        if views.weak:
+            adjust_together(model, views.xy, views.times, surest.readout, median_error(model) / FEATURE_SD)
         remove_wild(model)
         return replace(surest, model=model)
 
     def _windows(self, count: int) -> int:
         """How many there are; 0 where all is made at once."""
-        windows = len(windows_of(count))
+        windows = len(windows_of(count, self.window))
         return windows if windows > 1 and len(self.cam_from_rig) == 1 else 0
 
     def _window(self, window: range, views: _Views, pairs: Sequence[VerifiedPair]) -> _Adjusted | None:
         inside = [replace(p, first=p.first - window.start, second=p.second - window.start)
                   for p in pairs if p.first in window and p.second in window]  # fmt: skip
-        snapshots = Snapshots(self.snapshots.folder / f"window_{window.start:06d}")
+        snapshots = Snapshots(self.snapshots.folder / f"window_{window.start:06d}_{window.stop:06d}")
         snapshots.folder.mkdir(exist_ok=True)
         return replace(self, snapshots=snapshots)._calibrated(views, inside)
 
     def map_window(self, number: int, keyframe_ids: Sequence[int], proposed: Sequence[tuple[int, int]]) -> None:
         """Leave the models of a window in the snapshots; all features and pairs are there."""
-        window, all_features = windows_of(len(keyframe_ids))[number], self.features_of(keyframe_ids, range(0))
-        all_features, pairs = self._bridged(keyframe_ids, all_features, self.pairs_of(all_features, proposed))
-        features = all_features.part(window)
-        times = np.array([self.time(keyframe_ids[k]) for k in window])
-        views = _Views(features, [f.xy for f in features], times)
-        self._window(window, views, pairs)
+        window, features = windows_of(len(keyframe_ids), self.window)[number], self.features_of(keyframe_ids, range(0))
+        views, pairs = self._bridged(keyframe_ids, features, self.pairs_of(features, proposed))
+        self._window(window, views.part(window), pairs)
 
     def _places(self, views: Sequence[object]) -> int:
         return len(views) // len(self.cam_from_rig)
@@ -219,10 +223,10 @@ class StructureFromMotion:
             return None
         model, mapper, report = found
         readout = NO_READOUT if len(self.cam_from_rig) > 1 else read_readout(self.config.rolling_shutter)
-        rolling = adjust_rolling(model, views.xy, views.times, readout, not self.is_fixed)
+        rolling = adjust_rolling(model, views.xy, views.times, readout, not self.is_fixed, bool(views.weak))
         if rolling is not None:
             return _Adjusted(rolling[0], mapper, rolling[2], report.score, rolling[1])
-        return _Adjusted(model, mapper, adjust(model, refine_camera=not self.is_fixed), report.score, NO_READOUT)
+        return _Adjusted(model, mapper, adjust(model, not self.is_fixed, bool(views.weak)), report.score, NO_READOUT)
 
     def _pieces(
         self, views: _Views, pairs: Sequence[VerifiedPair], model: pycolmap.Reconstruction
@@ -325,12 +329,14 @@ class StructureFromMotion:
 
     def _bridged(
         self, keyframe_ids: Sequence[int], features: Streamed[Features], pairs: list[VerifiedPair]
-    ) -> tuple[Streamed[Features], list[VerifiedPair]]:
-        """With points followed through keyframes that hold the path's size badly."""
+    ) -> tuple[_Views, list[VerifiedPair]]:
+        """All views, with points followed through keyframes that hold the path's size badly."""
         weak = weak_keyframes(pairs, len(features), self.config.overlap) if len(self.cam_from_rig) == 1 else []
-        told = self.progress.track(weak, "weak keyframes", len(weak))
-        more, pairs = with_bridges(features, pairs, list(told), lambda k: self.picture(keyframe_ids[k]))
-        return features.changed(lambda k, f: more.get(k, f)) if more else features, pairs
+        if weak:
+            told = self.progress.track(weak, "weak keyframes", len(weak))
+            stored = Snapshots(self.snapshots.folder / "bridges")
+            features, pairs = with_bridges(features, pairs, told, lambda k: self.picture(keyframe_ids[k]), stored)
+        return _Views(features, [f.xy for f in features], np.array([self.time(k) for k in keyframe_ids]), weak), pairs
 
     def _map(
         self,
@@ -377,9 +383,12 @@ class StructureFromMotion:
         model = self.snapshots.model(name, lambda work: self._run_mapper(name, work, views.features, pairs))
         if model is None:
             return None
-        places = self._places(views.xy)
-        model = without_misplaced(model, every, views.xy, places, self.config.overlap)
-        return model, name, judge(model, every, views.xy, places, self.config.overlap)
+        seen = every, views.xy, self._places(views.xy), self.config.overlap
+        model = without_misplaced(model, *seen)
+        report = judge(model, *seen)
+        if views.weak:
+            model, report = mended(model, report, *seen, self.seed)
+        return model, name, report
 
     def _run_mapper(
         self, name: str, work: Path, features: Streamed[Features], pairs: Sequence[VerifiedPair]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 import pycolmap
@@ -23,23 +22,12 @@ from pipelines.structure.rolling import Readout, RollingModel, straightened, vel
 
 Array = NDArray[np.float64]
 
-SIZE, SHARED = 500, 40
-"""Keyframes of a window, and those that it shares with the one before. All at once is surer (0.20 cm against 0.26 in
-windows of 32 of a walk of 77 keyframes, the one recording tried), while there is room for it."""
 _LEAST_SHARED = 30
 _LEAST_MATCHES, _NEAR, _OUTLIER = 12, 0.05, 3.0
 """A loop between windows: its least matches, their median error as a share of the picture's width, from where it is
 left to `global_ba`, and how many medians a match may be off. On made-up walks only."""
 WIDE = 40.0
 """Of the loss of the adjustment that pulls loops together: standard deviations."""
-
-
-def windows_of(count: int, size: int = SIZE, shared: int = SHARED) -> list[range]:
-    """All keyframes in windows of about that size; one window for less than half as much again."""
-    parts = max(1, round((count - shared) / (size - shared))) if count > 1.5 * size else 1
-    shared *= parts > 1
-    edges = np.linspace(0, count - shared, parts + 1).round().astype(int).tolist()
-    return [range(a, b + shared) for a, b in pairwise(edges)]
 
 
 @dataclass

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.correspondence.bridges import LEAST, weak_keyframes, with_bridges
+from pipelines.correspondence.bridges import LEAST, Picture, bridged, weak_keyframes
 from pipelines.correspondence.matching import VerifiedPair, match_features
 from pipelines.correspondence.retrieval import describe, learn_vocabulary
 from pipelines.types import Features
@@ -46,6 +48,14 @@ def weak() -> tuple[list[Features], list[VerifiedPair]]:
     return [_features(k, seen) for k in range(3)], [_pair(0, 1, rows, rows), _pair(1, 2, rows + 20, rows + 20)]
 
 
+def _bridged(
+    weak: tuple[list[Features], list[VerifiedPair]], picture: Callable[[int], Picture]
+) -> tuple[dict[int, Features], list[VerifiedPair]]:
+    found: dict[int, Features] = {}
+    pairs = bridged(*weak, [1], picture, found.__setitem__)
+    return found, pairs
+
+
 def test_a_keyframe_is_weak_where_few_features_match_before_and_behind_it() -> None:
     many, few = np.arange(2 * LEAST), np.arange(10)
     pairs = [_pair(k, k + 1, many, many if k != 3 else many[::-1] + 5000) for k in range(6)]
@@ -57,37 +67,37 @@ def test_a_keyframe_is_weak_where_few_features_match_before_and_behind_it() -> N
 
 
 def test_corners_join_what_features_do_not(weak: tuple[list[Features], list[VerifiedPair]]) -> None:
-    features, pairs = weak
+    pairs = weak[1]
     assert weak_keyframes(pairs, 3, reach=8) == [1]
-    found, bridged = with_bridges(features, pairs, [1], lambda k: (_picture(k), None))
+    found, more = _bridged(weak, lambda k: (_picture(k), None))
     count = len(found[1]) - 40
     assert count > 40
     assert [len(found[k]) for k in range(3)] == [40 + count] * 3
-    for k, pair in enumerate(bridged):
+    for k, pair in enumerate(more):
         assert np.array_equal(pair.matches[:20], pairs[k].matches)
         moved = found[k + 1].xy[pair.matches[20:, 1]] - found[k].xy[pair.matches[20:, 0]]
         assert np.quantile(np.linalg.norm(moved - STEP, axis=1), 0.8) < 0.1  # at the rim a corner is worse off
-    assert set(bridged[0].matches[20:, 1]) == set(bridged[1].matches[20:, 0])
+    assert set(more[0].matches[20:, 1]) == set(more[1].matches[20:, 0])
 
 
 def test_no_corner_lies_on_what_is_left_out(weak: tuple[list[Features], list[VerifiedPair]]) -> None:
     hidden = np.zeros(SIZE[::-1], np.bool_)
     hidden[:, 80:] = True
-    found, _ = with_bridges(*weak, [1], lambda k: (_picture(k), hidden))
+    found, _ = _bridged(weak, lambda k: (_picture(k), hidden))
     assert len(found[1]) > 50
     assert all((found[k].xy[40:, 0] < 81).all() for k in range(3))
 
 
 def test_a_corner_is_like_nothing(weak: tuple[list[Features], list[VerifiedPair]]) -> None:
-    features, pairs = weak
-    found, _ = with_bridges(features, pairs, [1], lambda k: (_picture(k), None))
+    features = weak[0]
+    found, _ = _bridged(weak, lambda k: (_picture(k), None))
     assert match_features(found[0], found[1]).max() < 40
     vocabulary = learn_vocabulary(features, 0)
     assert np.array_equal(describe(found[1], vocabulary), describe(features[1], vocabulary))
 
 
 def test_pictures_without_corners_change_nothing(weak: tuple[list[Features], list[VerifiedPair]]) -> None:
-    features, pairs = weak
-    found, bridged = with_bridges(features, pairs, [1], lambda k: (np.full(SIZE[::-1], 90, np.uint8), None))
+    pairs = weak[1]
+    found, more = _bridged(weak, lambda k: (np.full(SIZE[::-1], 90, np.uint8), None))
     assert [len(f) for f in found.values()] == [40] * 3
-    assert all(np.array_equal(a.matches, b.matches) for a, b in zip(bridged, pairs, strict=True))
+    assert all(np.array_equal(a.matches, b.matches) for a, b in zip(more, pairs, strict=True))

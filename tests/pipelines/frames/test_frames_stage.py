@@ -6,7 +6,6 @@ import hashlib
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -29,7 +28,7 @@ from pipelines.stages import StageContext
 from pipelines.stored import dataclass_from_json
 from pipelines.structure import sfm
 from pipelines.structure.adjust import adjust
-from pipelines.structure.windows import windows_of
+from pipelines.structure.window_size import windows_of
 from pipelines.types import Calibration
 from tests.pipelines.frames.conftest import QUICK, WALK_FRAMES, Walk, render, sideways, turn, write_walk
 from tests.pipelines.travelling import Travelling
@@ -92,7 +91,7 @@ def test_workers_leave_the_same_bytes(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(sfm, "windows_of", partial(windows_of, size=7, shared=3))
+    monkeypatch.setattr(sfm, "windows_of", lambda count, _: windows_of(count, 7, 3))
     whole, workers = make_context(bent_walk.folder, name="whole"), Travelling(tmp_path, 2)
     divided = replace(make_context(bent_walk.folder, name="divided"), workers=workers)
     assert run(divided) == run(whole)

@@ -13,10 +13,13 @@ from pipelines.correspondence.matching import VerifiedPair
 from pipelines.geometry import se3
 from pipelines.geometry.alignment import Similarity, align_points
 from pipelines.geometry.camera import project
-from pipelines.structure.adjust import reprojection_errors
+from pipelines.structure.adjust import adjust, reprojection_errors
+from pipelines.structure.consistency import judge
 from pipelines.structure.lens import unknown_camera
+from pipelines.structure.mend import mended, resize_behind, size_ratio
 from pipelines.structure.rolling import NO_READOUT
-from pipelines.structure.windows import SHARED, SIZE, WIDE, Joined, adjust_together, close_loops, windows_of
+from pipelines.structure.window_size import SHARED, SIZE, window_size, windows_of
+from pipelines.structure.windows import WIDE, Joined, adjust_together, close_loops
 from pipelines.types import Intrinsics
 from tests.world.paths import look_at
 
@@ -80,6 +83,13 @@ def test_windows_hold_all_keyframes_and_share_some() -> None:
         assert all(a.stop - b.start == SHARED for a, b in pairwise(windows))
 
 
+def test_the_memory_that_is_given_decides_how_large_windows_are() -> None:
+    assert window_size(0, 27648) == window_size(4000, 27648) == SIZE  # a machine's own memory decides nothing
+    assert [window_size(m, 27648) for m in (100, 700, 1000)] == [100, 177, 354]
+    assert window_size(1000, 307200) < 354  # of larger pictures
+    assert all(len(w) <= 1.5 * 177 for w in windows_of(2272, window_size(700, 27648)))
+
+
 def test_windows_of_three_worlds_become_one_model() -> None:
     joined, windows = Joined(), windows_of(COUNT, 17, 6)
     assert len(windows) == 3
@@ -141,3 +151,70 @@ def test_windows_that_share_too_little_are_not_joined() -> None:
     joined, first = Joined(), moves()[0]
     assert joined.add(model_of(range(15), first, 1e-3)[0], 0)
     assert not joined.add(model_of(range(20, 35), first, 1e-3)[0], 20)
+
+
+def matched(xy: list[Array], numbers: list[NDArray[np.int64]]) -> list[VerifiedPair]:
+    """Neighbours' features of the same points."""
+    pairs = []
+    for a in range(COUNT):
+        for b in range(a + 1, min(a + 4, COUNT)):
+            _, i, j = np.intersect1d(numbers[a], numbers[b], return_indices=True)
+            pairs.append(VerifiedPair(a, b, np.stack([i, j], 1).astype(np.uint32), 2, np.zeros((3, 3, 3)), len(i)))
+    return pairs
+
+
+def torn(at: int, ratio: float) -> tuple[pycolmap.Reconstruction, list[Array], list[VerifiedPair]]:
+    """The walk in two structures that share one keyframe, and no point; what lies behind it is larger by a ratio."""
+    model, xy = model_of(range(COUNT), moves()[0], 0.0)
+    pairs = matched(xy, [np.array([p for p, _ in view]) for view in seen()[1]])
+    resize_behind(model, at, ratio)
+    for point in sorted(model.point3D_ids()):
+        elements = [(e.image_id, e.point2D_idx) for e in model.points3D[point].track.elements]
+        behind = np.mean([np.sign(i - 1 - at) for i, _ in elements]) > 0
+        for image, feature in elements:
+            if (image - 1 > at) != behind and image - 1 != at and model.exists_point3D(point):
+                model.delete_observation(image, feature)
+    return model, xy, pairs
+
+
+@pytest.mark.parametrize("ratio", [5.9, 0.3])
+def test_a_path_that_lost_its_size_is_mended_by_what_matches(ratio: float) -> None:
+    model, xy, pairs = torn(20, ratio)
+    report = judge(model, pairs, xy, COUNT, 4)
+    assert sorted(len(p) for p in report.parts) in ([20, 20], [19, 21])  # the shared keyframe goes with either
+    found, count = size_ratio(model, 20, pairs, xy, 4)
+    assert found == pytest.approx(1 / ratio, rel=0.02)
+    assert count > 100
+    whole, better = mended(model, report, pairs, xy, COUNT, 4, 0)
+    assert [len(p) for p in better.parts] == [COUNT]
+    centers = np.array([whole.images[i].projection_center() for i in range(1, COUNT + 1)])
+    wanted = se3.inverse(path())[:, :3, 3]
+    assert np.linalg.norm(align_points(centers, wanted).apply(centers) - wanted, axis=1).max() < 0.02
+
+
+def test_a_path_that_nothing_holds_stays_in_parts() -> None:
+    model, xy, pairs = torn(20, 3.0)
+    apart = [p for p in pairs if (p.first <= 20) == (p.second <= 20)]
+    report = judge(model, apart, xy, COUNT, 4)
+    left, same = mended(model, report, apart, xy, COUNT, 4, 0)
+    assert left is model
+    assert same is report
+    assert len(report.parts) > 1
+
+
+def test_points_a_pixel_off_have_no_say_in_a_narrow_adjustment() -> None:
+    """Most are seen to a twentieth of a pixel, one in six to the right of where it is."""
+    model, _ = model_of(range(COUNT), moves()[0], 1e-3)
+    (points, views), rng = seen(), np.random.default_rng(3)
+    for k, (view, pose) in enumerate(zip(views, path(), strict=True), 1):
+        exact, _ = project(points[[p for p, _ in view]] @ pose[:3, :3].T + pose[:3, 3], CAMERA)
+        off = np.where(rng.random((len(view), 1)) < 1 / 6, rng.uniform([0.5, 0], [2, 1e-9], (len(view), 2)), 0.0)
+        for point, at in zip(model.images[k].points2D, exact + off + rng.normal(0, 0.05, off.shape), strict=True):
+            point.xy = at
+    wanted, errors = se3.inverse(path())[:, :3, 3], []
+    for narrowly in (False, True):
+        tried = pycolmap.Reconstruction(model)
+        adjust(tried, refine_camera=False, narrowly=narrowly)
+        found = np.array([tried.images[i].projection_center() for i in range(1, COUNT + 1)])
+        errors.append(np.linalg.norm(align_points(found, wanted).apply(found) - wanted, axis=1).mean())
+    assert errors[1] < 0.5 * errors[0]
