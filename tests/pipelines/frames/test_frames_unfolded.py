@@ -73,7 +73,7 @@ def test_sides_that_look_alike_do_not_fold_the_path(tmp_path: Path) -> None:
         lambda *_: np.zeros((0, 2), np.uint32), Snapshots(tmp_path), SilentProgress(), threads=1, seed=0,
     )  # fmt: skip
     streamed = Streamed(VIEWS, features.__getitem__, lambda f: f.nbytes, 1e9)
-    given = _Views(streamed, [f.xy for f in features], np.arange(VIEWS, dtype=float))
+    given = _Views(streamed, [f.xy for f in features], np.arange(VIEWS, dtype=float), [])
     folded = structure._tried("global", given, pairs, pairs)
     found = structure._map(given, pairs)
     assert folded is not None
