@@ -18,6 +18,8 @@ KEPT_CLASSES = 4
 _FORMAT = "gaussians-compact-1"
 _STEPS = 65535
 _MOST_CLASSES = 255
+_AT_ONCE = 1 << 16
+"""Gaussians that are packed at a time: in double precision, and sorted by class, they take many times their room."""
 
 
 def write_compact(path: Path, cloud: GaussianCloud, class_names: tuple[str, ...] = ()) -> None:
@@ -30,7 +32,7 @@ def write_compact(path: Path, cloud: GaussianCloud, class_names: tuple[str, ...]
     low, side = _bounds(cloud.means)
     isotropic = bool((cloud.log_scales == cloud.log_scales[:, :1]).all())
     arrays: dict[str, NDArray] = {
-        "means": np.round((cloud.means.astype(np.float64) - low) / side * _STEPS).astype(np.uint16),
+        "means": np.concatenate([_quantised(cloud.means[rows], low, side) for rows in _parts(len(cloud))]),
         "box": np.stack([low, side]),
         "log_scales": cloud.log_scales[:, :1].astype(np.float16) if isotropic else cloud.log_scales.astype(np.float16),
         "opacity_logits": cloud.opacity_logits.astype(np.float16),
@@ -85,12 +87,24 @@ def _bounds(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np
     return low, np.where(high > low, high - low, 1.0)
 
 
+def _quantised(means: NDArray[np.float32], low: NDArray[np.float64], side: NDArray[np.float64]) -> NDArray[np.uint16]:
+    return np.round((means.astype(np.float64) - low) / side * _STEPS).astype(np.uint16)
+
+
 def _top_classes(probs: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """(M, k) ids and 8 bit probabilities, most probable first; equal ones by id."""
-    kept = min(KEPT_CLASSES, probs.shape[1])
-    ids = np.argsort(-probs, axis=1, kind="stable")[:, :kept]
-    values = np.take_along_axis(probs, ids, axis=1)
-    return ids.astype(np.uint8), np.floor(values.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+    ids = np.empty((len(probs), min(KEPT_CLASSES, probs.shape[1])), np.uint8)
+    values = np.empty(ids.shape, np.uint8)
+    for rows in _parts(len(probs)):
+        order = np.argsort(-probs[rows], axis=1, kind="stable")[:, : ids.shape[1]]
+        best = np.take_along_axis(probs[rows], order, axis=1).clip(0, 1)
+        ids[rows], values[rows] = order, np.floor(best * 255 + 0.5)
+    return ids, values
+
+
+def _parts(count: int) -> list[slice]:
+    """At least one, so that none of nothing can be joined too."""
+    return [slice(start, start + _AT_ONCE) for start in range(0, max(count, 1), _AT_ONCE)]
 
 
 def _spread_classes(ids: NDArray[np.uint8], values: NDArray[np.uint8], count: int) -> NDArray[np.float32]:

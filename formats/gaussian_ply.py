@@ -45,7 +45,7 @@ def write_gaussian_ply(
     dtype: list[tuple[str, str]] = [(name, "<f4") for name in fields]
     if cloud.class_ids is not None:
         dtype.append(("class_id", "u1"))
-    occurring = [] if cloud.class_probs is None else np.flatnonzero((cloud.class_probs != 0).any(axis=0)).tolist()
+    occurring = [] if cloud.class_probs is None else [i for i, of in enumerate(cloud.class_probs.T) if of.any()]
     dtype += [(f"{_PROB}{i}", "<f4") for i in occurring]
     blocks = (_rows(cloud, rows, np.dtype(dtype), occurring) for rows in slices(len(cloud)))
     comments = [f"class {i} {name}" for i, name in enumerate(class_names)]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipelines.depth.posed import PosedDepth
 from pipelines.gaussian_map import GaussianMap, decided_channels
-from pipelines.gaussians.render import median_depth, render
+from pipelines.gaussians.render import median_and_seen, render
 from pipelines.types import Intrinsics
 
 
@@ -50,10 +50,11 @@ class Shown(Sequence[PosedDepth]):
 @torch.no_grad()
 def drawn_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], camera: Intrinsics) -> DrawnView:
     """Median depth with a weight: none where the map is thin or the depth jumps, less far away."""
-    m = gaussian_map
-    geometry, pose = (m.means, m.radii, m.opacities), torch.as_tensor(cam_from_world, device=m.means.device)
-    depth = median_depth(*geometry, pose, camera).cpu().numpy()
-    rendering = render(*geometry, torch.cat([m.colors, m.class_logits], dim=1), pose, camera)
+    m, pose = gaussian_map, torch.as_tensor(cam_from_world, device=gaussian_map.means.device)
+    radii, opacities = m.radii, m.opacities
+    median, seen = median_and_seen(m.means, radii, opacities, pose, camera)
+    depth, features = median.cpu().numpy(), torch.cat([m.colors[seen], m.class_logits[seen]], dim=1)
+    rendering = render(m.means[seen], radii[seen], opacities[seen], features, pose, camera)
     silhouette, features = rendering.silhouette.cpu().numpy(), rendering.features
     solid = (silhouette > 0.7) & (depth > 0) & ~_jumps(depth)
     typical = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0

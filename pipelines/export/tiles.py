@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from formats.gaussian_ply import write_gaussian_ply
@@ -25,10 +26,11 @@ def write_tiles(outcome: Outcome, folder: Path) -> list[Path]:
     submaps = outcome.run.load_submaps()
     if not submaps:
         return []
-    cloud, anchors = map_cloud(outcome), outcome.require_map().anchor_frame_ids.cpu().numpy()
+    anchors = outcome.require_map().anchor_frame_ids
     rows: list[dict[str, Any]] = []
     for number, submap in enumerate(submaps, 1):
-        tile, name = cloud.only(np.isin(anchors, submap["own"])), f"submap_{number}"
+        own = torch.isin(anchors, torch.as_tensor(submap["own"], device=anchors.device))
+        tile, name = map_cloud(outcome, own), f"submap_{number}"
         if len(tile) == 0:
             continue
         simpler = coarse(tile)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from formats.atomic import copy_file, write_text
 from formats.colmap import write_colmap_model
@@ -27,6 +28,9 @@ from pipelines.run_folder import save_classes, save_left_out
 from pipelines.types import SparseModel
 from pipelines.upright.world import World, save_world
 from pipelines.wording import stretches
+
+_AT_ONCE = 1 << 16
+"""Gaussians whose probabilities are copied at a time."""
 
 
 def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
@@ -68,13 +72,17 @@ def seen_points(
     )  # fmt: skip
 
 
-def map_cloud(outcome: Outcome) -> GaussianCloud:
-    """The map as a splat cloud, class probabilities in the order of the run's classes where it has any."""
+def map_cloud(outcome: Outcome, rows: Tensor | None = None) -> GaussianCloud:
+    """The map, or `rows` (M,) bool of it, as a splat cloud, class probabilities in the order of the run's classes where
+    it has any."""
     m, channels = outcome.require_map(), outcome.label_of_channel
+    m = m if rows is None else m.only(rows)
     probabilities = None
     if len(channels):
         probabilities = np.zeros((len(m), len(outcome.classes)), np.float32)
-        probabilities[:, channels] = torch.softmax(m.class_logits, dim=1).cpu().numpy()
+        for start in range(0, len(m), _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
+            probabilities[part, channels] = torch.softmax(m.class_logits[part], dim=1).cpu().numpy()
     means, log_radii, logits, colors = (x.cpu().numpy() for x in (m.means, m.log_radii, m.opacity_logits, m.colors))
     return isotropic_cloud(means, log_radii, logits, colors, probabilities)
 

@@ -6,7 +6,7 @@
 
 from pipelines.gaussians.render.compositing import Composite, composite
 from pipelines.gaussians.render.culling import in_view
-from pipelines.gaussians.render.inspection import BlendingWeights, blending_weights, median_depth
+from pipelines.gaussians.render.inspection import BlendingWeights, blending_weights, median_and_seen, median_depth
 from pipelines.gaussians.render.rendering import Rendering, render
 from pipelines.gaussians.render.threads import get_threads, set_threads
 from pipelines.gaussians.render.tracking import PoseFit, track_gn
@@ -20,6 +20,7 @@ __all__ = [
     "composite",
     "get_threads",
     "in_view",
+    "median_and_seen",
     "median_depth",
     "render",
     "set_threads",

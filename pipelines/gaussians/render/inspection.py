@@ -36,6 +36,15 @@ def median_depth(
     return _inspect(means, radii, opacities, cam_from_world, intrinsics, near, backend)[0]
 
 
+def median_and_seen(
+    means: Tensor, radii: Tensor, opacities: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics
+) -> tuple[Tensor, Tensor]:
+    """The `median_depth`, and the rows (n,) of the Gaussians that have a weight in the image: what hides behind walls
+    has none, and without it the same image is rendered."""
+    median, _, largest = _inspect(means, radii, opacities, cam_from_world, intrinsics, NEAR, None)
+    return median, torch.nonzero(largest)[:, 0]
+
+
 def blending_weights(
     means: Tensor,
     radii: Tensor,

@@ -4,7 +4,7 @@ import pytest
 import torch
 from render_scenes import random_gaussians, room
 
-from pipelines.gaussians.render import blending_weights, in_view, median_depth, render, set_threads
+from pipelines.gaussians.render import blending_weights, in_view, median_and_seen, median_depth, render, set_threads
 from pipelines.gaussians.render.compositing import choose_backend
 from pipelines.geometry import se3
 
@@ -75,3 +75,18 @@ def test_what_is_in_view_is_all_that_a_picture_depends_on():
         torch.testing.assert_close(part, whole, rtol=0, atol=0)
         seen = blending_weights(*arguments[:3], turned, scene.intrinsics, backend=backend).total > 0
         assert 100 < seen.sum() < len(rows) < 1.3 * seen.sum() + 50 < 2000
+
+
+def test_what_hides_behind_walls_is_not_seen_and_changes_nothing():
+    """Of a room twice as far behind the room only a little shines through; the picture is the same without the rest."""
+    scene = room(64, 48, 20_000, 1)
+    means, k = torch.cat([scene.means, 3 * scene.means]), scene.intrinsics
+    radii, opacities, colors = (torch.cat([x, x]) for x in (scene.radii, scene.opacities, scene.colors))
+    median, seen = median_and_seen(means, radii, opacities, POSE, k)
+    assert (median == median_depth(means, radii, opacities, POSE, k)).all()
+    assert len(seen) < 0.8 * len(in_view(means, radii, POSE, k))
+    with torch.no_grad():
+        part = render(means[seen], radii[seen], opacities[seen], colors[seen], POSE, k)
+        whole = render(means, radii, opacities, colors, POSE, k)
+    for name in ("features", "depth", "silhouette"):
+        assert (getattr(part, name) == getattr(whole, name)).all()
