@@ -15,8 +15,8 @@ from pipelines.correspondence.matching import VerifiedPair
 from pipelines.structure.adjust import median_error
 
 _FAR_OFF = 8.0
-"""Median errors within which an observation belongs to a point, at most COLMAP's own limits. On four stretches of a
-made-up walk, where that is one pixel, half as much and twice as much are no better, and four times is worse."""
+"""Median errors within which an observation belongs to a point, at most COLMAP's own limits. Of half, once and twice as
+much it is the best on two of four stretches of one made-up walk; COLMAP's four pixels double the error of one."""
 
 
 def complete_tracks(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair], seed: int) -> int:
