@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -90,7 +91,8 @@ def build_scene(
     scale = min(1.0, _SIDE / max(intrinsics.width, intrinsics.height))
     camera = intrinsics.resized(max(1, round(intrinsics.width * scale)), max(1, round(intrinsics.height * scale)))
     rows = [_gather(f, camera, size) for f in frames]
-    voxels = merge(size, [(keys, values) for keys, values, _ in rows])
+    # Votes are by the same cubes, however many.
+    voxels = merge(size, [(keys, values) for keys, values, _ in rows], sys.maxsize)
     voxels = select(voxels, voxels.weight > _LEAST_WEIGHT)
     cameras = np.array([f.world_from_cam for f in frames])
     gravity = find_gravity(voxels, -cameras[:, :3, 1].mean(0))

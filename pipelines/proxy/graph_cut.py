@@ -9,14 +9,13 @@ from pipelines.jit import kernel
 
 
 def cut_graph(
-    a: NDArray[np.int64], b: NDArray[np.int64], cost: NDArray[np.float64], mass: NDArray[np.float64], scale: float
+    a: NDArray[np.integer], b: NDArray[np.integer], cost: NDArray[np.float64], mass: NDArray[np.float64], scale: float
 ) -> NDArray[np.int64]:
     """(V,) component of every node, numbered from 0, for edges a-b (E,) with a cost each.
 
     Two components join when the edge costs no more than the dearest edge inside either plus `scale` over its mass.
     """
-    order = np.lexsort((b, a, cost))
-    root = _join(a[order], b[order], cost[order], mass, scale)
+    root = _join(np.lexsort((b, a, cost)), a, b, cost, mass, scale)
     return np.unique(root, return_inverse=True)[1]
 
 
@@ -45,12 +44,17 @@ def _root(parent: NDArray[np.int64], i: int) -> int:
 
 @kernel
 def _join(
-    a: NDArray[np.int64], b: NDArray[np.int64], cost: NDArray[np.float64], mass: NDArray[np.float64], scale: float
+    order: NDArray[np.int64],
+    a: NDArray[np.integer],
+    b: NDArray[np.integer],
+    cost: NDArray[np.float64],
+    mass: NDArray[np.float64],
+    scale: float,
 ) -> NDArray[np.int64]:
     parent = np.arange(len(mass))
     total = mass.copy()
     inner = np.zeros(len(mass))
-    for e in range(len(cost)):
+    for e in order:
         i, j = _root(parent, a[e]), _root(parent, b[e])
         if i != j and cost[e] <= min(inner[i] + scale / total[i], inner[j] + scale / total[j]):
             parent[j] = i

@@ -26,7 +26,7 @@ def cut_parts(voxels: Voxels, largest: int) -> NDArray[np.int64]:
     if len(voxels) == 0:
         return np.empty(0, np.int64)
     a, b, cost = _edges(voxels)
-    part = cut_graph(a, b, cost, voxels.weight / np.median(voxels.weight), _SCALE)
+    part = cut_graph(a, b, cost, voxels.weight / np.median(voxels.weight), _SCALE).astype(np.int32)
     return _absorb_small(part, a, b, cost, voxels.weight, largest)
 
 
@@ -37,7 +37,7 @@ def cut_patches(voxels: Voxels) -> NDArray[np.int64]:
     return cut_graph(*_edges(voxels), voxels.weight / np.median(voxels.weight), _PATCH_SCALE)
 
 
-def _edges(voxels: Voxels) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+def _edges(voxels: Voxels) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
     a, b = touching(voxels.keys)
     cost = np.empty(len(a))
     for start in range(0, len(a), _BLOCK):
@@ -46,7 +46,7 @@ def _edges(voxels: Voxels) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArra
     return a, b, cost
 
 
-def _costs(voxels: Voxels, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.float64]:
+def _costs(voxels: Voxels, a: NDArray[np.int32], b: NDArray[np.int32]) -> NDArray[np.float64]:
     between = voxels.position[b] - voxels.position[a]
     between /= np.maximum(np.linalg.norm(between, axis=1, keepdims=True), 1e-12)
     bend = 1 - (voxels.normal[a] * voxels.normal[b]).sum(1)
@@ -56,9 +56,9 @@ def _costs(voxels: Voxels, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArra
 
 
 def _absorb_small(
-    part: NDArray[np.int64],
-    a: NDArray[np.int64],
-    b: NDArray[np.int64],
+    part: NDArray[np.int32],
+    a: NDArray[np.int32],
+    b: NDArray[np.int32],
     cost: NDArray[np.float64],
     weight: NDArray[np.float64],
     largest: int,

@@ -90,7 +90,7 @@ class SegmentLabels:
         self._size = _scene_depth([depth_of(f) for f in posed[:: max(1, len(posed) // 12)]]) / _VOXELS_PER_DEPTH
         tracked = self._progress.track(posed, "regions", len(posed))
         voxels = merge(self._size, (self._gather(f, depth_of(f)) for f in tracked))
-        voxels = select(voxels, voxels.weight > _LEAST_WEIGHT)
+        voxels, self._size = select(voxels, voxels.weight > _LEAST_WEIGHT), voxels.size
         cameras = np.array([self._world_from_cam[f.id] for f in posed])
         gravity = find_gravity(voxels, -cameras[:, :3, 1].mean(0))
         return voxels, gravity, name_structure(voxels, gravity, cameras[:, :3, 3])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -16,6 +16,9 @@ _BITS = 21
 _HALF = 1 << (_BITS - 1)
 _WAITING = 500_000
 """Voxels of single frames that wait to be summed, at least."""
+MOST, _COARSER = 1_500_000, 2**0.5
+"""Voxels, and how much larger they become where a scene has more: half of them are left. They take about 300 bytes each
+while they are looked at, by no recording but memory alone."""
 _BLOCK = 50_000
 """Voxels whose surroundings are looked at together."""
 _OFFSETS = np.array([(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], np.int64)
@@ -62,17 +65,17 @@ def find(sorted_keys: NDArray[np.int64], keys: NDArray[np.int64]) -> NDArray[np.
     return np.where(sorted_keys[at] == keys, at, -1)
 
 
-def touching(sorted_keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def touching(sorted_keys: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Cubes (E,) and (E,) that touch, the first of each two the one with the smaller key; a block at a time, for all 27
     around each of a building's millions need gigabytes."""
     later = _OFFSETS[len(_OFFSETS) // 2 + 1 :]
-    found: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+    found: list[tuple[NDArray[np.int32], NDArray[np.int32]]] = []
     for start in range(0, len(sorted_keys), _BLOCK):
         around = find(sorted_keys, neighbour_keys(sorted_keys[start : start + _BLOCK], later))
         a, k = np.nonzero(around >= 0)
-        found.append((a + start, around[a, k]))
+        found.append(((a + start).astype(np.int32), around[a, k].astype(np.int32)))
     first, second = zip(*found, strict=True) if found else ((), ())
-    return np.concatenate([np.empty(0, np.int64), *first]), np.concatenate([np.empty(0, np.int64), *second])
+    return np.concatenate([np.empty(0, np.int32), *first]), np.concatenate([np.empty(0, np.int32), *second])
 
 
 def find_near(sorted_keys: NDArray[np.int64], keys: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -137,26 +140,48 @@ def gather_frame(
     return _sum_by_key(keys[use], values)
 
 
-def merge(size: float, frames: Iterable[tuple[NDArray[np.int64], NDArray[np.float64]]]) -> Voxels:
-    """All frames' voxels together: memory grows with the scene, not with the number of frames."""
-    keys, total = np.empty(0, np.int64), np.empty((0, 10))
+def merge(size: float, frames: Iterable[tuple[NDArray[np.int64], NDArray[np.float64]]], most: int = MOST) -> Voxels:
+    """All frames' voxels together: memory grows with the scene, not with the number of frames, and where there are more
+    than `most`, they grow instead."""
+    gathered = _Gathered(size, most, np.empty(0, np.int64), [np.empty(0)] * 10)
     waiting: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
-
-    def together() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        return _sum_by_key(
-            np.concatenate([keys, *(k for k, _ in waiting)]), np.concatenate([total, *(v for _, v in waiting)])
-        )
-
     for row in frames:
         waiting.append(row)
-        if sum(len(k) for k, _ in waiting) > max(len(keys), _WAITING):
-            keys, total = together()
-            waiting.clear()
-    keys, total = together()
-    weight = np.maximum(total[:, :1], 1e-12)
-    normal = total[:, 4:7]
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    return Voxels(size, keys, total[:, 0], total[:, 1:4] / weight, normal, total[:, 7:10] / weight)
+        if sum(len(k) for k, _ in waiting) > max(len(gathered.keys) / 2, _WAITING):
+            gathered.add(waiting, size)
+            waiting = []
+    gathered.add(waiting, size)
+    sums, weight = gathered.sums, np.maximum(gathered.sums[0], 1e-12)
+    position = np.stack([sums.pop(1) / weight for _ in range(3)], axis=1)
+    normal = np.stack([sums.pop(1) for _ in range(3)], axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    color = np.stack([sums.pop(1) / weight for _ in range(3)], axis=1)
+    return Voxels(gathered.size, gathered.keys, sums[0], position, normal, color)
+
+
+@dataclass
+class _Gathered:
+    """Sorted keys (V,) of cubes of a size, and ten sums (V,) each: weight, position, normal, colour."""
+
+    size: float
+    most: int
+    keys: NDArray[np.int64]
+    sums: list[NDArray[np.float64]]
+
+    def add(self, rows: Sequence[tuple[NDArray[np.int64], NDArray[np.float64]]], size: float) -> None:
+        """Rows of frames, in cubes of `size`; one of the sums at a time is there twice."""
+        keys = [k if size == self.size else voxel_keys(v[:, 1:4] / v[:, :1], self.size) for k, v in rows]
+        self._sum(np.concatenate([self.keys, *keys]), [v for _, v in rows])
+        while len(self.keys) > self.most:
+            self.size *= _COARSER
+            weight = np.maximum(self.sums[0], 1e-12)
+            self._sum(voxel_keys(np.stack([x / weight for x in self.sums[1:4]], axis=1), self.size), [])
+
+    def _sum(self, keys: NDArray[np.int64], more: Sequence[NDArray[np.float64]]) -> None:
+        self.keys, place = np.unique(keys, return_inverse=True)
+        for c in range(len(self.sums)):
+            values = np.concatenate([self.sums[c], *(v[:, c] for v in more)])
+            self.sums[c] = np.asarray(np.bincount(place, weights=values, minlength=len(self.keys)), np.float64)
 
 
 def select(voxels: Voxels, keep: NDArray[np.bool_]) -> Voxels:

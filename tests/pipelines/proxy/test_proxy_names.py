@@ -147,3 +147,26 @@ def test_voxels_of_many_frames_are_summed_as_they_come(monkeypatch: pytest.Monke
     for name in ("keys", "weight", "position", "normal", "color"):
         assert getattr(as_they_come, name).tobytes() == getattr(at_once, name).tobytes()
     assert len(merge(0.05, [])) == 0
+
+
+def test_voxels_grow_where_a_scene_has_too_many() -> None:
+    """As if all points had been gathered in the larger ones, but for points near their sides."""
+    rng = np.random.default_rng(0)
+    points = rng.random((20, 500, 3)) * [4.0, 4.0, 0.01]
+
+    def gathered(size: float) -> list[tuple[np.ndarray, np.ndarray]]:
+        rows = []
+        for of_frame in points:
+            keys, place = np.unique(voxel_keys(of_frame, size), return_inverse=True)
+            values = np.concatenate([np.ones((500, 1)), of_frame, np.ones((500, 6))], axis=1)
+            rows.append((keys, np.stack([np.bincount(place, v) for v in values.T], axis=1)))
+        return rows
+
+    grown = merge(0.05, gathered(0.05), most=2000)
+    plain = merge(0.1, gathered(0.1))
+    assert grown.size == pytest.approx(0.1)
+    assert len(grown) == pytest.approx(len(plain), rel=0.05)
+    assert len(grown) <= 2000 < len(merge(0.05, gathered(0.05)))
+    assert grown.weight.sum() == plain.weight.sum() == 10_000
+    np.testing.assert_allclose(grown.weight @ grown.position, points.sum((0, 1)))
+    assert (voxel_keys(grown.position, grown.size) == grown.keys).mean() > 0.9
