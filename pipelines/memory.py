@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
+import sys
+
 from pipelines.config import Config
 from pipelines.types import Intrinsics
 
@@ -31,3 +34,10 @@ def submap_size(config: Config, camera: Intrinsics) -> int:
     pixels = small.width * small.height / 1e6
     room = (1 - VIEWS_SHARE) * memory_mb - least - a_million_pixels * camera.width * camera.height / 1e6
     return min(most, max(LEAST_SUBMAP, int(room / (a_million_gaussians * GAUSSIANS / 1e6 * pixels))))
+
+
+def give_back() -> None:
+    """Hand what is free back to the system, where the C library has a call for that: glibc keeps what lies between
+    pieces still in use, after a window of structure from motion 40 to 190 MB."""
+    if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+        trim(0)

@@ -19,6 +19,7 @@ from formats.errors import DiskFullError, InputError, RecoverableError
 from pipelines.config import Config, settings_of_stage
 from pipelines.device import settle_device
 from pipelines.journal import JOURNAL, Journal, empty
+from pipelines.memory import give_back
 from pipelines.progress import Progress, log
 from pipelines.records import (
     FORMAT,
@@ -99,8 +100,13 @@ class StageContext:
         """What `work`, a function of a module's top level, returns of every task, in their order: done here, one after
         the other, or by the workers. A task leaves files below `folder`, and does nothing where they are."""
         if self.workers is None:
-            return [work(task, self.progress) for task in tasks]
+            return [self._done(work, task) for task in tasks]
         return self.workers.each(work, tasks, self.folder)
+
+    def _done(self, work: Callable[[T, Progress], R], task: T) -> R:
+        result = work(task, self.progress)
+        give_back()
+        return result
 
     def warn(self, message: str) -> None:
         """A degraded result: logged now, counted and kept for the report."""

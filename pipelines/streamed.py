@@ -9,6 +9,8 @@ from pathlib import Path
 from threading import RLock
 from typing import Generic, TypeVar, overload
 
+from pipelines.memory import give_back
+
 T = TypeVar("T")
 
 _UNKNOWN_MACHINE = 8_000_000_000
@@ -54,10 +56,11 @@ class Streamed(Sequence[T], Generic[T]):
                 self._used -= self._size_of(self._kept.popitem(last=False)[1])
 
     def forget(self) -> None:
-        """Keep nothing until it is asked for again."""
+        """Keep nothing until it is asked for again: what comes now needs the memory."""
         with self._lock:
             self._kept.clear()
             self._used = 0
+        give_back()
 
     def part(self, numbers: range) -> Streamed[T]:
         """Those numbers of the same, counted from 0; keeps its own."""

@@ -29,7 +29,7 @@ LEAST_WEIGHT = 1.5
 """A voxel seen with less weight, in views at the median depth, has no surface."""
 LONG = 200
 """Keyframes of a recording for which `export.max_blocks` is meant; a longer one may have more by its length."""
-_KEPT_BYTES = 200e6
+_KEPT_BYTES = 100e6
 
 
 def keyframe_rows(outcome: Outcome) -> list[int]:

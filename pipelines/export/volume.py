@@ -24,7 +24,7 @@ SIDE = 8
 """Voxels along the side of a block."""
 CHUNK = 8
 """Blocks along the side of a chunk, of which regions are made; surfaces are extracted chunk by chunk."""
-_AT_ONCE = 32_000
+_AT_ONCE = 8_000
 """Blocks of a region, 4 kB each, without the layer that it shares with its neighbours."""
 
 
