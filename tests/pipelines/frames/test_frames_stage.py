@@ -294,8 +294,8 @@ def test_a_focal_length_that_ran_away_is_found_again_with_the_lens_held(
     """The first attempt is made to look unsure; the second must be asked for, be as good, and be taken."""
     sure = []
 
-    def adjust_unsure(model: pycolmap.Reconstruction, refine_camera: bool) -> float:
-        sure.append(adjust(model, refine_camera))
+    def adjust_unsure(model: pycolmap.Reconstruction, refine_camera: bool, narrowly: bool) -> float:
+        sure.append(adjust(model, refine_camera, narrowly))
         return sure[0] + 0.1 * bent_walk.focal if len(sure) == 1 else sure[-1]
 
     monkeypatch.setattr(sfm, "adjust", adjust_unsure)

@@ -246,16 +246,28 @@ def test_tiles_are_the_map_and_a_coarse_one(finished: RunFolder, tmp_path: Path)
 def test_submaps_are_brought_to_one_exposure() -> None:
     """Each was made with exposures relative to a gain and an offset of its own; all is told by what they share."""
     rng = np.random.default_rng(0)
-    log_gains, offsets = rng.normal(0, 0.1, (2, 12, 3))
+    log_gains, offsets = rng.normal(0, 0.1, (2, 120, 3))
     own_gain, own_offset = rng.normal(0, 0.1, (3, 3)), rng.normal(0, 0.02, (3, 3))
     own_gain, own_offset = own_gain - own_gain.mean(0), own_offset - own_offset.mean(0)
     seen = []
-    for gain, offset, ids in zip(own_gain, own_offset, (range(6), range(3, 9), range(7, 12)), strict=True):
+    for gain, offset, ids in zip(own_gain, own_offset, (range(60), range(30, 90), range(60, 120)), strict=True):
         mine = np.array(ids)
         photo_offsets = offsets[mine] + offset * np.exp(log_gains[mine])
         seen.append(SeenExposures(mine, log_gains[mine] + gain, photo_offsets))
     found_gain, found_offset = common_exposure(seen)
-    assert found_gain == pytest.approx(own_gain, abs=1e-4)
-    assert found_offset == pytest.approx(own_offset, abs=1e-4)
-    alone, _ = common_exposure([*seen, SeenExposures(np.array([99]), np.ones((1, 3)), np.ones((1, 3)))])
+    assert found_gain == pytest.approx(own_gain, abs=0.15 * np.abs(own_gain).max())
+    assert found_offset == pytest.approx(own_offset, abs=0.3 * np.abs(own_offset).max())
+    alone, _ = common_exposure([*seen, SeenExposures(np.array([999]), np.ones((1, 3)), np.ones((1, 3)))])
     assert alone[3] == pytest.approx(0)
+
+
+def test_what_submaps_say_of_each_other_does_not_add_up_over_a_building() -> None:
+    """Each seems a little brighter than the one before it, because what is newly seen shows less contrast."""
+    bias, count, each = 0.06, 40, 60
+    seen = []
+    for n in range(count):
+        ids = np.arange(n * each, (n + 1) * each + 32)
+        log_gains = np.where(np.arange(len(ids)) < 32, bias, 0.0)[:, None] * np.ones(3)
+        seen.append(SeenExposures(ids, log_gains, np.zeros_like(log_gains)))
+    found, _ = common_exposure(seen)
+    assert np.abs(found).max() < 0.5 < bias * count / 4
