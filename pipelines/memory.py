@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import sys
+from pathlib import Path
 
 from pipelines.config import Config
 from pipelines.types import Intrinsics
@@ -21,6 +23,10 @@ VIEWS_SHARE = 0.25
 """Of the memory that mapping plans with, for views; what has no room there is read again."""
 LEAST_SUBMAP = 60
 """Keyframes: smaller submaps are mostly border."""
+ALIGNED_TOGETHER = 200
+"""Fields of depths that are solved for at once: their equations take 0.4 MB each."""
+_UNKNOWN_MACHINE = 8_000_000_000
+_CONTAINER = Path("/sys/fs/cgroup")
 
 
 def submap_size(config: Config, camera: Intrinsics) -> int:
@@ -41,3 +47,30 @@ def give_back() -> None:
     pieces still in use, after a window of structure from motion 40 to 190 MB."""
     if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
         trim(0)
+
+
+def memory_room(memory_mb: int) -> float:
+    """Bytes that the process may need: `run.memory_mb`, for 0 half of what the machine (or its container) has."""
+    return memory_mb * 1e6 if memory_mb else machine_memory() / 2
+
+
+def machine_memory() -> float:
+    """Bytes of memory of the machine, or of the container where that has less; 8 GB where nobody tells."""
+    return min([_physical_memory(), *_container_limits()])
+
+
+def _physical_memory() -> float:
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    return float(_UNKNOWN_MACHINE)
+
+
+def _container_limits() -> list[float]:
+    """Of cgroups, version 2 and 1."""
+    found = []
+    for name in ("memory.max", "memory/memory.limit_in_bytes"):
+        try:
+            found.append(float((_CONTAINER / name).read_text(encoding="ascii")))
+        except (OSError, ValueError):  # no such file; "max"
+            continue
+    return found

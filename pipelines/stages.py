@@ -19,7 +19,7 @@ from formats.errors import DiskFullError, InputError, RecoverableError
 from pipelines.config import Config, settings_of_stage
 from pipelines.device import settle_device
 from pipelines.journal import JOURNAL, Journal, empty
-from pipelines.memory import give_back
+from pipelines.memory import give_back, memory_room
 from pipelines.progress import Progress, log
 from pipelines.records import (
     FORMAT,
@@ -38,7 +38,6 @@ from pipelines.run_folder_names import STAGES
 from pipelines.settings_file import save_settings
 from pipelines.stage_identity import stage_identity
 from pipelines.stopping import stop_if_asked
-from pipelines.streamed import memory_room
 from pipelines.workers import TaskWorkers
 
 T = TypeVar("T")

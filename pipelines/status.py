@@ -7,16 +7,15 @@ from typing import Any
 
 from formats.errors import InputError
 from pipelines.config import Config
-from pipelines.memory import GAUSSIANS, NEEDS, submap_size
+from pipelines.memory import ALIGNED_TOGETHER, GAUSSIANS, NEEDS, memory_room, submap_size
 from pipelines.records import StageRecord, differing_settings, load_records, load_source
 from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
 from pipelines.settings_file import load_settings
-from pipelines.streamed import memory_room
 from pipelines.structure.window_size import window_size, windows_of
 
-_TRACKED_AT_ONCE, _BEYOND = 200, 0.3
-"""Keyframes that tracking has in work at any time, and MB for each one that it or `frames` has not."""
+_BEYOND = 0.3
+"""MB for each keyframe that `frames` or tracking has not in work."""
 DONE, DAMAGED, INTERRUPTED, OUTDATED, NOT_YET = "done", "damaged", "interrupted", "outdated", "not yet"
 
 
@@ -123,7 +122,7 @@ def expected_mb(stage: str, run: RunFolder, config: Config) -> float | None:
     gaussians = of_part * (1 if stage == "mapping" else parts) / 1e6
     pixels = camera.width * camera.height / 1e6
     window = windows_of(keyframes, window_size(config.run.memory_mb, camera.width * camera.height))[0]
-    at_once = {"frames": len(window), "tracking": _TRACKED_AT_ONCE}
+    at_once = {"frames": len(window), "tracking": ALIGNED_TOGETHER}
     inside = min(keyframes, at_once.get(stage, keyframes))
     by_keyframes = a_keyframe * inside + _BEYOND * (keyframes - inside)
     return round(least + a_million_pixels * pixels + by_keyframes + a_million_gaussians * gaussians)

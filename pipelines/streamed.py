@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from threading import RLock
 from typing import Generic, TypeVar, overload
 
 from pipelines.memory import give_back
 
 T = TypeVar("T")
-
-_UNKNOWN_MACHINE = 8_000_000_000
-_CONTAINER = Path("/sys/fs/cgroup")
 
 
 class Streamed(Sequence[T], Generic[T]):
@@ -75,30 +70,3 @@ class Streamed(Sequence[T], Generic[T]):
             other._kept[key] = function(key, value)
         other._used, self._used = self._used, 0
         return other
-
-
-def memory_room(memory_mb: int) -> float:
-    """Bytes that the process may need: `run.memory_mb`, for 0 half of what the machine (or its container) has."""
-    return memory_mb * 1e6 if memory_mb else machine_memory() / 2
-
-
-def machine_memory() -> float:
-    """Bytes of memory of the machine, or of the container where that has less; 8 GB where nobody tells."""
-    return min([_physical_memory(), *_container_limits()])
-
-
-def _physical_memory() -> float:
-    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
-        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    return float(_UNKNOWN_MACHINE)
-
-
-def _container_limits() -> list[float]:
-    """Of cgroups, version 2 and 1."""
-    found = []
-    for name in ("memory.max", "memory/memory.limit_in_bytes"):
-        try:
-            found.append(float((_CONTAINER / name).read_text(encoding="ascii")))
-        except (OSError, ValueError):  # no such file; "max"
-            continue
-    return found

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipelines.depth.fields import FINE, Basis, DepthFields
 from pipelines.depth.posed import PosedDepth, neighbours
 from pipelines.depth.solve import Equations, Prior, solve_fields
+from pipelines.memory import ALIGNED_TOGETHER
 from pipelines.streamed import Streamed
 from pipelines.types import Intrinsics, ProxyMaps, SparseModel
 
@@ -33,8 +34,6 @@ GROSS = 0.15
 SHARE = 0.25
 """Neighbouring samples err alike: a picture's worth of them counts as a few per node."""
 ROUNDS = 4
-TOGETHER = 200
-"""Fields that are solved for at once: their equations take 0.4 MB each."""
 _ROOM = 75_000_000
 """Bytes of depths, and of samples of them, that are kept; what has no room is read again."""
 
@@ -105,7 +104,7 @@ def fit_fields(views: Sequence[PosedDepth], anchors: Mapping[int, Anchors], expe
     fields = start.copy()
     samples = Streamed(len(views), lambda n: _Samples.of(views[n]), lambda s: s.nbytes, _ROOM)
     near = neighbours(views)
-    windows = np.array_split(np.arange(len(views)), -(-len(views) // TOGETHER)) if len(views) else []
+    windows = np.array_split(np.arange(len(views)), -(-len(views) // ALIGNED_TOGETHER)) if len(views) else []
     for window in windows * ROUNDS:
         first, last = int(window[0]), int(window[-1])
         points = (_point_equations(n, views[n], anchors[n], fields) for n in window.tolist() if n in anchors)

@@ -31,9 +31,9 @@ from pipelines.mapping.parameters import KEYS
 from pipelines.mapping.state import Exposures, OptimisedMap
 from pipelines.mapping.submaps import Submap, nearest_seeing
 from pipelines.mapping.views import View
+from pipelines.memory import memory_room
 from pipelines.progress import Progress
 from pipelines.run_folder import RunFolder
-from pipelines.streamed import memory_room
 from pipelines.types import Intrinsics, Trajectory
 
 MADE, JOINED, REFINED, AGREED = "made", "joined", "refined", "agreed"

@@ -32,9 +32,11 @@ def adjust(model: pycolmap.Reconstruction, refine_camera: bool, narrowly: bool =
     and how far its values from the first and the second half of the views are apart. The first alone is too sure of
     itself several times over, because rolling shutter and blur are no noise.
     """
-    focal_sd = _calibrated(model) if refine_camera else 0.0
     images = sorted(model.reg_image_ids())
-    if not refine_camera:
+    if refine_camera:
+        focal_sd = _calibrate(model, images)
+    else:
+        focal_sd = 0.0
         for _ in range(2):
             solve(model, images, refine_camera=False)
             remove_wild(model)
@@ -44,18 +46,17 @@ def adjust(model: pycolmap.Reconstruction, refine_camera: bool, narrowly: bool =
     return focal_sd
 
 
-def _calibrated(model: pycolmap.Reconstruction) -> float:
-    """See `adjust`."""
-    images, refine_camera = sorted(model.reg_image_ids()), True
-    solve(model, images, refine_camera)
+def _calibrate(model: pycolmap.Reconstruction, images: Sequence[int]) -> float:
+    """The adjustment with the camera; the standard deviation of its focal length, see `adjust`."""
+    solve(model, images, refine_camera=True)
     remove_wild(model)
-    solve(model, images, refine_camera)
+    solve(model, images, refine_camera=True)
     simple_focal = float(model.cameras[1].focal_length)
     set_lens(model.cameras[1], 2)
-    solve(model, images, refine_camera)
+    solve(model, images, refine_camera=True)
     remove_wild(model)
     # Before points are removed: the adjuster keeps pointers into the model.
-    formal = _formal_sd(model, solve(model, images, refine_camera))
+    formal = _formal_sd(model, solve(model, images, refine_camera=True))
     remove_wild(model)
     focal = float(model.cameras[1].focal_length)
     return math.hypot(formal, focal - simple_focal, _difference_of_halves(model, images) / 2)

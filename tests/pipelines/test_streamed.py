@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from pipelines import streamed
-from pipelines.streamed import Streamed, machine_memory, memory_room
+from pipelines import memory
+from pipelines.memory import machine_memory, memory_room
+from pipelines.streamed import Streamed
 
 
 def test_what_was_used_last_stays_and_the_rest_is_made_again() -> None:
@@ -91,7 +92,7 @@ def test_room_is_half_of_the_machine_or_container(tmp_path: Path, monkeypatch: p
     assert memory_room(700) == 700e6
     assert 2e8 < memory_room(0) == machine_memory() / 2
     (tmp_path / "memory.max").write_text("max\n")
-    monkeypatch.setattr(streamed, "_CONTAINER", tmp_path)
+    monkeypatch.setattr(memory, "_CONTAINER", tmp_path)
     whole = machine_memory()
     (tmp_path / "memory.max").write_text("300000000\n")
     assert machine_memory() == 300e6 < whole

@@ -177,7 +177,7 @@ def test_windows_of_a_long_recording_agree_with_all_at_once(
     posed = [v.posed_depth() for v in room.views[:9]]
     tilted = [replace(p, depth=p.depth * np.float32(1 + 0.04 * (-1) ** n)) for n, p in enumerate(posed)]
     at_once = fit_fields(tilted, {})
-    monkeypatch.setattr(alignment, "TOGETHER", 4)
+    monkeypatch.setattr(alignment, "ALIGNED_TOGETHER", 4)
     in_windows = fit_fields(tilted, {})
     assert np.abs(at_once).mean() > 0.02
     assert np.abs(in_windows - at_once).mean() < 0.01  # windows of three views, which share most of what they see

@@ -19,8 +19,8 @@ from pipelines.depth.posed import PosedDepth
 from pipelines.export.tiles import write_tiles
 from pipelines.gaussians.render import render
 from pipelines.geometry import se3
+from pipelines.mapping import gauge, submaps
 from pipelines.mapping import stage as mapping_stage
-from pipelines.mapping import submaps
 from pipelines.mapping.divided import refine_divided
 from pipelines.mapping.gauge import SeenExposures, common_exposure
 from pipelines.mapping.submaps import BORDER, divide, nearest_seeing
@@ -243,7 +243,7 @@ def test_tiles_are_the_map_and_a_coarse_one(finished: RunFolder, tmp_path: Path)
     assert float(shown[1].silhouette.mean()) > 0.9 * float(shown[0].silhouette.mean())
 
 
-def test_submaps_are_brought_to_one_exposure() -> None:
+def test_submaps_are_brought_to_one_exposure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each was made with exposures relative to a gain and an offset of its own; all is told by what they share."""
     rng = np.random.default_rng(0)
     log_gains, offsets = rng.normal(0, 0.1, (2, 120, 3))
@@ -257,6 +257,10 @@ def test_submaps_are_brought_to_one_exposure() -> None:
     found_gain, found_offset = common_exposure(seen)
     assert found_gain == pytest.approx(own_gain, abs=0.15 * np.abs(own_gain).max())
     assert found_offset == pytest.approx(own_offset, abs=0.3 * np.abs(own_offset).max())
+    monkeypatch.setattr(gauge, "_REST", 1e-6)  # to what is shared alone
+    found_gain, found_offset = common_exposure(seen)
+    assert found_gain == pytest.approx(own_gain, abs=1e-4)
+    assert found_offset == pytest.approx(own_offset, abs=1e-4)
     alone, _ = common_exposure([*seen, SeenExposures(np.array([999]), np.ones((1, 3)), np.ones((1, 3)))])
     assert alone[3] == pytest.approx(0)
 
