@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.sparse import bsr_matrix
+from scipy.sparse import bsr_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
 from pipelines.geometry import se3
@@ -110,7 +110,7 @@ def adjust_bundle(
         normal = problem.linearise(motions, points)
         accepted = False
         while damping < 1e8:
-            step = problem.solve(normal, damping)
+            step = problem.solve((motions, points), normal, damping)
             if step is not None:
                 moved, shifted = se3.exp(step[0]) @ motions, points + step[1]
                 tried = problem.cost(moved, shifted)
@@ -154,9 +154,12 @@ class Problem:
     def linearise(self, motions: Array, points: Array) -> tuple[Array, ...]:
         return kernels.linearise(motions, points, *self.data)
 
-    def solve(self, normal: tuple[Array, ...], damping: float) -> tuple[Array, Array] | None:
-        """Steps of cameras (N, 6) and points (P, 3); None where the system is not positive definite."""
-        cam_block, cam_right, point_block, point_right, mixed = normal
+    def solve(
+        self, at: tuple[Array, Array], normal: tuple[Array, ...], damping: float
+    ) -> tuple[Array, Array] | None:  # fmt: skip
+        """Steps of cameras (N, 6) and points (P, 3) from the motions and points at which the normal equations were
+        made; None where the system is not positive definite."""
+        cam_block, cam_right, point_block, point_right = normal
         n = len(cam_block)
         blocks, right = np.zeros((len(self.pairs), 6, 6)), cam_right.ravel().copy()
         diagonal = np.einsum("nii->ni", cam_block)
@@ -166,7 +169,7 @@ class Problem:
             blocks[own, i, i] += damping * diagonal[:, i] + 1e-9
         inverse = kernels.invert_points(point_block, damping)
         index = self.rows, np.ascontiguousarray(self.pairs[:, 1])
-        kernels.eliminate_points(self.starts, self.obs_cam, mixed, inverse, point_right, *index, blocks, right)
+        kernels.eliminate_points(*at, *self.data, self.starts, inverse, point_right, *index, blocks, right)
         pairs, moving, turns, place = self.pairs, self.free, None, np.arange(n)
         if len(self.rig) > 1:
             blocks, pairs, right, place, turns = tie_cameras(blocks, pairs, right, self.ids, self.rig)
@@ -181,7 +184,7 @@ class Problem:
         cam_step = step.reshape(-1, 6)[place]
         if turns is not None:
             cam_step = np.einsum("nij,nj->ni", turns, cam_step)
-        shift = kernels.point_steps(self.obs_cam, self.obs_point, mixed, inverse, point_right, cam_step)
+        shift = kernels.point_steps(*at, *self.data, inverse, point_right, cam_step)
         return cam_step, shift
 
 
@@ -201,19 +204,27 @@ def solve_blocks(
         except LinAlgError:
             return None
         return cho_solve(factor, right[free])
-    off = pairs[:, 0] != pairs[:, 1]
-    rows = np.concatenate([pairs[:, 0], pairs[off, 1]])
-    columns = np.concatenate([pairs[:, 1], pairs[off, 0]])
-    values = np.concatenate([blocks, np.swapaxes(blocks[off], 1, 2)])
-    order = np.lexsort((columns, rows))
-    starts = np.searchsorted(rows[order], np.arange(count + 1))
-    matrix = bsr_matrix((values[order], columns[order], starts), shape=(6 * count, 6 * count)).tocsc()
+    matrix = _symmetric(blocks, pairs, count)
+    if not free.all():
+        matrix = matrix[free][:, free]
     try:
-        return splu(matrix[free][:, free], permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(
-            right[free]
-        )
+        return splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(right[free])
     except RuntimeError:  # exactly singular
         return None
+
+
+def _symmetric(blocks: Array, pairs: NDArray[np.int64], count: int) -> csc_matrix:
+    """The matrix (6 * count, 6 * count) of upper blocks and their mirror images."""
+    off = np.flatnonzero(pairs[:, 0] != pairs[:, 1])
+    rows, columns = (np.concatenate([pairs[:, a], pairs[off, b]]) for a, b in ((0, 1), (1, 0)))
+    order = np.lexsort((columns, rows))
+    values = blocks[np.concatenate([np.arange(len(pairs)), off])[order]]
+    mirrored = order >= len(pairs)
+    values[mirrored] = np.swapaxes(values[mirrored], 1, 2)
+    starts = np.searchsorted(rows[order], np.arange(count + 1))
+    by_row = bsr_matrix((values, columns[order], starts), shape=(6 * count, 6 * count)).tocsr()
+    # Rows of a symmetric matrix are its columns: scipy's own conversion takes several times its memory.
+    return csc_matrix((by_row.data, by_row.indices, by_row.indptr), by_row.shape)
 
 
 def adjust_pose(

@@ -28,14 +28,13 @@ def _residual(motion, point, camera, xy, inverse_sd, log_depth, depth_weight, re
     residual[1] = (camera[1] * y * iz + camera[3] - xy[1]) * inverse_sd
     residual[2] = (np.log(z) - log_depth) * depth_weight
     a, b = camera[0] * iz * inverse_sd, camera[1] * iz * inverse_sd
-    by_cam = np.zeros((3, 3))
-    by_cam[0, 0] = a
-    by_cam[0, 2] = -a * x * iz
-    by_cam[1, 1] = b
-    by_cam[1, 2] = -b * y * iz
-    by_cam[2, 2] = depth_weight * iz
     for i in range(3):
-        d0, d1, d2 = by_cam[i, 0], by_cam[i, 1], by_cam[i, 2]
+        if i == 0:
+            d0, d1, d2 = a, 0.0, -a * x * iz
+        elif i == 1:
+            d0, d1, d2 = 0.0, b, -b * y * iz
+        else:
+            d0, d1, d2 = 0.0, 0.0, depth_weight * iz
         jac_cam[i, 0], jac_cam[i, 1], jac_cam[i, 2] = d0, d1, d2
         jac_cam[i, 3] = d2 * y - d1 * z
         jac_cam[i, 4] = d0 * z - d2 * x
@@ -47,9 +46,14 @@ def _residual(motion, point, camera, xy, inverse_sd, log_depth, depth_weight, re
 
 @kernel
 def _cauchy(squared, width):  # type: ignore[no-untyped-def]
-    """Cost and weight of Cauchy's loss of a squared residual."""
-    scaled = squared / (width * width)
-    return width * width * np.log1p(scaled), 1.0 / (1.0 + scaled)
+    """Cauchy's loss of a squared residual."""
+    return width * width * np.log1p(squared / (width * width))
+
+
+@kernel
+def _cauchy_weight(squared, width):  # type: ignore[no-untyped-def]
+    """The weight that it gives."""
+    return 1.0 / (1.0 + squared / (width * width))
 
 
 @kernel
@@ -62,47 +66,64 @@ def total_cost(motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_
             motions[obs_cam[o]], points[obs_point[o]], camera, xy[o], inverse_sd[o], log_depth[o], depth_weight[o],
             residual, jac_cam, jac_point,
         ):  # fmt: skip
-            cost += _cauchy(100.0 * width * width, width)[0]
+            cost += _cauchy(100.0 * width * width, width)
             continue
-        cost += _cauchy(residual[0] ** 2 + residual[1] ** 2, width)[0] + _cauchy(residual[2] ** 2, width)[0]
+        cost += _cauchy(residual[0] ** 2 + residual[1] ** 2, width) + _cauchy(residual[2] ** 2, width)
     return cost
 
 
 @kernel
+def _weighted(motion, point, camera, xy, inverse_sd, log_depth, depth_weight, width, residual, jac_cam, jac_point, weight):  # type: ignore[no-untyped-def]
+    """`_residual`, and the weights (3,) that the robust loss gives its rows: all zero behind the camera."""
+    weight[:] = 0.0
+    if _residual(motion, point, camera, xy, inverse_sd, log_depth, depth_weight, residual, jac_cam, jac_point):
+        weight[0] = _cauchy_weight(residual[0] ** 2 + residual[1] ** 2, width)
+        weight[1] = weight[0]
+        if depth_weight != 0.0:
+            weight[2] = _cauchy_weight(residual[2] ** 2, width)
+
+
+@kernel
+def _mix(weight, jac_cam, jac_point, block):  # type: ignore[no-untyped-def]
+    """Fill block (6, 3) with what mixes camera and point in an observation."""
+    block[:] = 0.0
+    for k in range(3):
+        if weight[k] != 0.0:
+            for i in range(6):
+                wi = weight[k] * jac_cam[k, i]
+                for j in range(3):
+                    block[i, j] += wi * jac_point[k, j]
+
+
+@kernel
 def linearise(motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_depth, depth_weight, width):  # type: ignore[no-untyped-def]
-    """Normal equations: camera blocks (N, 6, 6), (N, 6), point blocks (P, 3, 3), (P, 3), mixed (O, 6, 3)."""
+    """Normal equations: camera blocks (N, 6, 6), (N, 6), point blocks (P, 3, 3), (P, 3). What mixes a camera and a
+    point is made again where it is needed: as many blocks as observations would be most of the memory."""
     n, p, o_count = len(motions), len(points), len(obs_cam)
     cam_block, cam_right = np.zeros((n, 6, 6)), np.zeros((n, 6))
     point_block, point_right = np.zeros((p, 3, 3)), np.zeros((p, 3))
-    mixed = np.zeros((o_count, 6, 3))
     residual, jac_cam, jac_point, weight = np.empty(3), np.empty((3, 6)), np.empty((3, 3)), np.empty(3)
     for o in range(o_count):
         c, q = obs_cam[o], obs_point[o]
-        if not _residual(
-            motions[c], points[q], camera, xy[o], inverse_sd[o], log_depth[o], depth_weight[o],
-            residual, jac_cam, jac_point,
-        ):  # fmt: skip
-            continue
-        weight[0] = _cauchy(residual[0] ** 2 + residual[1] ** 2, width)[1]
-        weight[1] = weight[0]
-        weight[2] = _cauchy(residual[2] ** 2, width)[1]
+        _weighted(
+            motions[c], points[q], camera, xy[o], inverse_sd[o], log_depth[o], depth_weight[o], width,
+            residual, jac_cam, jac_point, weight,
+        )  # fmt: skip
         for k in range(3):
             w, r = weight[k], residual[k]
-            if w == 0.0 or (k == 2 and depth_weight[o] == 0.0):
+            if w == 0.0:
                 continue
             for i in range(6):
                 wi = w * jac_cam[k, i]
                 cam_right[c, i] -= wi * r
                 for j in range(6):
                     cam_block[c, i, j] += wi * jac_cam[k, j]
-                for j in range(3):
-                    mixed[o, i, j] += wi * jac_point[k, j]
             for i in range(3):
                 wi = w * jac_point[k, i]
                 point_right[q, i] -= wi * r
                 for j in range(3):
                     point_block[q, i, j] += wi * jac_point[k, j]
-    return cam_block, cam_right, point_block, point_right, mixed
+    return cam_block, cam_right, point_block, point_right
 
 
 @kernel
@@ -132,7 +153,7 @@ def border(  # type: ignore[no-untyped-def]
         c, q = obs_cam[o], obs_point[o]
         if not _residual(motions[c], points[q], camera, xy[o], inverse_sd[o], 0.0, 0.0, residual, jac_cam, jac_point):
             continue
-        weight = _cauchy(residual[0] ** 2 + residual[1] ** 2, width)[1]
+        weight = _cauchy_weight(residual[0] ** 2 + residual[1] ** 2, width)
         for i in range(2):
             step = moved[o, i] * inverse_sd[o]
             own += weight * step * step
@@ -188,17 +209,28 @@ def number_blocks(starts, obs_cam, count):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def eliminate_points(starts, obs_cam, mixed, inverse_block, point_right, rows, columns, blocks, right):  # type: ignore[no-untyped-def]
+def eliminate_points(  # type: ignore[no-untyped-def]
+    motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_depth, depth_weight, width,
+    starts, inverse_block, point_right, rows, columns, blocks, right,
+):  # fmt: skip
     """Subtract the points' share from the blocks (B, 6, 6) of the reduced camera system and its right side (6N,).
 
     Observations are sorted by point, then camera; starts (P + 1,) are their ranges; `rows` and `columns` as of
     `number_blocks`.
     """
-    left = np.empty((6, 3))
+    residual, jac_cam, jac_point, weight = np.empty(3), np.empty((3, 6)), np.empty((3, 3)), np.empty(3)
+    left, mixed = np.empty((6, 3)), np.empty((np.max(np.diff(starts)) if len(starts) > 1 else 0, 6, 3))
     for q in range(len(starts) - 1):
-        first, last = starts[q], starts[q + 1]
-        for a in range(first, last):
-            row = 6 * obs_cam[a]
+        first, count = starts[q], starts[q + 1] - starts[q]
+        for a in range(count):
+            o = first + a
+            _weighted(
+                motions[obs_cam[o]], points[q], camera, xy[o], inverse_sd[o], log_depth[o], depth_weight[o], width,
+                residual, jac_cam, jac_point, weight,
+            )  # fmt: skip
+            _mix(weight, jac_cam, jac_point, mixed[a])
+        for a in range(count):
+            cam = obs_cam[first + a]
             for i in range(6):
                 total = 0.0
                 for j in range(3):
@@ -207,11 +239,10 @@ def eliminate_points(starts, obs_cam, mixed, inverse_block, point_right, rows, c
                         value += mixed[a, i, k] * inverse_block[q, k, j]
                     left[i, j] = value
                     total += value * point_right[q, j]
-                right[row + i] -= total
-            end = rows[obs_cam[a] + 1]
-            number = rows[obs_cam[a]]
-            for b in range(a, last):
-                number += np.searchsorted(columns[number:end], obs_cam[b])
+                right[6 * cam + i] -= total
+            number, end = rows[cam], rows[cam + 1]
+            for b in range(a, count):
+                number += np.searchsorted(columns[number:end], obs_cam[first + b])
                 block = blocks[number]
                 for i in range(6):
                     for j in range(6):
@@ -221,14 +252,26 @@ def eliminate_points(starts, obs_cam, mixed, inverse_block, point_right, rows, c
 
 
 @kernel
-def point_steps(obs_cam, obs_point, mixed, inverse_block, point_right, cam_step):  # type: ignore[no-untyped-def]
+def point_steps(  # type: ignore[no-untyped-def]
+    motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_depth, depth_weight, width,
+    inverse_block, point_right, cam_step,
+):  # fmt: skip
     """Back substitution: steps (P, 3) of the points for the cameras' steps (N, 6)."""
+    residual, jac_cam, jac_point, weight = np.empty(3), np.empty((3, 6)), np.empty((3, 3)), np.empty(3)
     rest = point_right.copy()
     for o in range(len(obs_cam)):
         c, q = obs_cam[o], obs_point[o]
-        for j in range(3):
+        _weighted(
+            motions[c], points[q], camera, xy[o], inverse_sd[o], log_depth[o], depth_weight[o], width,
+            residual, jac_cam, jac_point, weight,
+        )  # fmt: skip
+        for k in range(3):
+            moved = 0.0
             for i in range(6):
-                rest[q, j] -= mixed[o, i, j] * cam_step[c, i]
+                moved += jac_cam[k, i] * cam_step[c, i]
+            moved *= weight[k]
+            for j in range(3):
+                rest[q, j] -= moved * jac_point[k, j]
     out = np.zeros_like(rest)
     for q in range(len(rest)):
         for i in range(3):

@@ -130,9 +130,10 @@ def estimate(bundle: Bundle, xy: Array, camera: Intrinsics, times: Array, direct
     velocity, seen = velocities(bundle.cam_from_world, times), (bundle.obs_cam, bundle.obs_point)
     moved = _moved(bundle.cam_from_world, bundle.points, seen, xy[order], camera, velocity, direction)
     problem = Problem(bundle, camera)
-    blocks, cam_right, point_blocks, point_right, mixed = problem.linearise(bundle.cam_from_world, bundle.points)
+    at = bundle.cam_from_world, bundle.points
+    blocks, cam_right, point_blocks, point_right = problem.linearise(*at)
     cams, points, own, right = kernels.border(bundle.cam_from_world, bundle.points, *problem.data, moved)
-    solved = problem.solve((blocks, cams, point_blocks, points, mixed), 1e-7)
+    solved = problem.solve(at, (blocks, cams, point_blocks, points), 1e-7)
     if solved is None:
         return 0.0, 0.0
     information = own - float((solved[0] * cams).sum() + (solved[1] * points).sum())
@@ -153,11 +154,12 @@ class RollingModel:
         self.images = sorted(model.reg_image_ids())
         self.times = times[[i - 1 for i in self.images]]
         self.point_ids = sorted(model.point3D_ids())
-        row = {p: k for k, p in enumerate(self.point_ids)}
-        seen = [[p.point3D_id for p in model.images[i].points2D] for i in self.images]
-        self.features = [np.array([p in row for p in points], bool).nonzero()[0] for points in seen]
+        seen = [np.array([p.point3D_id for p in model.images[i].points2D], np.uint64) for i in self.images]
+        known = np.array(self.point_ids, np.uint64)
+        self.features = [np.isin(points, known).nonzero()[0] for points in seen]
         self.obs_cam = np.repeat(np.arange(len(seen)), [len(f) for f in self.features])
-        self.obs_point = np.array([row[p] for points in seen for p in points if p in row], np.int64)
+        observed = [points[f] for points, f in zip(seen, self.features, strict=True)]
+        self.obs_point = np.searchsorted(known, np.concatenate([known[:0], *observed]))
         plain = [xy[i - 1][f] for i, f in zip(self.images, self.features, strict=True)]
         self.plain: Array = np.concatenate([np.zeros((0, 2)), *plain])
         self.now = self.plain
@@ -171,7 +173,7 @@ class RollingModel:
             np.array([pose_of(model.images[i]) for i in self.images]),
             np.array([model.points3D[p].xyz for p in self.point_ids]),
             self.obs_cam, self.obs_point, np.asarray(camera.cam_from_img(self.now)) * focal + half,
-            np.full(count, FEATURE_SD), np.zeros(count), np.ones(count),
+            *(np.broadcast_to(value, count) for value in (FEATURE_SD, 0.0, 1.0)),
         )  # fmt: skip
         return bundle, np.asarray(camera.cam_from_img(self.plain)) * focal + half, pinhole
 

@@ -35,7 +35,7 @@ def test_gradient_agrees_with_differences_of_the_cost(known_bundle: KnownBundle)
     data = (
         camera, b.obs_cam, b.obs_point, b.obs_xy, 1 / b.obs_sd, np.log(b.obs_depth), 1 / b.obs_depth_sd, 2.0
     )  # fmt: skip
-    _, cam_right, _, point_right, _ = kernels.linearise(b.cam_from_world, b.points, *data)
+    _, cam_right, _, point_right = kernels.linearise(b.cam_from_world, b.points, *data)
     for c, k in ((0, 0), (3, 2), (7, 3), (11, 5), (5, 4)):
         step = np.zeros((12, 6))
         step[c, k] = 1e-6
