@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from formats.atomic import copy_file
 from pipelines.correspondence.retrieval import Looks, describe_all, unit
 from pipelines.depth.fields import DepthFields
 from pipelines.depth.scales import sample_proxy
@@ -25,6 +26,7 @@ from pipelines.mapping.divided import refine_divided
 from pipelines.mapping.load import load_views, with_rigid_panoramas
 from pipelines.mapping.poses import move_trajectory
 from pipelines.run_folder import (
+    MAP,
     RunFolder,
     save_depth_fields,
     save_exposure,
@@ -65,7 +67,7 @@ def run(context: StageContext) -> dict[str, Any]:
     is_rig = context.run.load_calibration().directions > 1
     found = search(context, model) if settings.use_loops and not is_rig else FoundLoops([], 0, 0, 0, 0)
     closed = adjust(context, model, found)
-    gaussian_map = context.run.load_map("mapping", context.device)
+    gaussian_map: GaussianMap | None = None  # as mapping left it
     moved_px = 0.0
     if closed is not None:
         before = poses_of(trajectory, model.frame_ids)
@@ -73,11 +75,16 @@ def run(context: StageContext) -> dict[str, Any]:
         moved_px = largest_motion(context, closed.state, model)
         trajectory = correct_trajectory(trajectory, closed.state, model, ratio)
         after = poses_of(trajectory, model.frame_ids)
+        gaussian_map = context.run.load_map("mapping", context.device)
         gaussian_map = move_map(gaussian_map, model.frame_ids, before, after, ratio)
         model = to_sparse_model(closed.state)
         fields = align_depths(model, closed.report, context.run.load_calibration().intrinsics, context.run.find_proxy)
     save_depth_fields(context.folder, fields)
-    refined = refine(context, gaussian_map, trajectory, fields, moved_px, found)
+    refined = None
+    if settings.joint == "always" or (settings.joint == "moved" and moved_px >= JOINT_PX):
+        if gaussian_map is None:
+            gaussian_map = context.run.load_map("mapping", context.device)
+        refined = refine(context, gaussian_map, trajectory, fields, found)
     return save(context, model, trajectory, gaussian_map, found, closed, refined, moved_px)
 
 
@@ -214,13 +221,10 @@ def refine(
     gaussian_map: GaussianMap,
     trajectory: Trajectory,
     fields: DepthFields,
-    moved_px: float,
     found: FoundLoops,
-) -> Refined | None:
-    """Map and poses together where the adjustment has moved them, or always, or never, as the settings say."""
+) -> Refined:
+    """Map and poses together."""
     settings = context.config.global_ba
-    if settings.joint == "never" or (settings.joint == "moved" and moved_px < JOINT_PX):
-        return None
     mapping = context.config.mapping
     exposure = context.run.load_exposure()
     if context.run.load_submaps():
@@ -246,13 +250,13 @@ def save(
     context: StageContext,
     model: SparseModel,
     trajectory: Trajectory,
-    gaussian_map: GaussianMap,
+    gaussian_map: GaussianMap | None,
     found: FoundLoops,
     closed: Closed | None,
     refined: Refined | None,
     moved_px: float,
 ) -> dict[str, Any]:
-    """Write the result; returns its key figures."""
+    """Write the result, with mapping's own map where there is no other; returns its key figures."""
     exposure = context.run.load_exposure()
     if refined is not None and refined.kept:
         gaussian_map = refined.gaussian_map
@@ -260,7 +264,10 @@ def save(
         exposure |= {"log_gains": refined.log_gains, "offsets": refined.offsets}
     save_trajectory(context.folder, trajectory)
     save_sparse(context.folder, model)
-    save_map(context.folder, gaussian_map)
+    if gaussian_map is None:
+        copy_file(context.run.file("mapping", MAP), context.folder / MAP)
+    else:
+        save_map(context.folder, gaussian_map)
     save_exposure(context.folder, exposure["frame_ids"], exposure["log_gains"], exposure["offsets"])
     save_loops(context.folder, [loop.edge for loop in found.loops] if closed is not None else [])
     figures = {

@@ -73,7 +73,9 @@ def total_cost(motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_
 
 
 @kernel
-def _weighted(motion, point, camera, xy, inverse_sd, log_depth, depth_weight, width, residual, jac_cam, jac_point, weight):  # type: ignore[no-untyped-def]
+def _weighted(  # type: ignore[no-untyped-def]
+    motion, point, camera, xy, inverse_sd, log_depth, depth_weight, width, residual, jac_cam, jac_point, weight
+):  # fmt: skip
     """`_residual`, and the weights (3,) that the robust loss gives its rows: all zero behind the camera."""
     weight[:] = 0.0
     if _residual(motion, point, camera, xy, inverse_sd, log_depth, depth_weight, residual, jac_cam, jac_point):
