@@ -27,7 +27,6 @@ from pipelines.mapping.submap_tasks import (
     make_submap,
     measure_submap,
     refine_submap,
-    together,
 )
 from pipelines.mapping.submaps import Submap, divide
 from pipelines.memory import submap_size
@@ -61,9 +60,10 @@ def map_divided(context: StageContext, trajectory: Trajectory, class_ids: tuple[
     tasks = submap_tasks(context, submaps, trajectory, fields, class_ids)
     for work in (make_submap, join_submap, refine_submap, agree_submap):
         context.each(work, tasks)
-    result, ids = all_together(tasks, AGREED)
-    moved = move_trajectory(trajectory, ids, result.cam_from_world)
-    keyframes, held_out = measure(context, tasks, moved, ids, (result.log_gains, result.offsets), AGREED, fields)
+    ids, poses, exposure = in_order([task.load(AGREED, task.number).without_map for task in tasks])
+    moved = move_trajectory(trajectory, ids, poses)
+    keyframes, held_out = measure(context, tasks, moved, ids, exposure, AGREED, fields)
+    result = all_together(tasks, AGREED)  # last: whole it is the largest thing there is
     return Mapped(result, ids, tasks[0].class_ids, moved, keyframes, held_out, submaps)
 
 
@@ -89,11 +89,10 @@ def refine_divided(
         task.save(JOINED, SubmapResult(own, ids[rows], poses, exposure[0][rows], exposure[1][rows], *nothing))
     for work in (refine_submap, agree_submap):
         context.each(work, [replace(task, passes=passes) for task in tasks])
-    result, _ = all_together(tasks, AGREED)
     before, _ = measure(context, tasks, trajectory, ids, exposure, JOINED, fields)
-    moved = move_trajectory(trajectory, ids, result.cam_from_world)
-    after, _ = measure(context, tasks, moved, ids, (result.log_gains, result.offsets), AGREED, fields)
-    return _mean_psnr(before), result, _mean_psnr(after)
+    ids, poses, refined = in_order([task.load(AGREED, task.number).without_map for task in tasks])
+    after, _ = measure(context, tasks, move_trajectory(trajectory, ids, poses), ids, refined, AGREED, fields)
+    return _mean_psnr(before), all_together(tasks, AGREED), _mean_psnr(after)
 
 
 def _mean_psnr(figures: Sequence[ViewFigures]) -> float:
@@ -149,13 +148,20 @@ def _only(fields: DepthFields, frame_ids: NDArray[np.int64]) -> DepthFields:
     return DepthFields(wanted) if wanted else fields  # one without any field means another thing
 
 
-def all_together(tasks: Sequence[SubmapTask], kind: str) -> tuple[OptimisedMap, NDArray[np.int64]]:
-    """The whole map with all keyframes in order, and their ids."""
-    results = [task.load(kind, task.number).without_map for task in tasks]
-    ids, poses, (gains, offsets) = in_order(results)
-    steps = sum(int(r.steps.sum()) for r in results)
-    whole = together(task.load(kind, task.number).gaussian_map for task in tasks)
-    return OptimisedMap(whole, poses, gains, offsets, steps), ids
+def all_together(tasks: Sequence[SubmapTask], kind: str) -> OptimisedMap:
+    """The whole map with all keyframes in order; held once, with one part of it beside it."""
+    results, counts, whole = [], [], {}
+    for task in tasks:
+        result = task.load(kind, task.number)
+        results.append(result.without_map)
+        counts.append(len(result.gaussian_map))
+    for task, end, count in zip(tasks, np.cumsum(counts).tolist(), counts, strict=True):
+        for name, part in vars(task.load(kind, task.number).gaussian_map).items():
+            if name not in whole:
+                whole[name] = part.new_empty((sum(counts), *part.shape[1:]))
+            whole[name][end - count : end] = part
+    _, poses, exposure = in_order(results)
+    return OptimisedMap(GaussianMap(**whole), poses, *exposure, sum(int(r.steps.sum()) for r in results))
 
 
 def measure(
