@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from formats.errors import InputError
-from formats.gaussians import GaussianCloud, unit_quaternions
+from formats.gaussians import GaussianCloud, parts_of, unit_quaternions
 from formats.reading import parsing
 from formats.tensors import load_safetensors, save_safetensors
 
@@ -22,18 +23,33 @@ _AT_ONCE = 1 << 16
 """Gaussians that are packed at a time: in double precision, and sorted by class, they take many times their room."""
 
 
-def write_compact(path: Path, cloud: GaussianCloud, class_names: tuple[str, ...] = ()) -> None:
-    """Write isotropic or general Gaussians into a .safetensors file of quantised arrays.
+def write_compact(
+    path: Path, cloud: GaussianCloud | Sequence[GaussianCloud], class_names: tuple[str, ...] = ()
+) -> None:  # fmt: skip
+    """Write isotropic or general Gaussians, or the parts of such a cloud, into a .safetensors file of quantised arrays.
 
     Means: 16 bits over the bounding box, an error of at most its side / 131070. Scales and opacity: half precision.
     Colours: 8 bits, clipped to 0..1. Classes: the `KEPT_CLASSES` most probable, with 8 bit probabilities.
     Rotations are left out where all three scales are equal. Raises InputError when the disk refuses.
     """
-    low, side = _bounds(cloud.means)
-    isotropic = bool((cloud.log_scales == cloud.log_scales[:, :1]).all())
+    parts, corners, isotropic, count = parts_of(cloud), [], True, 0
+    for part in parts:
+        corners += [part.means.min(axis=0), part.means.max(axis=0)] if len(part) else []
+        isotropic &= bool((part.log_scales == part.log_scales[:, :1]).all())
+        count = 0 if part.class_probs is None else part.class_probs.shape[1]
+    low, side = _bounds(corners)
+    packed = [_packed(part, low, side, isotropic) for part in parts]
+    arrays = {name: np.concatenate([p[name] for p in packed]) for name in packed[0]}
+    meta = {"format": _FORMAT, "class_count": str(count), "class_names": "\n".join(class_names)}
+    save_safetensors(path, arrays | {"box": np.stack([low, side])}, meta)
+
+
+def _packed(
+    cloud: GaussianCloud, low: NDArray[np.float64], side: NDArray[np.float64], isotropic: bool
+) -> dict[str, NDArray]:  # fmt: skip
+    """The arrays of one part."""
     arrays: dict[str, NDArray] = {
         "means": np.concatenate([_quantised(cloud.means[rows], low, side) for rows in _parts(len(cloud))]),
-        "box": np.stack([low, side]),
         "log_scales": cloud.log_scales[:, :1].astype(np.float16) if isotropic else cloud.log_scales.astype(np.float16),
         "opacity_logits": cloud.opacity_logits.astype(np.float16),
         "colors": np.round(cloud.colors.clip(0, 1) * 255).astype(np.uint8),
@@ -42,9 +58,7 @@ def write_compact(path: Path, cloud: GaussianCloud, class_names: tuple[str, ...]
         arrays["quat_wxyz"] = cloud.quat_wxyz.astype(np.float16)
     if cloud.class_probs is not None:
         arrays["top_classes"], arrays["top_probs"] = _top_classes(cloud.class_probs)
-    count = 0 if cloud.class_probs is None else cloud.class_probs.shape[1]
-    meta = {"format": _FORMAT, "class_count": str(count), "class_names": "\n".join(class_names)}
-    save_safetensors(path, arrays, meta)
+    return arrays
 
 
 def read_compact(path: Path) -> tuple[GaussianCloud, tuple[str, ...]]:
@@ -79,11 +93,11 @@ def _unpacked(arrays: dict[str, NDArray], class_count: int) -> GaussianCloud:
     )
 
 
-def _bounds(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lowest corner and side lengths, a side of 0 replaced by 1."""
-    if not len(means):
+def _bounds(corners: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lowest corner and side lengths of the box around points, a side of 0 replaced by 1."""
+    if not corners:
         return np.zeros(3), np.ones(3)
-    low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
+    low, high = np.min(corners, axis=0).astype(np.float64), np.max(corners, axis=0).astype(np.float64)
     return low, np.where(high > low, high - low, 1.0)
 
 

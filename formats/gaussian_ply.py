@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData
 
 from formats.errors import InputError
-from formats.gaussians import GaussianCloud, unit_quaternions
+from formats.gaussians import GaussianCloud, parts_of, unit_quaternions
 from formats.ply_table import Rows, columns, read_ply, slices, write_ply
 from formats.reading import parsing
 
@@ -26,9 +27,9 @@ _PROB = "class_prob_"
 
 
 def write_gaussian_ply(
-    path: Path, cloud: GaussianCloud, class_names: tuple[str, ...] = (), *, sh_degree: int = 0
+    path: Path, cloud: GaussianCloud | Sequence[GaussianCloud], class_names: tuple[str, ...] = (), *, sh_degree: int = 0
 ) -> None:
-    """Write a cloud so that splat viewers and trainers take it as their own.
+    """Write a cloud, or the parts of one, so that splat viewers and trainers take it as their own.
 
     The properties are those of the original code in its order: x y z, nx ny nz (0), f_dc_0..2, f_rest_* (as many as
     `sh_degree` has, all 0), opacity (logit), scale_0..2 (log), rot_0..3 (w x y z); after them class_id (uchar) and
@@ -43,13 +44,18 @@ def write_gaussian_ply(
     fields = [*_MEANS, *_NORMALS, *_DC, *(f"f_rest_{i}" for i in range(_REST_COUNTS[sh_degree]))]
     fields += ["opacity", *_SCALES, *_ROTATION]
     dtype: list[tuple[str, str]] = [(name, "<f4") for name in fields]
-    if cloud.class_ids is not None:
+    parts, count, found = parts_of(cloud), 0, set[int]()
+    for part in parts:
+        count += len(part)
+        if part.class_probs is not None:
+            found |= {i for i, of in enumerate(part.class_probs.T) if of.any()}
+    if parts[0].class_ids is not None:
         dtype.append(("class_id", "u1"))
-    occurring = [] if cloud.class_probs is None else [i for i, of in enumerate(cloud.class_probs.T) if of.any()]
+    occurring = sorted(found)
     dtype += [(f"{_PROB}{i}", "<f4") for i in occurring]
-    blocks = (_rows(cloud, rows, np.dtype(dtype), occurring) for rows in slices(len(cloud)))
+    blocks = (_rows(part, rows, np.dtype(dtype), occurring) for part in parts for rows in slices(len(part)))
     comments = [f"class {i} {name}" for i, name in enumerate(class_names)]
-    write_ply(path, {"vertex": Rows(np.dtype(dtype), len(cloud), blocks)}, comments)
+    write_ply(path, {"vertex": Rows(np.dtype(dtype), count, blocks)}, comments)
 
 
 def _rows(cloud: GaussianCloud, rows: slice, dtype: np.dtype, occurring: list[int]) -> NDArray[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -70,6 +71,11 @@ def unit_quaternions(quat: NDArray) -> NDArray[np.float32]:
     length = np.linalg.norm(wide, axis=1, keepdims=True)
     identity = np.array([1.0, 0, 0, 0])
     return np.where(length > 1e-12, wide / np.maximum(length, 1e-12), identity).astype(np.float32)
+
+
+def parts_of(cloud: GaussianCloud | Sequence[GaussianCloud]) -> Sequence[GaussianCloud]:
+    """The parts, at least one, that a cloud is given in: a sequence may make each as it is asked for."""
+    return [cloud] if isinstance(cloud, GaussianCloud) else cloud
 
 
 def isotropic_cloud(

@@ -53,8 +53,8 @@ class GaussianMap:
         """(M,) in 0..1."""
         return torch.sigmoid(self.opacity_logits)
 
-    def only(self, rows: Tensor) -> GaussianMap:
-        """The Gaussians of rows (M,) bool or indices."""
+    def only(self, rows: Tensor | slice) -> GaussianMap:
+        """The Gaussians of rows (M,) bool, indices or a slice."""
         return GaussianMap(**{name: tensor[rows] for name, tensor in vars(self).items()})
 
     def moved(self, other_from_world: Similarity) -> GaussianMap:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from formats.mesh import MeshBlocks
@@ -16,6 +18,7 @@ from pipelines.export.joined import Region
 from pipelines.export.paint import paint
 from pipelines.export.surface import chunk_surfaces, weld
 from pipelines.export.volume import Grid, fuse, make_grid
+from pipelines.gaussian_map import GaussianMap
 from pipelines.gaussians.render import get_threads
 from pipelines.outcome import Outcome
 from pipelines.progress import Progress
@@ -37,10 +40,21 @@ def keyframe_rows(outcome: Outcome) -> list[int]:
     return np.flatnonzero(outcome.trajectory.is_keyframe).tolist()
 
 
-def draw(outcome: Outcome, settings: ExportConfig, number: int) -> DrawnView:
-    """What the map shows in one of the `keyframe_rows`."""
-    pose = outcome.trajectory.cam_from_world[keyframe_rows(outcome)[number]]
-    return drawn_view(outcome.require_map(), pose, outcome.calibration.intrinsics.at_most(settings.mesh_side))
+def maps_around(outcome: Outcome) -> Callable[[int], GaussianMap]:
+    """What may be seen from a keyframe: of a map made in submaps what its own and those beside it hold. So a view of a
+    long recording takes no longer than one of a short one."""
+    whole, submaps = outcome.require_map(), outcome.run.load_submaps()
+    number_of = {i: n for n, submap in enumerate(submaps) for i in submap["own"].tolist()}
+
+    @functools.lru_cache(maxsize=1)
+    def around(number: int | None) -> GaussianMap:
+        if number is None:  # made whole
+            return whole
+        near = np.concatenate([submaps[n]["own"] for n in (number, *submaps[number]["beside"].tolist())])
+        rows = np.isin(whole.anchor_frame_ids.cpu().numpy(), near)
+        return whole.only(torch.from_numpy(rows).to(whole.means.device))
+
+    return lambda frame_id: around(number_of.get(frame_id))
 
 
 def drawn_views(
@@ -48,12 +62,19 @@ def drawn_views(
 ) -> Sequence[DrawnView]:
     """What the map shows in the `keyframe_rows`, of which those with `numbers` (all) are drawn where they are not in
     `scratch`; those used last are in memory."""
-    count = len(keyframe_rows(outcome))
+    rows = keyframe_rows(outcome)
+    count = len(rows)
     files = [scratch / f"view_{number:06d}.npz" for number in range(count)]
     wanted = range(count) if numbers is None else numbers
+    t, camera, near = (
+        outcome.trajectory,
+        outcome.calibration.intrinsics.at_most(settings.mesh_side),
+        maps_around(outcome),
+    )
     for number in progress.track(wanted, "drawing", len(wanted)):
         if not files[number].exists():
-            save_value(files[number], draw(outcome, settings, number))
+            row = rows[number]
+            save_value(files[number], drawn_view(near(int(t.frame_ids[row])), t.cam_from_world[row], camera))
     return Streamed(count, lambda number: load_value(files[number]), lambda view: view.size, _KEPT_BYTES)
 
 

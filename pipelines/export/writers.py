@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,12 +26,13 @@ from pipelines.geometry.rig import rig_of
 from pipelines.metres.files import save_metres
 from pipelines.outcome import Outcome
 from pipelines.run_folder import save_classes, save_left_out
+from pipelines.streamed import Streamed
 from pipelines.types import SparseModel
 from pipelines.upright.world import World, save_world
 from pipelines.wording import stretches
 
-_AT_ONCE = 1 << 16
-"""Gaussians whose probabilities are copied at a time."""
+_AT_ONCE, _PART = 1 << 16, 1 << 18
+"""Gaussians whose probabilities are copied at a time, and those of a part that is written at a time."""
 
 
 def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
@@ -72,9 +74,9 @@ def seen_points(
     )  # fmt: skip
 
 
-def map_cloud(outcome: Outcome, rows: Tensor | None = None) -> GaussianCloud:
-    """The map, or `rows` (M,) bool of it, as a splat cloud, class probabilities in the order of the run's classes where
-    it has any."""
+def map_cloud(outcome: Outcome, rows: Tensor | slice | None = None) -> GaussianCloud:
+    """The map, or `rows` of it (a slice or (M,) bool), as a splat cloud, class probabilities in the order of the run's
+    classes where it has any."""
     m, channels = outcome.require_map(), outcome.label_of_channel
     m = m if rows is None else m.only(rows)
     probabilities = None
@@ -88,13 +90,20 @@ def map_cloud(outcome: Outcome, rows: Tensor | None = None) -> GaussianCloud:
 
 
 def write_ply(outcome: Outcome, sh_rest: bool, folder: Path) -> list[Path]:
-    """The map as splat PLYs, in its own colours and in those of the classes, and as a compact file."""
-    cloud, names = map_cloud(outcome), outcome.classes.names
+    """The map as splat PLYs, in its own colours and in those of the classes, and as a compact file; part by part, for a
+    cloud takes more memory than the map it is of."""
+    names = outcome.classes.names
     paths = [folder / n for n in ("point_cloud.ply", "point_cloud_semantic.ply", "point_cloud_compact.safetensors")]
-    write_gaussian_ply(paths[0], cloud, names, sh_degree=3 * sh_rest)
-    write_gaussian_ply(paths[1], _by_class(cloud, outcome), names, sh_degree=3 * sh_rest)
-    write_compact(paths[2], cloud, names)
+    write_gaussian_ply(paths[0], _in_parts(outcome, lambda cloud: cloud), names, sh_degree=3 * sh_rest)
+    write_gaussian_ply(paths[1], _in_parts(outcome, lambda c: _by_class(c, outcome)), names, sh_degree=3 * sh_rest)
+    write_compact(paths[2], _in_parts(outcome, lambda cloud: cloud), names)
     return paths
+
+
+def _in_parts(outcome: Outcome, of: Callable[[GaussianCloud], GaussianCloud]) -> Streamed[GaussianCloud]:
+    """The map as clouds of a `_PART` each, one at a time in memory."""
+    starts = range(0, max(len(outcome.require_map()), 1), _PART)
+    return Streamed(len(starts), lambda n: of(map_cloud(outcome, slice(starts[n], starts[n] + _PART))), len, 0)
 
 
 def write_spz_file(outcome: Outcome, world: World, version: int, folder: Path) -> list[Path]:
