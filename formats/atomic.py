@@ -7,7 +7,7 @@ import hashlib
 import os
 import platform
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Protocol
@@ -105,6 +105,12 @@ def write_bytes(path: Path, data: bytes | bytearray | memoryview) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write a UTF-8 text file atomically, line ends as they are. Raises InputError as `atomic_path` does."""
     write_bytes(path, text.encode("utf-8"))
+
+
+def write_lines(path: Path, lines: Iterable[str]) -> None:
+    """A UTF-8 text file of these lines, of which one is in memory at a time, atomically."""
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(f"{line}\n" for line in lines)
 
 
 def copy_file(source: Path, target: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from formats.atomic import write_bytes, write_text
+from formats.atomic import write_bytes, write_lines, write_text
 from formats.colmap_binary import require_whole_files
 from formats.errors import InputError
+from formats.ply_table import slices
 from formats.reading import parsing, require_file
 from formats.trajectory import FARTHEST, nearest_rotation, poses_from_quaternions
 
@@ -77,8 +79,8 @@ def write_colmap_model(
     folder = Path(folder)
     # Binary last: readers look for it first, and must not find it before the rest is there.
     write_text(folder / "cameras.txt", _cameras_text(camera))
-    write_text(folder / "images.txt", _images_text(images))
-    write_text(folder / "points3D.txt", _points_text(points, colors, errors, tracks))
+    write_lines(folder / "images.txt", _images_text(images))
+    write_lines(folder / "points3D.txt", _points_text(points, colors, errors, tracks))
     write_bytes(folder / "cameras.bin", _cameras_binary(camera))
     write_bytes(folder / "images.bin", _images_binary(images))
     write_bytes(folder / "points3D.bin", _points_binary(points, colors, errors, tracks))
@@ -232,11 +234,13 @@ def _point_errors(
 ) -> NDArray[np.float64]:
     """(P,) mean reprojection error in pixels, 0 for a point without observations."""
     _, _, fx, fy, cx, cy = camera
-    transforms = cam_from_world[obs_image]
-    in_cam = np.einsum("oij,oj->oi", transforms[:, :3, :3], points[obs_point]) + transforms[:, :3, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        projected = in_cam[:, :2] / in_cam[:, 2:] * [fx, fy] + [cx, cy]
-    distance = np.nan_to_num(np.linalg.norm(projected - obs_xy, axis=1), nan=0.0, posinf=0.0)
+    distance = np.zeros(len(obs_xy))
+    for rows in slices(len(obs_xy)):  # a pose for each observation is the largest thing here
+        transforms = cam_from_world[obs_image[rows]]
+        in_cam = np.einsum("oij,oj->oi", transforms[:, :3, :3], points[obs_point[rows]]) + transforms[:, :3, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            projected = in_cam[:, :2] / in_cam[:, 2:] * [fx, fy] + [cx, cy]
+        distance[rows] = np.nan_to_num(np.linalg.norm(projected - obs_xy[rows], axis=1), nan=0.0, posinf=0.0)
     counts = np.bincount(obs_point, minlength=len(points))
     return np.bincount(obs_point, distance, minlength=len(points)) / np.maximum(counts, 1)
 
@@ -247,33 +251,27 @@ def _cameras_text(camera: tuple[int, int, float, float, float, float]) -> str:
     return f"{head}{_CAMERA_ID} PINHOLE {width} {height} {_numbers(parameters)}\n"
 
 
-def _images_text(images: _Images) -> str:
-    lines = [
-        "# Image list with two lines of data per image:",
-        "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
-        "#   POINTS2D[] as (X, Y, POINT3D_ID)",
-    ]
+def _images_text(images: _Images) -> Iterator[str]:
+    yield "# Image list with two lines of data per image:"
+    yield "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"
+    yield "#   POINTS2D[] as (X, Y, POINT3D_ID)"
     for i, name in enumerate(images.names):
         here = slice(images.starts[i], images.starts[i + 1])
         pose = _numbers([*images.quat_wxyz[i], *images.translations[i]])
-        lines.append(f"{i + 1} {pose} {_CAMERA_ID} {name}")
+        yield f"{i + 1} {pose} {_CAMERA_ID} {name}"
         pairs = zip(images.obs_xy[here].tolist(), images.obs_point[here].tolist(), strict=True)
-        lines.append(" ".join(f"{x!r} {y!r} {point + 1}" for (x, y), point in pairs))
-    return "\n".join(lines) + "\n"
+        yield " ".join(f"{x!r} {y!r} {point + 1}" for (x, y), point in pairs)
 
 
 def _points_text(
     points: NDArray[np.float64], colors: NDArray[np.uint8], errors: NDArray[np.float64], tracks: _Tracks
-) -> str:
-    lines = [
-        "# 3D point list with one line of data per point:",
-        "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
-    ]
-    elements = tracks.elements.tolist()
-    for p, (xyz, rgb) in enumerate(zip(points.tolist(), colors.tolist(), strict=True)):
-        track = " ".join(f"{image} {index}" for image, index in elements[tracks.starts[p] : tracks.starts[p + 1]])
-        lines.append(f"{p + 1} {_numbers(xyz)} {rgb[0]} {rgb[1]} {rgb[2]} {float(errors[p])!r} {track}".rstrip())
-    return "\n".join(lines) + "\n"
+) -> Iterator[str]:
+    yield "# 3D point list with one line of data per point:"
+    yield "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"
+    for p, (xyz, rgb) in enumerate(zip(points, colors, strict=True)):
+        elements = tracks.elements[tracks.starts[p] : tracks.starts[p + 1]].tolist()
+        track = " ".join(f"{image} {index}" for image, index in elements)
+        yield f"{p + 1} {_numbers(xyz)} {rgb[0]} {rgb[1]} {rgb[2]} {float(errors[p])!r} {track}".rstrip()
 
 
 def _cameras_binary(camera: tuple[int, int, float, float, float, float]) -> bytes:

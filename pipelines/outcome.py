@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from formats.errors import InputError
@@ -157,6 +159,23 @@ def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:
         vocabulary=tuple(map(str, report.get("vocabulary", ()))),
         metres=load_metres(run) if "export" in records else None,
     )
+
+
+def maps_around(outcome: Outcome) -> Callable[[int], GaussianMap]:
+    """What may be seen from a keyframe: of a map made in submaps what its own and those beside it hold. So a view of a
+    long recording takes no longer than one of a short one."""
+    whole, submaps = outcome.require_map(), outcome.run.load_submaps()
+    number_of = {i: n for n, submap in enumerate(submaps) for i in submap["own"].tolist()}
+
+    @functools.lru_cache(maxsize=1)
+    def around(number: int | None) -> GaussianMap:
+        if number is None:  # made whole
+            return whole
+        near = np.concatenate([submaps[n]["own"] for n in (number, *submaps[number]["beside"].tolist())])
+        rows = np.isin(whole.anchor_frame_ids.cpu().numpy(), near)
+        return whole.only(torch.from_numpy(rows).to(whole.means.device))
+
+    return lambda frame_id: around(number_of.get(frame_id))
 
 
 def _load_exposure(run: RunFolder, map_stage: str, trajectory: Trajectory) -> Exposure | None:

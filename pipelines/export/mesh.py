@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from formats.mesh import MeshBlocks
@@ -18,9 +16,8 @@ from pipelines.export.joined import Region
 from pipelines.export.paint import paint
 from pipelines.export.surface import chunk_surfaces, weld
 from pipelines.export.volume import Grid, fuse, make_grid
-from pipelines.gaussian_map import GaussianMap
 from pipelines.gaussians.render import get_threads
-from pipelines.outcome import Outcome
+from pipelines.outcome import Outcome, maps_around
 from pipelines.progress import Progress
 from pipelines.streamed import Streamed
 from pipelines.travel import load_value, save_value
@@ -38,23 +35,6 @@ _KEPT_BYTES = 100e6
 def keyframe_rows(outcome: Outcome) -> list[int]:
     """The rows of the trajectory whose views the mesh is made from."""
     return np.flatnonzero(outcome.trajectory.is_keyframe).tolist()
-
-
-def maps_around(outcome: Outcome) -> Callable[[int], GaussianMap]:
-    """What may be seen from a keyframe: of a map made in submaps what its own and those beside it hold. So a view of a
-    long recording takes no longer than one of a short one."""
-    whole, submaps = outcome.require_map(), outcome.run.load_submaps()
-    number_of = {i: n for n, submap in enumerate(submaps) for i in submap["own"].tolist()}
-
-    @functools.lru_cache(maxsize=1)
-    def around(number: int | None) -> GaussianMap:
-        if number is None:  # made whole
-            return whole
-        near = np.concatenate([submaps[n]["own"] for n in (number, *submaps[number]["beside"].tolist())])
-        rows = np.isin(whole.anchor_frame_ids.cpu().numpy(), near)
-        return whole.only(torch.from_numpy(rows).to(whole.means.device))
-
-    return lambda frame_id: around(number_of.get(frame_id))
 
 
 def drawn_views(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.export.depth_views import depth_view
-from pipelines.outcome import Outcome, evenly
+from pipelines.outcome import Outcome, evenly, maps_around
 from pipelines.proxy.regions.structure import Gravity, find_gravity, floor_plane, name_structure
 from pipelines.proxy.regions.voxels import Voxels, gather_frame, merge, select
 from pipelines.upright.lines import up_of_lines
@@ -59,7 +59,7 @@ def find_upright(outcome: Outcome) -> Upright:
     poses = trajectory.cam_from_world[rows]
     pictures = (outcome.run.image(outcome.frames[row]) for row in rows)
     lines = up_of_lines(pictures, poses, outcome.calibration.intrinsics, prior)
-    voxels = surface_voxels(outcome, evenly(list(poses), _VIEWS))
+    voxels = surface_voxels(outcome, evenly(rows, _VIEWS))
     level = find_gravity(voxels, prior) if len(voxels) else Gravity(prior, False)
     if not (lines.is_sure or level.is_sure):
         return Upright(prior, "", None)
@@ -83,18 +83,18 @@ def _verdict(witnesses: dict[str, Array]) -> tuple[Array, str]:
     return witnesses[told_by], told_by
 
 
-def surface_voxels(outcome: Outcome, cam_from_world: Sequence[Array]) -> Voxels:
-    """The surface that the map shows from poses (N, 4, 4), as voxels a sixtieth of its usual depth wide."""
-    gaussian_map, camera = outcome.require_map(), outcome.calibration.intrinsics.at_most(_SIDE)
-    views = [depth_view(gaussian_map, pose, camera) for pose in cam_from_world]
+def surface_voxels(outcome: Outcome, rows: Sequence[int]) -> Voxels:
+    """The surface that the map shows in keyframes of the trajectory, as voxels a sixtieth of its usual depth wide."""
+    t, camera, near = outcome.trajectory, outcome.calibration.intrinsics.at_most(_SIDE), maps_around(outcome)
+    views = [depth_view(near(int(t.frame_ids[row])), t.cam_from_world[row], camera) for row in rows]
     seen = np.concatenate([np.zeros(0), *(v.depth[v.trust > 0] for v in views)])
     size = float(np.median(seen)) / _VOXELS_PER_DEPTH if len(seen) else 1.0
     black = np.zeros((camera.height, camera.width, 3), np.uint8)
-    rows = (
+    gathered = (
         gather_frame(v.depth, v.trust, black, camera, np.linalg.inv(v.cam_from_world).astype(np.float64), size)
         for v in views
     )
-    voxels = merge(size, rows)
+    voxels = merge(size, gathered)
     return select(voxels, voxels.weight > _LEAST_WEIGHT)
 
 
