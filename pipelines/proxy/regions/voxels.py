@@ -16,7 +16,7 @@ _BITS = 21
 _HALF = 1 << (_BITS - 1)
 _WAITING = 500_000
 """Voxels of single frames that wait to be summed, at least."""
-MOST, _COARSER = 1_500_000, 2**0.5
+MOST, _COARSER = 750_000, 2**0.5
 """Voxels, and how much larger they become where a scene has more: half of them are left. They take about 300 bytes each
 while they are looked at, by no recording but memory alone."""
 _BLOCK = 50_000
