@@ -26,6 +26,8 @@ LoadProxy = Callable[[int], ProxyMaps | None]
 OUTLIER_SD = 4.0
 MOST_FRAMES = 400
 """Up to so many frames are adjusted together; of more only the keyframes."""
+_FITTED_TOGETHER = 500
+"""Keyframes whose fields are fitted at once: by memory alone."""
 ROUNDS = 3
 ITERATIONS = 20
 """Of each round's bundle adjustment."""
@@ -173,9 +175,15 @@ def set_scale(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics) -> Bundle
     for c, rows in enumerate(rows_by(bundle.obs_cam, len(middles))):
         mine = rows[usable[rows]] if ties.has_depth[c] else rows[:0]
         middles[c] = scales.keyframe_scale(log_ratio[mine], ties.reliability[mine])
-    used = usable & ties.has_depth[bundle.obs_cam]
-    basis = COARSE.at(bundle.obs_xy[used], intrinsics.width, intrinsics.height)
-    ties.fields = scales.fit_to_points(bundle.obs_cam[used], basis, log_ratio[used], ties.reliability[used], middles)
+    fields = []
+    for first in range(0, max(len(middles), 1), _FITTED_TOGETHER):  # no field knows of another one
+        own = slice(first, first + _FITTED_TOGETHER)
+        near = (bundle.obs_cam >= own.start) & (bundle.obs_cam < own.stop)
+        used = np.flatnonzero(usable & ties.has_depth[bundle.obs_cam] & near)
+        basis = COARSE.at(bundle.obs_xy[used], intrinsics.width, intrinsics.height)
+        known = log_ratio[used], ties.reliability[used], middles[own]
+        fields.append(scales.fit_to_points(bundle.obs_cam[used] - first, basis, *known))
+    ties.fields = np.concatenate(fields)
     if not (ties.metric and ties.has_depth.any()):
         return bundle
     ties.world = scales.world_scale(middles[ties.has_depth])
