@@ -29,18 +29,19 @@ from pipelines.correspondence.retrieval import (
 )
 from pipelines.correspondence.snapshots import Snapshots
 from pipelines.geometry.rig import ONE_CAMERA
+from pipelines.memory import give_back
 from pipelines.progress import Progress
 from pipelines.streamed import Streamed
-from pipelines.structure.adjust import adjust, median_error, remove_wild
+from pipelines.structure.adjust import adjust
 from pipelines.structure.consistency import ModelReport, check_pairs, judge, without_misplaced
 from pipelines.structure.lens import set_lens
 from pipelines.structure.mappers import calibrate_focal, map_globally, map_incrementally
 from pipelines.structure.mend import mended
 from pipelines.structure.parallax import HOW_TO_FILM, require_parallax
-from pipelines.structure.rolling import FEATURE_SD, NO_READOUT, Readout, adjust_rolling, read_readout
+from pipelines.structure.rolling import NO_READOUT, Readout, adjust_rolling, read_readout
 from pipelines.structure.seams import cut, take_out
 from pipelines.structure.window_size import SIZE, windows_of
-from pipelines.structure.windows import WIDE, Joined, adjust_together, close_loops
+from pipelines.structure.windows import Joined, adjust_joined
 from pipelines.types import Features, Vocabulary
 
 _PAIRS_PER_BLOCK = 64
@@ -184,15 +185,11 @@ class StructureFromMotion:
                 return None
             surest = found if surest is None or found.focal_sd < surest.focal_sd else surest
         assert surest is not None
-        model = joined.model(surest.model.cameras[1], views.xy)
-        adjust_together(model, views.xy, views.times, surest.readout)
-        if close_loops(model, pairs, windows, views.xy):
-            adjust_together(model, views.xy, views.times, surest.readout, WIDE)
-            adjust_together(model, views.xy, views.times, surest.readout)
-        if views.weak:
-            adjust_together(model, views.xy, views.times, surest.readout, median_error(model) / FEATURE_SD)
-        remove_wild(model)
-        return replace(surest, model=model)
+        whole = replace(surest, model=joined.model(surest.model.cameras[1], views.xy))
+        del joined, surest, found  # not beside the model of all
+        give_back()
+        adjust_joined(whole.model, views.xy, views.times, whole.readout, pairs, windows, bool(views.weak))
+        return whole
 
     def _windows(self, count: int) -> int:
         """How many there are; 0 where all is made at once."""

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from pipelines.correspondence.matching import VerifiedPair
 from pipelines.geometry import se3
 from pipelines.geometry.alignment import Similarity, best_rotation
+from pipelines.structure.adjust import median_error, remove_wild
 from pipelines.structure.backbone import pose_of
 from pipelines.structure.bundle import adjust_bundle
-from pipelines.structure.rolling import Readout, RollingModel, straightened, velocities
+from pipelines.structure.rolling import FEATURE_SD, Readout, RollingModel, straightened, velocities
 
 Array = NDArray[np.float64]
 
@@ -126,6 +127,20 @@ def close_loops(
                 model.merge_points3D(p, q)
                 merged += 1
     return merged
+
+
+def adjust_joined(
+    model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout, pairs: Iterable[VerifiedPair],
+    windows: Sequence[range], narrowly: bool,
+) -> None:  # fmt: skip
+    """The joined windows adjusted as one, with the loops between them, in place; `narrowly` as of `adjust`."""
+    adjust_together(model, xy, times, readout)
+    if close_loops(model, pairs, windows, xy):
+        adjust_together(model, xy, times, readout, WIDE)
+        adjust_together(model, xy, times, readout)
+    if narrowly:
+        adjust_together(model, xy, times, readout, median_error(model) / FEATURE_SD)
+    remove_wild(model)
 
 
 def adjust_together(

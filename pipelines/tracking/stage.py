@@ -9,6 +9,7 @@ import numpy as np
 
 from formats.errors import InputError
 from pipelines.geometry.rig import Rig, rig_of
+from pipelines.memory import give_back
 from pipelines.run_folder import save_depth_fields, save_figures, save_sparse, save_trajectory
 from pipelines.stages import Stage, StageContext
 from pipelines.stopping import is_asked
@@ -45,6 +46,7 @@ def run(context: StageContext) -> dict[str, Any]:
             "rotation or pictures without texture give no parallax; film while walking, or choose another part"
         )
     report = adjust_state(state, intrinsics, pictures.proxy, metric, settings)
+    give_back()
     compared = compare_all(context, state, pictures) if settings.render == "all" else {}
     hold_turns(state, pictures, context.config.run.seed)
     if state.turned:
