@@ -30,6 +30,7 @@ from pipelines.export.writers import (
     write_world,
 )
 from pipelines.journal import empty
+from pipelines.memory import give_back
 from pipelines.metres.files import save_metres
 from pipelines.metres.find import Machine, find_metres
 from pipelines.outcome import Outcome, load_outcome
@@ -53,12 +54,14 @@ def run(context: StageContext) -> dict[str, Any]:
     world, reasons = find_world(found, settings)
     for reason in reasons:
         context.warn(reason)
-    found = replace(found, metres=gps_metres(world) or guess_metres(context, found, settings))
-    outcome = on_earth(found.moved(world.exported_from_run), world)
+    metres = gps_metres(world) or guess_metres(context, found, settings)
+    outcome = on_earth(replace(found, metres=metres).moved(world.exported_from_run), world)
+    del found  # one map is enough
+    give_back()
     write_pieces(context)
     write_all_but_mesh(outcome, world, settings, context.folder)
     if world.earth is not None:
-        save_metres(context.folder, found.metres)
+        save_metres(context.folder, metres)
     workers = MeshWorkers(context, world.exported_from_run) if context.workers is not None else None
     kinds, scratch = mesh_kinds(settings), scratch_of(context)
     write_meshes(outcome, world, settings, kinds, context.folder, scratch, context.progress, workers, keep=True)
@@ -71,7 +74,7 @@ def run(context: StageContext) -> dict[str, Any]:
         "compact_map_mb": round((context.folder / "point_cloud_compact.safetensors").stat().st_size / 1e6, 2),
         **mesh_figures(mesh),
         **world_figures(world),
-        **metres_figures(found.metres),
+        **metres_figures(metres),
     }
 
 
