@@ -63,14 +63,17 @@ def run(context: StageContext) -> dict[str, Any]:
     if world.earth is not None:
         save_metres(context.folder, metres)
     workers = MeshWorkers(context, world.exported_from_run) if context.workers is not None else None
-    kinds, scratch = mesh_kinds(settings), scratch_of(context)
-    write_meshes(outcome, world, settings, kinds, context.folder, scratch, context.progress, workers, keep=True)
+    given = settings, mesh_kinds(settings), context.folder, scratch_of(context), context.progress, workers
+    views, gaussians = views_for_meshes(outcome, *given, keep=True), len(outcome.require_map())
+    outcome = replace(outcome, gaussian_map=None)  # a mesh is made of views
+    give_back()
+    write_meshes(outcome, views, world, *given, keep=True)
     mesh = mesh_blocks(context.folder / "mesh.ply")
     if mesh.face_count == 0:
         context.warn("the mesh is empty: no surface is seen by enough keyframes")
     return {
         "images": int(outcome.trajectory.is_placed.sum()),
-        "gaussians": len(outcome.require_map()),
+        "gaussians": gaussians,
         "compact_map_mb": round((context.folder / "point_cloud_compact.safetensors").stat().st_size / 1e6, 2),
         **mesh_figures(mesh),
         **world_figures(world),
@@ -78,8 +81,27 @@ def run(context: StageContext) -> dict[str, Any]:
     }
 
 
+def views_for_meshes(
+    outcome: Outcome,
+    settings: ExportConfig,
+    kinds: tuple[str, ...],
+    folder: Path,
+    scratch: Path,
+    progress: Progress,
+    workers: MeshWorkers | None = None,
+    keep: bool = False,
+) -> Sequence[DrawnView]:
+    """What `write_meshes` needs the map for: what it shows in the keyframes; nothing where no mesh is left to make."""
+    if keep and _mesh_ply(kinds, folder, scratch).exists() and "texture" not in kinds:
+        return ()
+    if workers:
+        workers.draw(outcome)
+    return drawn_views(outcome, settings, scratch, progress)
+
+
 def write_meshes(
     outcome: Outcome,
+    views: Sequence[DrawnView],
     world: World,
     settings: ExportConfig,
     kinds: tuple[str, ...],
@@ -92,14 +114,8 @@ def write_meshes(
     """Write those `kinds` of the mesh ("mesh", "texture") into a folder, but for mesh.ply and mesh.glb that are there
     to `keep`. What does not fit into memory lies in `scratch`; `workers` draw and fuse."""
     names, axes = outcome.classes.names, world.gltf_from_exported
-    ply, glb = (folder if "mesh" in kinds else scratch) / "mesh.ply", folder / "mesh.glb"
-    is_made = keep and ply.exists()
-    views: Sequence[DrawnView] = ()
-    if not is_made or "texture" in kinds:
-        if workers:
-            workers.draw(outcome)
-        views = drawn_views(outcome, settings, scratch, progress)
-    if not is_made:
+    ply, glb = _mesh_ply(kinds, folder, scratch), folder / "mesh.glb"
+    if not (keep and ply.exists()):
         grid = make_grid_of(views, settings)
         if workers:
             workers.fuse(grid)
@@ -112,6 +128,10 @@ def write_meshes(
         whole = SemanticMesh(**vars(read_mesh_ply(ply)))
         paths += write_textured(make_textured(outcome, whole, Shown(views), progress), names, folder, axes)
     return paths
+
+
+def _mesh_ply(kinds: tuple[str, ...], folder: Path, scratch: Path) -> Path:
+    return (folder if "mesh" in kinds else scratch) / "mesh.ply"
 
 
 def mesh_kinds(settings: ExportConfig) -> tuple[str, ...]:
@@ -222,7 +242,8 @@ def export_run(
     def mesh(*kinds: str) -> list[Path]:
         empty(scratch := folder / ".mesh")  # what a killed export has left
         try:
-            return write_meshes(outcome, world, settings, kinds, folder, scratch, progress or SilentProgress())
+            given = settings, kinds, folder, scratch, progress or SilentProgress()
+            return write_meshes(outcome, views_for_meshes(outcome, *given), world, *given)
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
 
