@@ -245,12 +245,13 @@ def eliminate_points(  # type: ignore[no-untyped-def]
             number, end = rows[cam], rows[cam + 1]
             for b in range(a, count):
                 number += np.searchsorted(columns[number:end], obs_cam[first + b])
-                block = blocks[number]
+                block, twice = blocks[number], b != a and obs_cam[first + b] == cam
                 for i in range(6):
                     for j in range(6):
-                        block[i, j] -= (
-                            left[i, 0] * mixed[b, j, 0] + left[i, 1] * mixed[b, j, 1] + left[i, 2] * mixed[b, j, 2]
-                        )
+                        share = left[i, 0] * mixed[b, j, 0] + left[i, 1] * mixed[b, j, 1] + left[i, 2] * mixed[b, j, 2]
+                        block[i, j] -= share
+                        if twice:  # b with a lies in the same block as a with b
+                            block[j, i] -= share
 
 
 @kernel

@@ -9,7 +9,7 @@ import pytest
 from pipelines.geometry import se3
 from pipelines.geometry.alignment import align_points
 from pipelines.structure import bundle_kernels as kernels
-from pipelines.structure.bundle import Bundle, adjust_bundle, adjust_pose
+from pipelines.structure.bundle import Bundle, Problem, adjust_bundle, adjust_pose
 from pipelines.tracking.pnp import colmap_camera
 from pipelines.types import Intrinsics
 from tests.pipelines.tracking.conftest import KnownBundle
@@ -48,6 +48,20 @@ def test_gradient_agrees_with_differences_of_the_cost(known_bundle: KnownBundle)
         up = kernels.total_cost(b.cam_from_world, b.points + step, *data)
         down = kernels.total_cost(b.cam_from_world, b.points - step, *data)
         assert -2 * point_right[p, k] == pytest.approx((up - down) / 2e-6, rel=1e-4)
+
+
+def test_what_a_picture_sees_twice_counts_as_what_it_sees_once_but_surer(known_bundle: KnownBundle) -> None:
+    once, quadratic = without_depth(known_bundle.bundle), 1e6
+    here = once.obs_cam == 3
+    twice = once.select(np.concatenate([np.arange(len(here)), np.flatnonzero(here)]))
+    surer = replace(once, obs_sd=once.obs_sd / np.where(here, np.sqrt(2), 1))
+    at, steps = (once.cam_from_world, once.points), []
+    for bundle in (twice, surer):
+        problem = Problem(bundle, known_bundle.intrinsics, quadratic)
+        steps.append(problem.solve(at, problem.linearise(*at), 1e-4))
+    for found, wanted in zip(*steps, strict=True):
+        assert np.abs(wanted).max() > 1e-3
+        np.testing.assert_allclose(found, wanted, atol=1e-9)
 
 
 def test_recovers_poses_and_scale_only_with_depth(known_bundle: KnownBundle) -> None:
