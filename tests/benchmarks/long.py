@@ -4,6 +4,7 @@
     python tests/benchmarks/long.py --work RUNS 60 300 1200 --json rows.json
     python tests/benchmarks/long.py --work RUNS 60x10                  60 seconds of walk, ten times forth and back
     python tests/benchmarks/long.py --work RUNS --fps 10 --size 640x480 --focal 0.6 --set mapping.passes=5
+    python tests/benchmarks/long.py --work RUNS --poses --size 480x360   structure from motion alone: its error
 
 The walk leads through a building of rooms and corridors that is made as it is read (`tests/world/building.py`): exact
 poses, depth and classes. Every stage runs in a process of its own, so that its peak of memory is its own, and its CPU
@@ -28,9 +29,12 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 import numpy as np
+from numpy.typing import NDArray
 
 from formats.images import read_rgb
 from formats.video_writer import write_video
+from pipelines.geometry.alignment import align_points
+from pipelines.run_folder import RunFolder
 from pipelines.run_folder_names import STAGES
 from tests.world import ClipOptions, write_sequence
 from tests.world.building import Walk, around, frames
@@ -60,16 +64,19 @@ def cpu_seconds() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def run_walk(name: str, work: Path, camera: dict[str, Any], settings: list[str]) -> dict[str, Any]:
-    """One row: the walk made, reconstructed stage by stage, evaluated."""
+def prepared(name: str, work: Path, camera: dict[str, Any]) -> tuple[Path, Path, Path]:
+    """The video of a walk, its truth, and where its run is."""
     seconds, _, turns = name.partition("x")
     folder = work / f"walk_{name}_{camera['width']}"
-    video, truth = make_clip(folder, Walk(float(seconds), int(turns or 0)), camera)
-    run = folder / "video.msgs"
-    chosen = [part for setting in settings for part in ("--set", setting)]
+    return *make_clip(folder, Walk(float(seconds), int(turns or 0)), camera), folder / "video.msgs"
+
+
+def run_walk(name: str, work: Path, camera: dict[str, Any], settings: list[str]) -> dict[str, Any]:
+    """One row: the walk made, reconstructed stage by stage, evaluated."""
+    video, truth, run = prepared(name, work, camera)
     for stage in STAGES:
         before, cpu = cpu_seconds(), run.with_suffix(f".{stage}.cpu")
-        msgs_slam("reconstruct", video, "--out", run, "--until", stage, "-q", *chosen)
+        msgs_slam("reconstruct", video, "--out", run, "--until", stage, "-q", *settings)
         if not cpu.exists():
             cpu.write_text(f"{cpu_seconds() - before:.2f}")
     if not (run / "evaluation" / "evaluation.json").exists():
@@ -77,12 +84,34 @@ def run_walk(name: str, work: Path, camera: dict[str, Any], settings: list[str])
     return row_of(name, run, truth)
 
 
+def poses_of(name: str, work: Path, camera: dict[str, Any], settings: list[str]) -> dict[str, Any]:
+    """One row of `frames` alone: how far its keyframes are off."""
+    video, truth, run = prepared(name, work, camera)
+    msgs_slam("reconstruct", video, "--out", run, "--until", STAGES[0], "-q", *settings)
+    backbone, frames = RunFolder(run).load_backbone(), RunFolder(run).load_frames()
+    assert backbone is not None
+    stage = json.loads((run / "manifest.json").read_text())["stages"][STAGES[0]]
+    centers, path = true_path(truth)
+    wanted = centers[[frames[i].source_index for i in backbone.frame_ids]]
+    found = np.linalg.inv(backbone.cam_from_world)[:, :3, 3]
+    apart = np.linalg.norm(align_points(found, wanted).apply(found) - wanted, axis=1)
+    ate = float(np.sqrt((apart**2).mean()))
+    placed = f"{len(found)} of {stage['figures']['frames']} frames"
+    figures = {"ate_cm": round(100 * ate, 2), "ate_share_of_path": round(ate / path, 6)}
+    return {"walk": name, "path_m": round(path, 1), "keyframes": placed, **figures, "peak_mb": stage["peak_memory_mb"]}
+
+
+def true_path(truth: Path) -> tuple[NDArray[np.float64], float]:
+    """Camera centres (N, 3) and the length of the way, metres."""
+    centers = np.loadtxt(truth / "traj.txt").reshape(-1, 4, 4)[:, :3, 3]
+    return centers, float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
+
+
 def row_of(name: str, run: Path, truth: Path) -> dict[str, Any]:
     """Figures of a finished and evaluated run."""
     stages = json.loads((run / "manifest.json").read_text())["stages"]
     found = json.loads((run / "evaluation" / "evaluation.json").read_text())
-    centers = np.loadtxt(truth / "traj.txt").reshape(-1, 4, 4)[:, :3, 3]
-    path = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
+    _, path = true_path(truth)
     keyframes = stages["tracking"]["figures"]["keyframes"]
     ate = found["trajectory"].get("sim3 all", {}).get("rmse")
     views = [v["psnr"] for v in found["views"] if "psnr" in v] if isinstance(found["views"], list) else []
@@ -108,7 +137,7 @@ def row_of(name: str, run: Path, truth: Path) -> dict[str, Any]:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown: one row a walk, then seconds a keyframe and peak memory of every stage."""
-    by_stage = ("seconds_a_keyframe", "cpu_seconds_a_keyframe", "peak_mb")
+    by_stage = ("seconds_a_keyframe", "cpu_seconds_a_keyframe", "peak_mb") if "posed" in rows[0] else ()
     plain = [k for k in rows[0] if k not in by_stage]
     lines = ["| " + " | ".join(plain) + " |", "|" + " --- |" * len(plain)]
     lines += ["| " + " | ".join(str(row[k]) for k in plain) + " |" for row in rows]
@@ -130,11 +159,14 @@ def main() -> None:
     parser.add_argument("--fps", type=float, default=5.0, help="of the video")
     parser.add_argument("--focal", type=float, default=0.85, help="of the lens, as a share of the width")
     parser.add_argument("--set", dest="settings", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    parser.add_argument("--poses", action="store_true", help="frames alone, and how far its keyframes are off")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     width, height = (int(x) for x in arguments.size.split("x"))
     camera = {"width": width, "height": height, "fps": arguments.fps, "focal": arguments.focal * width}
-    rows = [run_walk(name, arguments.work, camera, arguments.settings) for name in arguments.walks]
+    settings = [part for setting in arguments.settings for part in ("--set", setting)]
+    row = poses_of if arguments.poses else run_walk
+    rows = [row(name, arguments.work, camera, settings) for name in arguments.walks]
     print(table(rows))
     if arguments.json:
         arguments.json.write_text(json.dumps(rows, indent=1) + "\n")
