@@ -120,6 +120,17 @@ def test_a_long_class_table_costs_only_the_classes_that_occur(tmp_path: Path) ->
     assert (back == cloud.class_probs).all()
 
 
+def test_a_cloud_in_parts_is_the_same_file(tmp_path: Path) -> None:
+    cloud, names = _cloud(300, 7), tuple("abcdefg")
+    assert cloud.class_probs is not None
+    cloud.class_probs[:200, 2] = 0  # a class that occurs in the last part only
+    parts = [cloud.only(rows) for rows in np.array_split(np.arange(300), [1, 200, 200])]
+    for write in (write_gaussian_ply, write_compact):
+        write(tmp_path / "whole", cloud, names)
+        write(tmp_path / "parts", parts, names)
+        assert (tmp_path / "parts").read_bytes() == (tmp_path / "whole").read_bytes()
+
+
 def test_values_that_are_not_finite_are_not_written(tmp_path: Path) -> None:
     cloud = _cloud(5)
     cloud.means[2, 1] = np.nan

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from finished import note_finished
+from numpy.typing import NDArray
 from scipy import sparse
 
 from formats.gaussian_ply import read_gaussian_ply
@@ -25,7 +26,7 @@ from pipelines.mapping.divided import refine_divided
 from pipelines.mapping.gauge import SeenExposures, common_exposure
 from pipelines.mapping.submaps import BORDER, divide, nearest_seeing
 from pipelines.memory import LEAST_SUBMAP, submap_size
-from pipelines.outcome import load_outcome
+from pipelines.outcome import load_outcome, maps_around
 from pipelines.progress import SilentProgress
 from pipelines.run_folder import RunFolder
 from pipelines.stages import StageContext
@@ -241,6 +242,22 @@ def test_tiles_are_the_map_and_a_coarse_one(finished: RunFolder, tmp_path: Path)
     assert all(row["coarse_gaussians"] < 0.4 * row["gaussians"] for row in rows)
     assert float((shown[0].features - shown[1].features).abs().mean()) < 0.08
     assert float(shown[1].silhouette.mean()) > 0.9 * float(shown[0].silhouette.mean())
+
+
+def test_a_view_is_drawn_from_its_submap_and_those_beside_it(finished: RunFolder) -> None:
+    class NothingBeside(RunFolder):
+        def load_submaps(self) -> list[dict[str, NDArray[np.int64]]]:
+            return [{**submap, "beside": np.zeros(0, np.int64)} for submap in super().load_submaps()]
+
+    outcome = load_outcome(finished, "cpu")
+    near, own_alone = maps_around(outcome), maps_around(replace(outcome, run=NothingBeside(finished.root)))
+    anchors, submaps = outcome.require_map().anchor_frame_ids.numpy(), finished.load_submaps()
+    for submap in submaps:
+        around = np.concatenate([submap["own"], *(submaps[n]["own"] for n in submap["beside"])])
+        for frame_id in submap["own"].tolist():
+            assert len(near(frame_id)) == np.isin(anchors, around).sum()
+            assert set(own_alone(frame_id).anchor_frame_ids.tolist()) <= set(submap["own"].tolist())
+    assert len(near(10_000)) == len(outcome.require_map())  # of no submap
 
 
 def test_submaps_are_brought_to_one_exposure(monkeypatch: pytest.MonkeyPatch) -> None:
