@@ -34,7 +34,7 @@ GROSS = 0.15
 SHARE = 0.25
 """Neighbouring samples err alike: a picture's worth of them counts as a few per node."""
 ROUNDS = 4
-_ROOM = 75_000_000
+_ROOM = 60_000_000
 """Bytes of depths, and of samples of them, that are kept; what has no room is read again."""
 
 
