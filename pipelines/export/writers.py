@@ -31,7 +31,7 @@ from pipelines.types import SparseModel
 from pipelines.upright.world import World, save_world
 from pipelines.wording import stretches
 
-_AT_ONCE, _PART = 1 << 16, 1 << 18
+_AT_ONCE, _PART = 1 << 16, 1 << 17
 """Gaussians whose probabilities are copied at a time, and those of a part that is written at a time."""
 
 
