@@ -148,12 +148,14 @@ def adjust_together(
 ) -> None:  # fmt: skip
     """Poses and points adjusted in place, with the camera as it is; see `adjust_bundle` for the width of the loss."""
     rolling = RollingModel(model, xy, times)
+    images, point_ids = rolling.images, rolling.point_ids
     bundle, plain, pinhole = rolling.bundle()
     if any(readout):
         velocity = velocities(bundle.cam_from_world, rolling.times)
         bundle = straightened(bundle, plain, pinhole, velocity, readout)
+    del rolling, plain  # pixels of all observations once more
     adjusted = adjust_bundle(bundle, pinhole, width=width).bundle
-    for i, pose in zip(rolling.images, adjusted.cam_from_world, strict=True):
+    for i, pose in zip(images, adjusted.cam_from_world, strict=True):
         model.frames[model.images[i].frame_id].rig_from_world = pycolmap.Rigid3d(pose[:3])
-    for p, xyz in zip(rolling.point_ids, adjusted.points, strict=True):
+    for p, xyz in zip(point_ids, adjusted.points, strict=True):
         model.points3D[p].xyz = xyz

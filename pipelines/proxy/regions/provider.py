@@ -16,6 +16,7 @@ from formats.errors import InputError
 from pipelines.depth.resize import resample_nearest
 from pipelines.geometry.camera import unproject_depth
 from pipelines.jit import kernel
+from pipelines.memory import give_back
 from pipelines.progress import Progress
 from pipelines.proxy.palette import class_colors
 from pipelines.proxy.providers import DepthEstimate, LabelEstimate
@@ -88,6 +89,7 @@ class SegmentLabels:
         """All frames' surface in voxels (V,), which way is up, and floor, ceiling, wall, surface or other (V,)."""
         posed = [f for f in frames if f.id in self._world_from_cam]
         self._size = _scene_depth([depth_of(f) for f in posed[:: max(1, len(posed) // 12)]]) / _VOXELS_PER_DEPTH
+        give_back()  # what depths and moving things have needed
         tracked = self._progress.track(posed, "regions", len(posed))
         voxels = merge(self._size, (self._gather(f, depth_of(f)) for f in tracked))
         voxels, self._size = select(voxels, voxels.weight > _LEAST_WEIGHT), voxels.size
