@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -63,11 +63,13 @@ def run(context: StageContext) -> dict[str, Any]:
     if world.earth is not None:
         save_metres(context.folder, metres)
     workers = MeshWorkers(context, world.exported_from_run) if context.workers is not None else None
-    given = settings, mesh_kinds(settings), context.folder, scratch_of(context), context.progress, workers
-    views, gaussians = views_for_meshes(outcome, *given, keep=True), len(outcome.require_map())
+    job = MeshJob(
+        settings, mesh_kinds(settings), context.folder, scratch_of(context), context.progress, workers, keep=True
+    )
+    views, gaussians = views_for_meshes(job, outcome), len(outcome.require_map())
     outcome = replace(outcome, gaussian_map=None)  # a mesh is made of views
     give_back()
-    write_meshes(outcome, views, world, *given, keep=True)
+    write_meshes(job, outcome, views, world)
     mesh = mesh_blocks(context.folder / "mesh.ply")
     if mesh.face_count == 0:
         context.warn("the mesh is empty: no surface is seen by enough keyframes")
@@ -81,57 +83,56 @@ def run(context: StageContext) -> dict[str, Any]:
     }
 
 
-def views_for_meshes(
-    outcome: Outcome,
-    settings: ExportConfig,
-    kinds: tuple[str, ...],
-    folder: Path,
-    scratch: Path,
-    progress: Progress,
-    workers: MeshWorkers | None = None,
-    keep: bool = False,
-) -> Sequence[DrawnView]:
+@dataclass(frozen=True)
+class MeshJob:
+    """Which `kinds` of the mesh ("mesh", "texture") go into a folder; a mesh.ply and mesh.glb that are there to `keep`
+    stay. What does not fit into memory lies in `scratch`; `workers` draw and fuse."""
+
+    settings: ExportConfig
+    kinds: tuple[str, ...]
+    folder: Path
+    scratch: Path
+    progress: Progress
+    workers: MeshWorkers | None = None
+    keep: bool = False
+
+    @property
+    def ply(self) -> Path:
+        """Of the mesh, which a texture needs too."""
+        return (self.folder if "mesh" in self.kinds else self.scratch) / "mesh.ply"
+
+    @property
+    def is_made(self) -> bool:
+        """Whether the mesh is there to stay."""
+        return self.keep and self.ply.exists()
+
+
+def views_for_meshes(job: MeshJob, outcome: Outcome) -> Sequence[DrawnView]:
     """What `write_meshes` needs the map for: what it shows in the keyframes; nothing where no mesh is left to make."""
-    if keep and _mesh_ply(kinds, folder, scratch).exists() and "texture" not in kinds:
+    if job.is_made and "texture" not in job.kinds:
         return ()
-    if workers:
-        workers.draw(outcome)
-    return drawn_views(outcome, settings, scratch, progress)
+    if job.workers:
+        job.workers.draw(outcome)
+    return drawn_views(outcome, job.settings, job.scratch, job.progress)
 
 
-def write_meshes(
-    outcome: Outcome,
-    views: Sequence[DrawnView],
-    world: World,
-    settings: ExportConfig,
-    kinds: tuple[str, ...],
-    folder: Path,
-    scratch: Path,
-    progress: Progress,
-    workers: MeshWorkers | None = None,
-    keep: bool = False,
-) -> list[Path]:
-    """Write those `kinds` of the mesh ("mesh", "texture") into a folder, but for mesh.ply and mesh.glb that are there
-    to `keep`. What does not fit into memory lies in `scratch`; `workers` draw and fuse."""
+def write_meshes(job: MeshJob, outcome: Outcome, views: Sequence[DrawnView], world: World) -> list[Path]:
+    """What the job asks for, made of views; the map may be gone."""
     names, axes = outcome.classes.names, world.gltf_from_exported
-    ply, glb = _mesh_ply(kinds, folder, scratch), folder / "mesh.glb"
-    if not (keep and ply.exists()):
-        grid = make_grid_of(views, settings)
-        if workers:
-            workers.fuse(grid)
-        write_mesh_ply(ply, joined(fused_regions(outcome, views, grid, scratch, progress)), names)
-    mesh = mesh_blocks(ply)
-    if "mesh" in kinds and mesh.face_count and not (keep and glb.exists()):
+    glb = job.folder / "mesh.glb"
+    if not job.is_made:
+        grid = make_grid_of(views, job.settings)
+        if job.workers:
+            job.workers.fuse(grid)
+        write_mesh_ply(job.ply, joined(fused_regions(outcome, views, grid, job.scratch, job.progress)), names)
+    mesh = mesh_blocks(job.ply)
+    if "mesh" in job.kinds and mesh.face_count and not (job.keep and glb.exists()):
         write_mesh_glb(glb, mesh, names, axes)
-    paths = [ply, glb][: 1 + (mesh.face_count > 0)] if "mesh" in kinds else []
-    if "texture" in kinds and mesh.face_count:
-        whole = SemanticMesh(**vars(read_mesh_ply(ply)))
-        paths += write_textured(make_textured(outcome, whole, Shown(views), progress), names, folder, axes)
+    paths = [job.ply, glb][: 1 + (mesh.face_count > 0)] if "mesh" in job.kinds else []
+    if "texture" in job.kinds and mesh.face_count:
+        whole = SemanticMesh(**vars(read_mesh_ply(job.ply)))
+        paths += write_textured(make_textured(outcome, whole, Shown(views), job.progress), names, job.folder, axes)
     return paths
-
-
-def _mesh_ply(kinds: tuple[str, ...], folder: Path, scratch: Path) -> Path:
-    return (folder if "mesh" in kinds else scratch) / "mesh.ply"
 
 
 def mesh_kinds(settings: ExportConfig) -> tuple[str, ...]:
@@ -242,8 +243,8 @@ def export_run(
     def mesh(*kinds: str) -> list[Path]:
         empty(scratch := folder / ".mesh")  # what a killed export has left
         try:
-            given = settings, kinds, folder, scratch, progress or SilentProgress()
-            return write_meshes(outcome, views_for_meshes(outcome, *given), world, *given)
+            job = MeshJob(settings, kinds, folder, scratch, progress or SilentProgress())
+            return write_meshes(job, outcome, views_for_meshes(job, outcome), world)
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
 

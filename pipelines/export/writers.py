@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -92,18 +91,19 @@ def map_cloud(outcome: Outcome, rows: Tensor | slice | None = None) -> GaussianC
 def write_ply(outcome: Outcome, sh_rest: bool, folder: Path) -> list[Path]:
     """The map as splat PLYs, in its own colours and in those of the classes, and as a compact file; part by part, for a
     cloud takes more memory than the map it is of."""
-    names = outcome.classes.names
+    clouds, names = _in_parts(outcome), outcome.classes.names
     paths = [folder / n for n in ("point_cloud.ply", "point_cloud_semantic.ply", "point_cloud_compact.safetensors")]
-    write_gaussian_ply(paths[0], _in_parts(outcome, lambda cloud: cloud), names, sh_degree=3 * sh_rest)
-    write_gaussian_ply(paths[1], _in_parts(outcome, lambda c: _by_class(c, outcome)), names, sh_degree=3 * sh_rest)
-    write_compact(paths[2], _in_parts(outcome, lambda cloud: cloud), names)
+    write_gaussian_ply(paths[0], clouds, names, sh_degree=3 * sh_rest)
+    by_class = clouds.changed(lambda _, cloud: _by_class(cloud, outcome))
+    write_gaussian_ply(paths[1], by_class, names, sh_degree=3 * sh_rest)
+    write_compact(paths[2], clouds, names)
     return paths
 
 
-def _in_parts(outcome: Outcome, of: Callable[[GaussianCloud], GaussianCloud]) -> Streamed[GaussianCloud]:
+def _in_parts(outcome: Outcome) -> Streamed[GaussianCloud]:
     """The map as clouds of a `_PART` each, one at a time in memory."""
     starts = range(0, max(len(outcome.require_map()), 1), _PART)
-    return Streamed(len(starts), lambda n: of(map_cloud(outcome, slice(starts[n], starts[n] + _PART))), len, 0)
+    return Streamed(len(starts), lambda n: map_cloud(outcome, slice(starts[n], starts[n] + _PART)), len, 0)
 
 
 def write_spz_file(outcome: Outcome, world: World, version: int, folder: Path) -> list[Path]:

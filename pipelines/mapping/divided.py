@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pipelines.depth.fields import DepthFields
 from pipelines.depth.posed import PosedDepth, overlaps
@@ -60,11 +61,11 @@ def map_divided(context: StageContext, trajectory: Trajectory, class_ids: tuple[
     tasks = submap_tasks(context, submaps, trajectory, fields, class_ids)
     for work in (make_submap, join_submap, refine_submap, agree_submap):
         context.each(work, tasks)
-    ids, poses, exposure = in_order([task.load(AGREED, task.number).without_map for task in tasks])
-    moved = move_trajectory(trajectory, ids, poses)
-    keyframes, held_out = measure(context, tasks, moved, ids, exposure, AGREED, fields)
-    result = all_together(tasks, AGREED)  # last: whole it is the largest thing there is
-    return Mapped(result, ids, tasks[0].class_ids, moved, keyframes, held_out, submaps)
+    made = _survey(tasks, AGREED)
+    moved = move_trajectory(trajectory, made.ids, made.cam_from_world)
+    keyframes, held_out = measure(context, tasks, moved, made.ids, made.exposure, AGREED, fields)
+    result = all_together(tasks, AGREED, made)  # last: whole it is the largest thing there is
+    return Mapped(result, made.ids, tasks[0].class_ids, moved, keyframes, held_out, submaps)
 
 
 def refine_divided(
@@ -90,9 +91,10 @@ def refine_divided(
     for work in (refine_submap, agree_submap):
         context.each(work, [replace(task, passes=passes) for task in tasks])
     before, _ = measure(context, tasks, trajectory, ids, exposure, JOINED, fields)
-    ids, poses, refined = in_order([task.load(AGREED, task.number).without_map for task in tasks])
-    after, _ = measure(context, tasks, move_trajectory(trajectory, ids, poses), ids, refined, AGREED, fields)
-    return _mean_psnr(before), all_together(tasks, AGREED), _mean_psnr(after)
+    made = _survey(tasks, AGREED)
+    moved = move_trajectory(trajectory, made.ids, made.cam_from_world)
+    after, _ = measure(context, tasks, moved, made.ids, made.exposure, AGREED, fields)
+    return _mean_psnr(before), all_together(tasks, AGREED, made), _mean_psnr(after)
 
 
 def _mean_psnr(figures: Sequence[ViewFigures]) -> float:
@@ -148,20 +150,37 @@ def _only(fields: DepthFields, frame_ids: NDArray[np.int64]) -> DepthFields:
     return DepthFields(wanted) if wanted else fields  # one without any field means another thing
 
 
-def all_together(tasks: Sequence[SubmapTask], kind: str) -> OptimisedMap:
-    """The whole map with all keyframes in order; held once, with one part of it beside it."""
-    results, counts, whole = [], [], {}
+@dataclass(frozen=True)
+class _Survey:
+    """Of all submaps: ids (N,), poses (N, 4, 4) and exposures of the keyframes in order, how many Gaussians each has,
+    and the steps of all."""
+
+    ids: NDArray[np.int64]
+    cam_from_world: NDArray[np.float64]
+    exposure: Exposures
+    counts: list[int]
+    steps: int
+
+
+def _survey(tasks: Sequence[SubmapTask], kind: str) -> _Survey:
+    """What there is beside the maps, of which one at a time is in memory."""
+    results, counts = [], []
     for task in tasks:
         result = task.load(kind, task.number)
         results.append(result.without_map)
         counts.append(len(result.gaussian_map))
-    for task, end, count in zip(tasks, np.cumsum(counts).tolist(), counts, strict=True):
+    return _Survey(*in_order(results), counts, sum(int(r.steps.sum()) for r in results))
+
+
+def all_together(tasks: Sequence[SubmapTask], kind: str, made: _Survey) -> OptimisedMap:
+    """The whole map; held once, with one part of it beside it."""
+    whole: dict[str, Tensor] = {}
+    for task, end, count in zip(tasks, np.cumsum(made.counts).tolist(), made.counts, strict=True):
         for name, part in vars(task.load(kind, task.number).gaussian_map).items():
             if name not in whole:
-                whole[name] = part.new_empty((sum(counts), *part.shape[1:]))
+                whole[name] = part.new_empty((sum(made.counts), *part.shape[1:]))
             whole[name][end - count : end] = part
-    _, poses, exposure = in_order(results)
-    return OptimisedMap(GaussianMap(**whole), poses, *exposure, sum(int(r.steps.sum()) for r in results))
+    return OptimisedMap(GaussianMap(**whole), made.cam_from_world, *made.exposure, made.steps)
 
 
 def measure(

@@ -175,11 +175,10 @@ def set_scale(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics) -> Bundle
     for c, rows in enumerate(rows_by(bundle.obs_cam, len(middles))):
         mine = rows[usable[rows]] if ties.has_depth[c] else rows[:0]
         middles[c] = scales.keyframe_scale(log_ratio[mine], ties.reliability[mine])
-    fields = []
+    fields, usable = [], usable & ties.has_depth[bundle.obs_cam]
     for first in range(0, max(len(middles), 1), _FITTED_TOGETHER):  # no field knows of another one
         own = slice(first, first + _FITTED_TOGETHER)
-        near = (bundle.obs_cam >= own.start) & (bundle.obs_cam < own.stop)
-        used = np.flatnonzero(usable & ties.has_depth[bundle.obs_cam] & near)
+        used = np.flatnonzero(usable & (bundle.obs_cam >= own.start) & (bundle.obs_cam < own.stop))
         basis = COARSE.at(bundle.obs_xy[used], intrinsics.width, intrinsics.height)
         known = log_ratio[used], ties.reliability[used], middles[own]
         fields.append(scales.fit_to_points(bundle.obs_cam[used] - first, basis, *known))
