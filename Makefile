@@ -1,33 +1,47 @@
-# `make demo`, `make test` and `make docs` do all the set-up: each makes .venv on first use.
+# `make demo`, `make test` and `make docs` do all the set-up on first use.
 PYTHON ?= python3
 VENV := .venv
-BIN := $(VENV)/bin
+# What is tested is the built wheel, in an environment outside the checkout: MSGS_SLAM_TESTED names another place.
+CACHE := $(if $(XDG_CACHE_HOME),$(XDG_CACHE_HOME),$(HOME)/.cache)
+TESTED := $(or $(MSGS_SLAM_TESTED),$(CACHE)/msgs-slam/tested-$(shell pwd | cksum | cut -d' ' -f1))
+PIP := -m pip install --quiet --disable-pip-version-check
+NAMES := build/names/msgs_slam
 
-.PHONY: demo test lint docs clean
+.PHONY: demo test lint docs names wheel clean
 
-demo: $(VENV)/.installed
-	$(BIN)/msgs-slam models pull --yes || echo "The demo goes on without networks: no names, no metres."
-	$(BIN)/msgs-slam demo
+demo:
+	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/python $(PIP) .
+	$(VENV)/bin/msgs-slam models pull --yes || echo "The demo goes on without networks: no names, no metres."
+	$(VENV)/bin/msgs-slam demo
 
-test: lint
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+test: lint wheel
+	$(TESTED)/bin/python $(PIP) --force-reinstall --no-deps build/dist/*.whl
+	cd $(TESTED) && MSGS_SLAM_CHECKOUT=$(CURDIR) bin/python -m pytest --rootdir $(CURDIR) -c $(CURDIR)/pyproject.toml \
+		--numprocesses auto --maxprocesses 4 --dist loadfile $(CURDIR)/tests
 
-lint: $(VENV)/.installed-dev
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+wheel: $(TESTED)/.installed # by way of the source distribution, which is released too
+	rm -rf build/dist
+	$(TESTED)/bin/python -m build --no-isolation --outdir build/dist . > build/wheel.log || (cat build/wheel.log; exit 1)
 
-docs: $(VENV)/.installed-dev
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+lint: $(TESTED)/.installed names
+	$(TESTED)/bin/ruff check .
+	$(TESTED)/bin/ruff format --check .
+	$(TESTED)/bin/mypy
 
-$(VENV)/.installed: pyproject.toml
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -e .
-	touch $@
+# The folders under the names by which they are imported, for tools that read sources (mypy, editors).
+names:
+	mkdir -p $(NAMES)
+	for folder in msgs_cli pipelines formats; do ln -sfn ../../../$$folder $(NAMES)/$$folder; done
+	for file in __init__ __main__; do ln -sf ../../../msgs_cli/msgs_slam/$$file.py $(NAMES)/$$file.py; done
 
-$(VENV)/.installed-dev: $(VENV)/.installed
-	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev,docs,cuda-check]'
+docs: $(TESTED)/.installed names
+	NO_MKDOCS_2_WARNING=1 $(TESTED)/bin/mkdocs build --strict
+
+$(TESTED)/.installed: pyproject.toml
+	$(PYTHON) -m venv $(TESTED)
+	$(TESTED)/bin/python $(PIP) '.[dev,docs,cuda-check,viewer]'
 	touch $@
 
 clean:
-	rm -rf $(VENV) build *.egg-info
+	rm -rf $(VENV) $(TESTED) build *.egg-info

@@ -13,8 +13,8 @@ import click
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 
-from msgs_cli.main import main
-from pipelines.config import Config, allowed_values, config_to_dict
+from msgs_slam.msgs_cli.main import main
+from msgs_slam.pipelines.config import Config, allowed_values, config_to_dict
 
 _MATHS = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 

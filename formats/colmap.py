@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from formats.atomic import write_bytes, write_lines, write_text
-from formats.colmap_binary import require_whole_files
-from formats.errors import InputError
-from formats.ply_table import slices
-from formats.reading import parsing, require_file
-from formats.trajectory import FARTHEST, nearest_rotation, poses_from_quaternions
+from msgs_slam.formats.atomic import write_bytes, write_lines, write_text
+from msgs_slam.formats.colmap_binary import require_whole_files
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.ply_table import slices
+from msgs_slam.formats.reading import parsing, require_file
+from msgs_slam.formats.trajectory import FARTHEST, nearest_rotation, poses_from_quaternions
 
 _PINHOLE_MODEL_ID = 1
 _CAMERA_ID = 1

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from formats.gaussians import GaussianCloud, parts_of, unit_quaternions
-from formats.reading import parsing
-from formats.tensors import load_safetensors, save_safetensors
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gaussians import GaussianCloud, parts_of, unit_quaternions
+from msgs_slam.formats.reading import parsing
+from msgs_slam.formats.tensors import load_safetensors, save_safetensors
 
 KEPT_CLASSES = 4
 """The most probable classes of each Gaussian that are kept; the rest shares what is left equally."""

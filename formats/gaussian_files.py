@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.compact_gaussians import read_compact
-from formats.errors import InputError
-from formats.gaussian_glb import read_gaussian_glb
-from formats.gaussian_ply import read_gaussian_ply
-from formats.gaussians import GaussianCloud, unit_quaternions
-from formats.reading import parsing, read_bytes
-from formats.spz import read_spz
+from msgs_slam.formats.compact_gaussians import read_compact
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gaussian_glb import read_gaussian_glb
+from msgs_slam.formats.gaussian_ply import read_gaussian_ply
+from msgs_slam.formats.gaussians import GaussianCloud, unit_quaternions
+from msgs_slam.formats.reading import parsing, read_bytes
+from msgs_slam.formats.spz import read_spz
 
 _SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
 _SMALLEST_SCALE = 1e-9

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from formats.gaussian_ply import SH_C0
-from formats.gaussians import GaussianCloud, unit_quaternions
-from formats.glb import FLOAT, WIDTHS, Part, glb_parts, write_primitive
-from formats.reading import parsing, read_bytes
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gaussian_ply import SH_C0
+from msgs_slam.formats.gaussians import GaussianCloud, unit_quaternions
+from msgs_slam.formats.glb import FLOAT, WIDTHS, Part, glb_parts, write_primitive
+from msgs_slam.formats.reading import parsing, read_bytes
 
 EXTENSION = "KHR_gaussian_splatting"
 _LABEL = "_LABEL"

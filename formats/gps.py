@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from formats.images import exif_gps
-from formats.reading import parsing, read_bytes
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import exif_gps
+from msgs_slam.formats.reading import parsing, read_bytes
 
 Array = NDArray[np.float64]
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, UnidentifiedImageError
 from pillow_heif import register_heif_opener
 
-from formats.atomic import write_bytes
-from formats.errors import InputError
-from formats.reading import opened, parsing, reaching
+from msgs_slam.formats.atomic import write_bytes
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.reading import opened, parsing, reaching
 
 register_heif_opener()
 

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from formats.glb import Part, write_primitive
-from formats.ply_table import Rows, columns, read_ply, read_rows, write_ply
-from formats.reading import parsing, read_bytes
-from formats.trajectory import FARTHEST
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.glb import Part, write_primitive
+from msgs_slam.formats.ply_table import Rows, columns, read_ply, read_rows, write_ply
+from msgs_slam.formats.reading import parsing, read_bytes
+from msgs_slam.formats.trajectory import FARTHEST
 
 _LABEL_ATTRIBUTE = "_LABEL"
 _MAX_GLB_BYTES = 4 * 1024**3

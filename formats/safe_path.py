@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from formats.errors import InputError
+from msgs_slam.formats.errors import InputError
 
 _LONGEST_NAME = 255
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from formats.errors import InputError
-from formats.reading import parsing
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.reading import parsing
 
 WHOLE, PART = "equirectangular", "part of a sphere"
 _MOST_OF_MOOV = 64 << 20

@@ -16,11 +16,11 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from formats.atomic import write_bytes
-from formats.errors import InputError
-from formats.gaussian_ply import SH_C0
-from formats.gaussians import GaussianCloud, unit_quaternions
-from formats.reading import opened, parsing, require_file
+from msgs_slam.formats.atomic import write_bytes
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gaussian_ply import SH_C0
+from msgs_slam.formats.gaussians import GaussianCloud, unit_quaternions
+from msgs_slam.formats.reading import opened, parsing, require_file
 
 _MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")

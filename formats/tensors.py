@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import safe_open
 
-from formats.atomic import atomic_path
-from formats.errors import InputError
-from formats.reading import parsing, require_file
+from msgs_slam.formats.atomic import atomic_path
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.reading import parsing, require_file
 
 if TYPE_CHECKING:
     import torch

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.atomic import write_text
-from formats.glb import Part, write_primitive
-from formats.images import jpeg_bytes, write_rgb
+from msgs_slam.formats.atomic import write_text
+from msgs_slam.formats.glb import Part, write_primitive
+from msgs_slam.formats.images import jpeg_bytes, write_rgb
 
 _UNLIT = "KHR_materials_unlit"
 _LINEAR, _MIPMAPPED, _CLAMPED = 9729, 9987, 33071

@@ -21,10 +21,10 @@ os.environ.setdefault("OPENCV_VIDEOIO_DEBUG", "0")
 
 import cv2
 
-from formats.errors import InputError
-from formats.hdr_video import HdrCapture, can_tone_map, hdr_transfer
-from formats.images import IMAGE_SUFFIXES
-from formats.reading import opened
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.hdr_video import HdrCapture, can_tone_map, hdr_transfer
+from msgs_slam.formats.images import IMAGE_SUFFIXES
+from msgs_slam.formats.reading import opened
 
 MAX_FRAME_PIXELS = 64_000_000
 """A larger frame is taken for a damaged or hostile header (8K video has 33 million)."""

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.atomic import atomic_path, free_bytes, is_disk_full
-from formats.errors import DiskFullError, InputError
+from msgs_slam.formats.atomic import atomic_path, free_bytes, is_disk_full
+from msgs_slam.formats.errors import DiskFullError, InputError
 
 CODECS = {".mp4": "mp4v", ".avi": "FFV1", ".mkv": "FFV1"}
 """By the file's ending: MPEG-4 plays everywhere, FFV1 loses nothing."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from msgs_cli.options import (
+from msgs_slam.msgs_cli.options import (
     FOLDER,
     make_progress,
     set_up_logging,
@@ -16,7 +16,7 @@ from msgs_cli.options import (
     stopping_softly,
     verbosity_options,
 )
-from msgs_cli.text import say
+from msgs_slam.msgs_cli.text import say
 
 
 @click.command()
@@ -56,10 +56,10 @@ def ablate(
     and proxies are made once. Stopped at any moment, the same command goes on where it was.
     """
     set_up_logging(quiet, verbose)
-    from formats.datasets import open_sequence
-    from pipelines.config import load_config
-    from pipelines.evaluation.ablation import ABLATIONS, ablate, ablation_table
-    from pipelines.reconstruct import default_run_folder
+    from msgs_slam.formats.datasets import open_sequence
+    from msgs_slam.pipelines.config import load_config
+    from msgs_slam.pipelines.evaluation.ablation import ABLATIONS, ablate, ablation_table
+    from msgs_slam.pipelines.reconstruct import default_run_folder
 
     texts = [f"mapping.hold_out={hold_out}", *overrides, *source_settings(about_source)]
     config = load_config(config_file, texts)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from msgs_cli.options import (
+from msgs_slam.msgs_cli.options import (
     FOLDER,
     UNTIL,
     engine_options,
@@ -21,10 +21,10 @@ from msgs_cli.options import (
     verbosity_options,
     worker_setup,
 )
-from msgs_cli.text import say
+from msgs_slam.msgs_cli.text import say
 
 if TYPE_CHECKING:
-    from pipelines.engines import LocalEngine, RayEngine
+    from msgs_slam.pipelines.engines import LocalEngine, RayEngine
 
 
 @click.command()
@@ -57,9 +57,9 @@ def batch(
     """
     set_up_logging(quiet, verbose)
     require_engine(engine_name, address)
-    from formats.jsonfile import read_toml
-    from pipelines.batch import Shard, find_recordings, run_batch, table_rows, write_table
-    from pipelines.config import load_config
+    from msgs_slam.formats.jsonfile import read_toml
+    from msgs_slam.pipelines.batch import Shard, find_recordings, run_batch, table_rows, write_table
+    from msgs_slam.pipelines.config import load_config
 
     recordings = find_recordings(folder.resolve(), out.resolve())
     mine = Shard.parse(shard).of(recordings)
@@ -88,7 +88,7 @@ def batch(
 def _open_engine(name: str, address: str, threads: int) -> tuple[LocalEngine | RayEngine, int, tuple[str, ...]]:
     """The engine, the CPUs of a recording, and the settings that follow: the same number of threads on every node, or
     the results would differ."""
-    from pipelines.engines import LocalEngine, RayEngine
+    from msgs_slam.pipelines.engines import LocalEngine, RayEngine
 
     if name == "local":
         return LocalEngine(), 1, ()
@@ -98,7 +98,7 @@ def _open_engine(name: str, address: str, threads: int) -> tuple[LocalEngine | R
 
 
 def _print(rows: list[dict[str, object]]) -> None:
-    from msgs_cli.tables import format_figure, format_table, terminal_width
+    from msgs_slam.msgs_cli.tables import format_figure, format_table, terminal_width
 
     columns = list(dict.fromkeys(key for row in rows for key in row))
     cells = [[format_figure(row[c]) if c in row else "" for c in columns] for row in rows]

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from msgs_cli.options import RUN_ARGUMENT, make_progress, open_run, set_up_logging, verbosity_options
-from msgs_cli.text import say
+from msgs_slam.msgs_cli.options import RUN_ARGUMENT, make_progress, open_run, set_up_logging, verbosity_options
+from msgs_slam.msgs_cli.text import say
 
 
 @click.command()
@@ -31,10 +31,10 @@ def evaluate(
 ) -> None:
     """Compare RUN with the truth: poses, images, depth, labels, mesh. Writes RUN/evaluation/."""
     set_up_logging(quiet, verbose)
-    from formats.datasets import open_sequence
-    from pipelines.evaluation.class_map import open_class_map
-    from pipelines.evaluation.table import evaluation_table
-    from pipelines.evaluation.write import write_evaluation
+    from msgs_slam.formats.datasets import open_sequence
+    from msgs_slam.pipelines.evaluation.class_map import open_class_map
+    from msgs_slam.pipelines.evaluation.table import evaluation_table
+    from msgs_slam.pipelines.evaluation.write import write_evaluation
 
     joins = open_class_map(class_map) if class_map else None
     run = open_run(run_path)
@@ -52,7 +52,7 @@ def evaluate(
 def report(run_path: Path, to: Path | None, quiet: bool, verbose: bool) -> None:
     """Write one HTML file that says what was found, how good it is, and what to film better."""
     set_up_logging(quiet, verbose)
-    from pipelines.evaluation.report import write_report
+    from msgs_slam.pipelines.evaluation.report import write_report
 
     say(write_report(open_run(run_path), to, make_progress(quiet)))
 
@@ -73,7 +73,7 @@ def report(run_path: Path, to: Path | None, quiet: bool, verbose: bool) -> None:
 def render(run_path: Path, target: Path, kind: str, camera_path: str, fps: float, quiet: bool, verbose: bool) -> None:
     """Draw the map of RUN along a camera path into a video (.mp4) or a folder of pictures."""
     set_up_logging(quiet, verbose)
-    from pipelines.render_run import render_run
+    from msgs_slam.pipelines.render_run import render_run
 
     say(render_run(open_run(run_path), target, kind, camera_path, fps, progress=make_progress(quiet)))
 
@@ -87,7 +87,7 @@ def view(path: Path, port: int, host: str) -> None:
 
     Needs the extra: pip install 'msgs-slam[viewer]'.
     """
-    from pipelines.viewer import open_viewer
+    from msgs_slam.pipelines.viewer import open_viewer
 
     viewer = open_viewer(path, host, port)
     say(f"open {viewer.url} in a browser; Ctrl-C ends it", err=True)

@@ -13,14 +13,14 @@ import click
 # Spinning OpenMP threads of one library steal the cores of the next; must be set before torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-from formats.errors import InputError
-from msgs_cli import looking
-from msgs_cli.ablating import ablate
-from msgs_cli.batch import batch
-from msgs_cli.doctor import doctor
-from msgs_cli.json_lines import JsonError
-from msgs_cli.models import models
-from msgs_cli.options import (
+from msgs_slam.formats.errors import InputError
+from msgs_slam.msgs_cli import looking
+from msgs_slam.msgs_cli.ablating import ablate
+from msgs_slam.msgs_cli.batch import batch
+from msgs_slam.msgs_cli.doctor import doctor
+from msgs_slam.msgs_cli.json_lines import JsonError
+from msgs_slam.msgs_cli.models import models
+from msgs_slam.msgs_cli.options import (
     FOLDER,
     LOG_FORMAT,
     RUN_ARGUMENT,
@@ -36,9 +36,9 @@ from msgs_cli.options import (
     stopping_softly,
     verbosity_options,
 )
-from msgs_cli.text import flush_output, prepare_streams, printable, say
-from msgs_cli.work import work
-from pipelines.run_folder_names import EXPORTS
+from msgs_slam.msgs_cli.text import flush_output, prepare_streams, printable, say
+from msgs_slam.msgs_cli.work import work
+from msgs_slam.pipelines.run_folder_names import EXPORTS
 
 
 class FriendlyGroup(click.Group):
@@ -125,10 +125,10 @@ def reconstruct(
     a changed setting only the stages that depend on it run again.
     """
     set_up_logging(quiet, verbose)
-    from pipelines.config import load_config
-    from pipelines.reconstruct import default_run_folder, existing_config, one_source
-    from pipelines.reconstruct import reconstruct as run_reconstruct
-    from pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.config import load_config
+    from msgs_slam.pipelines.reconstruct import default_run_folder, existing_config, one_source
+    from msgs_slam.pipelines.reconstruct import reconstruct as run_reconstruct
+    from msgs_slam.pipelines.run_folder import RunFolder
 
     run = RunFolder(out) if out else default_run_folder(sources[0])
     texts = source_settings(about_source)
@@ -161,11 +161,11 @@ def resume(
 ) -> None:
     """Go on with RUN where it stopped. Finished stages are kept unless one of their settings is changed."""
     set_up_logging(quiet, verbose)
-    from pipelines.config import load_config
-    from pipelines.reconstruct import require_run
-    from pipelines.reconstruct import resume as run_resume
-    from pipelines.run_folder import RunFolder
-    from pipelines.settings_file import load_settings
+    from msgs_slam.pipelines.config import load_config
+    from msgs_slam.pipelines.reconstruct import require_run
+    from msgs_slam.pipelines.reconstruct import resume as run_resume
+    from msgs_slam.pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.settings_file import load_settings
 
     run = RunFolder(run_path)
     require_run(run)
@@ -185,8 +185,8 @@ def resume(
 @click.option("--json", "as_json", is_flag=True, help="The same for programs, with every figure.")
 def status(run_path: Path, verbose: bool, as_json: bool) -> None:
     """Say which stages of RUN are done, what they found, what was degraded, and which files are damaged."""
-    from msgs_cli.tables import scale_lines, status_table, warning_lines
-    from pipelines.status import run_status
+    from msgs_slam.msgs_cli.tables import scale_lines, status_table, warning_lines
+    from msgs_slam.pipelines.status import run_status
 
     run = open_run(run_path)
     found = run_status(run)
@@ -228,9 +228,9 @@ def export(
     set_up_logging(quiet, verbose)
     if (config_file or overrides) and to is None:
         raise click.UsageError("with --set or --config, say where to write with --to")
-    from pipelines.config import load_config
-    from pipelines.export.stage import export_run
-    from pipelines.reconstruct import made_with
+    from msgs_slam.pipelines.config import load_config
+    from msgs_slam.pipelines.export.stage import export_run
+    from msgs_slam.pipelines.reconstruct import made_with
 
     run = open_run(run_path)
     settings = load_config(config_file, overrides, base=made_with(run)).export
@@ -253,10 +253,10 @@ def export(
 def demo(out: Path, config_file: Path | None, overrides: tuple[str, ...], quiet: bool, verbose: bool) -> None:
     """Reconstruct a short video of a made-up room, compare with its known truth, print the errors and where to look."""
     set_up_logging(quiet, verbose)
-    from pipelines.config import load_config
-    from pipelines.demo import demo_summary, run_demo
-    from pipelines.reconstruct import reconstruct as run_reconstruct
-    from pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.config import load_config
+    from msgs_slam.pipelines.demo import demo_summary, run_demo
+    from msgs_slam.pipelines.reconstruct import reconstruct as run_reconstruct
+    from msgs_slam.pipelines.run_folder import RunFolder
 
     config = load_config(config_file, overrides)
 
@@ -276,14 +276,14 @@ def demo(out: Path, config_file: Path | None, overrides: tuple[str, ...], quiet:
 @settings_options
 def show_config(config_file: Path | None, overrides: tuple[str, ...]) -> None:
     """Print every setting as commented TOML: save it, change it, pass it with --config."""
-    from pipelines.config import config_to_toml, load_config
+    from msgs_slam.pipelines.config import config_to_toml, load_config
 
     click.echo(config_to_toml(load_config(config_file, overrides)), nl=False)
 
 
 def _print_summary(root: Path, records: dict[str, Any]) -> None:
-    from msgs_cli.tables import scale_lines, status_table, warning_lines
-    from pipelines.status import DONE, StageStatus
+    from msgs_slam.msgs_cli.tables import scale_lines, status_table, warning_lines
+    from msgs_slam.pipelines.status import DONE, StageStatus
 
     say(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
     for line in warning_lines(records):

@@ -12,20 +12,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from formats.atomic import write_text
-from formats.errors import InputError
-from formats.images import list_images
-from formats.jsonfile import write_json
-from pipelines.config import Config, load_config, merge_settings
-from pipelines.engines import Call, Engine
-from pipelines.frames.recording import open_recording
-from pipelines.lock import RunBusyError
-from pipelines.progress import Progress, log
-from pipelines.reconstruct import existing_config, reconstruct
-from pipelines.records import load_records
-from pipelines.run_folder import RunFolder
-from pipelines.run_folder_names import STAGES
-from pipelines.workers import code_identity, require_same_world
+from msgs_slam.formats.atomic import write_text
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import list_images
+from msgs_slam.formats.jsonfile import write_json
+from msgs_slam.pipelines.config import Config, load_config, merge_settings
+from msgs_slam.pipelines.engines import Call, Engine
+from msgs_slam.pipelines.frames.recording import open_recording
+from msgs_slam.pipelines.lock import RunBusyError
+from msgs_slam.pipelines.progress import Progress, log
+from msgs_slam.pipelines.reconstruct import existing_config, reconstruct
+from msgs_slam.pipelines.records import load_records
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run_folder_names import STAGES
+from msgs_slam.pipelines.workers import code_identity, require_same_world
 
 _VIDEOS = {
     ".3gp", ".avi", ".flv", ".insv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".sens",

@@ -8,11 +8,11 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from pipelines.config import Config
-from pipelines.records import Manifest, StageRecord, load_records, load_source, write_manifest
-from pipelines.run_folder import RunFolder
-from pipelines.settings_file import load_settings, save_settings
-from pipelines.stages import Stage, next_upstream, stage_fingerprint
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.records import Manifest, StageRecord, load_records, load_source, write_manifest
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.settings_file import load_settings, save_settings
+from msgs_slam.pipelines.stages import Stage, next_upstream, stage_fingerprint
 
 
 def branch(

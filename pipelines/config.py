@@ -14,9 +14,9 @@ from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
-from formats.errors import InputError
-from formats.jsonfile import read_toml
-from pipelines.earlier_versions import explain_retired
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.jsonfile import read_toml
+from msgs_slam.pipelines.earlier_versions import explain_retired
 
 
 def setting(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from formats.errors import InputError
-from pipelines.progress import log
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.progress import log
 
 
 def settle_device(wanted: str = "auto") -> str:

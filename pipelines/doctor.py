@@ -101,8 +101,8 @@ def _libraries() -> Finding:
 
 def _video() -> Finding:
     """A few frames through the encoder and back."""
-    from formats.video import iter_video
-    from formats.video_writer import write_video
+    from msgs_slam.formats.video import iter_video
+    from msgs_slam.formats.video_writer import write_video
 
     frames = [np.full((48, 64, 3), 40 * i, np.uint8) for i in range(5)]
     with tempfile.TemporaryDirectory() as folder:
@@ -157,7 +157,7 @@ def _gpu() -> Finding:
 
 
 def _models() -> Finding:
-    from pipelines.proxy.models.registry import ModelStore
+    from msgs_slam.pipelines.proxy.models.registry import ModelStore
 
     store = ModelStore.open()
     here = [model.name for model in store.models if store.is_here(model)]
@@ -168,7 +168,7 @@ def _models() -> Finding:
 
 
 def _kernels() -> Finding:
-    from pipelines.jit import cache_root
+    from msgs_slam.pipelines.jit import cache_root
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

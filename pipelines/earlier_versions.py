@@ -7,8 +7,8 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from formats.errors import InputError
-from pipelines.run_folder_names import STAGES
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.run_folder_names import STAGES
 
 MOVED = {
     "proxy.symmetry": "article.symmetry_weight",

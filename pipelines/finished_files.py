@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from formats.digest import file_sha256
-from formats.errors import InputError
-from pipelines.records import Manifest, read_manifest
+from msgs_slam.formats.digest import file_sha256
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.records import Manifest, read_manifest
 
 Stamp = tuple[int, int, int]
 """Inode, bytes and time of change: another one means that the file may be another."""

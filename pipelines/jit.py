@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import numba
 
-from pipelines.stage_identity import source_digest
+from msgs_slam.pipelines.stage_identity import source_digest
 
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -7,9 +7,9 @@ import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from formats.digest import file_sha256
-from formats.errors import RecoverableError
-from pipelines.stopping import stop_if_asked
+from msgs_slam.formats.digest import file_sha256
+from msgs_slam.formats.errors import RecoverableError
+from msgs_slam.pipelines.stopping import stop_if_asked
 
 JOURNAL = ".written"
 

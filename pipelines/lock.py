@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-from formats.errors import InputError, RecoverableError
-from pipelines.records import load_records
-from pipelines.run_folder import RunFolder
+from msgs_slam.formats.errors import InputError, RecoverableError
+from msgs_slam.pipelines.records import load_records
+from msgs_slam.pipelines.run_folder import RunFolder
 
 LOCK = ".lock"
 

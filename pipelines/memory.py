@@ -7,8 +7,8 @@ import os
 import sys
 from pathlib import Path
 
-from pipelines.config import Config
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.types import Intrinsics
 
 NEEDS = {
     "frames": (380, 640, 1.7, 0), "proxy": (405, 730, 1.8, 0), "tracking": (460, 450, 1.9, 0),

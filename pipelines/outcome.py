@@ -12,16 +12,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from pipelines.config import Config
-from pipelines.device import settle_device
-from pipelines.gaussian_map import GaussianMap
-from pipelines.geometry.alignment import Similarity
-from pipelines.metres.files import load_metres
-from pipelines.records import StageRecord, load_records, load_source, recorded_config
-from pipelines.run_folder import RunFolder
-from pipelines.settings_file import load_settings
-from pipelines.types import VOID, Calibration, ClassTable, Frame, Metres, SparseModel, Trajectory
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.device import settle_device
+from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.metres.files import load_metres
+from msgs_slam.pipelines.records import StageRecord, load_records, load_source, recorded_config
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.settings_file import load_settings
+from msgs_slam.pipelines.types import VOID, Calibration, ClassTable, Frame, Metres, SparseModel, Trajectory
 
 T = TypeVar("T")
 _MAP_STAGES = ("global_ba", "mapping")

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from formats.atomic import copy_file
-from formats.errors import InputError, RecoverableError
-from pipelines.config import Config
-from pipelines.records import load_records
-from pipelines.run_folder import (
+from msgs_slam.formats.atomic import copy_file
+from msgs_slam.formats.errors import InputError, RecoverableError
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.records import load_records
+from msgs_slam.pipelines.run_folder import (
     RunFolder,
     save_backbone,
     save_calibration,
@@ -26,7 +26,7 @@ from pipelines.run_folder import (
     save_left_out,
     save_matching,
 )
-from pipelines.stages import Stage, StageContext, run_stages
+from msgs_slam.pipelines.stages import Stage, StageContext, run_stages
 
 
 def make_pieces(context: StageContext) -> list[RunFolder]:

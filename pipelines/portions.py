@@ -9,11 +9,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pipelines.config import Config
-from pipelines.progress import Progress
-from pipelines.run_folder import RunFolder
-from pipelines.stages import StageContext
-from pipelines.travel import load_value, save_value
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.travel import load_value, save_value
 
 R = TypeVar("R")
 _PORTIONS = 3

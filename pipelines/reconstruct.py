@@ -7,30 +7,30 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from formats.atomic import temporary_of, write_text
-from formats.errors import InputError, RecoverableError
-from formats.video import probe_video
-from pipelines.config import Config
-from pipelines.device import settle_device
-from pipelines.frames.source import source_digest
-from pipelines.lock import LOCK, locked, make_folder
-from pipelines.progress import Progress
-from pipelines.records import StageRecord, load_records, load_source, recorded_config
-from pipelines.run_folder import RunFolder
-from pipelines.run_folder_names import SOURCE_LIST, STAGES
-from pipelines.settings_file import load_settings
-from pipelines.stages import Stage, run_stages
-from pipelines.workers import TaskWorkers
+from msgs_slam.formats.atomic import temporary_of, write_text
+from msgs_slam.formats.errors import InputError, RecoverableError
+from msgs_slam.formats.video import probe_video
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.device import settle_device
+from msgs_slam.pipelines.frames.source import source_digest
+from msgs_slam.pipelines.lock import LOCK, locked, make_folder
+from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.records import StageRecord, load_records, load_source, recorded_config
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run_folder_names import SOURCE_LIST, STAGES
+from msgs_slam.pipelines.settings_file import load_settings
+from msgs_slam.pipelines.stages import Stage, run_stages
+from msgs_slam.pipelines.workers import TaskWorkers
 
 
 def all_stages() -> list[Stage]:
     """The stages in order. Imported here so that asking for help does not load torch."""
-    from pipelines.export.stage import STAGE as export
-    from pipelines.frames.stage import STAGE as frames
-    from pipelines.global_ba.stage import STAGE as global_ba
-    from pipelines.mapping.stage import STAGE as mapping
-    from pipelines.proxy.stage import STAGE as proxy
-    from pipelines.tracking.stage import STAGE as tracking
+    from msgs_slam.pipelines.export.stage import STAGE as export
+    from msgs_slam.pipelines.frames.stage import STAGE as frames
+    from msgs_slam.pipelines.global_ba.stage import STAGE as global_ba
+    from msgs_slam.pipelines.mapping.stage import STAGE as mapping
+    from msgs_slam.pipelines.proxy.stage import STAGE as proxy
+    from msgs_slam.pipelines.tracking.stage import STAGE as tracking
 
     return [frames, proxy, tracking, mapping, global_ba, export]
 
@@ -182,7 +182,7 @@ def set_threads(threads: int) -> None:
     import cv2
     import torch
 
-    from pipelines.gaussians.render import set_threads
+    from msgs_slam.pipelines.gaussians.render import set_threads
 
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)

@@ -10,17 +10,17 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from formats.digest import file_sha256
-from formats.errors import InputError
-from formats.jsonfile import read_json_object, read_toml, write_json
-from formats.reading import parsing
-from pipelines.config import Config, config_to_dict, merge_known_settings, settings_of_stage
-from pipelines.earlier_versions import migrated_stages
-from pipelines.run_folder_names import SOURCE_LIST, STAGES
-from pipelines.stored import dataclass_from_json
+from msgs_slam.formats.digest import file_sha256
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.jsonfile import read_json_object, read_toml, write_json
+from msgs_slam.formats.reading import parsing
+from msgs_slam.pipelines.config import Config, config_to_dict, merge_known_settings, settings_of_stage
+from msgs_slam.pipelines.earlier_versions import migrated_stages
+from msgs_slam.pipelines.run_folder_names import SOURCE_LIST, STAGES
+from msgs_slam.pipelines.stored import dataclass_from_json
 
 if TYPE_CHECKING:
-    from pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.run_folder import RunFolder
 
 FORMAT = 2
 """Of manifest.json. 1, that of 0.1.0, had neither a checksum nor the settings of the records."""

@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from formats.images import write_rgb
-from formats.video_writer import CODECS, write_video
-from pipelines.evaluation.camera_paths import orbit, resampled, smoothed
-from pipelines.evaluation.measure import render_outcome
-from pipelines.evaluation.pictures import Picture, depth_picture, depth_range, label_picture
-from pipelines.outcome import Outcome, load_outcome
-from pipelines.progress import Progress, SilentProgress
-from pipelines.run_folder import RunFolder
-from pipelines.upright.world import up_in_run
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import write_rgb
+from msgs_slam.formats.video_writer import CODECS, write_video
+from msgs_slam.pipelines.evaluation.camera_paths import orbit, resampled, smoothed
+from msgs_slam.pipelines.evaluation.measure import render_outcome
+from msgs_slam.pipelines.evaluation.pictures import Picture, depth_picture, depth_range, label_picture
+from msgs_slam.pipelines.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.progress import Progress, SilentProgress
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.upright.world import up_in_run
 
 KINDS = ("color", "depth", "labels", "side-by-side")
 PATHS = ("own", "smooth", "orbit")

@@ -20,15 +20,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.atomic import atomic_path
-from formats.images import read_grey_png, read_rgb, write_grey_png
-from formats.jsonfile import read_json, read_json_object, write_json
-from formats.tensors import load_tensors, save_arrays, save_tensors
-from pipelines import stored
-from pipelines.depth.fields import FINE, DepthFields
-from pipelines.finished_files import FinishedFiles
-from pipelines.stored import dataclass_from_json, load_layout, reading
-from pipelines.types import (
+from msgs_slam.formats.atomic import atomic_path
+from msgs_slam.formats.images import read_grey_png, read_rgb, write_grey_png
+from msgs_slam.formats.jsonfile import read_json, read_json_object, write_json
+from msgs_slam.formats.tensors import load_tensors, save_arrays, save_tensors
+from msgs_slam.pipelines import stored
+from msgs_slam.pipelines.depth.fields import FINE, DepthFields
+from msgs_slam.pipelines.finished_files import FinishedFiles
+from msgs_slam.pipelines.stored import dataclass_from_json, load_layout, reading
+from msgs_slam.pipelines.types import (
     VOID,
     Calibration,
     ClassTable,
@@ -44,7 +44,7 @@ from pipelines.types import (
 )
 
 if TYPE_CHECKING:
-    from pipelines.gaussian_map import GaussianMap
+    from msgs_slam.pipelines.gaussian_map import GaussianMap
 
 FRAMES, CALIBRATION, BACKBONE = "frames.json", "calibration.json", "backbone/model.npz"
 VOCABULARY, TRIED = "correspondence/vocabulary.npz", "correspondence/tried.npz"
@@ -193,7 +193,9 @@ class RunFolder(FinishedFiles):
 
     def load_map(self, stage: str, device: str = "cpu") -> GaussianMap:
         """The Gaussian map as `stage` left it."""
-        from pipelines.gaussian_map import GaussianMap  # torch takes seconds to import, and few who read a run need it
+        from msgs_slam.pipelines.gaussian_map import (
+            GaussianMap,  # torch takes seconds to import, and few who read a run need it
+        )
 
         path = self.file(stage, MAP)
         tensors = load_tensors(path)

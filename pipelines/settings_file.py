@@ -6,16 +6,16 @@ import hashlib
 import re
 from typing import TYPE_CHECKING, Any
 
-from formats.atomic import write_text
-from formats.errors import InputError
-from formats.jsonfile import MAX_TOML_BYTES, read_toml
-from formats.reading import opened
-from pipelines.config import Config, config_to_toml, merge_known_settings
-from pipelines.progress import log
-from pipelines.records import load_records, load_source, recorded_config
+from msgs_slam.formats.atomic import write_text
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.jsonfile import MAX_TOML_BYTES, read_toml
+from msgs_slam.formats.reading import opened
+from msgs_slam.pipelines.config import Config, config_to_toml, merge_known_settings
+from msgs_slam.pipelines.progress import log
+from msgs_slam.pipelines.records import load_records, load_source, recorded_config
 
 if TYPE_CHECKING:
-    from pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.run_folder import RunFolder
 
 _MARK = re.compile(r"# Written by msgs-slam\. Change settings with --set or --config\. Check: ([0-9a-f]{64})\n")
 

@@ -17,25 +17,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from formats.errors import InputError, RecoverableError
-from formats.jsonfile import read_json, write_json
-from pipelines.batch import Shard
-from pipelines.config import Config
-from pipelines.lock import RunBusyError, take_lock
-from pipelines.progress import Progress, log
-from pipelines.reconstruct import resume
-from pipelines.records import StageRecord
-from pipelines.run_folder import RunFolder
-from pipelines.stopping import stop_if_asked
-from pipelines.travel import load_value, name_of, of_name, save_value
-from pipelines.workers import code_identity, work_here
+from msgs_slam.formats.errors import InputError, RecoverableError
+from msgs_slam.formats.jsonfile import read_json, write_json
+from msgs_slam.pipelines.batch import Shard
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.lock import RunBusyError, take_lock
+from msgs_slam.pipelines.progress import Progress, log
+from msgs_slam.pipelines.reconstruct import resume
+from msgs_slam.pipelines.records import StageRecord
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.stopping import stop_if_asked
+from msgs_slam.pipelines.travel import TASK_MODULES, load_value, name_of, of_name, save_value
+from msgs_slam.pipelines.workers import code_identity, work_here
 
 T = TypeVar("T")
 R = TypeVar("R")
 _TASKS = ".tasks"
 _READY = "ready.json"
-_WORKS = ("pipelines.frames.begun", "pipelines.proxy.tasks", "pipelines.mapping.submap_tasks", "pipelines.export.tasks")
-"""Where what is done with tasks is written: a run from elsewhere could name any function of the program."""
 _BETWEEN_LOOKS = 0.5
 """Seconds."""
 
@@ -129,7 +127,7 @@ class Posted:
                 return False
             if self.done(number).exists() or not (self.folder / _READY).exists():
                 return False
-            if about["work"].partition(":")[0] not in _WORKS:
+            if about["work"].partition(":")[0] not in TASK_MODULES:
                 raise InputError(f"{self.folder / _READY}: {about['work']} is no work on a task. Delete the folder")
             work, folder = of_name(about["work"]), self.folder.parents[1] / about["folder"]
             name, task = f"{work.__name__} {number + 1}", load_value(self.task(number))

@@ -16,33 +16,31 @@ import ast
 import functools
 import hashlib
 import os
-import re
 import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE = Path(__file__).with_name("stage_versions.toml")
 PACKAGE = "msgs_slam"
-"""What the rooms lie in where the program is installed: imports begin with it there, and say the same."""
+"""The import name of `ROOT`: of the repository in an editable install, of a folder of site-packages in any other."""
 PLUMBING = frozenset(
     [
-        "pipelines.config",
-        "pipelines.earlier_versions",
-        "pipelines.stages",
-        "pipelines.progress",
-        "pipelines.stopping",
-        "pipelines.records",
-        "pipelines.settings_file",
-        "pipelines.finished_files",
-        "pipelines.journal",
-        "pipelines.stage_identity",
-        "pipelines.run_folder_names",
-        "formats.errors",
-        "formats.atomic",
-        "formats.reading",
+        "msgs_slam.pipelines.config",
+        "msgs_slam.pipelines.earlier_versions",
+        "msgs_slam.pipelines.stages",
+        "msgs_slam.pipelines.progress",
+        "msgs_slam.pipelines.stopping",
+        "msgs_slam.pipelines.records",
+        "msgs_slam.pipelines.settings_file",
+        "msgs_slam.pipelines.finished_files",
+        "msgs_slam.pipelines.journal",
+        "msgs_slam.pipelines.stage_identity",
+        "msgs_slam.pipelines.run_folder_names",
+        "msgs_slam.formats.errors",
+        "msgs_slam.formats.atomic",
+        "msgs_slam.formats.reading",
     ]
 )
-_INSTALLED = re.compile(rb"^(\s*(?:from|import) )msgs_slam\.", re.MULTILINE)
 
 
 @functools.cache
@@ -59,7 +57,6 @@ def source_digest(file: Path, root: Path = ROOT) -> str:
     named = {os.path.relpath(path, root).replace(os.sep, "/"): path for path in stage_sources(file, root)}
     for name, path in sorted(named.items()):
         content = path.read_bytes().replace(b"\r\n", b"\n")
-        content = _INSTALLED.sub(rb"\1", content)
         digest.update(f"{name}\0{hashlib.sha256(content).hexdigest()}\n".encode())
     return digest.hexdigest()[:16]
 
@@ -85,13 +82,12 @@ def _imported_files(path: Path, root: Path) -> tuple[Path, ...]:
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
             names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-    names = {n.removeprefix(f"{PACKAGE}.") for n in names}
-    inside = {n for n in names if (root / n.split(".")[0]).is_dir()}
-    inside |= {n.rsplit(".", k)[0] for n in inside for k in range(1, n.count(".") + 1)}
+    inside = {n for n in names if n.startswith(f"{PACKAGE}.")}
+    inside |= {n.rsplit(".", k)[0] for n in inside for k in range(1, n.count("."))}
     files = (file for name in sorted(inside - PLUMBING) for file in _files_of(name, root))
     return tuple(file for file in files if file.is_file())
 
 
 def _files_of(name: str, root: Path) -> tuple[Path, Path]:
-    base = root.joinpath(*name.split("."))
+    base = root.joinpath(*name.split(".")[1:])
     return base.with_suffix(".py"), base / "__init__.py"

@@ -14,14 +14,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from formats.atomic import is_disk_full, watched_by, write_text
-from formats.errors import DiskFullError, InputError, RecoverableError
-from pipelines.config import Config, settings_of_stage
-from pipelines.device import settle_device
-from pipelines.journal import JOURNAL, Journal, empty
-from pipelines.memory import give_back, memory_room
-from pipelines.progress import Progress, log
-from pipelines.records import (
+from msgs_slam.formats.atomic import is_disk_full, watched_by, write_text
+from msgs_slam.formats.errors import DiskFullError, InputError, RecoverableError
+from msgs_slam.pipelines.config import Config, settings_of_stage
+from msgs_slam.pipelines.device import settle_device
+from msgs_slam.pipelines.journal import JOURNAL, Journal, empty
+from msgs_slam.pipelines.memory import give_back, memory_room
+from msgs_slam.pipelines.progress import Progress, log
+from msgs_slam.pipelines.records import (
     FORMAT,
     Manifest,
     Source,
@@ -33,12 +33,12 @@ from pipelines.records import (
     settings_of,
     write_manifest,
 )
-from pipelines.run_folder import RunFolder
-from pipelines.run_folder_names import STAGES
-from pipelines.settings_file import save_settings
-from pipelines.stage_identity import stage_identity
-from pipelines.stopping import stop_if_asked
-from pipelines.workers import TaskWorkers
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run_folder_names import STAGES
+from msgs_slam.pipelines.settings_file import save_settings
+from msgs_slam.pipelines.stage_identity import stage_identity
+from msgs_slam.pipelines.stopping import stop_if_asked
+from msgs_slam.pipelines.workers import TaskWorkers
 
 T = TypeVar("T")
 R = TypeVar("R")

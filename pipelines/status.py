@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from formats.errors import InputError
-from pipelines.config import Config
-from pipelines.memory import ALIGNED_TOGETHER, GAUSSIANS, NEEDS, memory_room, submap_size
-from pipelines.records import StageRecord, differing_settings, load_records, load_source
-from pipelines.run_folder import RunFolder
-from pipelines.run_folder_names import STAGES
-from pipelines.settings_file import load_settings
-from pipelines.structure.window_size import window_size, windows_of
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.memory import ALIGNED_TOGETHER, GAUSSIANS, NEEDS, memory_room, submap_size
+from msgs_slam.pipelines.records import StageRecord, differing_settings, load_records, load_source
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run_folder_names import STAGES
+from msgs_slam.pipelines.settings_file import load_settings
+from msgs_slam.pipelines.structure.window_size import window_size, windows_of
 
 _BEYOND = 0.3
 """MB for each keyframe that `frames` or tracking has not in work."""
@@ -109,7 +109,7 @@ def run_status(run: RunFolder) -> RunStatus:
 def expected_mb(stage: str, run: RunFolder, config: Config) -> float | None:
     """MB that a stage will need about, or has needed, by the keyframes that `frames` has found. A map in submaps needs
     that of one submap at a time."""
-    from pipelines.mapping.submaps import submap_count
+    from msgs_slam.pipelines.mapping.submaps import submap_count
 
     try:
         camera, found = run.load_calibration().intrinsics, load_records(run)["frames"].figures

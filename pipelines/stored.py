@@ -15,9 +15,9 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from formats.reading import parsing
-from formats.tensors import load_arrays
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.reading import parsing
+from msgs_slam.formats.tensors import load_arrays
 
 T = TypeVar("T")
 _KINDS = {"f": "f", "i": "iu", "b": "b", "u": "U"}

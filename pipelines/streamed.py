@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from threading import RLock
 from typing import Generic, TypeVar, overload
 
-from pipelines.memory import give_back
+from msgs_slam.pipelines.memory import give_back
 
 T = TypeVar("T")
 

@@ -12,12 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from formats.reading import parsing
-from formats.tensors import load_arrays, save_arrays
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.reading import parsing
+from msgs_slam.formats.tensors import load_arrays, save_arrays
 
 _TREE = "tree"
-_OURS = "pipelines."
+_OURS = f"{__name__.rpartition('.')[0]}."
+TASK_MODULES = tuple(_OURS + name for name in ("frames.begun", "proxy.tasks", "mapping.submap_tasks", "export.tasks"))
+"""Where functions that do tasks are defined: a run from elsewhere could name any function of the program."""
 
 
 def save_value(path: Path, value: Any) -> None:

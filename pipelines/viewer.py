@@ -14,11 +14,11 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from formats.errors import InputError
-from formats.mesh import read_mesh_ply
-from pipelines.viewer_door import guarding
-from pipelines.viewer_scene import MODES, ViewerCamera, ViewerScene, load_scenes
-from pipelines.viewer_tools import Selection, Tape
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.pipelines.viewer_door import guarding
+from msgs_slam.pipelines.viewer_scene import MODES, ViewerCamera, ViewerScene, load_scenes
+from msgs_slam.pipelines.viewer_tools import Selection, Tape
 
 _FRUSTUM = 0.09
 _PREVIEW_WIDTH = 480

@@ -11,18 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from formats.errors import InputError
-from formats.gaussian_files import read_gaussians
-from formats.gaussians import GaussianCloud
-from formats.reading import reaching
-from pipelines.export.stage import on_earth
-from pipelines.export.writers import map_cloud
-from pipelines.gaussian_map import decided_channels
-from pipelines.outcome import Outcome, evenly, labels_of_channels, load_outcome
-from pipelines.proxy.palette import class_colors
-from pipelines.run_folder import MESH, WORLD, RunFolder
-from pipelines.types import Frame, Metres
-from pipelines.upright.world import load_world, read_world, up_in_run
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gaussian_files import read_gaussians
+from msgs_slam.formats.gaussians import GaussianCloud
+from msgs_slam.formats.reading import reaching
+from msgs_slam.pipelines.export.stage import on_earth
+from msgs_slam.pipelines.export.writers import map_cloud
+from msgs_slam.pipelines.gaussian_map import decided_channels
+from msgs_slam.pipelines.outcome import Outcome, evenly, labels_of_channels, load_outcome
+from msgs_slam.pipelines.proxy.palette import class_colors
+from msgs_slam.pipelines.run_folder import MESH, WORLD, RunFolder
+from msgs_slam.pipelines.types import Frame, Metres
+from msgs_slam.pipelines.upright.world import load_world, read_world, up_in_run
 
 MODES = ("colour", "classes", "depth")
 MOST_CAMERAS = 60

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from formats.gaussians import GaussianCloud
-from pipelines.types import Metres
+from msgs_slam.formats.gaussians import GaussianCloud
+from msgs_slam.pipelines.types import Metres
 
 Array = NDArray[np.float64]
 

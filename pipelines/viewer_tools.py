@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from formats.gaussian_ply import write_gaussian_ply
-from pipelines.types import VOID
-from pipelines.viewer_scene import ViewerScene
-from pipelines.viewer_tape import Touch, tape, tape_text, touch
+from msgs_slam.formats.gaussian_ply import write_gaussian_ply
+from msgs_slam.pipelines.types import VOID
+from msgs_slam.pipelines.viewer_scene import ViewerScene
+from msgs_slam.pipelines.viewer_tape import Touch, tape, tape_text, touch
 
 _SETTLE_SECONDS = 0.25
 """A slider is dragged through many values; the map is sent again once it rests."""

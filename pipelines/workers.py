@@ -11,11 +11,11 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from formats.atomic import own_temporaries, watched_by
-from formats.errors import InputError, RecoverableError
-from pipelines.engines import Call, Engine
-from pipelines.journal import Journal
-from pipelines.progress import Progress
+from msgs_slam.formats.atomic import own_temporaries, watched_by
+from msgs_slam.formats.errors import InputError, RecoverableError
+from msgs_slam.pipelines.engines import Call, Engine
+from msgs_slam.pipelines.journal import Journal
+from msgs_slam.pipelines.progress import Progress
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -75,7 +75,7 @@ def work_here(
     threads: int, code: str,
 ) -> tuple[str, Any]:  # fmt: skip
     """The task in this process, beside others that may write the same: (why it is refused or "", what it returns)."""
-    from pipelines.reconstruct import set_threads
+    from msgs_slam.pipelines.reconstruct import set_threads
 
     progress = prepare(name)
     try:
@@ -111,8 +111,8 @@ def require_same_world(folders: Sequence[Path], code: str) -> None:
 @functools.cache
 def code_identity() -> str:
     """Of what results depend on: the program's stages, Python, the libraries that compute; name=version of each."""
-    from pipelines.reconstruct import all_stages
-    from pipelines.stage_identity import stage_identity
+    from msgs_slam.pipelines.reconstruct import all_stages
+    from msgs_slam.pipelines.stage_identity import stage_identity
 
     stages = " ".join(stage_identity(stage.name, stage.file) for stage in all_stages())
     program = hashlib.sha256(stages.encode()).hexdigest()

@@ -16,8 +16,8 @@ import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_map
 
-from pipelines import outcome, stages
-from pipelines.gaussians.render import compositing, cpu, inspection
+from msgs_slam.pipelines import outcome, stages
+from msgs_slam.pipelines.gaussians.render import compositing, cpu, inspection
 
 DEVICE = "meta"
 _COPIES = {torch.ops.aten.copy_.default, torch.ops.aten._to_copy.default}

@@ -8,10 +8,13 @@ so only where its results are known to be the same bytes, for users keep what an
 
 import argparse
 import tomllib
+from pathlib import Path
 
-from formats.atomic import write_text
-from pipelines.run_folder_names import STAGES
-from pipelines.stage_identity import ROOT, TABLE, source_digest
+from msgs_slam.formats.atomic import write_text
+from msgs_slam.pipelines.run_folder_names import STAGES
+from msgs_slam.pipelines.stage_identity import ROOT, TABLE, source_digest
+
+PYPROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"
 
 
 def main() -> None:
@@ -21,7 +24,7 @@ def main() -> None:
     same = parser.parse_args().same
     text = TABLE.read_text(encoding="utf-8")
     before = tomllib.loads(text)
-    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    version = tomllib.loads(PYPROJECT.read_text(encoding="utf-8"))["project"]["version"]
     lines = [text.splitlines()[0], f'release = "{version}"']
     for name in STAGES:
         sources = source_digest(ROOT / "pipelines" / name / "stage.py")

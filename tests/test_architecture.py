@@ -25,14 +25,21 @@ FLOORS = (
 
 
 def imported_packages(path: Path) -> set[str]:
-    """Top-level packages that a file imports anywhere."""
+    """Top-level packages and folders of this project that a file imports anywhere."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            found |= {alias.name.split(".")[0] for alias in node.names}
+            found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-            found.add(node.module.split(".")[0])
-    return found
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return {name.removeprefix("msgs_slam.").split(".")[0] for name in found}
+
+
+def test_the_program_has_one_import_name() -> None:
+    """The folders' bare names work where the repository is the working folder, and in no installed copy."""
+    files = [p for room in (*FORBIDDEN, "tests", "docs") for p in (ROOT / room).rglob("*.py")]
+    bare = re.compile(rf"^\s*(from|import) ({'|'.join(FORBIDDEN)})\b", re.MULTILINE)
+    assert [str(p) for p in files if bare.search(p.read_text(encoding="utf-8"))] == []
 
 
 @pytest.mark.parametrize("room", FORBIDDEN)
@@ -50,7 +57,7 @@ def imported_folders(path: Path) -> set[str]:
         names = [a.name for a in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
         if isinstance(node, ast.ImportFrom):
             names = [f"{node.module}.{name}" for name in names]
-        found |= {n.split(".")[1] for n in names if n.startswith("pipelines.")}
+        found |= {n.split(".")[2] for n in names if n.startswith("msgs_slam.pipelines.")}
     return found
 
 
@@ -72,8 +79,8 @@ def test_tests_and_benchmarks_import_what_there_is() -> None:
     missing = []
     for path in sorted((ROOT / "tests").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in {*FORBIDDEN, "tests"}:
-                base = ROOT.joinpath(*node.module.split("."))
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith(("msgs_slam.", "tests.")):
+                base = ROOT.joinpath(*node.module.removeprefix("msgs_slam.").split("."))
                 if not base.with_suffix(".py").is_file() and not base.is_dir():
                     missing.append(f"{path.relative_to(ROOT)}: {node.module}")
     assert not missing
@@ -115,7 +122,7 @@ import sys
 before = set(sys.modules)
 import click
 from click.testing import CliRunner
-from msgs_cli.main import main
+from msgs_slam.msgs_cli.main import main
 
 def ask(command, words):
     result = CliRunner().invoke(main, [*words, "--help"])
@@ -125,10 +132,12 @@ def ask(command, words):
 
 ask(main, [])
 loaded = {name for name in set(sys.modules) - before if name.partition(".")[0] not in sys.stdlib_module_names}
-own = ("msgs_cli", "pipelines", "formats")
-print(*(name if name.startswith(own) else name.partition(".")[0] for name in loaded))
+print(*(name if name.startswith("msgs_slam") else name.partition(".")[0] for name in loaded))
 """
-LIGHT = {"click", "formats", "formats.errors", "pipelines", "pipelines.run_folder_names"}
+LIGHT = {
+    "click", "msgs_slam", "msgs_slam.formats", "msgs_slam.formats.errors", "msgs_slam.pipelines",
+    "msgs_slam.pipelines.run_folder_names",
+}  # fmt: skip
 """All that the help may load beside the standard library and the command line's own modules."""
 
 
@@ -136,8 +145,8 @@ def test_help_of_every_command_loads_nothing_heavy() -> None:
     done = subprocess.run([sys.executable, "-c", HELP_OF_EVERY_COMMAND], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     loaded = set(done.stdout.split())
-    assert "msgs_cli.models" in loaded
-    assert {name for name in loaded if not name.startswith("msgs_cli")} == LIGHT
+    assert "msgs_slam.msgs_cli.models" in loaded
+    assert {name for name in loaded if not name.startswith("msgs_slam.msgs_cli")} == LIGHT
 
 
 @pytest.mark.parametrize("path", sorted(p for room in FORBIDDEN for p in (ROOT / room).rglob("*.py")), ids=str)

@@ -13,8 +13,8 @@ from pathlib import Path
 import click
 import pytest
 
-from msgs_cli.main import main
-from pipelines.config import Config, load_config
+from msgs_slam.msgs_cli.main import main
+from msgs_slam.pipelines.config import Config, load_config
 
 ROOT = Path(__file__).resolve().parents[1]
 SITE = ROOT / "docs"

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
-from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.selection import Surroundings
-from pipelines.proxy.sequence import Sequence
-from pipelines.types import Frame
+from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.selection import Surroundings
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.types import Frame
 
 
 class PointsDepth:

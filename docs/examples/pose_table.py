@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.datasets.camera import Camera
-from formats.datasets.sequence import Sequence
-from formats.reading import parsing, read_bytes
-from formats.trajectory import poses_from_quaternions
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.datasets.sequence import Sequence
+from msgs_slam.formats.reading import parsing, read_bytes
+from msgs_slam.formats.trajectory import poses_from_quaternions
 
 TABLE = "poses.csv"
 

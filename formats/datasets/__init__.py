@@ -1,8 +1,8 @@
 """Readers of the data sets that the field uses, all giving the same `Sequence`."""
 
-from formats.datasets.camera import Camera
-from formats.datasets.opening import FORMATS, open_sequence, recognise, recognise_source
-from formats.datasets.sequence import VOID_LABEL, LabelClass, Sequence
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.datasets.opening import FORMATS, open_sequence, recognise, recognise_source
+from msgs_slam.formats.datasets.sequence import VOID_LABEL, LabelClass, Sequence
 
 __all__ = [
     "FORMATS",

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from formats.datasets.sequence import LabelClass
-from formats.errors import InputError
-from formats.jsonfile import read_json_object
+from msgs_slam.formats.datasets.sequence import LabelClass
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.jsonfile import read_json_object
 
 _VOID_NAMES = frozenset({"none", "void", "undefined", "unlabeled", "unlabelled", "unknown", "ignore"})
 

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.colmap import ColmapModel, model_suffix, read_colmap_model
-from formats.datasets.camera import Camera
-from formats.datasets.matching import times_or_frame_numbers
-from formats.datasets.sequence import Sequence
-from formats.errors import InputError
-from formats.images import natural_key
-from formats.safe_path import inside
+from msgs_slam.formats.colmap import ColmapModel, model_suffix, read_colmap_model
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.datasets.matching import times_or_frame_numbers
+from msgs_slam.formats.datasets.sequence import Sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import natural_key
+from msgs_slam.formats.safe_path import inside
 
 _MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0")
 _IMAGE_FOLDERS = ("images", "frames", ".", "rgb")

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.datasets.camera import Camera
-from formats.datasets.matching import poses_at
-from formats.datasets.sequence import Sequence
-from formats.errors import InputError
-from formats.safe_path import inside
-from formats.textfile import read_rows, read_table, read_text
-from formats.trajectory import clean_poses, poses_from_quaternions
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.datasets.matching import poses_at
+from msgs_slam.formats.datasets.sequence import Sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.safe_path import inside
+from msgs_slam.formats.textfile import read_rows, read_table, read_text
+from msgs_slam.formats.trajectory import clean_poses, poses_from_quaternions
 
 _NANOSECONDS = 1e-9
 

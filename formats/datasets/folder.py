@@ -7,21 +7,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.datasets.camera import Camera
-from formats.datasets.classes_json import read_classes_json
-from formats.datasets.intrinsics_json import read_intrinsics_json
-from formats.datasets.matching import (
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.datasets.classes_json import read_classes_json
+from msgs_slam.formats.datasets.intrinsics_json import read_intrinsics_json
+from msgs_slam.formats.datasets.matching import (
     classes_found,
     files_for_images,
     poses_at,
     poses_for_images,
     times_or_frame_numbers,
 )
-from formats.datasets.sequence import LabelClass, Sequence
-from formats.errors import InputError
-from formats.images import IMAGE_SUFFIXES, list_images
-from formats.textfile import read_rows
-from formats.trajectory import read_matrices, read_tum
+from msgs_slam.formats.datasets.sequence import LabelClass, Sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import IMAGE_SUFFIXES, list_images
+from msgs_slam.formats.textfile import read_rows
+from msgs_slam.formats.trajectory import read_matrices, read_tum
 
 _IMAGE_FOLDERS = ("rgb", "images", "color", "frames")
 _DEPTH_FOLDERS = ("depth", "depths")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from formats.datasets.camera import Camera, distortion_names
-from formats.errors import InputError
-from formats.jsonfile import number, optional_number, read_json_object
+from msgs_slam.formats.datasets.camera import Camera, distortion_names
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.jsonfile import number, optional_number, read_json_object
 
 
 def read_intrinsics_json(path: Path, *, integer_centres: bool) -> tuple[Camera, float | None]:

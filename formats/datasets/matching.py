@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.datasets.sequence import LabelClass, used_label_ids
-from formats.errors import InputError
-from formats.image_times import frame_number, read_image_times
-from formats.images import IMAGE_SUFFIXES, natural_key
+from msgs_slam.formats.datasets.sequence import LabelClass, used_label_ids
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.image_times import frame_number, read_image_times
+from msgs_slam.formats.images import IMAGE_SUFFIXES, natural_key
 
 ASSUMED_RATE = 30.0
 """Frames per second where a data set does not say."""

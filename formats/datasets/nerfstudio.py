@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.datasets.camera import Camera
-from formats.datasets.matching import times_or_frame_numbers
-from formats.datasets.sequence import Sequence
-from formats.errors import InputError
-from formats.images import image_size, natural_key
-from formats.jsonfile import number, optional_number, read_json_object
-from formats.safe_path import inside
-from formats.trajectory import clean_poses
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.datasets.matching import times_or_frame_numbers
+from msgs_slam.formats.datasets.sequence import Sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import image_size, natural_key
+from msgs_slam.formats.jsonfile import number, optional_number, read_json_object
+from msgs_slam.formats.safe_path import inside
+from msgs_slam.formats.trajectory import clean_poses
 
 _FILE_NAMES = ("transforms.json", "transforms_train.json")
 _SUFFIXES_TRIED = ("", ".png", ".jpg", ".jpeg")

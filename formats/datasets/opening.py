@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 
-from formats.datasets import (
+from msgs_slam.formats.datasets import (
     colmap,
     euroc,
     folder,
@@ -18,10 +18,10 @@ from formats.datasets import (
     seven_scenes,
     tum_rgbd,
 )
-from formats.datasets.sequence import Sequence
-from formats.errors import InputError
-from formats.images import IMAGE_SUFFIXES
-from formats.reading import reaching
+from msgs_slam.formats.datasets.sequence import Sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import IMAGE_SUFFIXES
+from msgs_slam.formats.reading import reaching
 
 
 @dataclass(frozen=True)

@@ -7,14 +7,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.datasets.camera import Camera
-from formats.datasets.classes_json import read_classes_json
-from formats.datasets.intrinsics_json import read_intrinsics_json
-from formats.datasets.matching import classes_found, files_for_images, poses_for_images, times_or_frame_numbers
-from formats.datasets.sequence import LabelClass, Sequence
-from formats.errors import InputError
-from formats.images import image_size, list_images
-from formats.trajectory import read_matrices
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.datasets.classes_json import read_classes_json
+from msgs_slam.formats.datasets.intrinsics_json import read_intrinsics_json
+from msgs_slam.formats.datasets.matching import (
+    classes_found,
+    files_for_images,
+    poses_for_images,
+    times_or_frame_numbers,
+)
+from msgs_slam.formats.datasets.sequence import LabelClass, Sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import image_size, list_images
+from msgs_slam.formats.trajectory import read_matrices
 
 _CLASS_FOLDERS = ("semantic_class", "semantic_classes")
 

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.datasets.camera import Camera
-from formats.datasets.matching import classes_found, files_for_images, times_or_frame_numbers
-from formats.datasets.scannet_labels import find_label_table, read_nyu40_classes
-from formats.datasets.sequence import LabelClass, Sequence
-from formats.errors import InputError
-from formats.images import image_size, list_images
-from formats.textfile import read_table
-from formats.trajectory import read_matrices
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.datasets.matching import classes_found, files_for_images, times_or_frame_numbers
+from msgs_slam.formats.datasets.scannet_labels import find_label_table, read_nyu40_classes
+from msgs_slam.formats.datasets.sequence import LabelClass, Sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import image_size, list_images
+from msgs_slam.formats.textfile import read_table
+from msgs_slam.formats.trajectory import read_matrices
 
 _LABEL_FOLDERS = ("label-filt", "label")
 _COLOR_SIZE, _DEPTH_SIZE = (1296, 968), (640, 480)

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.datasets.camera import Camera
-from formats.datasets.matching import ASSUMED_RATE, files_for_images
-from formats.datasets.sequence import Sequence
-from formats.errors import InputError
-from formats.image_times import frame_number
-from formats.images import image_size, list_images
-from formats.textfile import read_table
-from formats.trajectory import read_matrices
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.datasets.matching import ASSUMED_RATE, files_for_images
+from msgs_slam.formats.datasets.sequence import Sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.image_times import frame_number
+from msgs_slam.formats.images import image_size, list_images
+from msgs_slam.formats.textfile import read_table
+from msgs_slam.formats.trajectory import read_matrices
 
 _COLOR_FOCAL, _DEPTH_FOCAL = 525.0, 585.0
 _NOTES = (

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.datasets.camera import Camera
-from formats.datasets.intrinsics_json import read_intrinsics_json
-from formats.datasets.matching import SAME_INSTANT_SECONDS, nearest_index, poses_at
-from formats.datasets.sequence import Sequence
-from formats.errors import InputError
-from formats.images import image_size
-from formats.safe_path import inside
-from formats.textfile import read_rows
-from formats.trajectory import read_tum
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.datasets.intrinsics_json import read_intrinsics_json
+from msgs_slam.formats.datasets.matching import SAME_INSTANT_SECONDS, nearest_index, poses_at
+from msgs_slam.formats.datasets.sequence import Sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import image_size
+from msgs_slam.formats.safe_path import inside
+from msgs_slam.formats.textfile import read_rows
+from msgs_slam.formats.trajectory import read_tum
 
 _DEPTH_PER_METRE = 5000.0
 

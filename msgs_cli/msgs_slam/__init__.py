@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from pipelines.evaluation.views import MapView
-    from pipelines.outcome import Outcome
-    from pipelines.types import Intrinsics
+    from msgs_slam.pipelines.evaluation.views import MapView
+    from msgs_slam.pipelines.outcome import Outcome
+    from msgs_slam.pipelines.types import Intrinsics
 
 __all__ = ["Run", "main", "open_run", "reconstruct"]
 
@@ -38,9 +38,9 @@ class Run:
     @cached_property
     def outcome(self) -> Outcome:
         """All that the run has found; raises InputError where the folder is no run or its map is not done."""
-        from pipelines.outcome import load_outcome
-        from pipelines.run_folder import RunFolder
-        from pipelines.upright.world import load_world
+        from msgs_slam.pipelines.outcome import load_outcome
+        from msgs_slam.pipelines.run_folder import RunFolder
+        from msgs_slam.pipelines.upright.world import load_world
 
         found = load_outcome(RunFolder(self.path))
         found.require_map()
@@ -77,7 +77,7 @@ class Run:
         """
         import numpy as np
 
-        from pipelines.evaluation.measure import render_outcome
+        from msgs_slam.pipelines.evaluation.measure import render_outcome
 
         pose = np.asarray(world_from_cam, np.float64)
         if pose.shape != (4, 4):
@@ -98,11 +98,11 @@ def reconstruct(source: Path | str, out: Path | str | None = None, settings: Ite
     out: the run folder, by default the source's name with .msgs in the working folder; settings: as after `--set` on
     the command line, e.g. "mapping.passes=6". Raises InputError for a source or setting that cannot be used.
     """
-    from pipelines.config import load_config
-    from pipelines.progress import SilentProgress
-    from pipelines.reconstruct import default_run_folder, existing_config
-    from pipelines.reconstruct import reconstruct as run_reconstruct
-    from pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.config import load_config
+    from msgs_slam.pipelines.progress import SilentProgress
+    from msgs_slam.pipelines.reconstruct import default_run_folder, existing_config
+    from msgs_slam.pipelines.reconstruct import reconstruct as run_reconstruct
+    from msgs_slam.pipelines.run_folder import RunFolder
 
     source = Path(source)
     run = RunFolder(Path(out)) if out is not None else default_run_folder(source)
@@ -113,6 +113,6 @@ def reconstruct(source: Path | str, out: Path | str | None = None, settings: Ite
 
 def main() -> None:
     """The command `msgs-slam`."""
-    from msgs_cli.main import main as command
+    from msgs_slam.msgs_cli.main import main as command
 
     command()

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.correspondence.flow import corners, follow
-from pipelines.correspondence.matching import VerifiedPair
-from pipelines.correspondence.snapshots import Snapshots
-from pipelines.streamed import Streamed
-from pipelines.types import Features
+from msgs_slam.pipelines.correspondence.flow import corners, follow
+from msgs_slam.pipelines.correspondence.matching import VerifiedPair
+from msgs_slam.pipelines.correspondence.snapshots import Snapshots
+from msgs_slam.pipelines.streamed import Streamed
+from msgs_slam.pipelines.types import Features
 
 LEAST = 100
 """Features matched on both sides below which a keyframe is a weak one. On a made-up walk, steps beyond keyframes with

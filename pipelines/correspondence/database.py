@@ -9,8 +9,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipelines.correspondence.matching import VerifiedPair
-from pipelines.types import Features
+from msgs_slam.pipelines.correspondence.matching import VerifiedPair
+from msgs_slam.pipelines.types import Features
 
 
 def write_database(

@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipelines.types import Features, require_shape
+from msgs_slam.pipelines.types import Features, require_shape
 
 _of_thread = threading.local()
 

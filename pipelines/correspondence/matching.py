@@ -10,8 +10,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipelines.jit import kernel
-from pipelines.types import Features
+from msgs_slam.pipelines.jit import kernel
+from msgs_slam.pipelines.types import Features
 
 _SIFT, _LEARNED = (0.8, 0.7), (1.0, 0.555)
 """Of the angle between two descriptors that match: as a share of the next best one's (Lowe), and in radians."""

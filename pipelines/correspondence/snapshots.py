@@ -13,12 +13,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from formats.atomic import free_bytes, write_bytes
-from formats.errors import DiskFullError
-from formats.jsonfile import read_json, write_json
-from formats.tensors import load_arrays, save_arrays
-from pipelines.correspondence.matching import VerifiedPair
-from pipelines.types import Features
+from msgs_slam.formats.atomic import free_bytes, write_bytes
+from msgs_slam.formats.errors import DiskFullError
+from msgs_slam.formats.jsonfile import read_json, write_json
+from msgs_slam.formats.tensors import load_arrays, save_arrays
+from msgs_slam.pipelines.correspondence.matching import VerifiedPair
+from msgs_slam.pipelines.types import Features
 
 _DATABASE_SHARE = 3
 """Bytes of the database and the models made from it, over those of the packed features and matches: a guess on the safe

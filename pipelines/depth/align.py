@@ -13,12 +13,12 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.depth.fields import FINE, Basis, DepthFields
-from pipelines.depth.posed import PosedDepth, neighbours
-from pipelines.depth.solve import Equations, Prior, solve_fields
-from pipelines.memory import ALIGNED_TOGETHER
-from pipelines.streamed import Streamed
-from pipelines.types import Intrinsics, ProxyMaps, SparseModel
+from msgs_slam.pipelines.depth.fields import FINE, Basis, DepthFields
+from msgs_slam.pipelines.depth.posed import PosedDepth, neighbours
+from msgs_slam.pipelines.depth.solve import Equations, Prior, solve_fields
+from msgs_slam.pipelines.memory import ALIGNED_TOGETHER
+from msgs_slam.pipelines.streamed import Streamed
+from msgs_slam.pipelines.types import Intrinsics, ProxyMaps, SparseModel
 
 Array = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.depth.posed import PosedDepth, neighbours
-from pipelines.jit import kernel
+from msgs_slam.pipelines.depth.posed import PosedDepth, neighbours
+from msgs_slam.pipelines.jit import kernel
 
 STRIDE = 2
 AGREES = 0.03

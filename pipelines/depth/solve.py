@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-from pipelines.depth.fields import Basis, Grid
+from msgs_slam.pipelines.depth.fields import Basis, Grid
 
 Array = NDArray[np.float64]
 _ROWS_AT_ONCE = 200_000

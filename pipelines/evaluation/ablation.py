@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from formats.atomic import write_text
-from formats.datasets import Sequence
-from formats.errors import InputError
-from formats.jsonfile import read_json_object, write_json
-from pipelines.branch import branch
-from pipelines.config import Config, config_to_toml, load_config
-from pipelines.evaluation.evaluate import evaluate_run
-from pipelines.progress import Progress
-from pipelines.reconstruct import all_stages, reconstruct
-from pipelines.records import load_records
-from pipelines.run_folder import RunFolder
+from msgs_slam.formats.atomic import write_text
+from msgs_slam.formats.datasets import Sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.jsonfile import read_json_object, write_json
+from msgs_slam.pipelines.branch import branch
+from msgs_slam.pipelines.config import Config, config_to_toml, load_config
+from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
+from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.reconstruct import all_stages, reconstruct
+from msgs_slam.pipelines.records import load_records
+from msgs_slam.pipelines.run_folder import RunFolder
 
 COMPLETE = "complete"
 ABLATIONS: dict[str, tuple[str, ...]] = {

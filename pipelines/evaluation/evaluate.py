@@ -9,17 +9,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.datasets import Sequence
-from formats.errors import InputError
-from pipelines.evaluation.class_map import ClassMap, Matching, match_classes
-from pipelines.evaluation.legacy import legacy_cells
-from pipelines.evaluation.measure import Measured, measure_views
-from pipelines.evaluation.mesh_cells import mesh_cells
-from pipelines.evaluation.trajectory_error import AbsoluteError, ErrorStatistics, absolute_error, relative_error
-from pipelines.evaluation.truth import MatchedTruth, match_truth
-from pipelines.outcome import Outcome, load_outcome
-from pipelines.progress import Progress, SilentProgress
-from pipelines.run_folder import RunFolder
+from msgs_slam.formats.datasets import Sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.evaluation.class_map import ClassMap, Matching, match_classes
+from msgs_slam.pipelines.evaluation.legacy import legacy_cells
+from msgs_slam.pipelines.evaluation.measure import Measured, measure_views
+from msgs_slam.pipelines.evaluation.mesh_cells import mesh_cells
+from msgs_slam.pipelines.evaluation.trajectory_error import (
+    AbsoluteError,
+    ErrorStatistics,
+    absolute_error,
+    relative_error,
+)
+from msgs_slam.pipelines.evaluation.truth import MatchedTruth, match_truth
+from msgs_slam.pipelines.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.progress import Progress, SilentProgress
+from msgs_slam.pipelines.run_folder import RunFolder
 
 PROTOCOL = (
     "Frames belong to the truth of the same {by}; the other frames count as picked and posed only.",

@@ -6,8 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.evaluation.class_map import Matching
-from pipelines.evaluation.label_score import Counts, LabelScore, matched_by_majority, matched_one_to_one, renamed, score
+from msgs_slam.pipelines.evaluation.class_map import Matching
+from msgs_slam.pipelines.evaluation.label_score import (
+    Counts,
+    LabelScore,
+    matched_by_majority,
+    matched_one_to_one,
+    renamed,
+    score,
+)
 
 
 def label_cells(

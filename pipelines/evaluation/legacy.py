@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.evaluation.measure import KEYFRAMES, Measured
-from pipelines.evaluation.trajectory_error import absolute_error
-from pipelines.evaluation.truth import MatchedTruth
-from pipelines.outcome import Outcome
+from msgs_slam.pipelines.evaluation.measure import KEYFRAMES, Measured
+from msgs_slam.pipelines.evaluation.trajectory_error import absolute_error
+from msgs_slam.pipelines.evaluation.truth import MatchedTruth
+from msgs_slam.pipelines.outcome import Outcome
 
 NOTE = (
     'legacy figures, comparable with papers that use SplaTAM\'s script and with nothing else: its "ATE RMSE" is the '

@@ -9,20 +9,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipelines.evaluation.class_map import Matching
-from pipelines.evaluation.depth_error import DepthErrorSum
-from pipelines.evaluation.image_quality import psnr, ssim
-from pipelines.evaluation.label_cells import label_cells
-from pipelines.evaluation.label_score import Counts, count_labels
-from pipelines.evaluation.perceptual import open_lpips
-from pipelines.evaluation.trajectory_error import AbsoluteError
-from pipelines.evaluation.truth import MatchedTruth
-from pipelines.evaluation.views import MapView, view_map
-from pipelines.frames.source_pixels import FramePixels
-from pipelines.gaussians.render import track_gn
-from pipelines.mapping.load import split_frames
-from pipelines.outcome import Outcome, evenly
-from pipelines.progress import Progress
+from msgs_slam.pipelines.evaluation.class_map import Matching
+from msgs_slam.pipelines.evaluation.depth_error import DepthErrorSum
+from msgs_slam.pipelines.evaluation.image_quality import psnr, ssim
+from msgs_slam.pipelines.evaluation.label_cells import label_cells
+from msgs_slam.pipelines.evaluation.label_score import Counts, count_labels
+from msgs_slam.pipelines.evaluation.perceptual import open_lpips
+from msgs_slam.pipelines.evaluation.trajectory_error import AbsoluteError
+from msgs_slam.pipelines.evaluation.truth import MatchedTruth
+from msgs_slam.pipelines.evaluation.views import MapView, view_map
+from msgs_slam.pipelines.frames.source_pixels import FramePixels
+from msgs_slam.pipelines.gaussians.render import track_gn
+from msgs_slam.pipelines.mapping.load import split_frames
+from msgs_slam.pipelines.outcome import Outcome, evenly
+from msgs_slam.pipelines.progress import Progress
 
 KEYFRAMES, BETWEEN, HELD_OUT = "keyframes", "between", "held out"
 AT_TRUE_POSES, AT_REFINED_POSES = " at true poses", " at refined poses"

@@ -10,13 +10,19 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from pipelines.evaluation.surface_error import depth_points, sample_surface, seen_in_depth, surface_error, thinned
-from pipelines.evaluation.trajectory_error import AbsoluteError
-from pipelines.evaluation.truth import MatchedTruth
-from pipelines.outcome import Outcome
-from pipelines.run_folder import MESH
-from pipelines.types import Intrinsics
-from pipelines.upright.world import FIRST, load_world
+from msgs_slam.pipelines.evaluation.surface_error import (
+    depth_points,
+    sample_surface,
+    seen_in_depth,
+    surface_error,
+    thinned,
+)
+from msgs_slam.pipelines.evaluation.trajectory_error import AbsoluteError
+from msgs_slam.pipelines.evaluation.truth import MatchedTruth
+from msgs_slam.pipelines.outcome import Outcome
+from msgs_slam.pipelines.run_folder import MESH
+from msgs_slam.pipelines.types import Intrinsics
+from msgs_slam.pipelines.upright.world import FIRST, load_world
 
 SAMPLES = 200_000
 VIEWS = 60

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipelines.types import require_shape
+from msgs_slam.pipelines.types import require_shape
 
 Image = NDArray[np.uint8]
 

@@ -8,26 +8,26 @@ from typing import Any
 
 import numpy as np
 
-from formats.atomic import write_text
-from formats.datasets.camera import distortion_names
-from formats.jsonfile import read_json
-from formats.reading import read_bytes
-from pipelines.config import Config, config_to_dict, config_to_toml
-from pipelines.evaluation.facts import Capture, advice, lost_stretches, read_capture
-from pipelines.evaluation.html import bullets, chips, drawing, page, section, table
-from pipelines.evaluation.lengths import found_lengths
-from pipelines.evaluation.plots import RED, Line, plot
-from pipelines.evaluation.report_views import RenderedViews, class_section, quality_section, render_views
-from pipelines.evaluation.table import evaluation_table
-from pipelines.evaluation.write import PATH_FROM_ABOVE, trajectory_plots
-from pipelines.export.readme import lengths, readme
-from pipelines.outcome import Outcome, load_outcome
-from pipelines.progress import Progress, SilentProgress
-from pipelines.records import load_source
-from pipelines.run_folder import RunFolder
-from pipelines.types import LoopEdge, SparseModel
-from pipelines.upright.world import FIRST, load_world
-from pipelines.wording import lost_text
+from msgs_slam.formats.atomic import write_text
+from msgs_slam.formats.datasets.camera import distortion_names
+from msgs_slam.formats.jsonfile import read_json
+from msgs_slam.formats.reading import read_bytes
+from msgs_slam.pipelines.config import Config, config_to_dict, config_to_toml
+from msgs_slam.pipelines.evaluation.facts import Capture, advice, lost_stretches, read_capture
+from msgs_slam.pipelines.evaluation.html import bullets, chips, drawing, page, section, table
+from msgs_slam.pipelines.evaluation.lengths import found_lengths
+from msgs_slam.pipelines.evaluation.plots import RED, Line, plot
+from msgs_slam.pipelines.evaluation.report_views import RenderedViews, class_section, quality_section, render_views
+from msgs_slam.pipelines.evaluation.table import evaluation_table
+from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, trajectory_plots
+from msgs_slam.pipelines.export.readme import lengths, readme
+from msgs_slam.pipelines.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.progress import Progress, SilentProgress
+from msgs_slam.pipelines.records import load_source
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.types import LoopEdge, SparseModel
+from msgs_slam.pipelines.upright.world import FIRST, load_world
+from msgs_slam.pipelines.wording import lost_text
 
 
 def write_report(run: RunFolder, path: Path | None = None, progress: Progress | None = None) -> Path:

@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.evaluation.facts import Capture
-from pipelines.evaluation.html import image, section
-from pipelines.evaluation.image_quality import psnr
-from pipelines.evaluation.measure import render_outcome
-from pipelines.evaluation.pictures import depth_picture, depth_range, labels_on_photo
-from pipelines.evaluation.plots import BLUE, GREEN, GREY, ORANGE, RED, Line, Marks, bars, plot
-from pipelines.outcome import Outcome, evenly
-from pipelines.progress import Progress
-from pipelines.types import VOID
+from msgs_slam.pipelines.evaluation.facts import Capture
+from msgs_slam.pipelines.evaluation.html import image, section
+from msgs_slam.pipelines.evaluation.image_quality import psnr
+from msgs_slam.pipelines.evaluation.measure import render_outcome
+from msgs_slam.pipelines.evaluation.pictures import depth_picture, depth_range, labels_on_photo
+from msgs_slam.pipelines.evaluation.plots import BLUE, GREEN, GREY, ORANGE, RED, Line, Marks, bars, plot
+from msgs_slam.pipelines.outcome import Outcome, evenly
+from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.types import VOID
 
 MEASURED_VIEWS = 60
 SHOWN_VIEWS = 8

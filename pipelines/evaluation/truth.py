@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.datasets import Sequence
-from formats.textfile import read_rows
-from formats.trajectory import read_matrices
-from pipelines.evaluation.trajectory_error import associate
-from pipelines.frames.originals import written_name
-from pipelines.types import Frame
+from msgs_slam.formats.datasets import Sequence
+from msgs_slam.formats.textfile import read_rows
+from msgs_slam.formats.trajectory import read_matrices
+from msgs_slam.pipelines.evaluation.trajectory_error import associate
+from msgs_slam.pipelines.frames.originals import written_name
+from msgs_slam.pipelines.types import Frame
 
 _MOST_SECONDS_APART = 0.02
 

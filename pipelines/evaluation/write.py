@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from formats.atomic import write_text
-from formats.datasets import Sequence
-from formats.images import write_rgb
-from formats.jsonfile import write_json
-from pipelines.evaluation.class_map import ClassMap
-from pipelines.evaluation.evaluate import evaluate_outcome
-from pipelines.evaluation.measure import render_outcome
-from pipelines.evaluation.pictures import (
+from msgs_slam.formats.atomic import write_text
+from msgs_slam.formats.datasets import Sequence
+from msgs_slam.formats.images import write_rgb
+from msgs_slam.formats.jsonfile import write_json
+from msgs_slam.pipelines.evaluation.class_map import ClassMap
+from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
+from msgs_slam.pipelines.evaluation.measure import render_outcome
+from msgs_slam.pipelines.evaluation.pictures import (
     Picture,
     class_colors_by_name,
     depth_picture,
@@ -22,14 +22,14 @@ from pipelines.evaluation.pictures import (
     label_picture,
     sheet,
 )
-from pipelines.evaluation.plots import BLUE, GREY, Line, plot
-from pipelines.evaluation.table import evaluation_table
-from pipelines.evaluation.truth import MatchedTruth, match_truth
-from pipelines.frames.source_pixels import FramePixels
-from pipelines.geometry.alignment import Similarity, align_points
-from pipelines.outcome import Outcome, evenly, load_outcome
-from pipelines.progress import Progress
-from pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.evaluation.plots import BLUE, GREY, Line, plot
+from msgs_slam.pipelines.evaluation.table import evaluation_table
+from msgs_slam.pipelines.evaluation.truth import MatchedTruth, match_truth
+from msgs_slam.pipelines.frames.source_pixels import FramePixels
+from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
+from msgs_slam.pipelines.outcome import Outcome, evenly, load_outcome
+from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.run_folder import RunFolder
 
 PATH_FROM_ABOVE, PATH_FROM_THE_SIDE = "trajectory_top.svg", "trajectory_side.svg"
 SHEET_VIEWS = 6

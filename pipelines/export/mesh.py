@@ -8,20 +8,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.mesh import MeshBlocks
-from pipelines.config import ExportConfig
-from pipelines.depth.posed import PosedDepth
-from pipelines.export.depth_views import DrawnView, Shown, drawn_view
-from pipelines.export.joined import Region
-from pipelines.export.paint import paint
-from pipelines.export.surface import chunk_surfaces, weld
-from pipelines.export.volume import Grid, fuse, make_grid
-from pipelines.gaussians.render import get_threads
-from pipelines.outcome import Outcome, maps_around
-from pipelines.progress import Progress
-from pipelines.streamed import Streamed
-from pipelines.travel import load_value, save_value
-from pipelines.types import VOID
+from msgs_slam.formats.mesh import MeshBlocks
+from msgs_slam.pipelines.config import ExportConfig
+from msgs_slam.pipelines.depth.posed import PosedDepth
+from msgs_slam.pipelines.export.depth_views import DrawnView, Shown, drawn_view
+from msgs_slam.pipelines.export.joined import Region
+from msgs_slam.pipelines.export.paint import paint
+from msgs_slam.pipelines.export.surface import chunk_surfaces, weld
+from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid
+from msgs_slam.pipelines.gaussians.render import get_threads
+from msgs_slam.pipelines.outcome import Outcome, maps_around
+from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.streamed import Streamed
+from msgs_slam.pipelines.travel import load_value, save_value
+from msgs_slam.pipelines.types import VOID
 
 TRUNCATION = 4.0
 """Voxels on either side of a surface that a depth speaks for."""

@@ -7,10 +7,10 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.depth.posed import PosedDepth
-from pipelines.export.depth_views import DrawnView
-from pipelines.geometry.camera import project
-from pipelines.types import VOID
+from msgs_slam.pipelines.depth.posed import PosedDepth
+from msgs_slam.pipelines.export.depth_views import DrawnView
+from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.types import VOID
 
 
 def paint(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from pipelines.types import Metres
-from pipelines.upright.world import World
+from msgs_slam.pipelines.types import Metres
+from msgs_slam.pipelines.upright.world import World
 
 _FILES = """\
 What is in this folder

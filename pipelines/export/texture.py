@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.depth.posed import PosedDepth
-from pipelines.export.atlas import Atlas, owners
-from pipelines.gaussians.render.threads import for_each
-from pipelines.geometry.camera import project
-from pipelines.jit import kernel
-from pipelines.progress import Progress
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.depth.posed import PosedDepth
+from msgs_slam.pipelines.export.atlas import Atlas, owners
+from msgs_slam.pipelines.gaussians.render.threads import for_each
+from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.jit import kernel
+from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.types import Intrinsics
 
 AGREES = 0.03
 """Relative difference up to which the depth of a view confirms that it sees a place."""

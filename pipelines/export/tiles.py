@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from formats.gaussian_ply import write_gaussian_ply
-from formats.gaussians import GaussianCloud, isotropic_cloud
-from formats.jsonfile import write_json
-from pipelines.export.writers import map_cloud
-from pipelines.outcome import Outcome
+from msgs_slam.formats.gaussian_ply import write_gaussian_ply
+from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
+from msgs_slam.formats.jsonfile import write_json
+from msgs_slam.pipelines.export.writers import map_cloud
+from msgs_slam.pipelines.outcome import Outcome
 
 COARSE = 6.0
 """Side of the cells that each become one Gaussian of the coarse level, in median radii of the tile."""

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.depth.posed import PosedDepth
-from pipelines.gaussians.render.jit import kernel
-from pipelines.geometry.camera import unproject_depth
-from pipelines.proxy.regions.voxels import cells_of, voxel_keys
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.depth.posed import PosedDepth
+from msgs_slam.pipelines.gaussians.render.jit import kernel
+from msgs_slam.pipelines.geometry.camera import unproject_depth
+from msgs_slam.pipelines.proxy.regions.voxels import cells_of, voxel_keys
+from msgs_slam.pipelines.types import Intrinsics
 
 SIDE = 8
 """Voxels along the side of a block."""

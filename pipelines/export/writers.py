@@ -10,25 +10,25 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from formats.atomic import copy_file, write_text
-from formats.colmap import write_colmap_model
-from formats.compact_gaussians import write_compact
-from formats.gaussian_glb import write_gaussian_glb
-from formats.gaussian_ply import write_gaussian_ply
-from formats.gaussians import GaussianCloud, isotropic_cloud
-from formats.nerfstudio import write_transforms
-from formats.sog import write_sog
-from formats.spz import write_spz
-from formats.trajectory import write_tum
-from pipelines.export.readme import lengths, readme
-from pipelines.geometry.rig import rig_of
-from pipelines.metres.files import save_metres
-from pipelines.outcome import Outcome
-from pipelines.run_folder import save_classes, save_left_out
-from pipelines.streamed import Streamed
-from pipelines.types import SparseModel
-from pipelines.upright.world import World, save_world
-from pipelines.wording import stretches
+from msgs_slam.formats.atomic import copy_file, write_text
+from msgs_slam.formats.colmap import write_colmap_model
+from msgs_slam.formats.compact_gaussians import write_compact
+from msgs_slam.formats.gaussian_glb import write_gaussian_glb
+from msgs_slam.formats.gaussian_ply import write_gaussian_ply
+from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
+from msgs_slam.formats.nerfstudio import write_transforms
+from msgs_slam.formats.sog import write_sog
+from msgs_slam.formats.spz import write_spz
+from msgs_slam.formats.trajectory import write_tum
+from msgs_slam.pipelines.export.readme import lengths, readme
+from msgs_slam.pipelines.geometry.rig import rig_of
+from msgs_slam.pipelines.metres.files import save_metres
+from msgs_slam.pipelines.outcome import Outcome
+from msgs_slam.pipelines.run_folder import save_classes, save_left_out
+from msgs_slam.pipelines.streamed import Streamed
+from msgs_slam.pipelines.types import SparseModel
+from msgs_slam.pipelines.upright.world import World, save_world
+from msgs_slam.pipelines.wording import stretches
 
 _AT_ONCE, _PART = 1 << 16, 1 << 17
 """Gaussians whose probabilities are copied at a time, and those of a part that is written at a time."""

@@ -10,27 +10,27 @@ from typing import Any
 
 import pycolmap
 
-from formats.datasets.camera import Camera
-from formats.images import read_rgb
-from pipelines.correspondence.bridges import Picture
-from pipelines.correspondence.features import to_grey
-from pipelines.correspondence.matching import match_features
-from pipelines.correspondence.snapshots import Snapshots
-from pipelines.frames.faces import Faces, find_faces
-from pipelines.frames.learned import open_learned, picture_features
-from pipelines.frames.masks import FrameMasks
-from pipelines.frames.recording import RecordingSource
-from pipelines.frames.sharpness import reduced_size
-from pipelines.frames.source import FolderSource, VideoSource, open_source
-from pipelines.geometry.rig import Rig, rig_of
-from pipelines.portions import Portion
-from pipelines.progress import Progress
-from pipelines.stages import StageContext
-from pipelines.structure.calibration import read_intrinsics
-from pipelines.structure.lens import to_pycolmap, unknown_camera
-from pipelines.structure.sfm import Ahead, StructureFromMotion, nothing_ahead
-from pipelines.structure.window_size import window_size
-from pipelines.types import Features, Frame
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.images import read_rgb
+from msgs_slam.pipelines.correspondence.bridges import Picture
+from msgs_slam.pipelines.correspondence.features import to_grey
+from msgs_slam.pipelines.correspondence.matching import match_features
+from msgs_slam.pipelines.correspondence.snapshots import Snapshots
+from msgs_slam.pipelines.frames.faces import Faces, find_faces
+from msgs_slam.pipelines.frames.learned import open_learned, picture_features
+from msgs_slam.pipelines.frames.masks import FrameMasks
+from msgs_slam.pipelines.frames.recording import RecordingSource
+from msgs_slam.pipelines.frames.sharpness import reduced_size
+from msgs_slam.pipelines.frames.source import FolderSource, VideoSource, open_source
+from msgs_slam.pipelines.geometry.rig import Rig, rig_of
+from msgs_slam.pipelines.portions import Portion
+from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.structure.calibration import read_intrinsics
+from msgs_slam.pipelines.structure.lens import to_pycolmap, unknown_camera
+from msgs_slam.pipelines.structure.sfm import Ahead, StructureFromMotion, nothing_ahead
+from msgs_slam.pipelines.structure.window_size import window_size
+from msgs_slam.pipelines.types import Features, Frame
 
 AnySource = VideoSource | FolderSource | RecordingSource
 _FOCAL_GUESS = 1.2

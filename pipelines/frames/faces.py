@@ -13,17 +13,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.datasets.camera import Camera
-from formats.errors import InputError
-from formats.spherical import PART, WHOLE, image_sphere, video_sphere
-from pipelines.config import FramesConfig
-from pipelines.frames.recording import RecordingSource
-from pipelines.frames.sharpness import reduced_size
-from pipelines.frames.source import FolderSource, VideoSource
-from pipelines.geometry.rig import CUBE, LEVEL
-from pipelines.structure.calibration import read_intrinsics
-from pipelines.structure.lens import make_lens, to_pycolmap
-from pipelines.types import Intrinsics
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.spherical import PART, WHOLE, image_sphere, video_sphere
+from msgs_slam.pipelines.config import FramesConfig
+from msgs_slam.pipelines.frames.recording import RecordingSource
+from msgs_slam.pipelines.frames.sharpness import reduced_size
+from msgs_slam.pipelines.frames.source import FolderSource, VideoSource
+from msgs_slam.pipelines.geometry.rig import CUBE, LEVEL
+from msgs_slam.pipelines.structure.calibration import read_intrinsics
+from msgs_slam.pipelines.structure.lens import make_lens, to_pycolmap
+from msgs_slam.pipelines.types import Intrinsics
 
 Pixel = TypeVar("Pixel", np.uint8, np.bool_)
 Map = tuple[NDArray[np.float32], NDArray[np.float32]]

@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.images import read_rgb
-from pipelines.config import Config
-from pipelines.frames.faces import Faces
-from pipelines.frames.source import Source, open_source
-from pipelines.geometry.rig import ONE_CAMERA, Rig
-from pipelines.masks.files import MaskFiles, open_masks
-from pipelines.masks.people import PeopleCards, PeopleFinder, people_cards
-from pipelines.progress import Progress
-from pipelines.proxy.models.registry import ModelStore
-from pipelines.run_folder import load_left_out, save_left_out
-from pipelines.structure.lens import Lens
-from pipelines.types import Frame, any_of
+from msgs_slam.formats.images import read_rgb
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.frames.faces import Faces
+from msgs_slam.pipelines.frames.source import Source, open_source
+from msgs_slam.pipelines.geometry.rig import ONE_CAMERA, Rig
+from msgs_slam.pipelines.masks.files import MaskFiles, open_masks
+from msgs_slam.pipelines.masks.people import PeopleCards, PeopleFinder, people_cards
+from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.proxy.models.registry import ModelStore
+from msgs_slam.pipelines.run_folder import load_left_out, save_left_out
+from msgs_slam.pipelines.structure.lens import Lens
+from msgs_slam.pipelines.types import Frame, any_of
 
 
 def mask_inputs(source: Path, config: Config) -> dict[str, str] | None:

@@ -6,11 +6,11 @@ from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from formats.datasets import Camera, Sequence, open_sequence, recognise_source
-from formats.errors import InputError
-from formats.images import exif_focal_px, image_size
-from formats.video import VideoFrame
-from pipelines.frames.originals import reusable, written_names
+from msgs_slam.formats.datasets import Camera, Sequence, open_sequence, recognise_source
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import exif_focal_px, image_size
+from msgs_slam.formats.video import VideoFrame
+from msgs_slam.pipelines.frames.originals import reusable, written_names
 
 Warn = Callable[[str], None]
 

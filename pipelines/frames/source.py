@@ -10,15 +10,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.digest import file_sha256, files_sha256
-from formats.errors import InputError
-from formats.image_times import read_image_times, times_file
-from formats.images import exif_focal_px, image_size, is_depth_map, list_images, read_rgb
-from formats.reading import reaching, require_file
-from formats.textfile import read_text
-from formats.video import VideoFrame, VideoReader, probe_video
-from pipelines.frames.originals import reusable, written_names
-from pipelines.frames.recording import RecordingSource, open_recording
+from msgs_slam.formats.digest import file_sha256, files_sha256
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.image_times import read_image_times, times_file
+from msgs_slam.formats.images import exif_focal_px, image_size, is_depth_map, list_images, read_rgb
+from msgs_slam.formats.reading import reaching, require_file
+from msgs_slam.formats.textfile import read_text
+from msgs_slam.formats.video import VideoFrame, VideoReader, probe_video
+from msgs_slam.pipelines.frames.originals import reusable, written_names
+from msgs_slam.pipelines.frames.recording import RecordingSource, open_recording
 
 Warn = Callable[[str], None]
 LIST_SUFFIX = ".videos"

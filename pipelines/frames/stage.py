@@ -11,14 +11,14 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from formats.atomic import copy_file
-from formats.errors import InputError, RecoverableError
-from formats.images import read_rgb, write_rgb
-from formats.jsonfile import read_json, write_json
-from formats.video import VideoFrame
-from pipelines.config import Config, FramesConfig
-from pipelines.correspondence.bridges import Picture
-from pipelines.frames.begun import (
+from msgs_slam.formats.atomic import copy_file
+from msgs_slam.formats.errors import InputError, RecoverableError
+from msgs_slam.formats.images import read_rgb, write_rgb
+from msgs_slam.formats.jsonfile import read_json, write_json
+from msgs_slam.formats.video import VideoFrame
+from msgs_slam.pipelines.config import Config, FramesConfig
+from msgs_slam.pipelines.correspondence.bridges import Picture
+from msgs_slam.pipelines.frames.begun import (
     AHEAD,
     AnySource,
     grey_of,
@@ -27,16 +27,16 @@ from pipelines.frames.begun import (
     picked,
     structure_from_motion,
 )
-from pipelines.frames.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
-from pipelines.frames.keyframes import KeyframeChoice, choose_keyframes
-from pipelines.frames.learned import learned_inputs, open_learned
-from pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
-from pipelines.frames.pick import sharpest_of_windows
-from pipelines.frames.sharpness import reduce_image
-from pipelines.frames.source import FolderSource, open_source
-from pipelines.geometry.rig import Rig, rig_of
-from pipelines.portions import in_portions
-from pipelines.run_folder import (
+from msgs_slam.pipelines.frames.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
+from msgs_slam.pipelines.frames.keyframes import KeyframeChoice, choose_keyframes
+from msgs_slam.pipelines.frames.learned import learned_inputs, open_learned
+from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
+from msgs_slam.pipelines.frames.pick import sharpest_of_windows
+from msgs_slam.pipelines.frames.sharpness import reduce_image
+from msgs_slam.pipelines.frames.source import FolderSource, open_source
+from msgs_slam.pipelines.geometry.rig import Rig, rig_of
+from msgs_slam.pipelines.portions import in_portions
+from msgs_slam.pipelines.run_folder import (
     save_backbone,
     save_calibration,
     save_features,
@@ -44,14 +44,14 @@ from pipelines.run_folder import (
     save_matching,
     save_sparse,
 )
-from pipelines.stages import Stage, StageContext
-from pipelines.structure.backbone import to_sparse_model
-from pipelines.structure.calibration import read_intrinsics
-from pipelines.structure.lens import Lens, distortion_of, make_lens
-from pipelines.structure.parallax import require_motion
-from pipelines.structure.rolling import read_readout
-from pipelines.structure.sfm import Structure, parallel_map
-from pipelines.types import Calibration, Frame
+from msgs_slam.pipelines.stages import Stage, StageContext
+from msgs_slam.pipelines.structure.backbone import to_sparse_model
+from msgs_slam.pipelines.structure.calibration import read_intrinsics
+from msgs_slam.pipelines.structure.lens import Lens, distortion_of, make_lens
+from msgs_slam.pipelines.structure.parallax import require_motion
+from msgs_slam.pipelines.structure.rolling import read_readout
+from msgs_slam.pipelines.structure.sfm import Structure, parallel_map
+from msgs_slam.pipelines.types import Calibration, Frame
 
 _SIGNIFICANT_SHIFT_PX = 0.3
 _FEW_KEYFRAMES = 12

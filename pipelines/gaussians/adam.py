@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.gaussians.render.jit import kernel
-from pipelines.gaussians.render.threads import for_each
+from msgs_slam.pipelines.gaussians.render.jit import kernel
+from msgs_slam.pipelines.gaussians.render.threads import for_each
 
 _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15
 _ROWS = 8192

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from pipelines.gaussians.render.jit import kernel
-from pipelines.gaussians.render.threads import for_each
+from msgs_slam.pipelines.gaussians.render.jit import kernel
+from msgs_slam.pipelines.gaussians.render.threads import for_each
 
 _ROWS = 16
 

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.types import Intrinsics
 
 
 def project(

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from pipelines.config import GlobalBaConfig
-from pipelines.correspondence.retrieval import Looks, far_apart, loop_pairs
-from pipelines.global_ba.semantics import LabelSummary, richness, similarity
-from pipelines.types import SparseModel
+from msgs_slam.pipelines.config import GlobalBaConfig
+from msgs_slam.pipelines.correspondence.retrieval import Looks, far_apart, loop_pairs
+from msgs_slam.pipelines.global_ba.semantics import LabelSummary, richness, similarity
+from msgs_slam.pipelines.types import SparseModel
 
 SHARED_POINTS = 15
 """Keyframes with this many points in common need no loop."""

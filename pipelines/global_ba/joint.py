@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipelines.config import MappingConfig
-from pipelines.gaussian_map import GaussianMap
-from pipelines.mapping.measure import measure_view
-from pipelines.mapping.optimise import optimise_map
-from pipelines.mapping.views import View
-from pipelines.stages import StageContext
+from msgs_slam.pipelines.config import MappingConfig
+from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.mapping.measure import measure_view
+from msgs_slam.pipelines.mapping.optimise import optimise_map
+from msgs_slam.pipelines.mapping.views import View
+from msgs_slam.pipelines.stages import StageContext
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import torch
 
-from pipelines.config import MappingConfig
-from pipelines.gaussian_map import GaussianMap
-from pipelines.gaussians.adam import AdamTable, gradients_of
-from pipelines.gaussians.render import render
-from pipelines.geometry import se3
-from pipelines.global_ba.verify import Loop
-from pipelines.mapping import losses
-from pipelines.mapping.optimise import scene_depth
-from pipelines.mapping.views import View
+from msgs_slam.pipelines.config import MappingConfig
+from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.gaussians.adam import AdamTable, gradients_of
+from msgs_slam.pipelines.gaussians.render import render
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.global_ba.verify import Loop
+from msgs_slam.pipelines.mapping import losses
+from msgs_slam.pipelines.mapping.optimise import scene_depth
+from msgs_slam.pipelines.mapping.views import View
 
 _RATE = 1e-3
 """Of Adam, rotations in radians and translations in units of the world; the article has 3e-3 for its tracking."""

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.tensors import load_arrays, save_arrays
-from pipelines.geometry import se3
-from pipelines.global_ba.verify import ROTATION, TRANSLATION, KeyframeView, Loop, verify_loop
-from pipelines.tracking.state import Sightings
-from pipelines.types import Intrinsics, LoopEdge
+from msgs_slam.formats.tensors import load_arrays, save_arrays
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.global_ba.verify import ROTATION, TRANSLATION, KeyframeView, Loop, verify_loop
+from msgs_slam.pipelines.tracking.state import Sightings
+from msgs_slam.pipelines.types import Intrinsics, LoopEdge
 
 Array = NDArray[np.float64]
 

@@ -8,24 +8,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.atomic import copy_file
-from pipelines.correspondence.retrieval import Looks, describe_all, unit
-from pipelines.depth.fields import DepthFields
-from pipelines.depth.scales import sample_proxy
-from pipelines.gaussian_map import GaussianMap
-from pipelines.geometry import se3
-from pipelines.global_ba.candidates import loop_candidates
-from pipelines.global_ba.close import Closed, close_loops
-from pipelines.global_ba.joint import Refined, refine_together
-from pipelines.global_ba.local import adjust_views, loop_keyframes
-from pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_found
-from pipelines.global_ba.move_map import follow_keyframes, move_map
-from pipelines.global_ba.semantics import LabelSummary, summarise_labels
-from pipelines.global_ba.verify import KeyframeView, Loop, make_view
-from pipelines.mapping.divided import refine_divided
-from pipelines.mapping.load import load_views, with_rigid_panoramas
-from pipelines.mapping.poses import move_trajectory
-from pipelines.run_folder import (
+from msgs_slam.formats.atomic import copy_file
+from msgs_slam.pipelines.correspondence.retrieval import Looks, describe_all, unit
+from msgs_slam.pipelines.depth.fields import DepthFields
+from msgs_slam.pipelines.depth.scales import sample_proxy
+from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.global_ba.candidates import loop_candidates
+from msgs_slam.pipelines.global_ba.close import Closed, close_loops
+from msgs_slam.pipelines.global_ba.joint import Refined, refine_together
+from msgs_slam.pipelines.global_ba.local import adjust_views, loop_keyframes
+from msgs_slam.pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_found
+from msgs_slam.pipelines.global_ba.move_map import follow_keyframes, move_map
+from msgs_slam.pipelines.global_ba.semantics import LabelSummary, summarise_labels
+from msgs_slam.pipelines.global_ba.verify import KeyframeView, Loop, make_view
+from msgs_slam.pipelines.mapping.divided import refine_divided
+from msgs_slam.pipelines.mapping.load import load_views, with_rigid_panoramas
+from msgs_slam.pipelines.mapping.poses import move_trajectory
+from msgs_slam.pipelines.run_folder import (
     MAP,
     RunFolder,
     save_depth_fields,
@@ -36,14 +36,14 @@ from pipelines.run_folder import (
     save_sparse,
     save_trajectory,
 )
-from pipelines.stages import Stage, StageContext
-from pipelines.streamed import Streamed
-from pipelines.structure.bundle import reprojection_errors
-from pipelines.tracking.adjust import align_depths, without_dependent_depth
-from pipelines.tracking.pictures import Pictures, load_shutter
-from pipelines.tracking.result import to_sparse_model
-from pipelines.tracking.state import FEATURE_SD, TrackState
-from pipelines.types import VOID, Intrinsics, SparseModel, Trajectory
+from msgs_slam.pipelines.stages import Stage, StageContext
+from msgs_slam.pipelines.streamed import Streamed
+from msgs_slam.pipelines.structure.bundle import reprojection_errors
+from msgs_slam.pipelines.tracking.adjust import align_depths, without_dependent_depth
+from msgs_slam.pipelines.tracking.pictures import Pictures, load_shutter
+from msgs_slam.pipelines.tracking.result import to_sparse_model
+from msgs_slam.pipelines.tracking.state import FEATURE_SD, TrackState
+from msgs_slam.pipelines.types import VOID, Intrinsics, SparseModel, Trajectory
 
 Array = NDArray[np.float64]
 

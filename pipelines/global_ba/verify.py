@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pipelines.correspondence.matching import match_descriptors
-from pipelines.geometry import se3
-from pipelines.geometry.camera import unproject
-from pipelines.tracking.pnp import FramePose, solve_pose
-from pipelines.tracking.relocalise import SNAP
-from pipelines.tracking.state import Sightings
-from pipelines.types import Features, Intrinsics, LoopEdge
+from msgs_slam.pipelines.correspondence.matching import match_descriptors
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.camera import unproject
+from msgs_slam.pipelines.tracking.pnp import FramePose, solve_pose
+from msgs_slam.pipelines.tracking.relocalise import SNAP
+from msgs_slam.pipelines.tracking.state import Sightings
+from msgs_slam.pipelines.types import Features, Intrinsics, LoopEdge
 
 Array = NDArray[np.float64]
 

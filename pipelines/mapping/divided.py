@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.depth.fields import DepthFields
-from pipelines.depth.posed import PosedDepth, overlaps
-from pipelines.gaussian_map import GaussianMap
-from pipelines.mapping.load import split_frames
-from pipelines.mapping.measure import ViewFigures
-from pipelines.mapping.poses import interpolate_rows, move_trajectory
-from pipelines.mapping.state import Exposures, OptimisedMap
-from pipelines.mapping.submap_tasks import (
+from msgs_slam.pipelines.depth.fields import DepthFields
+from msgs_slam.pipelines.depth.posed import PosedDepth, overlaps
+from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.mapping.load import split_frames
+from msgs_slam.pipelines.mapping.measure import ViewFigures
+from msgs_slam.pipelines.mapping.poses import interpolate_rows, move_trajectory
+from msgs_slam.pipelines.mapping.state import Exposures, OptimisedMap
+from msgs_slam.pipelines.mapping.submap_tasks import (
     AGREED,
     JOINED,
     SubmapResult,
@@ -29,11 +29,11 @@ from pipelines.mapping.submap_tasks import (
     measure_submap,
     refine_submap,
 )
-from pipelines.mapping.submaps import Submap, divide
-from pipelines.memory import submap_size
-from pipelines.run_folder import RunFolder
-from pipelines.stages import StageContext
-from pipelines.types import Trajectory
+from msgs_slam.pipelines.mapping.submaps import Submap, divide
+from msgs_slam.pipelines.memory import submap_size
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.types import Trajectory
 
 
 @dataclass(frozen=True)

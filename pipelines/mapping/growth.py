@@ -9,16 +9,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pipelines.config import ArticleConfig, MappingConfig
-from pipelines.gaussians.render import Rendering
-from pipelines.gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
-from pipelines.mapping import densify
-from pipelines.mapping.article.class_growth import wrong_classes
-from pipelines.mapping.region_prior import with_region_prior
-from pipelines.mapping.schedule import Seeding
-from pipelines.mapping.splitting import CHILDREN, Blame, split
-from pipelines.mapping.state import OptimiserState
-from pipelines.mapping.views import View
+from msgs_slam.pipelines.config import ArticleConfig, MappingConfig
+from msgs_slam.pipelines.gaussians.render import Rendering
+from msgs_slam.pipelines.gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
+from msgs_slam.pipelines.mapping import densify
+from msgs_slam.pipelines.mapping.article.class_growth import wrong_classes
+from msgs_slam.pipelines.mapping.region_prior import with_region_prior
+from msgs_slam.pipelines.mapping.schedule import Seeding
+from msgs_slam.pipelines.mapping.splitting import CHILDREN, Blame, split
+from msgs_slam.pipelines.mapping.state import OptimiserState
+from msgs_slam.pipelines.mapping.views import View
 
 GROWN_OPACITY = 0.3
 """Of Gaussians added to a map that is already there: opaque ones would hide what has been learnt."""

@@ -10,16 +10,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipelines.config import ArticleConfig, MappingConfig
-from pipelines.depth.fields import DepthFields
-from pipelines.depth.see_through import contradicted
-from pipelines.mapping.article.mirrors import Mirrors
-from pipelines.mapping.views import View, make_view, occurring_classes
-from pipelines.memory import VIEWS_SHARE
-from pipelines.run_folder import RunFolder
-from pipelines.stages import StageContext
-from pipelines.streamed import Streamed
-from pipelines.types import Frame, Intrinsics, ProxyMaps, Trajectory
+from msgs_slam.pipelines.config import ArticleConfig, MappingConfig
+from msgs_slam.pipelines.depth.fields import DepthFields
+from msgs_slam.pipelines.depth.see_through import contradicted
+from msgs_slam.pipelines.mapping.article.mirrors import Mirrors
+from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes
+from msgs_slam.pipelines.memory import VIEWS_SHARE
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.streamed import Streamed
+from msgs_slam.pipelines.types import Frame, Intrinsics, ProxyMaps, Trajectory
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pipelines.gaussians.entropy import weighted_entropy
+from msgs_slam.pipelines.gaussians.entropy import weighted_entropy
 
 NU = 1.2
 """ν of eq. (18)."""

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipelines.gaussian_map import GaussianMap
-from pipelines.gaussians.render import Rendering, render
-from pipelines.gaussians.ssim import ssim_map
-from pipelines.mapping.views import View
-from pipelines.types import VOID
+from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.gaussians.render import Rendering, render
+from msgs_slam.pipelines.gaussians.ssim import ssim_map
+from msgs_slam.pipelines.mapping.views import View
+from msgs_slam.pipelines.types import VOID
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from pipelines.config import ArticleConfig, MappingConfig
-from pipelines.gaussians.render import Rendering
-from pipelines.mapping import losses
-from pipelines.mapping.article.boundary_clip import clip_beside_boundary
-from pipelines.mapping.article.edge_term import edge_loss
-from pipelines.mapping.article.label_image import label_image_loss
-from pipelines.mapping.article.mirrors import label_symmetry_loss, symmetry_loss
-from pipelines.mapping.photo_loss import photo_loss
-from pipelines.mapping.views import View
+from msgs_slam.pipelines.config import ArticleConfig, MappingConfig
+from msgs_slam.pipelines.gaussians.render import Rendering
+from msgs_slam.pipelines.mapping import losses
+from msgs_slam.pipelines.mapping.article.boundary_clip import clip_beside_boundary
+from msgs_slam.pipelines.mapping.article.edge_term import edge_loss
+from msgs_slam.pipelines.mapping.article.label_image import label_image_loss
+from msgs_slam.pipelines.mapping.article.mirrors import label_symmetry_loss, symmetry_loss
+from msgs_slam.pipelines.mapping.photo_loss import photo_loss
+from msgs_slam.pipelines.mapping.views import View
 
 SILHOUETTE_WEIGHT = 0.05
 """Of the pressure towards an opaque map."""

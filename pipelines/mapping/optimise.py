@@ -10,21 +10,21 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pipelines.config import ArticleConfig, MappingConfig
-from pipelines.gaussian_map import GaussianMap
-from pipelines.gaussians.adam import AdamTable, gradients_of
-from pipelines.gaussians.render import Rendering, blending_weights, in_view, render
-from pipelines.mapping.exposure import SOLID, expose, fit_exposure
-from pipelines.mapping.growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
-from pipelines.mapping.objective import Objective
-from pipelines.mapping.parameters import COLOR_KEYS, KEYS
-from pipelines.mapping.schedule import Schedule, Seeding, Step
-from pipelines.mapping.splitting import Blame, blame
-from pipelines.mapping.state import Exposures, OptimisedMap, OptimiserState
-from pipelines.mapping.views import View, halved
-from pipelines.progress import Progress, SilentProgress
-from pipelines.stopping import is_asked
-from pipelines.streamed import Streamed
+from msgs_slam.pipelines.config import ArticleConfig, MappingConfig
+from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.gaussians.adam import AdamTable, gradients_of
+from msgs_slam.pipelines.gaussians.render import Rendering, blending_weights, in_view, render
+from msgs_slam.pipelines.mapping.exposure import SOLID, expose, fit_exposure
+from msgs_slam.pipelines.mapping.growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
+from msgs_slam.pipelines.mapping.objective import Objective
+from msgs_slam.pipelines.mapping.parameters import COLOR_KEYS, KEYS
+from msgs_slam.pipelines.mapping.schedule import Schedule, Seeding, Step
+from msgs_slam.pipelines.mapping.splitting import Blame, blame
+from msgs_slam.pipelines.mapping.state import Exposures, OptimisedMap, OptimiserState
+from msgs_slam.pipelines.mapping.views import View, halved
+from msgs_slam.pipelines.progress import Progress, SilentProgress
+from msgs_slam.pipelines.stopping import is_asked
+from msgs_slam.pipelines.streamed import Streamed
 
 MAP_RATES = {"means": 0.1, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2, "class_logits": 6e-2}
 """Learning rates of Adam, of positions in radii of the Gaussian: what is small has to be placed finely."""

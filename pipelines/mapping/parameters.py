@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pipelines.gaussian_map import GaussianMap
-from pipelines.gaussians.adam import AdamTable
+from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.gaussians.adam import AdamTable
 
 COLOR_KEYS = ("means", "log_radii", "opacity_logits", "colors")
 KEYS = (*COLOR_KEYS, "class_logits")

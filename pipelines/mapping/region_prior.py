@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.types import VOID
+from msgs_slam.pipelines.types import VOID
 
 _MIN_REGION = 64
 _REGION_SAMPLES = 4000

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from pipelines.config import MappingConfig
-from pipelines.depth.posed import overlaps
-from pipelines.mapping.article.label_choice import label_likeness
-from pipelines.mapping.covisibility import keyframe_weights
-from pipelines.mapping.views import View
+from msgs_slam.pipelines.config import MappingConfig
+from msgs_slam.pipelines.depth.posed import overlaps
+from msgs_slam.pipelines.mapping.article.label_choice import label_likeness
+from msgs_slam.pipelines.mapping.covisibility import keyframe_weights
+from msgs_slam.pipelines.mapping.views import View
 
 WINDOW_STEPS = 2
 """Coarse steps after each keyframe while the map is seeded: on it, covisible and random past keyframes."""

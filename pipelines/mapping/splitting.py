@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pipelines.gaussian_map import GaussianMap
-from pipelines.gaussians.render import blending_weights, render
-from pipelines.gaussians.render.rendering import project_map
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.gaussians.render import blending_weights, render
+from msgs_slam.pipelines.gaussians.render.rendering import project_map
+from msgs_slam.pipelines.types import Intrinsics
 
 CHILDREN = 4
 CHILD_RADIUS, CHILD_OFFSET = 0.55, 0.6

@@ -11,12 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from formats.tensors import load_tensors, save_tensors
-from pipelines.gaussian_map import GaussianMap
-from pipelines.gaussians.adam import AdamTable
-from pipelines.geometry import se3
-from pipelines.mapping.parameters import MapParameters, empty_map
-from pipelines.mapping.views import View
+from msgs_slam.formats.tensors import load_tensors, save_tensors
+from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.gaussians.adam import AdamTable
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.mapping.parameters import MapParameters, empty_map
+from msgs_slam.pipelines.mapping.views import View
 
 VIEW_KEYS = ("twist",)
 

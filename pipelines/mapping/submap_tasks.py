@@ -16,25 +16,25 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
-from pipelines.config import Config
-from pipelines.depth.fields import DepthFields
-from pipelines.depth.posed import PosedDepth
-from pipelines.device import settle_device
-from pipelines.gaussian_map import GaussianMap
-from pipelines.gaussians.render import blending_weights, median_depth
-from pipelines.mapping.gauge import SeenExposures, common_exposure
-from pipelines.mapping.load import MappingInput, load_views
-from pipelines.mapping.measure import ViewFigures, measure_view
-from pipelines.mapping.optimise import optimise_map
-from pipelines.mapping.parameters import KEYS
-from pipelines.mapping.state import Exposures, OptimisedMap
-from pipelines.mapping.submaps import Submap, nearest_seeing
-from pipelines.mapping.views import View
-from pipelines.memory import memory_room
-from pipelines.progress import Progress
-from pipelines.run_folder import RunFolder
-from pipelines.types import Intrinsics, Trajectory
+from msgs_slam.formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.depth.fields import DepthFields
+from msgs_slam.pipelines.depth.posed import PosedDepth
+from msgs_slam.pipelines.device import settle_device
+from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.gaussians.render import blending_weights, median_depth
+from msgs_slam.pipelines.mapping.gauge import SeenExposures, common_exposure
+from msgs_slam.pipelines.mapping.load import MappingInput, load_views
+from msgs_slam.pipelines.mapping.measure import ViewFigures, measure_view
+from msgs_slam.pipelines.mapping.optimise import optimise_map
+from msgs_slam.pipelines.mapping.parameters import KEYS
+from msgs_slam.pipelines.mapping.state import Exposures, OptimisedMap
+from msgs_slam.pipelines.mapping.submaps import Submap, nearest_seeing
+from msgs_slam.pipelines.mapping.views import View
+from msgs_slam.pipelines.memory import memory_room
+from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.types import Intrinsics, Trajectory
 
 MADE, JOINED, REFINED, AGREED = "made", "joined", "refined", "agreed"
 _ARRAYS = ("frame_ids", "cam_from_world", "log_gains", "offsets", "depths", "steps", "rows", "weights")

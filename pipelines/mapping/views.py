@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.depth.posed import PosedDepth
-from pipelines.depth.resize import resize_depth, resize_maps
-from pipelines.mapping.article.mirrors import Mirrors
-from pipelines.types import VOID, Intrinsics, ProxyMaps
+from msgs_slam.pipelines.depth.posed import PosedDepth
+from msgs_slam.pipelines.depth.resize import resize_depth, resize_maps
+from msgs_slam.pipelines.mapping.article.mirrors import Mirrors
+from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.digest import files_sha256
-from formats.errors import InputError
-from formats.images import image_size, natural_key, read_rgb
-from pipelines.frames.source import Source, VideoSource
+from msgs_slam.formats.digest import files_sha256
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import image_size, natural_key, read_rgb
+from msgs_slam.pipelines.frames.source import Source, VideoSource
 
 _LAST_NUMBER = re.compile(r"(\d+)(?!.*\d)")
 

@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.jit import kernel
-from pipelines.progress import Progress
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.jit import kernel
+from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.types import Intrinsics
 
 SIDE = 160
 """Pixels along the long side; all numbers below were chosen with it, on a woman pasted into 37 keyframes of one room,

@@ -8,18 +8,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.depth.fields import DepthFields
-from pipelines.metres.evidence import Combined, Evidence, combine, independence
-from pipelines.metres.files import load_scale_spreads
-from pipelines.metres.heights import camera_height, ceiling_height, usual_distance
-from pipelines.metres.known import MEASURED, known_scale
-from pipelines.metres.network import network_scale
-from pipelines.metres.scene import Scene, SeenFrame, build_scene
-from pipelines.metres.sizes import THINGS
-from pipelines.metres.things import sizes_of_things
-from pipelines.proxy.networks.card import Card
-from pipelines.run_folder import DEPTH_FIELDS, RunFolder
-from pipelines.types import Intrinsics, Metres, MetresSource, Trajectory
+from msgs_slam.pipelines.depth.fields import DepthFields
+from msgs_slam.pipelines.metres.evidence import Combined, Evidence, combine, independence
+from msgs_slam.pipelines.metres.files import load_scale_spreads
+from msgs_slam.pipelines.metres.heights import camera_height, ceiling_height, usual_distance
+from msgs_slam.pipelines.metres.known import MEASURED, known_scale
+from msgs_slam.pipelines.metres.network import network_scale
+from msgs_slam.pipelines.metres.scene import Scene, SeenFrame, build_scene
+from msgs_slam.pipelines.metres.sizes import THINGS
+from msgs_slam.pipelines.metres.things import sizes_of_things
+from msgs_slam.pipelines.proxy.networks.card import Card
+from msgs_slam.pipelines.run_folder import DEPTH_FIELDS, RunFolder
+from msgs_slam.pipelines.types import Intrinsics, Metres, MetresSource, Trajectory
 
 _MOST_FRAMES = 40
 _MOST_NETWORK_FRAMES = 24

@@ -5,10 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.metres.evidence import Evidence, Mode, measured
-from pipelines.metres.scene import Scene
-from pipelines.metres.sizes import CAMERA_OVER_FLOOR, CAMERA_OVER_TABLE, CEILING_OVER_FLOOR, DISTANCE, FLOORS, FURNITURE
-from pipelines.proxy.regions.structure import FLOOR
+from msgs_slam.pipelines.metres.evidence import Evidence, Mode, measured
+from msgs_slam.pipelines.metres.scene import Scene
+from msgs_slam.pipelines.metres.sizes import (
+    CAMERA_OVER_FLOOR,
+    CAMERA_OVER_TABLE,
+    CEILING_OVER_FLOOR,
+    DISTANCE,
+    FLOORS,
+    FURNITURE,
+)
+from msgs_slam.pipelines.proxy.regions.structure import FLOOR
 
 Array = NDArray[np.float64]
 

@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.metres.evidence import Evidence, Mode
-from pipelines.metres.scene import LEAST_CONFIDENCE, SeenFrame
-from pipelines.proxy.networks.card import Card
-from pipelines.proxy.networks.depth import network_depth
-from pipelines.proxy.networks.letterbox import Letterbox
-from pipelines.proxy.networks.session import Network
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.metres.evidence import Evidence, Mode
+from msgs_slam.pipelines.metres.scene import LEAST_CONFIDENCE, SeenFrame
+from msgs_slam.pipelines.proxy.networks.card import Card
+from msgs_slam.pipelines.proxy.networks.depth import network_depth
+from msgs_slam.pipelines.proxy.networks.letterbox import Letterbox
+from msgs_slam.pipelines.proxy.networks.session import Network
+from msgs_slam.pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.depth.resize import resize_maps
-from pipelines.geometry.camera import unproject_depth
-from pipelines.proxy.regions.structure import (
+from msgs_slam.pipelines.depth.resize import resize_maps
+from msgs_slam.pipelines.geometry.camera import unproject_depth
+from msgs_slam.pipelines.proxy.regions.structure import (
     CEILING,
     FLOOR,
     FloorPlane,
@@ -20,9 +20,9 @@ from pipelines.proxy.regions.structure import (
     floor_plane,
     name_structure,
 )
-from pipelines.proxy.regions.voxels import Voxels, find, gather_frame, merge, select, voxel_keys
-from pipelines.proxy.sequence import resize_area
-from pipelines.types import VOID, Intrinsics, ProxyMaps
+from msgs_slam.pipelines.proxy.regions.voxels import Voxels, find, gather_frame, merge, select, voxel_keys
+from msgs_slam.pipelines.proxy.sequence import resize_area
+from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 
 Array = NDArray[np.float64]
 

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from pipelines.proxy.networks.depth_provider import OnnxDepth
-from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.scale import depth_at_points
-from pipelines.proxy.sequence import Sequence
-from pipelines.types import Frame
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.proxy.networks.depth_provider import OnnxDepth
+from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.scale import depth_at_points
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.types import Frame
 
 Array = NDArray[np.float64]
 

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.proxy.providers import DepthEstimate, DepthProvider
-from pipelines.proxy.scale import DepthScale, measure_scale
-from pipelines.proxy.sequence import Sequence
-from pipelines.proxy.stereo.fill import SURE
-from pipelines.proxy.stereo.provider import MultiviewDepth
-from pipelines.types import Frame
+from msgs_slam.pipelines.proxy.providers import DepthEstimate, DepthProvider
+from msgs_slam.pipelines.proxy.scale import DepthScale, measure_scale
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.proxy.stereo.fill import SURE
+from msgs_slam.pipelines.proxy.stereo.provider import MultiviewDepth
+from msgs_slam.pipelines.types import Frame
 
 _GRID_REACH = 1 / 10
 """Standard deviation of the scale grid's smoothing, as a part of the image's width."""

@@ -5,16 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from formats.digest import files_sha256
-from pipelines.config import Config
-from pipelines.frames.recording import RecordingSource
-from pipelines.frames.source import open_source
-from pipelines.progress import SilentProgress, log
-from pipelines.proxy.files.depth import FilesDepth, require_sizes
-from pipelines.proxy.files.labels import FilesLabels
-from pipelines.proxy.networks.identity import card_identity
-from pipelines.proxy.scale_reference import require_reference_in
-from pipelines.proxy.selection import (
+from msgs_slam.formats.digest import files_sha256
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.frames.recording import RecordingSource
+from msgs_slam.pipelines.frames.source import open_source
+from msgs_slam.pipelines.progress import SilentProgress, log
+from msgs_slam.pipelines.proxy.files.depth import FilesDepth, require_sizes
+from msgs_slam.pipelines.proxy.files.labels import FilesLabels
+from msgs_slam.pipelines.proxy.networks.identity import card_identity
+from msgs_slam.pipelines.proxy.scale_reference import require_reference_in
+from msgs_slam.pipelines.proxy.selection import (
     Surroundings,
     choose_depth,
     choose_semantics,
@@ -24,8 +24,8 @@ from pipelines.proxy.selection import (
     open_learned_depth,
     open_learned_semantics,
 )
-from pipelines.proxy.sequence import Sequence
-from pipelines.types import Calibration, Frame, Intrinsics
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics
 
 
 def proxy_inputs(source: Path, config: Config) -> dict[str, Any]:

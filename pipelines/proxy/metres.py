@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from formats.errors import InputError
-from pipelines.frames.source import open_source
-from pipelines.proxy.providers import DepthEstimate, DepthProvider
-from pipelines.proxy.regions.provider import SegmentLabels
-from pipelines.proxy.scale import DepthScale
-from pipelines.proxy.scale_reference import ReferenceScale, distance_scale, height_scale, parse_reference
-from pipelines.proxy.sequence import Sequence
-from pipelines.stages import StageContext
-from pipelines.types import Frame
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.frames.source import open_source
+from msgs_slam.pipelines.proxy.providers import DepthEstimate, DepthProvider
+from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
+from msgs_slam.pipelines.proxy.scale import DepthScale
+from msgs_slam.pipelines.proxy.scale_reference import ReferenceScale, distance_scale, height_scale, parse_reference
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.types import Frame
 
 
 def reference_scale(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.correspondence.retrieval import unit
-from pipelines.types import Features
+from msgs_slam.pipelines.correspondence.retrieval import unit
+from msgs_slam.pipelines.types import Features
 
 _MOST_FEATURES = 1500
 _RATIO = 0.9

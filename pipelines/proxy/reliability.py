@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.types import VOID, Intrinsics
+from msgs_slam.pipelines.types import VOID, Intrinsics
 
 ALPHA, BETA, GAMMA = 0.7, 0.8, 0.5
 """Eq. (2): how much depth edges lower the reliability; exponents of the depth's confidence and of the agreement."""

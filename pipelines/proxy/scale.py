@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.camera import project
-from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.sequence import Sequence
-from pipelines.types import Frame
+from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.types import Frame
 
 _LEAST_POINTS = 20
 

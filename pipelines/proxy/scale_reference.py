@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from pipelines.correspondence.features import to_grey
-from pipelines.correspondence.flow import follow
-from pipelines.frames.source import Source, VideoSource
-from pipelines.geometry.camera import unproject
-from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.sequence import Sequence, resize_area
-from pipelines.types import Frame, Intrinsics
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.correspondence.features import to_grey
+from msgs_slam.pipelines.correspondence.flow import follow
+from msgs_slam.pipelines.frames.source import Source, VideoSource
+from msgs_slam.pipelines.geometry.camera import unproject
+from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
+from msgs_slam.pipelines.types import Frame, Intrinsics
 
 Array = NDArray[np.float64]
 DepthOf = Callable[[Frame], DepthEstimate]

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.atomic import atomic_path
-from formats.errors import InputError
-from formats.tensors import load_arrays
+from msgs_slam.formats.atomic import atomic_path
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.tensors import load_arrays
 
 
 def save_scratch(path: Path, **arrays: NDArray) -> None:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.types import Calibration, Frame, Intrinsics, SparseModel
+from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics, SparseModel
 
 
 @dataclass(frozen=True)

@@ -8,23 +8,23 @@ from typing import Any
 import cv2
 import numpy as np
 
-from formats.errors import InputError
-from pipelines.config import ProxyConfig
-from pipelines.correspondence.features import extract_features, to_grey
-from pipelines.masks.moving import find_moving
-from pipelines.progress import log
-from pipelines.proxy.inputs import check_proxy, proxy_inputs
-from pipelines.proxy.metres import reference_scale, scale_figures
-from pipelines.proxy.providers import (
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.config import ProxyConfig
+from msgs_slam.pipelines.correspondence.features import extract_features, to_grey
+from msgs_slam.pipelines.masks.moving import find_moving
+from msgs_slam.pipelines.progress import log
+from msgs_slam.pipelines.proxy.inputs import check_proxy, proxy_inputs
+from msgs_slam.pipelines.proxy.metres import reference_scale, scale_figures
+from msgs_slam.pipelines.proxy.providers import (
     DepthProvider,
     SemanticsProvider,
     prepared,
 )
-from pipelines.proxy.scale import DepthScale, measure_scale
-from pipelines.proxy.selection import open_depth, open_semantics
-from pipelines.proxy.sequence import Sequence
-from pipelines.proxy.symmetry import find_mirror_planes, mirror_pairs
-from pipelines.proxy.tasks import (
+from msgs_slam.pipelines.proxy.scale import DepthScale, measure_scale
+from msgs_slam.pipelines.proxy.selection import open_depth, open_semantics
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.proxy.symmetry import find_mirror_planes, mirror_pairs
+from msgs_slam.pipelines.proxy.tasks import (
     by_workers,
     depth_pass,
     load_depth,
@@ -38,7 +38,7 @@ from pipelines.proxy.tasks import (
     prepare_depths,
     surroundings,
 )
-from pipelines.run_folder import (
+from msgs_slam.pipelines.run_folder import (
     load_proxy_maps,
     proxy_path,
     save_classes,
@@ -48,8 +48,8 @@ from pipelines.run_folder import (
     save_left_out,
     save_mirror_pairs,
 )
-from pipelines.stages import Stage, StageContext
-from pipelines.types import VOID, Features, Frame
+from msgs_slam.pipelines.stages import Stage, StageContext
+from msgs_slam.pipelines.types import VOID, Features, Frame
 
 
 def run(context: StageContext) -> dict[str, Any]:

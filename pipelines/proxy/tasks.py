@@ -11,22 +11,28 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.depth.resize import resample_nearest
-from pipelines.frames.recording import open_recording
-from pipelines.masks.moving import SIDE, MovingView, look_once
-from pipelines.portions import Portion, in_portions
-from pipelines.progress import Progress
-from pipelines.proxy.compact import compact
-from pipelines.proxy.providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider, take_prepared
-from pipelines.proxy.regions.voxels import to_lab
-from pipelines.proxy.reliability import reliability, semantic_agreement, theta, warp_labels
-from pipelines.proxy.scale import DepthScale
-from pipelines.proxy.scratch import load_scratch, save_scratch
-from pipelines.proxy.selection import Surroundings, open_depth, open_semantics
-from pipelines.proxy.sequence import Sequence, resize_area
-from pipelines.run_folder import load_left_out, proxy_path, save_proxy_maps
-from pipelines.stages import StageContext
-from pipelines.types import Frame, Intrinsics, ProxyMaps, any_of
+from msgs_slam.pipelines.depth.resize import resample_nearest
+from msgs_slam.pipelines.frames.recording import open_recording
+from msgs_slam.pipelines.masks.moving import SIDE, MovingView, look_once
+from msgs_slam.pipelines.portions import Portion, in_portions
+from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.proxy.compact import compact
+from msgs_slam.pipelines.proxy.providers import (
+    DepthEstimate,
+    DepthProvider,
+    LabelEstimate,
+    SemanticsProvider,
+    take_prepared,
+)
+from msgs_slam.pipelines.proxy.regions.voxels import to_lab
+from msgs_slam.pipelines.proxy.reliability import reliability, semantic_agreement, theta, warp_labels
+from msgs_slam.pipelines.proxy.scale import DepthScale
+from msgs_slam.pipelines.proxy.scratch import load_scratch, save_scratch
+from msgs_slam.pipelines.proxy.selection import Surroundings, open_depth, open_semantics
+from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
+from msgs_slam.pipelines.run_folder import load_left_out, proxy_path, save_proxy_maps
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.types import Frame, Intrinsics, ProxyMaps, any_of
 
 R = TypeVar("R")
 

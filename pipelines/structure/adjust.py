@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipelines.structure.lens import set_lens
+from msgs_slam.pipelines.structure.lens import set_lens
 
 _CAUCHY_PX = 1.0
 _MAX_REPROJECTION_PX = 4.0

@@ -16,10 +16,10 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import bsr_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
-from pipelines.geometry import se3
-from pipelines.geometry.rig import ONE_CAMERA, Rig, tie_cameras
-from pipelines.structure import bundle_kernels as kernels
-from pipelines.types import Intrinsics, require_shape
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.rig import ONE_CAMERA, Rig, tie_cameras
+from msgs_slam.pipelines.structure import bundle_kernels as kernels
+from msgs_slam.pipelines.types import Intrinsics, require_shape
 
 Array = NDArray[np.float64]
 

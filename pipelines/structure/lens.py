@@ -9,8 +9,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from formats.datasets.camera import Camera
-from pipelines.types import Intrinsics
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.pipelines.types import Intrinsics
 
 _BORDER_POINTS = 65
 

@@ -13,12 +13,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipelines.correspondence.matching import VerifiedPair
-from pipelines.structure.adjust import remove_wild, solve
-from pipelines.structure.backbone import pose_of
-from pipelines.structure.consistency import ModelReport, judge
-from pipelines.structure.seams import LEAST_POINTS, tracks_of
-from pipelines.structure.tracks import complete_tracks
+from msgs_slam.pipelines.correspondence.matching import VerifiedPair
+from msgs_slam.pipelines.structure.adjust import remove_wild, solve
+from msgs_slam.pipelines.structure.backbone import pose_of
+from msgs_slam.pipelines.structure.consistency import ModelReport, judge
+from msgs_slam.pipelines.structure.seams import LEAST_POINTS, tracks_of
+from msgs_slam.pipelines.structure.tracks import complete_tracks
 
 _LEAST_ANGLE = 0.01
 """Radians between the rays of two cameras below which they tell no depth."""

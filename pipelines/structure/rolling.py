@@ -17,13 +17,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from pipelines.geometry import se3
-from pipelines.structure import bundle_kernels as kernels
-from pipelines.structure.adjust import adjust, solve
-from pipelines.structure.backbone import pose_of
-from pipelines.structure.bundle import Bundle, Problem
-from pipelines.types import Intrinsics
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.structure import bundle_kernels as kernels
+from msgs_slam.pipelines.structure.adjust import adjust, solve
+from msgs_slam.pipelines.structure.backbone import pose_of
+from msgs_slam.pipelines.structure.bundle import Bundle, Problem
+from msgs_slam.pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
 Readout = tuple[float, float]

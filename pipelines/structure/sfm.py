@@ -14,12 +14,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from pipelines.config import FramesConfig
-from pipelines.correspondence.bridges import Picture, weak_keyframes, with_bridges
-from pipelines.correspondence.database import write_database
-from pipelines.correspondence.matching import VerifiedPair, match_pair
-from pipelines.correspondence.retrieval import (
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.config import FramesConfig
+from msgs_slam.pipelines.correspondence.bridges import Picture, weak_keyframes, with_bridges
+from msgs_slam.pipelines.correspondence.database import write_database
+from msgs_slam.pipelines.correspondence.matching import VerifiedPair, match_pair
+from msgs_slam.pipelines.correspondence.retrieval import (
     Looks,
     describe_all,
     far_apart,
@@ -27,22 +27,22 @@ from pipelines.correspondence.retrieval import (
     loop_pairs,
     sequential_pairs,
 )
-from pipelines.correspondence.snapshots import Snapshots
-from pipelines.geometry.rig import ONE_CAMERA
-from pipelines.memory import give_back
-from pipelines.progress import Progress
-from pipelines.streamed import Streamed
-from pipelines.structure.adjust import adjust
-from pipelines.structure.consistency import ModelReport, check_pairs, judge, without_misplaced
-from pipelines.structure.lens import set_lens
-from pipelines.structure.mappers import calibrate_focal, map_globally, map_incrementally
-from pipelines.structure.mend import mended
-from pipelines.structure.parallax import HOW_TO_FILM, require_parallax
-from pipelines.structure.rolling import NO_READOUT, Readout, adjust_rolling, read_readout
-from pipelines.structure.seams import cut, take_out
-from pipelines.structure.window_size import SIZE, windows_of
-from pipelines.structure.windows import Joined, adjust_joined
-from pipelines.types import Features, Vocabulary
+from msgs_slam.pipelines.correspondence.snapshots import Snapshots
+from msgs_slam.pipelines.geometry.rig import ONE_CAMERA
+from msgs_slam.pipelines.memory import give_back
+from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.streamed import Streamed
+from msgs_slam.pipelines.structure.adjust import adjust
+from msgs_slam.pipelines.structure.consistency import ModelReport, check_pairs, judge, without_misplaced
+from msgs_slam.pipelines.structure.lens import set_lens
+from msgs_slam.pipelines.structure.mappers import calibrate_focal, map_globally, map_incrementally
+from msgs_slam.pipelines.structure.mend import mended
+from msgs_slam.pipelines.structure.parallax import HOW_TO_FILM, require_parallax
+from msgs_slam.pipelines.structure.rolling import NO_READOUT, Readout, adjust_rolling, read_readout
+from msgs_slam.pipelines.structure.seams import cut, take_out
+from msgs_slam.pipelines.structure.window_size import SIZE, windows_of
+from msgs_slam.pipelines.structure.windows import Joined, adjust_joined
+from msgs_slam.pipelines.types import Features, Vocabulary
 
 _PAIRS_PER_BLOCK = 64
 _FEATURES_SHARE = 0.25

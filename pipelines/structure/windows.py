@@ -13,13 +13,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipelines.correspondence.matching import VerifiedPair
-from pipelines.geometry import se3
-from pipelines.geometry.alignment import Similarity, best_rotation
-from pipelines.structure.adjust import median_error, remove_wild
-from pipelines.structure.backbone import pose_of
-from pipelines.structure.bundle import adjust_bundle
-from pipelines.structure.rolling import FEATURE_SD, Readout, RollingModel, straightened, velocities
+from msgs_slam.pipelines.correspondence.matching import VerifiedPair
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.alignment import Similarity, best_rotation
+from msgs_slam.pipelines.structure.adjust import median_error, remove_wild
+from msgs_slam.pipelines.structure.backbone import pose_of
+from msgs_slam.pipelines.structure.bundle import adjust_bundle
+from msgs_slam.pipelines.structure.rolling import FEATURE_SD, Readout, RollingModel, straightened, velocities
 
 Array = NDArray[np.float64]
 

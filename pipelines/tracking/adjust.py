@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.config import TrackingConfig
-from pipelines.depth import scales
-from pipelines.depth.align import align_keyframes
-from pipelines.depth.fields import DepthFields
-from pipelines.depth.scales import COARSE, WorldScale
-from pipelines.structure.bundle import Bundle, adjust_bundle, adjust_pose
-from pipelines.structure.rolling import straight_pixels, straightened, velocities
-from pipelines.tracking.places import settle_places
-from pipelines.tracking.state import TrackState
-from pipelines.types import Intrinsics, ProxyMaps, SparseModel, rows_by
+from msgs_slam.pipelines.config import TrackingConfig
+from msgs_slam.pipelines.depth import scales
+from msgs_slam.pipelines.depth.align import align_keyframes
+from msgs_slam.pipelines.depth.fields import DepthFields
+from msgs_slam.pipelines.depth.scales import COARSE, WorldScale
+from msgs_slam.pipelines.structure.bundle import Bundle, adjust_bundle, adjust_pose
+from msgs_slam.pipelines.structure.rolling import straight_pixels, straightened, velocities
+from msgs_slam.pipelines.tracking.places import settle_places
+from msgs_slam.pipelines.tracking.state import TrackState
+from msgs_slam.pipelines.types import Intrinsics, ProxyMaps, SparseModel, rows_by
 
 Array = NDArray[np.float64]
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.config import TrackingConfig
-from pipelines.correspondence.flow import FLOW_SD, follow
-from pipelines.geometry.camera import project
-from pipelines.tracking.extend import promote, start_segment
-from pipelines.tracking.motion import predict_pose
-from pipelines.tracking.pictures import Pictures
-from pipelines.tracking.pnp import MIN_INLIERS, FramePose, solve_pose
-from pipelines.tracking.refine import RenderWeights, compare_frame
-from pipelines.tracking.relocalise import relocalise
-from pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
+from msgs_slam.pipelines.config import TrackingConfig
+from msgs_slam.pipelines.correspondence.flow import FLOW_SD, follow
+from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.tracking.extend import promote, start_segment
+from msgs_slam.pipelines.tracking.motion import predict_pose
+from msgs_slam.pipelines.tracking.pictures import Pictures
+from msgs_slam.pipelines.tracking.pnp import MIN_INLIERS, FramePose, solve_pose
+from msgs_slam.pipelines.tracking.refine import RenderWeights, compare_frame
+from msgs_slam.pipelines.tracking.relocalise import relocalise
+from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
 
 Array = NDArray[np.float64]
 

@@ -9,13 +9,13 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.config import FramesConfig
-from pipelines.correspondence.features import to_grey
-from pipelines.correspondence.retrieval import describe
-from pipelines.frames.learned import open_learned, picture_features
-from pipelines.run_folder import RunFolder
-from pipelines.structure.rolling import Shutter
-from pipelines.types import Features, ProxyMaps
+from msgs_slam.pipelines.config import FramesConfig
+from msgs_slam.pipelines.correspondence.features import to_grey
+from msgs_slam.pipelines.correspondence.retrieval import describe
+from msgs_slam.pipelines.frames.learned import open_learned, picture_features
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.structure.rolling import Shutter
+from msgs_slam.pipelines.types import Features, ProxyMaps
 
 T = TypeVar("T")
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from pipelines.geometry import se3
-from pipelines.tracking.state import NO_SIGHTINGS, TrackState
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, TrackState
 
 
 def settle_places(state: TrackState) -> None:

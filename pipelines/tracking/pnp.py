@@ -8,8 +8,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipelines.structure.bundle import adjust_pose, reprojection_errors
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.structure.bundle import adjust_pose, reprojection_errors
+from msgs_slam.pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
 

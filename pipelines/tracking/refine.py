@@ -13,12 +13,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.config import ArticleConfig
-from pipelines.gaussians.render import render, track_gn
-from pipelines.tracking.pictures import Pictures
-from pipelines.tracking.state import TrackState
-from pipelines.tracking.working_map import WORKING_SIDE, View, WorkingMap, seed_map, view_of
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.config import ArticleConfig
+from msgs_slam.pipelines.gaussians.render import render, track_gn
+from msgs_slam.pipelines.tracking.pictures import Pictures
+from msgs_slam.pipelines.tracking.state import TrackState
+from msgs_slam.pipelines.tracking.working_map import WORKING_SIDE, View, WorkingMap, seed_map, view_of
+from msgs_slam.pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
 

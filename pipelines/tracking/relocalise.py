@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pipelines.correspondence.matching import match_descriptors
-from pipelines.geometry import se3
-from pipelines.tracking.pictures import Pictures
-from pipelines.tracking.pnp import MIN_INLIERS, FramePose, solve_pose
-from pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
+from msgs_slam.pipelines.correspondence.matching import match_descriptors
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.tracking.pictures import Pictures
+from msgs_slam.pipelines.tracking.pnp import MIN_INLIERS, FramePose, solve_pose
+from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
 
 Array = NDArray[np.float64]
 

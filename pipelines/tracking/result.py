@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.geometry import se3
-from pipelines.tracking.state import TrackState
-from pipelines.types import Frame, SparseModel, Trajectory
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.tracking.state import TrackState
+from msgs_slam.pipelines.types import Frame, SparseModel, Trajectory
 
 
 def split_worlds(state: TrackState, least: int) -> list[TrackState]:

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from pipelines.geometry import se3
-from pipelines.geometry.alignment import Similarity
-from pipelines.tracking.pictures import Pictures
-from pipelines.tracking.pnp import MIN_INLIERS
-from pipelines.tracking.relocalise import group_by_points, recognise
-from pipelines.tracking.state import Sightings, TrackState
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.tracking.pictures import Pictures
+from msgs_slam.pipelines.tracking.pnp import MIN_INLIERS
+from msgs_slam.pipelines.tracking.relocalise import group_by_points, recognise
+from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 
 Array = NDArray[np.float64]
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.tensors import load_arrays, save_arrays
-from pipelines.geometry.rig import ONE_CAMERA, Rig
-from pipelines.structure.rolling import Shutter, velocities
-from pipelines.types import SparseModel
+from msgs_slam.formats.tensors import load_arrays, save_arrays
+from msgs_slam.pipelines.geometry.rig import ONE_CAMERA, Rig
+from msgs_slam.pipelines.structure.rolling import Shutter, velocities
+from msgs_slam.pipelines.types import SparseModel
 
 Array = NDArray[np.float64]
 

@@ -7,15 +7,15 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.correspondence.flow import corners, follow
-from pipelines.correspondence.matching import match_descriptors
-from pipelines.geometry.alignment import best_rotation
-from pipelines.geometry.camera import project, unproject
-from pipelines.tracking.motion import MAX_GAP
-from pipelines.tracking.pictures import Pictures
-from pipelines.tracking.pnp import MIN_INLIERS
-from pipelines.tracking.state import NO_SIGHTINGS, TrackState
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.correspondence.flow import corners, follow
+from msgs_slam.pipelines.correspondence.matching import match_descriptors
+from msgs_slam.pipelines.geometry.alignment import best_rotation
+from msgs_slam.pipelines.geometry.camera import project, unproject
+from msgs_slam.pipelines.tracking.motion import MAX_GAP
+from msgs_slam.pipelines.tracking.pictures import Pictures
+from msgs_slam.pipelines.tracking.pnp import MIN_INLIERS
+from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, TrackState
+from msgs_slam.pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
 

@@ -10,13 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.depth.resize import resize_maps
-from pipelines.depth.scales import scale_at_points
-from pipelines.gaussians.seeding import seed_gaussians, seed_grid
-from pipelines.proxy.palette import class_colors
-from pipelines.tracking.pictures import Pictures
-from pipelines.tracking.state import TrackState
-from pipelines.types import VOID, Intrinsics, ProxyMaps
+from msgs_slam.pipelines.depth.resize import resize_maps
+from msgs_slam.pipelines.depth.scales import scale_at_points
+from msgs_slam.pipelines.gaussians.seeding import seed_gaussians, seed_grid
+from msgs_slam.pipelines.proxy.palette import class_colors
+from msgs_slam.pipelines.tracking.pictures import Pictures
+from msgs_slam.pipelines.tracking.state import TrackState
+from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 
 Array = NDArray[np.float64]
 WORKING_SIDE = 320

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
 

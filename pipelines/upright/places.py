@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from formats.gps import Track, photo_places, read_track
-from pipelines.frames.source import FolderSource, open_source
-from pipelines.outcome import Outcome
-from pipelines.progress import log
-from pipelines.records import load_source
-from pipelines.upright.georeference import georeference
-from pipelines.upright.world import World
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gps import Track, photo_places, read_track
+from msgs_slam.pipelines.frames.source import FolderSource, open_source
+from msgs_slam.pipelines.outcome import Outcome
+from msgs_slam.pipelines.progress import log
+from msgs_slam.pipelines.records import load_source
+from msgs_slam.pipelines.upright.georeference import georeference
+from msgs_slam.pipelines.upright.world import World
 
 Array = NDArray[np.float64]
 OFF, AUTO = "off", "auto"

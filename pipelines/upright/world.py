@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.jsonfile import read_json_object, write_json
-from pipelines.geometry.alignment import Similarity
-from pipelines.outcome import Outcome
-from pipelines.run_folder import WORLD, RunFolder
-from pipelines.stored import reading
-from pipelines.upright.find import Upright, cameras_up
-from pipelines.upright.georeference import Georeference
+from msgs_slam.formats.jsonfile import read_json_object, write_json
+from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.outcome import Outcome
+from msgs_slam.pipelines.run_folder import WORLD, RunFolder
+from msgs_slam.pipelines.stored import reading
+from msgs_slam.pipelines.upright.find import Upright, cameras_up
+from msgs_slam.pipelines.upright.georeference import Georeference
 
 Array = NDArray[np.float64]
 

@@ -25,11 +25,11 @@ import click
 import numpy as np
 from click.testing import CliRunner, Result
 
-from formats.digest import file_sha256
-from msgs_cli.main import main as msgs_slam
-from pipelines.run_folder import RunFolder
-from pipelines.run_folder_names import STAGES
-from pipelines.viewer import Viewer
+from msgs_slam.formats.digest import file_sha256
+from msgs_slam.msgs_cli.main import main as msgs_slam
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run_folder_names import STAGES
+from msgs_slam.pipelines.viewer import Viewer
 
 PORT = 18097
 Damage = Callable[[Path, Path], None]

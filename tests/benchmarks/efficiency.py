@@ -28,13 +28,13 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 os.environ["PYTHONPATH"] = str(ROOT)  # of the nodes, as an installed program is found
 
-from msgs_cli.options import worker_setup
-from pipelines.demo import unpack_demo_clip
-from pipelines.engines import Call, Ended, Engine, RayEngine
-from pipelines.progress import SilentProgress
-from pipelines.reconstruct import resume
-from pipelines.run_folder import RunFolder
-from pipelines.workers import Workers
+from msgs_slam.msgs_cli.options import worker_setup
+from msgs_slam.pipelines.demo import unpack_demo_clip
+from msgs_slam.pipelines.engines import Call, Ended, Engine, RayEngine
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.reconstruct import resume
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.workers import Workers
 from tests.benchmarks.shards import SETTINGS, msgs_slam
 from tests.benchmarks.task_graph import makespan
 

@@ -40,7 +40,7 @@ JOBS = {
 
 def msgs_slam(*arguments: object) -> None:
     """Run the tool as a user does; its errors end this script."""
-    subprocess.run([sys.executable, "-m", "msgs_cli.main", *map(str, arguments)], check=True, stdout=sys.stderr)
+    subprocess.run([sys.executable, "-m", "msgs_slam", *map(str, arguments)], check=True, stdout=sys.stderr)
 
 
 def run_job(name: str, job: Job, work: Path) -> dict[str, Any]:

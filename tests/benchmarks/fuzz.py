@@ -32,7 +32,7 @@ sys.path[:0] = [str(p) for p in (ROOT, TESTS / "damage", TESTS / "pipelines", TE
 from damage_doors import DOORS, Door, Nonsense  # noqa: E402
 from damage_mutate import damage  # noqa: E402
 
-from formats.errors import InputError  # noqa: E402
+from msgs_slam.formats.errors import InputError  # noqa: E402
 
 SECONDS, RESIDENT_MB, EXTRA_BYTES = 20, 2000, 4 << 30
 FINE = ("accepted", "refused")

@@ -20,13 +20,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from formats.gps import enu_from_geodetic, photo_places
-from pipelines.frames.source import FolderSource, open_source
-from pipelines.outcome import load_outcome
-from pipelines.records import load_source
-from pipelines.run_folder import RunFolder
-from pipelines.upright.georeference import georeference
-from pipelines.upright.world import load_world
+from msgs_slam.formats.gps import enu_from_geodetic, photo_places
+from msgs_slam.pipelines.frames.source import FolderSource, open_source
+from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.records import load_source
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.upright.georeference import georeference
+from msgs_slam.pipelines.upright.world import load_world
 
 Array = NDArray[np.float64]
 WRONG, OFF = 12, np.array([500.0, 0, 0])

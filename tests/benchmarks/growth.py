@@ -27,20 +27,20 @@ sys.path.insert(0, str(ROOT))
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.config import GlobalBaConfig
-from pipelines.correspondence.retrieval import Looks, far_apart, loop_pairs, unit
-from pipelines.depth.align import fit_fields
-from pipelines.depth.posed import PosedDepth, neighbours
-from pipelines.depth.see_through import contradicted
-from pipelines.geometry import se3
-from pipelines.geometry.camera import pixel_centers, project
-from pipelines.global_ba.candidates import loop_candidates
-from pipelines.global_ba.semantics import summarise_labels
-from pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
-from pipelines.structure.bundle import adjust_bundle
-from pipelines.tracking.adjust import make_bundle
-from pipelines.tracking.state import TrackState
-from pipelines.types import Intrinsics, SparseModel
+from msgs_slam.pipelines.config import GlobalBaConfig
+from msgs_slam.pipelines.correspondence.retrieval import Looks, far_apart, loop_pairs, unit
+from msgs_slam.pipelines.depth.align import fit_fields
+from msgs_slam.pipelines.depth.posed import PosedDepth, neighbours
+from msgs_slam.pipelines.depth.see_through import contradicted
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.camera import pixel_centers, project
+from msgs_slam.pipelines.global_ba.candidates import loop_candidates
+from msgs_slam.pipelines.global_ba.semantics import summarise_labels
+from msgs_slam.pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
+from msgs_slam.pipelines.structure.bundle import adjust_bundle
+from msgs_slam.pipelines.tracking.adjust import make_bundle
+from msgs_slam.pipelines.tracking.state import TrackState
+from msgs_slam.pipelines.types import Intrinsics, SparseModel
 from tests.world.building import HEIGHT, LENGTH, ROOM_WIDTH, Walk, module_at
 
 CAMERA = Intrinsics(320, 240, 272.0, 272.0, 160.0, 120.0)

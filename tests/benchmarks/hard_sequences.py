@@ -151,7 +151,7 @@ def replica_fast(folder: Path, data: Path) -> Array:
 
 def whiteroom_fast(folder: Path, data: Path) -> Array:
     """The white room in steps of 10 to 17 degrees; most of it has hardly any texture."""
-    from formats.video import iter_video
+    from msgs_slam.formats.video import iter_video
 
     steps = np.cumsum(np.random.default_rng(4).integers(12, 17, 40))
     poses = np.loadtxt(data / "whiteroom/traj.txt").reshape(-1, 4, 4)

@@ -69,7 +69,7 @@ def command(*arguments: object, before: Act | None = None, powerless: bool = Fal
             ctypes.CDLL(None).capset(struct.pack("Ii", CAPABILITIES_3, 0), bytes(24))
         if before is not None:
             before()
-        from msgs_cli.main import main
+        from msgs_slam.msgs_cli.main import main
 
         try:
             main([str(a) for a in arguments])
@@ -196,7 +196,7 @@ def settings() -> list[str]:
 
 def digests_of(run: Path, stage: str) -> dict[str, str]:
     """Of the files of one stage."""
-    from pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.run_folder import RunFolder
 
     return {name: digest for name, digest in digests(RunFolder(run)).items() if name.startswith(f"{stage}/")}
 
@@ -320,7 +320,7 @@ def prepare(work: Path) -> None:
 
 def begin_all(work: Path, source: Path) -> dict[str, Path]:
     """Stage → a run of which everything before that stage is done."""
-    from pipelines.run_folder_names import STAGES
+    from msgs_slam.pipelines.run_folder_names import STAGES
 
     whole, begun = work / "whole.msgs", {}
     shutil.rmtree(whole, ignore_errors=True)
@@ -360,8 +360,8 @@ def main() -> None:
     disk = work / "disk"
     disk.mkdir(parents=True, exist_ok=True)
     os.environ["MSGS_SLAM_CACHE"] = str(work / "no_networks")
-    from pipelines.reconstruct import all_stages
-    from pipelines.stage_identity import stage_identity
+    from msgs_slam.pipelines.reconstruct import all_stages
+    from msgs_slam.pipelines.stage_identity import stage_identity
 
     for stage in all_stages():  # what every child would read again
         stage_identity(stage.name, stage.file)

@@ -29,16 +29,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from formats.digest import file_sha256
-from formats.jsonfile import read_json_object, write_json
-from formats.video_writer import write_video
-from pipelines.config import Config, load_config
-from pipelines.progress import SilentProgress
-from pipelines.reconstruct import all_stages, reconstruct, resume
-from pipelines.run_folder import RunFolder
-from pipelines.run_folder_names import STAGES
-from pipelines.settings_file import load_settings
-from pipelines.stage_identity import stage_identity
+from msgs_slam.formats.digest import file_sha256
+from msgs_slam.formats.jsonfile import read_json_object, write_json
+from msgs_slam.formats.video_writer import write_video
+from msgs_slam.pipelines.config import Config, load_config
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.reconstruct import all_stages, reconstruct, resume
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run_folder_names import STAGES
+from msgs_slam.pipelines.settings_file import load_settings
+from msgs_slam.pipelines.stage_identity import stage_identity
 from tests.world import ClipOptions, iter_clip, make_world
 
 SETTINGS = (

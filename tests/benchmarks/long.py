@@ -31,11 +31,11 @@ sys.path.insert(0, str(ROOT))
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.images import read_rgb
-from formats.video_writer import write_video
-from pipelines.geometry.alignment import align_points
-from pipelines.run_folder import RunFolder
-from pipelines.run_folder_names import STAGES
+from msgs_slam.formats.images import read_rgb
+from msgs_slam.formats.video_writer import write_video
+from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run_folder_names import STAGES
 from tests.world import ClipOptions, write_sequence
 from tests.world.building import Walk, around, frames
 
@@ -55,7 +55,7 @@ def make_clip(folder: Path, walk: Walk, camera: dict[str, Any]) -> tuple[Path, P
 
 def msgs_slam(*arguments: object) -> None:
     """Run the tool as a user does; its errors end this script."""
-    subprocess.run([sys.executable, "-m", "msgs_cli.main", *map(str, arguments)], check=True, stdout=sys.stderr)
+    subprocess.run([sys.executable, "-m", "msgs_slam", *map(str, arguments)], check=True, stdout=sys.stderr)
 
 
 def cpu_seconds() -> float:

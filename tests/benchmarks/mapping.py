@@ -30,14 +30,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.datasets import open_sequence
-from pipelines.config import load_config
-from pipelines.evaluation.ablation import ABLATIONS as ARTICLE_ABLATIONS
-from pipelines.evaluation.evaluate import evaluate_run
-from pipelines.progress import SilentProgress
-from pipelines.reconstruct import reconstruct
-from pipelines.records import load_records
-from pipelines.run_folder import RunFolder
+from msgs_slam.formats.datasets import open_sequence
+from msgs_slam.pipelines.config import load_config
+from msgs_slam.pipelines.evaluation.ablation import ABLATIONS as ARTICLE_ABLATIONS
+from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.reconstruct import reconstruct
+from msgs_slam.pipelines.records import load_records
+from msgs_slam.pipelines.run_folder import RunFolder
 
 
 @dataclass(frozen=True)

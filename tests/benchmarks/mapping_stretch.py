@@ -29,19 +29,19 @@ import torch
 from mapping import ABLATIONS, noisy_depth, noisy_labels
 from numpy.typing import NDArray
 
-from formats.datasets import Sequence, open_sequence
-from pipelines.config import Config, load_config
-from pipelines.depth.align import fit_fields
-from pipelines.depth.fields import FINE, field_scales
-from pipelines.evaluation.depth_error import DepthErrorSum
-from pipelines.evaluation.image_quality import psnr, ssim
-from pipelines.evaluation.label_score import count_labels, score
-from pipelines.evaluation.views import view_map
-from pipelines.mapping.load import without_contradicted_depth
-from pipelines.mapping.optimise import optimise_map
-from pipelines.mapping.views import View, make_view, occurring_classes
-from pipelines.streamed import Streamed
-from pipelines.types import VOID, Intrinsics, ProxyMaps
+from msgs_slam.formats.datasets import Sequence, open_sequence
+from msgs_slam.pipelines.config import Config, load_config
+from msgs_slam.pipelines.depth.align import fit_fields
+from msgs_slam.pipelines.depth.fields import FINE, field_scales
+from msgs_slam.pipelines.evaluation.depth_error import DepthErrorSum
+from msgs_slam.pipelines.evaluation.image_quality import psnr, ssim
+from msgs_slam.pipelines.evaluation.label_score import count_labels, score
+from msgs_slam.pipelines.evaluation.views import view_map
+from msgs_slam.pipelines.mapping.load import without_contradicted_depth
+from msgs_slam.pipelines.mapping.optimise import optimise_map
+from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes
+from msgs_slam.pipelines.streamed import Streamed
+from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 
 
 @dataclass(frozen=True)

@@ -22,19 +22,19 @@ from typing import Any
 
 import numpy as np
 
-from formats.datasets import open_sequence
-from formats.trajectory import read_matrices
-from pipelines.geometry.alignment import align_points
-from pipelines.metres.evidence import Evidence, combine
-from pipelines.metres.find import Machine, Seen, describe, load_seen, usual_evidence
-from pipelines.progress import SilentProgress
-from pipelines.proxy.models.registry import ModelStore
-from pipelines.proxy.networks.labels_provider import OnnxLabels
-from pipelines.proxy.networks.network_pass import ResultCache, Workplace
-from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.sequence import Sequence, map_intrinsics
-from pipelines.run_folder import RunFolder
-from pipelines.types import Trajectory
+from msgs_slam.formats.datasets import open_sequence
+from msgs_slam.formats.trajectory import read_matrices
+from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.metres.evidence import Evidence, combine
+from msgs_slam.pipelines.metres.find import Machine, Seen, describe, load_seen, usual_evidence
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.proxy.models.registry import ModelStore
+from msgs_slam.pipelines.proxy.networks.labels_provider import OnnxLabels
+from msgs_slam.pipelines.proxy.networks.network_pass import ResultCache, Workplace
+from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.sequence import Sequence, map_intrinsics
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.types import Trajectory
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
@@ -63,7 +63,7 @@ def reconstruct(name: str, work: Path) -> RunFolder:
     """The run of a job until tracking; its errors end this script."""
     job, run = JOBS[name], RunFolder(work / f"{name}.msgs")
     if not (run.stage("tracking") / "trajectory.npz").exists():
-        command = [sys.executable, "-m", "msgs_cli.main", "reconstruct", DATA / job.source, "--out", run.root]
+        command = [sys.executable, "-m", "msgs_slam", "reconstruct", DATA / job.source, "--out", run.root]
         rest = ["--until", "tracking", "-q", *job.options]
         subprocess.run([*map(str, command), *rest], check=True, stdout=sys.stderr)
     return run
@@ -75,7 +75,7 @@ def true_scale(run: RunFolder, trajectory: Trajectory, truth: Path) -> float:
     if truth.suffix == ".txt":  # a pose for every frame of the video
         true = read_matrices(truth)[[f.source_index for f in frames]]
     else:
-        from pipelines.evaluation.truth import match_truth
+        from msgs_slam.pipelines.evaluation.truth import match_truth
 
         true = match_truth(frames, truth.name == "replica_office0", open_sequence(truth)).world_from_cam
     usable = trajectory.is_posed & np.isfinite(true).all(axis=(1, 2))

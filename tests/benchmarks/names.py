@@ -34,27 +34,27 @@ from numpy.typing import NDArray
 from proxy import TimedProgress
 from scipy.spatial import cKDTree
 
-from formats.datasets import Sequence, open_sequence
-from formats.images import write_rgb
-from formats.mesh import read_mesh_ply
-from pipelines.config import ProxyConfig, load_config
-from pipelines.depth.resize import resample_nearest
-from pipelines.evaluation.class_map import Matching, match_classes
-from pipelines.evaluation.label_score import count_labels, score
-from pipelines.evaluation.measure import render_outcome
-from pipelines.evaluation.pictures import Picture, label_picture
-from pipelines.evaluation.truth import match_truth
-from pipelines.frames.source_pixels import FramePixels
-from pipelines.geometry.camera import unproject_depth
-from pipelines.outcome import Outcome, load_outcome
-from pipelines.proxy.networks.labels import network_labels
-from pipelines.proxy.networks.session import Network
-from pipelines.proxy.palette import class_colors
-from pipelines.proxy.selection import choose_semantics
-from pipelines.reconstruct import reconstruct
-from pipelines.run_folder import RunFolder
-from pipelines.types import VOID, ClassTable
-from pipelines.upright.world import FIRST, load_world
+from msgs_slam.formats.datasets import Sequence, open_sequence
+from msgs_slam.formats.images import write_rgb
+from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.pipelines.config import ProxyConfig, load_config
+from msgs_slam.pipelines.depth.resize import resample_nearest
+from msgs_slam.pipelines.evaluation.class_map import Matching, match_classes
+from msgs_slam.pipelines.evaluation.label_score import count_labels, score
+from msgs_slam.pipelines.evaluation.measure import render_outcome
+from msgs_slam.pipelines.evaluation.pictures import Picture, label_picture
+from msgs_slam.pipelines.evaluation.truth import match_truth
+from msgs_slam.pipelines.frames.source_pixels import FramePixels
+from msgs_slam.pipelines.geometry.camera import unproject_depth
+from msgs_slam.pipelines.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.proxy.networks.labels import network_labels
+from msgs_slam.pipelines.proxy.networks.session import Network
+from msgs_slam.pipelines.proxy.palette import class_colors
+from msgs_slam.pipelines.proxy.selection import choose_semantics
+from msgs_slam.pipelines.reconstruct import reconstruct
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.types import VOID, ClassTable
+from msgs_slam.pipelines.upright.world import FIRST, load_world
 
 DATA = ROOT.parent / "shared" / "data"
 SOURCES = {

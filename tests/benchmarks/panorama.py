@@ -21,13 +21,13 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from formats.images import write_rgb
-from pipelines.geometry import se3
-from pipelines.geometry.alignment import Similarity, align_points
-from pipelines.geometry.rig import CUBE, rig_of
-from pipelines.outcome import load_outcome
-from pipelines.run_folder import RunFolder
-from pipelines.upright.world import load_world
+from msgs_slam.formats.images import write_rgb
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
+from msgs_slam.pipelines.geometry.rig import CUBE, rig_of
+from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.upright.world import load_world
 from tests.world.build import World
 from tests.world.clip import ClipOptions, make_world, render_frame, render_view, walk
 from tests.world.panorama import render_panorama
@@ -49,7 +49,7 @@ def film(out: Path, world: World, steps: Array, width: int) -> None:
 
 
 def reconstruct(source: Path, run: Path, more: list[str]) -> None:
-    command = [sys.executable, "-m", "msgs_cli.main", "reconstruct", str(source), "--out", str(run), *more]
+    command = [sys.executable, "-m", "msgs_slam", "reconstruct", str(source), "--out", str(run), *more]
     subprocess.run(command, check=True)
 
 

@@ -30,21 +30,21 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from formats.images import read_depth_png, read_rgb, write_grey_png, write_rgb
-from pipelines.config import load_config
-from pipelines.evaluation.image_quality import psnr
-from pipelines.evaluation.measure import render_outcome
-from pipelines.frames.source_pixels import FramePixels
-from pipelines.geometry.alignment import Similarity, align_points
-from pipelines.geometry.camera import project, unproject_depth
-from pipelines.outcome import Outcome, load_outcome
-from pipelines.progress import SilentProgress
-from pipelines.proxy.models.registry import ModelStore
-from pipelines.proxy.networks.person import person_probability
-from pipelines.proxy.networks.session import Network
-from pipelines.reconstruct import reconstruct
-from pipelines.run_folder import RunFolder
-from pipelines.types import Intrinsics
+from msgs_slam.formats.images import read_depth_png, read_rgb, write_grey_png, write_rgb
+from msgs_slam.pipelines.config import load_config
+from msgs_slam.pipelines.evaluation.image_quality import psnr
+from msgs_slam.pipelines.evaluation.measure import render_outcome
+from msgs_slam.pipelines.frames.source_pixels import FramePixels
+from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
+from msgs_slam.pipelines.geometry.camera import project, unproject_depth
+from msgs_slam.pipelines.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.proxy.models.registry import ModelStore
+from msgs_slam.pipelines.proxy.networks.person import person_probability
+from msgs_slam.pipelines.proxy.networks.session import Network
+from msgs_slam.pipelines.reconstruct import reconstruct
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.types import Intrinsics
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 CAMERA = Intrinsics(640, 480, 525.0, 525.0, 320.0, 240.0)

@@ -35,12 +35,12 @@ import torch
 from render_scenes import room
 from torch import Tensor
 
-from pipelines.gaussians.render import composite, render, set_threads, track_gn
-from pipelines.gaussians.render.compositing import choose_backend
-from pipelines.gaussians.render.rendering import project_map
-from pipelines.geometry import se3
-from pipelines.mapping import losses
-from pipelines.mapping.photo_loss import photo_loss
+from msgs_slam.pipelines.gaussians.render import composite, render, set_threads, track_gn
+from msgs_slam.pipelines.gaussians.render.compositing import choose_backend
+from msgs_slam.pipelines.gaussians.render.rendering import project_map
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.mapping import losses
+from msgs_slam.pipelines.mapping.photo_loss import photo_loss
 
 ROWS = [(320, 240, 50_000, 8), (320, 240, 200_000, 8), (640, 480, 200_000, 8), (640, 480, 200_000, 40)]
 WANTED = [8.2, 8.8, 12.3, 7.9]
@@ -254,7 +254,7 @@ FIRST_USE = """
 import sys, time; sys.path[:0] = {paths}
 import torch
 from render_scenes import random_gaussians
-from pipelines.gaussians.render import composite
+from msgs_slam.pipelines.gaussians.render import composite
 scene = {{k: x.requires_grad_() for k, x in random_gaussians(100, 40, 30, 11, 0).items()}}
 start = time.perf_counter(), time.process_time()
 composite(**scene, width=40, height=30).features.sum().backward()

@@ -23,9 +23,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from formats.digest import file_sha256
-from pipelines.demo import unpack_demo_clip
-from pipelines.run_folder_names import STAGES
+from msgs_slam.formats.digest import file_sha256
+from msgs_slam.pipelines.demo import unpack_demo_clip
+from msgs_slam.pipelines.run_folder_names import STAGES
 
 SETTINGS = (
     "run.threads=1", "frames.rate=4", "frames.max_features=600", "proxy.stereo_side=96", "proxy.stereo_planes=24",
@@ -35,7 +35,7 @@ SETTINGS = (
 
 def msgs_slam(*arguments: object) -> list[str]:
     """The command, for subprocess."""
-    return [sys.executable, "-m", "msgs_cli.main", *map(str, arguments), "-q"]
+    return [sys.executable, "-m", "msgs_slam", *map(str, arguments), "-q"]
 
 
 def beginning(video: Path, run: Path, until: str, *more: str) -> list[str]:

@@ -16,14 +16,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.datasets import open_sequence
-from formats.gaussians import GaussianCloud
-from pipelines.evaluation.truth import MatchedTruth, match_truth
-from pipelines.export.writers import map_cloud
-from pipelines.geometry.alignment import align_points
-from pipelines.outcome import Outcome, load_outcome
-from pipelines.run_folder import RunFolder
-from pipelines.viewer_tape import Touch, tape, touch
+from msgs_slam.formats.datasets import open_sequence
+from msgs_slam.formats.gaussians import GaussianCloud
+from msgs_slam.pipelines.evaluation.truth import MatchedTruth, match_truth
+from msgs_slam.pipelines.export.writers import map_cloud
+from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.viewer_tape import Touch, tape, touch
 
 Array = NDArray[np.float64]
 

@@ -30,21 +30,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from formats.datasets import open_sequence
-from pipelines.config import ArticleConfig, MappingConfig
-from pipelines.evaluation.truth import match_truth
-from pipelines.geometry import se3
-from pipelines.geometry.alignment import align_points
-from pipelines.global_ba.local import adjust_views
-from pipelines.mapping import schedule
-from pipelines.mapping.load import MappingInput, load_view, load_views
-from pipelines.mapping.measure import mean_figures, measure_view
-from pipelines.mapping.optimise import optimise_map, scene_depth
-from pipelines.mapping.views import View
-from pipelines.proxy.reliability import GAMMA, theta
-from pipelines.records import load_source
-from pipelines.run_folder import RunFolder
-from pipelines.types import Trajectory
+from msgs_slam.formats.datasets import open_sequence
+from msgs_slam.pipelines.config import ArticleConfig, MappingConfig
+from msgs_slam.pipelines.evaluation.truth import match_truth
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.global_ba.local import adjust_views
+from msgs_slam.pipelines.mapping import schedule
+from msgs_slam.pipelines.mapping.load import MappingInput, load_view, load_views
+from msgs_slam.pipelines.mapping.measure import mean_figures, measure_view
+from msgs_slam.pipelines.mapping.optimise import optimise_map, scene_depth
+from msgs_slam.pipelines.mapping.views import View
+from msgs_slam.pipelines.proxy.reliability import GAMMA, theta
+from msgs_slam.pipelines.records import load_source
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.types import Trajectory
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},

@@ -19,15 +19,15 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from formats.images import read_rgb, write_rgb
-from formats.mesh import read_mesh_ply
-from pipelines.evaluation.image_quality import psnr
-from pipelines.geometry.camera import project
-from pipelines.jit import kernel
-from pipelines.outcome import load_outcome
-from pipelines.run_folder import RunFolder
-from pipelines.types import Intrinsics
-from pipelines.upright.world import read_world
+from msgs_slam.formats.images import read_rgb, write_rgb
+from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.pipelines.evaluation.image_quality import psnr
+from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.jit import kernel
+from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.types import Intrinsics
+from msgs_slam.pipelines.upright.world import read_world
 
 SAMPLES = 2
 """A side of a pixel."""

@@ -25,15 +25,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.datasets import Sequence, open_sequence
-from pipelines.config import load_config
-from pipelines.depth.resize import resample_nearest
-from pipelines.evaluation.evaluate import evaluate_run
-from pipelines.evaluation.measure import render_outcome
-from pipelines.outcome import load_outcome
-from pipelines.progress import SilentProgress
-from pipelines.reconstruct import reconstruct
-from pipelines.run_folder import RunFolder
+from msgs_slam.formats.datasets import Sequence, open_sequence
+from msgs_slam.pipelines.config import load_config
+from msgs_slam.pipelines.depth.resize import resample_nearest
+from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
+from msgs_slam.pipelines.evaluation.measure import render_outcome
+from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.reconstruct import reconstruct
+from msgs_slam.pipelines.run_folder import RunFolder
 from tests.world import ClipOptions, make_world, write_sequence
 from tests.world.stairwell import BAR
 

@@ -156,8 +156,8 @@ def write_walk(folder: Path, layout: str, frames: int, laps: float) -> Path:
 
 def measure_ours(name: str, work: Path, settings: Sequence[str], until: str) -> dict[str, Any]:
     """Run the stages and compare the trajectory with the truth."""
-    from pipelines.config import load_config
-    from pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.config import load_config
+    from msgs_slam.pipelines.run_folder import RunFolder
 
     case = walk_case(name, work) if name.startswith("walk_") else cases(work)[name]
     source = prepare(name, case, work)
@@ -185,10 +185,10 @@ def run_stages_timed(
     source: Path, run: Any, config: Any, until: str
 ) -> tuple[dict[str, Any], dict[str, dict[str, float]]]:
     """The stages' records, and what each took; of a stage that is up to date, what it took when it ran."""
-    from pipelines.progress import SilentProgress
-    from pipelines.reconstruct import reconstruct
-    from pipelines.records import load_records
-    from pipelines.run_folder_names import STAGES
+    from msgs_slam.pipelines.progress import SilentProgress
+    from msgs_slam.pipelines.reconstruct import reconstruct
+    from msgs_slam.pipelines.records import load_records
+    from msgs_slam.pipelines.run_folder_names import STAGES
 
     stored = run.root.with_suffix(".seconds.json")
     seconds = json.loads(stored.read_text()) if stored.exists() else {}
@@ -206,8 +206,8 @@ def run_stages_timed(
 @contextmanager
 def adjustment_timed() -> Iterator[list[float]]:
     """CPU seconds of every adjustment of all keyframes together while this is open."""
-    from pipelines.structure import sfm
-    from pipelines.tracking import stage
+    from msgs_slam.pipelines.structure import sfm
+    from msgs_slam.pipelines.tracking import stage
 
     spent: list[float] = []
 
@@ -247,7 +247,7 @@ def original_names(source: Path, frames: Sequence[Any]) -> list[str]:
     """Names of the frames' pictures in a folder; nothing for a video."""
     if source.is_file():
         return [""] * len(frames)
-    from formats.images import list_images
+    from msgs_slam.formats.images import list_images
 
     names = [p.name for p in list_images(source)]
     return [names[f.source_index] for f in frames]
@@ -260,7 +260,7 @@ def errors(
     metric: bool,
 ) -> dict[str, Any]:
     """Frames posed, ATE after Sim(3), after SE(3) where metric, scale error; centimetres and per cent."""
-    from pipelines.geometry.alignment import align_points
+    from msgs_slam.pipelines.geometry.alignment import align_points
 
     out: dict[str, Any] = {"posed": int(posed.sum()), "frames": len(posed)}
     use = posed & np.array([t is not None for t in truth])
@@ -289,7 +289,7 @@ def measure_colmap(name: str, work: Path, mapper: str) -> dict[str, Any]:
     """
     import pycolmap
 
-    from pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.run_folder import RunFolder
 
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     case = cases(work)[name]
@@ -349,7 +349,7 @@ def in_process(job: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str,
 
 
 def _answer(sender: Any, job: Callable[..., dict[str, Any]], arguments: tuple[Any, ...]) -> None:
-    from formats.errors import InputError
+    from msgs_slam.formats.errors import InputError
 
     try:
         row = job(*arguments)

@@ -23,12 +23,12 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from formats.datasets import open_sequence
-from pipelines.evaluation.truth import match_truth
-from pipelines.geometry import se3
-from pipelines.outcome import load_outcome
-from pipelines.run_folder import RunFolder
-from pipelines.types import Intrinsics
+from msgs_slam.formats.datasets import open_sequence
+from msgs_slam.pipelines.evaluation.truth import match_truth
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
 POINTS, LEAST_VIEWS, ROUNDS, NOISE = 3000, 4, 4, 4.0

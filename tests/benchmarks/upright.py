@@ -18,14 +18,14 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from formats.datasets import open_sequence
-from pipelines.evaluation.mesh_cells import true_surface
-from pipelines.evaluation.trajectory_error import absolute_error
-from pipelines.evaluation.truth import match_truth
-from pipelines.outcome import load_outcome
-from pipelines.run_folder import RunFolder
-from pipelines.upright.find import find_upright
-from pipelines.upright.world import upright_world
+from msgs_slam.formats.datasets import open_sequence
+from msgs_slam.pipelines.evaluation.mesh_cells import true_surface
+from msgs_slam.pipelines.evaluation.trajectory_error import absolute_error
+from msgs_slam.pipelines.evaluation.truth import match_truth
+from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.upright.find import find_upright
+from msgs_slam.pipelines.upright.world import upright_world
 
 
 def main() -> None:

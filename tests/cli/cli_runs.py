@@ -6,7 +6,7 @@ from pathlib import Path
 
 from click.testing import CliRunner, Result
 
-from msgs_cli.main import main
+from msgs_slam.msgs_cli.main import main
 from tests.world import ClipOptions
 
 QUICK = (
@@ -46,8 +46,7 @@ def elsewhere(root: Path) -> dict[str, str]:
         (root / name).mkdir()
     places = {"HOME": root / "home", "XDG_CACHE_HOME": root / "home" / "cache", "TMPDIR": root / "temporary"}
     places |= {"NUMBA_CACHE_DIR": kernels(), "MSGS_SLAM_CACHE": root / "home" / "models"}
-    paths = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")]
-    return os.environ | {k: str(v) for k, v in places.items()} | {"PYTHONPATH": os.pathsep.join(paths)}
+    return os.environ | {k: str(v) for k, v in places.items()}
 
 
 def files_below(*folders: Path) -> dict[str, int]:

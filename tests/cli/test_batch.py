@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from formats.errors import InputError
-from formats.images import write_rgb
-from msgs_cli.main import main
-from pipelines import batch, workers
-from pipelines.batch import DONE, ELSEWHERE, FAILED, Job, Recording, Shard, find_recordings, work_on
-from pipelines.engines import Call, Ended
-from pipelines.lock import locked
-from pipelines.progress import SilentProgress
-from pipelines.run_folder import RunFolder
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import write_rgb
+from msgs_slam.msgs_cli.main import main
+from msgs_slam.pipelines import batch, workers
+from msgs_slam.pipelines.batch import DONE, ELSEWHERE, FAILED, Job, Recording, Shard, find_recordings, work_on
+from msgs_slam.pipelines.engines import Call, Ended
+from msgs_slam.pipelines.lock import locked
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.run_folder import RunFolder
 from tests.pipelines.frames.conftest import QUICK, render, sideways
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from msgs_cli.main import main
-from pipelines import doctor
-from pipelines.doctor import BAD, GOOD, NOTE, Finding, examine
+from msgs_slam.msgs_cli.main import main
+from msgs_slam.pipelines import doctor
+from msgs_slam.pipelines.doctor import BAD, GOOD, NOTE, Finding, examine
 
 
 def found(name: str, folder: Path) -> Finding:

@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 from cli_runs import elsewhere, files_below
 
-from formats.video_writer import write_video
-from pipelines.run_folder_names import STAGES
+from msgs_slam.formats.video_writer import write_video
+from msgs_slam.pipelines.run_folder_names import STAGES
 from tests.world import ClipOptions, iter_clip, make_world
 
 SETTINGS = (
@@ -35,7 +35,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def start(environment: dict[str, str], *arguments: object) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "msgs_cli.main", *map(str, arguments)]
+    command = [sys.executable, "-m", "msgs_slam", *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment)
 
 

@@ -12,14 +12,14 @@ from typing import ClassVar
 import pytest
 from cli_runs import FinishedRun, invoke
 
-from formats.errors import DiskFullError, InputError
-from formats.video_writer import write_video
-from pipelines import lock, records, stages
-from pipelines.run_folder import RunFolder
-from pipelines.stages import forget_peak, peak_memory_mb
-from pipelines.stopping import Stopped, is_asked, soft_stop, stop_if_asked
+from msgs_slam.formats.errors import DiskFullError, InputError
+from msgs_slam.formats.video_writer import write_video
+from msgs_slam.pipelines import lock, records, stages
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.stages import forget_peak, peak_memory_mb
+from msgs_slam.pipelines.stopping import Stopped, is_asked, soft_stop, stop_if_asked
 
-COMMAND = [sys.executable, "-m", "msgs_cli.main"]
+COMMAND = [sys.executable, "-m", "msgs_slam"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

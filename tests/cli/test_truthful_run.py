@@ -12,19 +12,19 @@ from pathlib import Path
 import pytest
 from cli_runs import OPTIONS, FinishedRun, invoke
 
-from formats.errors import InputError
-from pipelines.config import Config
-from pipelines.frames.source import source_digest
-from pipelines.lock import locked
-from pipelines.progress import SilentProgress
-from pipelines.reconstruct import made_with, reconstruct
-from pipelines.records import load_records
-from pipelines.run_folder import RunFolder
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.frames.source import source_digest
+from msgs_slam.pipelines.lock import locked
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.reconstruct import made_with, reconstruct
+from msgs_slam.pipelines.records import load_records
+from msgs_slam.pipelines.run_folder import RunFolder
 
 
 def interrupt_when(reached: Callable[[], bool], *arguments: object) -> subprocess.CompletedProcess[str]:
     """Start the command in a process of its own and press Ctrl-C as soon as `reached`."""
-    command = [sys.executable, "-m", "msgs_cli.main", *map(str, arguments)]
+    command = [sys.executable, "-m", "msgs_slam", *map(str, arguments)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     while process.poll() is None and not reached():
         time.sleep(0.005)

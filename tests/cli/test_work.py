@@ -7,9 +7,9 @@ from pathlib import Path
 
 from cli_runs import invoke
 
-from formats.digest import file_sha256
-from pipelines.records import load_records
-from pipelines.run_folder import RunFolder
+from msgs_slam.formats.digest import file_sha256
+from msgs_slam.pipelines.records import load_records
+from msgs_slam.pipelines.run_folder import RunFolder
 
 DIVIDED = ("--set", "mapping.submap=5", "--until", "mapping", "-q")
 
@@ -27,7 +27,7 @@ def test_two_shards_at_a_time_leave_what_one_process_does(copied_run: Callable[[
         assert invoke("resume", run, "--set", "mapping.submap=5", "--until", "tracking", "-q").exit_code == 0
     found = invoke("work", alone, "--shard", "15/16", "--until", "mapping", "-q")
     assert found.exit_code == 0, found.stderr
-    command = [sys.executable, "-m", "msgs_cli.main", "work", str(both), "--until", "mapping", "-q", "--shard"]
+    command = [sys.executable, "-m", "msgs_slam", "work", str(both), "--until", "mapping", "-q", "--shard"]
     processes = [subprocess.Popen([*command, f"{k}/2"]) for k in range(2)]
     assert [p.wait(timeout=300) for p in processes] == [0, 0]
     assert load_records(RunFolder(whole))["mapping"].figures["submaps"] == 3

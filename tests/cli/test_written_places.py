@@ -11,7 +11,7 @@ from cli_runs import FinishedRun, elsewhere, files_below
 ALL_OF_THEM = """
 import json, sys
 from click.testing import CliRunner
-from msgs_cli.main import main
+from msgs_slam.msgs_cli.main import main
 for arguments in json.loads(sys.argv[1]):
     done = CliRunner().invoke(main, arguments)
     assert done.exit_code == 0, (arguments, done.output, done.exception)

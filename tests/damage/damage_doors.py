@@ -29,19 +29,19 @@ from tiny_tflite import write_tflite
 from tokenizers import Tokenizer, normalizers, pre_tokenizers, trainers
 from tokenizers import models as tokenizer_models
 
-from formats.colmap import read_colmap_model, write_colmap_model
-from formats.compact_gaussians import write_compact
-from formats.datasets import Camera, Sequence, open_sequence, recognise_source
-from formats.datasets.classes_json import read_classes_json
-from formats.datasets.intrinsics_json import read_intrinsics_json
-from formats.datasets.scannet_labels import read_nyu40_classes
-from formats.errors import InputError
-from formats.gaussian_files import read_gaussians
-from formats.gaussian_glb import write_gaussian_glb
-from formats.gaussian_ply import write_gaussian_ply
-from formats.gaussians import GaussianCloud
-from formats.image_times import read_image_times
-from formats.images import (
+from msgs_slam.formats.colmap import read_colmap_model, write_colmap_model
+from msgs_slam.formats.compact_gaussians import write_compact
+from msgs_slam.formats.datasets import Camera, Sequence, open_sequence, recognise_source
+from msgs_slam.formats.datasets.classes_json import read_classes_json
+from msgs_slam.formats.datasets.intrinsics_json import read_intrinsics_json
+from msgs_slam.formats.datasets.scannet_labels import read_nyu40_classes
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gaussian_files import read_gaussians
+from msgs_slam.formats.gaussian_glb import write_gaussian_glb
+from msgs_slam.formats.gaussian_ply import write_gaussian_ply
+from msgs_slam.formats.gaussians import GaussianCloud
+from msgs_slam.formats.image_times import read_image_times
+from msgs_slam.formats.images import (
     exif_focal_px,
     exif_time,
     image_size,
@@ -53,26 +53,26 @@ from formats.images import (
     write_grey_png,
     write_rgb,
 )  # fmt: skip
-from formats.jsonfile import read_toml, write_json
-from formats.mesh import MeshArrays, MeshBlocks, read_mesh_glb, read_mesh_ply, write_mesh_glb, write_mesh_ply
-from formats.spz import write_spz
-from formats.tensors import load_arrays, load_safetensors, load_tensors, save_arrays, save_tensors
-from formats.trajectory import read_matrices, read_tum, write_matrices, write_tum
-from formats.video import VideoReader, probe_video
-from formats.video_writer import write_video
-from pipelines.evaluation.class_map import read_class_map
-from pipelines.frames.source import open_source
-from pipelines.masks.files import open_masks
-from pipelines.proxy.files.classes import read_class_table
-from pipelines.proxy.files.depth import _read as read_depth_file
-from pipelines.proxy.models.registry import ModelStore
-from pipelines.proxy.networks.card import Card, read_card
-from pipelines.proxy.networks.head import load_linear_head
-from pipelines.proxy.networks.network_pass import ResultCache
-from pipelines.proxy.networks.session import Network
-from pipelines.proxy.networks.words import load_word_head, open_tokenizer, with_words
-from pipelines.structure.calibration import read_intrinsics
-from pipelines.viewer_scene import load_scenes
+from msgs_slam.formats.jsonfile import read_toml, write_json
+from msgs_slam.formats.mesh import MeshArrays, MeshBlocks, read_mesh_glb, read_mesh_ply, write_mesh_glb, write_mesh_ply
+from msgs_slam.formats.spz import write_spz
+from msgs_slam.formats.tensors import load_arrays, load_safetensors, load_tensors, save_arrays, save_tensors
+from msgs_slam.formats.trajectory import read_matrices, read_tum, write_matrices, write_tum
+from msgs_slam.formats.video import VideoReader, probe_video
+from msgs_slam.formats.video_writer import write_video
+from msgs_slam.pipelines.evaluation.class_map import read_class_map
+from msgs_slam.pipelines.frames.source import open_source
+from msgs_slam.pipelines.masks.files import open_masks
+from msgs_slam.pipelines.proxy.files.classes import read_class_table
+from msgs_slam.pipelines.proxy.files.depth import _read as read_depth_file
+from msgs_slam.pipelines.proxy.models.registry import ModelStore
+from msgs_slam.pipelines.proxy.networks.card import Card, read_card
+from msgs_slam.pipelines.proxy.networks.head import load_linear_head
+from msgs_slam.pipelines.proxy.networks.network_pass import ResultCache
+from msgs_slam.pipelines.proxy.networks.session import Network
+from msgs_slam.pipelines.proxy.networks.words import load_word_head, open_tokenizer, with_words
+from msgs_slam.pipelines.structure.calibration import read_intrinsics
+from msgs_slam.pipelines.viewer_scene import load_scenes
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 4
 

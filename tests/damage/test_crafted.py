@@ -20,17 +20,17 @@ import pytest
 from damage_doors import DOORS, make_colmap, make_images, make_truth
 from PIL import Image
 
-from formats.colmap import read_colmap_model
-from formats.datasets import open_sequence
-from formats.errors import InputError
-from formats.gaussian_files import read_gaussians
-from formats.images import write_rgb
-from formats.jsonfile import read_json, read_toml
-from formats.mesh import read_mesh_glb, read_mesh_ply
-from formats.tensors import load_arrays, load_safetensors, save_safetensors
-from formats.trajectory import read_matrices, read_tum
-from pipelines.frames.recording import RecordingSource
-from pipelines.frames.source import FolderSource, open_source, source_digest
+from msgs_slam.formats.colmap import read_colmap_model
+from msgs_slam.formats.datasets import open_sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gaussian_files import read_gaussians
+from msgs_slam.formats.images import write_rgb
+from msgs_slam.formats.jsonfile import read_json, read_toml
+from msgs_slam.formats.mesh import read_mesh_glb, read_mesh_ply
+from msgs_slam.formats.tensors import load_arrays, load_safetensors, save_safetensors
+from msgs_slam.formats.trajectory import read_matrices, read_tum
+from msgs_slam.pipelines.frames.recording import RecordingSource
+from msgs_slam.pipelines.frames.source import FolderSource, open_source, source_digest
 
 Read = Callable[[Path], Any]
 DEEP = 100_000

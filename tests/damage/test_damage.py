@@ -15,7 +15,7 @@ import pytest
 from damage_doors import DOORS, Door
 from damage_mutate import damage
 
-from formats.errors import InputError
+from msgs_slam.formats.errors import InputError
 
 CASES = 16
 SECONDS = 20

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from formats.atomic import atomic_path, write_bytes, write_text
-from formats.errors import DiskFullError, InputError, RecoverableError
+from msgs_slam.formats.atomic import atomic_path, write_bytes, write_text
+from msgs_slam.formats.errors import DiskFullError, InputError, RecoverableError
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -54,7 +54,7 @@ def test_killed_writer_leaves_the_old_file_and_is_cleaned_by_the_next(tmp_path: 
     path = tmp_path / "a.txt"
     write_text(path, "old")
     program = (
-        "import os, signal, sys; from pathlib import Path; from formats.atomic import atomic_path\n"
+        "import os, signal, sys; from pathlib import Path; from msgs_slam.formats.atomic import atomic_path\n"
         "with atomic_path(Path(sys.argv[1])) as t:\n"
         "    t.write_text('half'); os.kill(os.getpid(), signal.SIGKILL)"
     )
@@ -80,7 +80,8 @@ def _limit_file_size() -> None:
 
 def test_a_write_that_really_stops_half_way(tmp_path: Path) -> None:
     program = (
-        "import sys; from pathlib import Path; from formats.atomic import write_bytes; from formats.errors import *\n"
+        "import sys; from pathlib import Path; from msgs_slam.formats.atomic import write_bytes\n"
+        "from msgs_slam.formats.errors import *\n"
         "try: write_bytes(Path(sys.argv[1]), b'x' * 5000)\n"
         "except InputError as e: print(e); sys.exit(1)"
     )

@@ -11,8 +11,8 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from formats.colmap import ColmapModel, model_suffix, read_colmap_model, write_colmap_model
-from formats.errors import InputError
+from msgs_slam.formats.colmap import ColmapModel, model_suffix, read_colmap_model, write_colmap_model
+from msgs_slam.formats.errors import InputError
 
 WIDTH, HEIGHT, FX, FY, CX, CY = 640, 480, 525.0, 520.0, 321.0, 238.5
 

@@ -11,12 +11,12 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from formats.datasets import VOID_LABEL, Camera, Sequence, open_sequence, recognise
-from formats.datasets.camera import warp_nearest
-from formats.datasets.matching import poses_at
-from formats.errors import InputError
-from formats.images import write_grey_png, write_rgb
-from formats.trajectory import write_matrices, write_tum
+from msgs_slam.formats.datasets import VOID_LABEL, Camera, Sequence, open_sequence, recognise
+from msgs_slam.formats.datasets.camera import warp_nearest
+from msgs_slam.formats.datasets.matching import poses_at
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import write_grey_png, write_rgb
+from msgs_slam.formats.trajectory import write_matrices, write_tum
 
 
 def _depth_disagreement(sequence: Sequence, i: int, j: int) -> float:

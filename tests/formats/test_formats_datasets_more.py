@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from formats.colmap import write_colmap_model
-from formats.datasets import VOID_LABEL, Camera, open_sequence, recognise
-from formats.datasets.colmap import camera_from_colmap
-from formats.errors import InputError
-from formats.images import write_grey_png, write_rgb
-from formats.trajectory import write_matrices
+from msgs_slam.formats.colmap import write_colmap_model
+from msgs_slam.formats.datasets import VOID_LABEL, Camera, open_sequence, recognise
+from msgs_slam.formats.datasets.colmap import camera_from_colmap
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import write_grey_png, write_rgb
+from msgs_slam.formats.trajectory import write_matrices
 
 WIDTH, HEIGHT, N = 64, 48, 5
 

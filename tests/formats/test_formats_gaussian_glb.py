@@ -13,10 +13,10 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from formats.errors import InputError
-from formats.gaussian_files import read_gaussians
-from formats.gaussian_glb import EXTENSION, read_gaussian_glb, write_gaussian_glb
-from formats.gaussians import GaussianCloud
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gaussian_files import read_gaussians
+from msgs_slam.formats.gaussian_glb import EXTENSION, read_gaussian_glb, write_gaussian_glb
+from msgs_slam.formats.gaussians import GaussianCloud
 
 
 def _cloud(m: int = 301) -> GaussianCloud:

@@ -9,10 +9,10 @@ import numpy as np
 import plyfile
 import pytest
 
-from formats.compact_gaussians import read_compact, write_compact
-from formats.errors import InputError
-from formats.gaussian_ply import SH_C0, read_gaussian_ply, write_gaussian_ply
-from formats.gaussians import GaussianCloud, isotropic_cloud
+from msgs_slam.formats.compact_gaussians import read_compact, write_compact
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gaussian_ply import SH_C0, read_gaussian_ply, write_gaussian_ply
+from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
 
 
 def _cloud(m: int = 300, classes: int = 7) -> GaussianCloud:

@@ -13,9 +13,9 @@ import pytest
 from PIL import ExifTags, Image
 from pillow_heif import from_bytes
 
-from formats.errors import InputError
-from formats.image_times import frame_number, read_image_times
-from formats.images import (
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.image_times import frame_number, read_image_times
+from msgs_slam.formats.images import (
     decode_rgb,
     exif_focal_px,
     exif_gps,

@@ -10,9 +10,9 @@ import plyfile
 import pytest
 import trimesh
 
-from formats import ply_table
-from formats.errors import InputError
-from formats.mesh import MeshBlocks, mesh_blocks, read_mesh_glb, read_mesh_ply, write_mesh_glb, write_mesh_ply
+from msgs_slam.formats import ply_table
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.mesh import MeshBlocks, mesh_blocks, read_mesh_glb, read_mesh_ply, write_mesh_glb, write_mesh_ply
 
 
 @pytest.fixture

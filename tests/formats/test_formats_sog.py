@@ -12,8 +12,8 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from formats.gaussians import GaussianCloud, unit_quaternions
-from formats.sog import write_sog
+from msgs_slam.formats.gaussians import GaussianCloud, unit_quaternions
+from msgs_slam.formats.sog import write_sog
 
 SH_C0 = 0.28209479177387814
 

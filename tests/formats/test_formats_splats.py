@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from formats.compact_gaussians import write_compact
-from formats.datasets import Camera, open_sequence
-from formats.errors import InputError
-from formats.gaussian_files import read_gaussians, read_splat
-from formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from formats.gaussians import GaussianCloud
-from formats.images import write_rgb
-from formats.nerfstudio import write_transforms
-from formats.spz import read_spz, write_spz
+from msgs_slam.formats.compact_gaussians import write_compact
+from msgs_slam.formats.datasets import Camera, open_sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gaussian_files import read_gaussians, read_splat
+from msgs_slam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from msgs_slam.formats.gaussians import GaussianCloud
+from msgs_slam.formats.images import write_rgb
+from msgs_slam.formats.nerfstudio import write_transforms
+from msgs_slam.formats.spz import read_spz, write_spz
 
 
 def _cloud(m: int = 500, extent: float = 5.0) -> GaussianCloud:

@@ -14,9 +14,15 @@ import pytest
 import safetensors.numpy
 import torch
 
-import formats.tensors
-from formats.errors import InputError
-from formats.tensors import load_arrays, load_safetensors, load_tensors, save_arrays, save_safetensors, save_tensors
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.tensors import (
+    load_arrays,
+    load_safetensors,
+    load_tensors,
+    save_arrays,
+    save_safetensors,
+    save_tensors,
+)
 
 REPO = Path(__file__).resolve().parents[2]
 ARRAYS = {
@@ -63,7 +69,7 @@ def test_npz_round_trip(tmp_path: Path) -> None:
 
 def test_bytes_do_not_depend_on_process_or_order(tmp_path: Path) -> None:
     program = (
-        "import sys; import numpy as np; from pathlib import Path; from formats.tensors import *\n"
+        "import sys; import numpy as np; from pathlib import Path; from msgs_slam.formats.tensors import *\n"
         "names = sys.argv[2].split(',')\n"
         "arrays = {n: np.arange(ord(n)) for n in names}\n"
         "save_safetensors(Path(sys.argv[1] + '.safetensors'), arrays, {n: n for n in names})\n"
@@ -108,7 +114,7 @@ def test_damaged_files_are_explained(tmp_path: Path, suffix: str) -> None:
 
 def test_arrays_larger_than_the_limit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for limit in ("MAX_ARRAY_BYTES", "MAX_UNPACKED_BYTES"):
-        monkeypatch.setattr(formats.tensors, limit, 100_000)
+        monkeypatch.setattr(f"msgs_slam.formats.tensors.{limit}", 100_000)
     np.savez_compressed(tmp_path / "bomb.npz", a=np.zeros(1_000_000, np.uint8))
     assert (tmp_path / "bomb.npz").stat().st_size < 10_000
     with pytest.raises(InputError, match="unpack"):

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from formats.errors import InputError
-from formats.trajectory import nearest_rotation, read_matrices, read_tum, write_matrices, write_tum
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.trajectory import nearest_rotation, read_matrices, read_tum, write_matrices, write_tum
 
 
 def _random_poses(n: int, seed: int = 0) -> np.ndarray:

@@ -17,9 +17,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from formats.errors import InputError
-from formats.video import _Clock, iter_video, probe_video
-from formats.video_writer import write_video
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.video import _Clock, iter_video, probe_video
+from msgs_slam.formats.video_writer import write_video
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -185,7 +185,7 @@ def test_one_image_is_no_video(tmp_path: Path) -> None:
 def test_a_damaged_file_is_silent_on_stderr(tmp_path: Path) -> None:
     (tmp_path / "broken.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(range(256)) * 20)
     program = (
-        "import sys; from formats.video import probe_video; from formats.errors import InputError\n"
+        "import sys; from msgs_slam.formats.video import probe_video; from msgs_slam.formats.errors import InputError\n"
         "try: probe_video(sys.argv[1])\n"
         "except InputError: print('refused')"
     )

@@ -10,12 +10,12 @@ import trimesh
 from finished import note_finished
 from numpy.typing import NDArray
 
-from formats.datasets import Sequence, open_sequence
-from formats.images import write_rgb
-from pipelines.config import Config, MappingConfig
-from pipelines.gaussian_map import GaussianMap
-from pipelines.geometry.alignment import Similarity
-from pipelines.run_folder import (
+from msgs_slam.formats.datasets import Sequence, open_sequence
+from msgs_slam.formats.images import write_rgb
+from msgs_slam.pipelines.config import Config, MappingConfig
+from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.run_folder import (
     RunFolder,
     proxy_path,
     save_calibration,
@@ -26,7 +26,7 @@ from pipelines.run_folder import (
     save_trajectory,
     write_json,
 )
-from pipelines.types import VOID, Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, Trajectory
+from msgs_slam.pipelines.types import VOID, Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, Trajectory
 
 KEYFRAME_EVERY = 4
 OracleRun = Callable[..., RunFolder]

@@ -2,10 +2,18 @@
 
 from collections.abc import Iterable
 
-from pipelines.config import Config
-from pipelines.records import Manifest, Source, StageRecord, checksums, content_digest, settings_of, write_manifest
-from pipelines.run_folder import RunFolder
-from pipelines.settings_file import save_settings
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.records import (
+    Manifest,
+    Source,
+    StageRecord,
+    checksums,
+    content_digest,
+    settings_of,
+    write_manifest,
+)
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.settings_file import save_settings
 
 
 def note_finished(

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import replace
 
-from formats.datasets import Sequence
+from msgs_slam.formats.datasets import Sequence
 
 
 def part_of(sequence: Sequence, indices: Iterable[int]) -> Sequence:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from formats.errors import InputError
-from pipelines.config import Config, config_to_dict, config_to_toml, load_config
-from pipelines.earlier_versions import FIXED, GONE, MOVED
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.config import Config, config_to_dict, config_to_toml, load_config
+from msgs_slam.pipelines.earlier_versions import FIXED, GONE, MOVED
 
 
 @pytest.mark.parametrize("comments", [True, False])

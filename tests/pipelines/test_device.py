@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 import torch
 
-from formats.datasets import open_sequence
-from pipelines.config import Config, ExportConfig, GlobalBaConfig, MappingConfig, ProxyConfig
-from pipelines.evaluation.evaluate import evaluate_run
-from pipelines.export.stage import export_run
-from pipelines.global_ba.move_map import move_map
-from pipelines.mapping import growth
-from pipelines.mapping import stage as mapping_stage
-from pipelines.progress import SilentProgress
-from pipelines.reconstruct import all_stages
-from pipelines.render_run import render_run
-from pipelines.run_folder import RunFolder
-from pipelines.run_folder_names import STAGES
-from pipelines.stages import StageContext, run_stages
-from pipelines.tracking.pictures import Pictures
-from pipelines.tracking.refine import RenderWeights, compare_frame
-from pipelines.tracking.state import FEATURE_SD, TrackState
-from pipelines.viewer_scene import load_scenes
+from msgs_slam.formats.datasets import open_sequence
+from msgs_slam.pipelines.config import Config, ExportConfig, GlobalBaConfig, MappingConfig, ProxyConfig
+from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
+from msgs_slam.pipelines.export.stage import export_run
+from msgs_slam.pipelines.global_ba.move_map import move_map
+from msgs_slam.pipelines.mapping import growth
+from msgs_slam.pipelines.mapping import stage as mapping_stage
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.reconstruct import all_stages
+from msgs_slam.pipelines.render_run import render_run
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run_folder_names import STAGES
+from msgs_slam.pipelines.stages import StageContext, run_stages
+from msgs_slam.pipelines.tracking.pictures import Pictures
+from msgs_slam.pipelines.tracking.refine import RenderWeights, compare_frame
+from msgs_slam.pipelines.tracking.state import FEATURE_SD, TrackState
+from msgs_slam.pipelines.viewer_scene import load_scenes
 from tests.pipelines.mapping.small_run import make_run
 from tests.pretend_device import DEVICE, PretendTensor, WrongDeviceError, pretended
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from formats.datasets import Sequence, opening
-from formats.errors import InputError
-from formats.images import write_rgb
-from pipelines.config import load_config
-from pipelines.outcome import load_outcome
-from pipelines.progress import SilentProgress
-from pipelines.proxy import selection
-from pipelines.run_folder import RunFolder
-from pipelines.types import Calibration, Frame
+from msgs_slam.formats.datasets import Sequence, opening
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import write_rgb
+from msgs_slam.pipelines.config import load_config
+from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.proxy import selection
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.types import Calibration, Frame
 from tests.pipelines.proxy.proxy_room import UNIT, Room, perfect_backbone
 from tests.world import ClipOptions, make_world, render_frame
 

@@ -18,10 +18,10 @@ from typing import Any
 import engine_calls
 import pytest
 
-from formats.errors import InputError, RecoverableError
-from pipelines import engines
-from pipelines.engines import Call, Engine, LocalEngine, RayEngine
-from pipelines.stopping import Stopped, soft_stop
+from msgs_slam.formats.errors import InputError, RecoverableError
+from msgs_slam.pipelines import engines
+from msgs_slam.pipelines.engines import Call, Engine, LocalEngine, RayEngine
+from msgs_slam.pipelines.stopping import Stopped, soft_stop
 
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra msgs-slam[cluster]")
 

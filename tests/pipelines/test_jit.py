@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines import jit
+from msgs_slam.pipelines import jit
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -75,13 +75,14 @@ def test_a_folder_others_may_write_to_is_not_trusted(monkeypatch, tmp_path):
 
 def test_a_kernel_follows_what_other_files_put_into_it(tmp_path):
     """numba itself would go on using the machine code into which the older function is inlined."""
-    room = tmp_path / "pipelines"
-    room.mkdir()
+    room = tmp_path / "msgs_slam" / "pipelines"
+    room.mkdir(parents=True)
     for name in ("jit.py", "stage_identity.py"):
         shutil.copyfile(ROOT / "pipelines" / name, room / name)
+    (room.parent / "__init__.py").write_text("")
     (room / "__init__.py").write_text("")
     (room / "kernel.py").write_text(
-        "from pipelines.inlined import value\nfrom pipelines.jit import kernel\n\n"
+        "from msgs_slam.pipelines.inlined import value\nfrom msgs_slam.pipelines.jit import kernel\n\n"
         "@kernel\ndef twice(x):\n    return 2 * value(x)\n\n"
         "print(twice(1.0), sum(twice.stats.cache_hits.values()))\n"
     )
@@ -89,9 +90,9 @@ def test_a_kernel_follows_what_other_files_put_into_it(tmp_path):
     said = []
     for factor in (3, 3, 5):
         (room / "inlined.py").write_text(
-            f"from pipelines.jit import kernel\n\n@kernel\ndef value(x):\n    return {factor} * x\n"
+            f"from msgs_slam.pipelines.jit import kernel\n\n@kernel\ndef value(x):\n    return {factor} * x\n"
         )
-        command = [sys.executable, "-m", "pipelines.kernel"]
+        command = [sys.executable, "-m", "msgs_slam.pipelines.kernel"]
         done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         said.append(done.stdout.strip())
@@ -108,7 +109,7 @@ def test_no_other_way_to_numba_and_no_fastmath():
 
 
 def test_kernels_run_and_are_cached_without_a_home(tmp_path):
-    code = "import numpy as np; from pipelines.gaussians.render.cpu_bands import list_tiles; "
+    code = "import numpy as np; from msgs_slam.pipelines.gaussians.render.cpu_bands import list_tiles; "
     code += "starts, members = list_tiles(np.array([20, 5, 1, 1, 0.5, 3], np.float32), 0, 40, 16); "
     code += "assert starts.tolist() == [0, 0, 1, 1]; print(sum(list_tiles.stats.cache_hits.values()))"
     environment = {**os.environ, "HOME": "/dev/null", "TMPDIR": str(tmp_path)}

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from formats.errors import InputError
-from pipelines.config import ExportConfig, config_to_toml
-from pipelines.records import FORMAT, load_records, load_source, recorded_config, write_manifest
-from pipelines.run_folder import RunFolder
-from pipelines.run_folder_names import STAGES
-from pipelines.settings_file import load_settings, save_settings
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.config import ExportConfig, config_to_toml
+from msgs_slam.pipelines.records import FORMAT, load_records, load_source, recorded_config, write_manifest
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run_folder_names import STAGES
+from msgs_slam.pipelines.settings_file import load_settings, save_settings
 
 WRITTEN = Path(__file__).with_name("run_of_0_1_0")
 
@@ -78,7 +78,7 @@ def test_a_setting_that_is_no_more_does_not_stop_a_run_of_this_format(
     assert manifest is not None
     write_manifest(run.manifest_file, manifest)
     text = config_to_toml(config).replace("[frames]\n", "[frames]\npeak_threshold = 0.01\n")
-    monkeypatch.setattr("pipelines.settings_file.config_to_toml", lambda _: text)
+    monkeypatch.setattr("msgs_slam.pipelines.settings_file.config_to_toml", lambda _: text)
     save_settings(run, config)
     assert load_settings(RunFolder(run.root)) == config
     assert "1 settings in it are none any more (frames.peak_threshold)" in caplog.text

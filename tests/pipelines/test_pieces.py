@@ -9,14 +9,14 @@ import pycolmap
 import pytest
 from click.testing import CliRunner
 
-from formats.images import write_rgb
-from formats.mesh import read_mesh_ply
-from msgs_cli.main import main
-from pipelines.evaluation.report import write_report
-from pipelines.geometry.alignment import align_points
-from pipelines.outcome import load_outcome
-from pipelines.run_folder import RunFolder
-from pipelines.viewer_scene import load_scenes
+from msgs_slam.formats.images import write_rgb
+from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.msgs_cli.main import main
+from msgs_slam.pipelines.evaluation.report import write_report
+from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.viewer_scene import load_scenes
 from tests.pipelines.frames.conftest import WALK_FRAMES, render, sideways, write_walk
 
 APART = 9

@@ -13,11 +13,11 @@ from pathlib import Path
 import engine_calls
 import pytest
 
-from formats.errors import InputError, RecoverableError
-from pipelines import shards, travel, workers
-from pipelines.batch import Shard
-from pipelines.run_folder import RunFolder
-from pipelines.shards import Posted, SharedWorkers, _posted
+from msgs_slam.formats.errors import InputError, RecoverableError
+from msgs_slam.pipelines import shards, travel, workers
+from msgs_slam.pipelines.batch import Shard
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.shards import Posted, SharedWorkers, _posted
 
 HOLDS = "import fcntl, sys; f = open(sys.argv[1], 'ab'); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()"
 
@@ -26,7 +26,7 @@ HOLDS = "import fcntl, sys; f = open(sys.argv[1], 'ab'); fcntl.flock(f, fcntl.LO
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Of an unfinished stage; the tasks are those of the tests."""
     monkeypatch.setattr(travel, "_OURS", "engine_calls")
-    monkeypatch.setattr(shards, "_WORKS", ("engine_calls",))
+    monkeypatch.setattr(shards, "TASK_MODULES", ("engine_calls",))
     (tmp_path / "proxy.partial").mkdir()
     return tmp_path / "proxy.partial"
 
@@ -113,7 +113,7 @@ def test_a_node_with_another_version_says_so_and_leaves_the_task(folder: Path, m
 
 
 def test_a_run_cannot_name_other_work(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shards, "_WORKS", ("pipelines.proxy.stage",))
+    monkeypatch.setattr(shards, "TASK_MODULES", ("msgs_slam.pipelines.proxy.stage",))
     posted = Posted.post(engine_calls.halve, [4], folder, 1)
     with pytest.raises(InputError, match="is no work on a task"):
         posted.do_one(Shard(0, 1), engine_calls.silent)

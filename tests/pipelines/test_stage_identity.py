@@ -5,9 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.reconstruct import all_stages
-from pipelines.run_folder_names import STAGES
-from pipelines.stage_identity import ROOT, TABLE, source_digest, stage_identity, stage_sources
+from msgs_slam.pipelines.reconstruct import all_stages
+from msgs_slam.pipelines.run_folder_names import STAGES
+from msgs_slam.pipelines.stage_identity import ROOT, TABLE, source_digest, stage_identity, stage_sources
+
+REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 def sources(stage: str) -> set[str]:
@@ -29,10 +31,11 @@ def test_any_change_of_them_is_another_digest(tmp_path: Path) -> None:
     room = tmp_path / "pipelines"
     room.mkdir()
     (room / "__init__.py").write_text("")
-    (room / "stage.py").write_text("def run():\n    from pipelines import far\n    return far\n")
-    (room / "far.py").write_text("from pipelines.config import Config\nfrom pipelines.farther import VALUE\n")
+    (room / "stage.py").write_text("def run():\n    from msgs_slam.pipelines import far\n    return far\n")
+    name = "msgs_slam.pipelines"
+    (room / "far.py").write_text(f"from {name}.config import Config\nfrom {name}.farther import VALUE\n")
     (room / "farther.py").write_text("VALUE = 1\n")
-    (room / "config.py").write_text("import pipelines.beside\n")
+    (room / "config.py").write_text("import msgs_slam.pipelines.beside\n")
     (room / "beside.py").write_text("")
     before = source_digest(room / "stage.py", tmp_path)
     (room / "beside.py").write_text("# not imported but by the plumbing\n")
@@ -44,7 +47,7 @@ def test_any_change_of_them_is_another_digest(tmp_path: Path) -> None:
 
 def test_a_release_has_the_digests_of_its_sources() -> None:
     table = tomllib.loads(TABLE.read_text())
-    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    version = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["version"]
     if table["release"] != version:
         assert "dev" in version, "a release needs its numbers: type `python tests/release.py`"
         pytest.skip(f"{version} is no release: stages are known by the digest of their sources")
@@ -61,7 +64,7 @@ def test_identity_is_a_number_only_where_the_sources_are_the_released_ones(
     for written, expected in ((digest, "7"), ("0" * 16, digest)):
         table = tmp_path / f"{expected}.toml"
         table.write_text(f'[export]\nnumber = 7\nsources = "{written}"\n')
-        monkeypatch.setattr("pipelines.stage_identity.TABLE", table)
+        monkeypatch.setattr("msgs_slam.pipelines.stage_identity.TABLE", table)
         stage_identity.cache_clear()
         assert stage_identity("export", file) == expected
     stage_identity.cache_clear()

@@ -6,15 +6,15 @@ from typing import Any
 
 import pytest
 
-from formats.atomic import write_text
-from formats.errors import DiskFullError, InputError
-from pipelines.config import Config, MappingConfig, load_config
-from pipelines.journal import JOURNAL
-from pipelines.progress import SilentProgress
-from pipelines.records import load_records
-from pipelines.run_folder import RunFolder
-from pipelines.run_folder_names import STAGES
-from pipelines.stages import SameSource, Stage, StageContext, run_stages
+from msgs_slam.formats.atomic import write_text
+from msgs_slam.formats.errors import DiskFullError, InputError
+from msgs_slam.pipelines.config import Config, MappingConfig, load_config
+from msgs_slam.pipelines.journal import JOURNAL
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.records import load_records
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run_folder_names import STAGES
+from msgs_slam.pipelines.stages import SameSource, Stage, StageContext, run_stages
 
 
 class Recorder:

@@ -6,10 +6,10 @@ from pathlib import Path
 import engine_calls
 import pytest
 
-from formats.errors import InputError, RecoverableError
-from pipelines import workers
-from pipelines.engines import LocalEngine
-from pipelines.workers import Workers
+from msgs_slam.formats.errors import InputError, RecoverableError
+from msgs_slam.pipelines import workers
+from msgs_slam.pipelines.engines import LocalEngine
+from msgs_slam.pipelines.workers import Workers
 
 WORKERS = Workers(LocalEngine(), engine_calls.silent, 1)
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from formats.datasets import open_sequence
-from formats.errors import InputError
-from formats.video import iter_video
-from formats.video_writer import write_video
-from pipelines.types import Intrinsics
+from msgs_slam.formats.datasets import open_sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.video import iter_video
+from msgs_slam.formats.video_writer import write_video
+from msgs_slam.pipelines.types import Intrinsics
 from tests.world import (
     ClipOptions,
     World,

@@ -9,7 +9,7 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.types import Intrinsics
 from tests.world.build import World, build_world
 from tests.world.cast import render_rays
 from tests.world.corridor import ring_corridor

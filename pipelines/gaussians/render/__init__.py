@@ -4,12 +4,17 @@
 `track_gn` fits a pose to an image, `median_depth` and `blending_weights` look at a map without gradients.
 """
 
-from pipelines.gaussians.render.compositing import Composite, composite
-from pipelines.gaussians.render.culling import in_view
-from pipelines.gaussians.render.inspection import BlendingWeights, blending_weights, median_and_seen, median_depth
-from pipelines.gaussians.render.rendering import Rendering, render
-from pipelines.gaussians.render.threads import get_threads, set_threads
-from pipelines.gaussians.render.tracking import PoseFit, track_gn
+from msgs_slam.pipelines.gaussians.render.compositing import Composite, composite
+from msgs_slam.pipelines.gaussians.render.culling import in_view
+from msgs_slam.pipelines.gaussians.render.inspection import (
+    BlendingWeights,
+    blending_weights,
+    median_and_seen,
+    median_depth,
+)
+from msgs_slam.pipelines.gaussians.render.rendering import Rendering, render
+from msgs_slam.pipelines.gaussians.render.threads import get_threads, set_threads
+from msgs_slam.pipelines.gaussians.render.tracking import PoseFit, track_gn
 
 __all__ = [
     "BlendingWeights",

@@ -12,7 +12,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from pipelines.gaussians.render.lanes import (
+from msgs_slam.pipelines.gaussians.render.lanes import (
     FLAGS,
     I64,
     WIDTH,

@@ -9,11 +9,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.gaussians.render.cpu_backward import backward_band, sum_shared
-from pipelines.gaussians.render.cpu_bands import split_into_bands
-from pipelines.gaussians.render.cpu_forward import forward_band
-from pipelines.gaussians.render.cpu_inspect import inspect
-from pipelines.gaussians.render.threads import for_each
+from msgs_slam.pipelines.gaussians.render.cpu_backward import backward_band, sum_shared
+from msgs_slam.pipelines.gaussians.render.cpu_bands import split_into_bands
+from msgs_slam.pipelines.gaussians.render.cpu_forward import forward_band
+from msgs_slam.pipelines.gaussians.render.cpu_inspect import inspect
+from msgs_slam.pipelines.gaussians.render.threads import for_each
 
 __all__ = ["composite", "inspect"]
 

@@ -10,18 +10,26 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.gaussians.render import rules
-from pipelines.gaussians.render.boxes import gradients_of_box
-from pipelines.gaussians.render.cpu_bands import (
+from msgs_slam.pipelines.gaussians.render import rules
+from msgs_slam.pipelines.gaussians.render.boxes import gradients_of_box
+from msgs_slam.pipelines.gaussians.render.cpu_bands import (
     BAND_ROWS,
     RECORD,
     TILE,
     first_pixel,
     last_pixel,
 )
-from pipelines.gaussians.render.cpu_forward import CHECK_EVERY, PIXELS, Guide, Vectors, channels_of, clear, is_opaque
-from pipelines.gaussians.render.jit import inner, kernel
-from pipelines.gaussians.render.lanes import (
+from msgs_slam.pipelines.gaussians.render.cpu_forward import (
+    CHECK_EVERY,
+    PIXELS,
+    Guide,
+    Vectors,
+    channels_of,
+    clear,
+    is_opaque,
+)
+from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
+from msgs_slam.pipelines.gaussians.render.lanes import (
     add_totals,
     at_most,
     counting,

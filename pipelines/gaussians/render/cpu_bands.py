@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.gaussians.render import rules
-from pipelines.gaussians.render.jit import inner, kernel
-from pipelines.gaussians.render.threads import for_each
+from msgs_slam.pipelines.gaussians.render import rules
+from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
+from msgs_slam.pipelines.gaussians.render.threads import for_each
 
 F32 = np.float32
 TILE = 16

@@ -11,17 +11,17 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.gaussians.render import rules
-from pipelines.gaussians.render.boxes import add_to_box
-from pipelines.gaussians.render.cpu_bands import (
+from msgs_slam.pipelines.gaussians.render import rules
+from msgs_slam.pipelines.gaussians.render.boxes import add_to_box
+from msgs_slam.pipelines.gaussians.render.cpu_bands import (
     BAND_ROWS,
     RECORD,
     TILE,
     first_pixel,
     last_pixel,
 )
-from pipelines.gaussians.render.jit import inner, kernel
-from pipelines.gaussians.render.lanes import (
+from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
+from msgs_slam.pipelines.gaussians.render.lanes import (
     any_of,
     at_most,
     counting,

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.gaussians.render.cpu_bands import (
+from msgs_slam.pipelines.gaussians.render.cpu_bands import (
     BAND_ROWS,
     RECORD,
     TILE,
@@ -15,7 +15,7 @@ from pipelines.gaussians.render.cpu_bands import (
     last_pixel,
     split_into_bands,
 )
-from pipelines.gaussians.render.cpu_forward import (
+from msgs_slam.pipelines.gaussians.render.cpu_forward import (
     CHECK_EVERY,
     LIGHT,
     PIXELS,
@@ -25,9 +25,19 @@ from pipelines.gaussians.render.cpu_forward import (
     is_opaque,
     open_tile,
 )
-from pipelines.gaussians.render.jit import kernel
-from pipelines.gaussians.render.lanes import counting, exp, largest, largest_of, load, splat, store, total, where
-from pipelines.gaussians.render.threads import for_each
+from msgs_slam.pipelines.gaussians.render.jit import kernel
+from msgs_slam.pipelines.gaussians.render.lanes import (
+    counting,
+    exp,
+    largest,
+    largest_of,
+    load,
+    splat,
+    store,
+    total,
+    where,
+)
+from msgs_slam.pipelines.gaussians.render.threads import for_each
 
 F32 = np.float32
 _HALF, _ZERO = F32(0.5), F32(0)

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.gaussians.render import rules
-from pipelines.gaussians.render.cpu_backward import ALPHA, PLANES, weigh_rows
-from pipelines.gaussians.render.cpu_bands import (
+from msgs_slam.pipelines.gaussians.render import rules
+from msgs_slam.pipelines.gaussians.render.cpu_backward import ALPHA, PLANES, weigh_rows
+from msgs_slam.pipelines.gaussians.render.cpu_bands import (
     BAND_ROWS,
     RECORD,
     TILE,
@@ -19,10 +19,10 @@ from pipelines.gaussians.render.cpu_bands import (
     last_pixel,
     split_into_bands,
 )
-from pipelines.gaussians.render.cpu_forward import CHECK_EVERY, LIGHT, PIXELS, clear, is_opaque
-from pipelines.gaussians.render.jit import inner, kernel
-from pipelines.gaussians.render.lanes import add_products, counting, exp, halves, load, load_twice, store
-from pipelines.gaussians.render.threads import for_each
+from msgs_slam.pipelines.gaussians.render.cpu_forward import CHECK_EVERY, LIGHT, PIXELS, clear, is_opaque
+from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
+from msgs_slam.pipelines.gaussians.render.lanes import add_products, counting, exp, halves, load, load_twice, store
+from msgs_slam.pipelines.gaussians.render.threads import for_each
 
 F32 = np.float32
 VALUE = 6

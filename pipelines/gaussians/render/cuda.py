@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pipelines.gaussians.render import rules
-from pipelines.gaussians.render.cuda_kernels import backward_tile, forward_tile
-from pipelines.gaussians.render.reference import inspect
+from msgs_slam.pipelines.gaussians.render import rules
+from msgs_slam.pipelines.gaussians.render.cuda_kernels import backward_tile, forward_tile
+from msgs_slam.pipelines.gaussians.render.reference import inspect
 
 __all__ = ["composite", "inspect"]
 

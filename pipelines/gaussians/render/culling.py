@@ -7,12 +7,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.gaussians.render import rules
-from pipelines.gaussians.render.compositing import require_finite
-from pipelines.gaussians.render.jit import kernel
-from pipelines.geometry import se3
-from pipelines.geometry.camera import project_gaussians
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.gaussians.render import rules
+from msgs_slam.pipelines.gaussians.render.compositing import require_finite
+from msgs_slam.pipelines.gaussians.render.jit import kernel
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.camera import project_gaussians
+from msgs_slam.pipelines.types import Intrinsics
 
 NEAR = 0.01
 """Gaussians whose centre is nearer than this (or behind the camera) are not drawn; in the unit of the map."""

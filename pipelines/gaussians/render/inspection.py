@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pipelines.gaussians.render.compositing import choose_backend, require_finite
-from pipelines.gaussians.render.culling import NEAR, in_view
-from pipelines.gaussians.render.rendering import project_map
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.gaussians.render.compositing import choose_backend, require_finite
+from msgs_slam.pipelines.gaussians.render.culling import NEAR, in_view
+from msgs_slam.pipelines.gaussians.render.rendering import project_map
+from msgs_slam.pipelines.types import Intrinsics
 
 
 @dataclass(frozen=True)

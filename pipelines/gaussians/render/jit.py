@@ -7,7 +7,7 @@ from typing import Any
 
 from numba.extending import register_jitable
 
-from pipelines import jit
+from msgs_slam.pipelines import jit
 
 # No "nnan" or "ninf": comparisons with a NaN must stay what they are. "contract" lets a*b+c become one instruction.
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract", "nsz", "arcp"}, "error_model": "numpy", "no_cfunc_wrapper": True}

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pipelines.gaussians.render.compositing import composite, require_finite
-from pipelines.gaussians.render.culling import NEAR, in_view
-from pipelines.geometry import se3
-from pipelines.geometry.camera import project_gaussians
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.gaussians.render.compositing import composite, require_finite
+from msgs_slam.pipelines.gaussians.render.culling import NEAR, in_view
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.camera import project_gaussians
+from msgs_slam.pipelines.types import Intrinsics
 
 
 @dataclass(frozen=True)

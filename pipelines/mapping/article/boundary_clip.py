@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from pipelines.types import VOID
+from msgs_slam.pipelines.types import VOID
 
 
 def beside_boundary(channels: Tensor) -> Tensor:

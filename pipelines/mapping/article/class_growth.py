@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pipelines.types import VOID
+from msgs_slam.pipelines.types import VOID
 
 
 def wrong_classes(logits: Tensor, channels: Tensor, weight: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pipelines.types import VOID
+from msgs_slam.pipelines.types import VOID
 
 SHARPNESS = 2000.0
 """ζ, for depth steps in units of the scene's median depth."""

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.mapping.views import View
-from pipelines.proxy.reliability import semantic_agreement
+from msgs_slam.pipelines.mapping.views import View
+from msgs_slam.pipelines.proxy.reliability import semantic_agreement
 
 _GRID = (40, 30)
 

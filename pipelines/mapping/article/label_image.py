@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from pipelines.gaussians.ssim import ssim_map
-from pipelines.mapping.photo_loss import SSIM_WEIGHT
-from pipelines.types import VOID
+from msgs_slam.pipelines.gaussians.ssim import ssim_map
+from msgs_slam.pipelines.mapping.photo_loss import SSIM_WEIGHT
+from msgs_slam.pipelines.types import VOID
 
 
 def label_image_loss(logits: Tensor, labels: Tensor, weight: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipelines.types import Intrinsics, MirrorPairs
+from msgs_slam.pipelines.types import Intrinsics, MirrorPairs
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from formats.images import MAX_IMAGE_PIXELS, image_size, read_depth_png, read_grey_png
-from formats.reading import parsing, reaching, require_file
-from pipelines.depth.resize import resample_nearest, resize_depth
-from pipelines.proxy.files.matching import find_folder, match_files
-from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.sequence import Sequence
-from pipelines.types import Frame
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import MAX_IMAGE_PIXELS, image_size, read_depth_png, read_grey_png
+from msgs_slam.formats.reading import parsing, reaching, require_file
+from msgs_slam.pipelines.depth.resize import resample_nearest, resize_depth
+from msgs_slam.pipelines.proxy.files.matching import find_folder, match_files
+from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.types import Frame
 
 _SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 _NAMES = ("depth",)

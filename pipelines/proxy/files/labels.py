@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from formats.images import read_label_png
-from pipelines.depth.resize import resample_nearest
-from pipelines.progress import Progress
-from pipelines.proxy.files.classes import MAX_ID, NamedClass, find_class_table, read_class_table
-from pipelines.proxy.files.depth import require_aspect
-from pipelines.proxy.files.matching import find_folder, match_files
-from pipelines.proxy.palette import class_colors
-from pipelines.proxy.providers import DepthEstimate, LabelEstimate
-from pipelines.proxy.sequence import Sequence
-from pipelines.types import VOID, ClassTable, Frame
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import read_label_png
+from msgs_slam.pipelines.depth.resize import resample_nearest
+from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.proxy.files.classes import MAX_ID, NamedClass, find_class_table, read_class_table
+from msgs_slam.pipelines.proxy.files.depth import require_aspect
+from msgs_slam.pipelines.proxy.files.matching import find_folder, match_files
+from msgs_slam.pipelines.proxy.palette import class_colors
+from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.types import VOID, ClassTable, Frame
 
 _SUFFIXES = (".png", ".tif", ".tiff")
 _NAMES = ("labels", "label", "semantic_class", "semantic", "semantics", "segmentation")

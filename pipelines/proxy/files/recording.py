@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.datasets import Sequence as Recording
-from formats.errors import InputError
-from pipelines.frames.source_pixels import FramePixels
-from pipelines.progress import Progress
-from pipelines.proxy.palette import class_colors
-from pipelines.proxy.providers import DepthEstimate, LabelEstimate
-from pipelines.proxy.sequence import Sequence
-from pipelines.types import VOID, ClassTable, Frame
+from msgs_slam.formats.datasets import Sequence as Recording
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.frames.source_pixels import FramePixels
+from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.proxy.palette import class_colors
+from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.types import VOID, ClassTable, Frame
 
 
 class _RecordingMaps:

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.proxy.networks.card import Card
-from pipelines.proxy.networks.labels import class_token, patch_features, softmax
-from pipelines.proxy.networks.labels_provider import OnnxLabels
-from pipelines.proxy.networks.network_pass import Arrays, Workplace
-from pipelines.types import Frame
+from msgs_slam.pipelines.proxy.networks.card import Card
+from msgs_slam.pipelines.proxy.networks.labels import class_token, patch_features, softmax
+from msgs_slam.pipelines.proxy.networks.labels_provider import OnnxLabels
+from msgs_slam.pipelines.proxy.networks.network_pass import Arrays, Workplace
+from msgs_slam.pipelines.types import Frame
 
 _SAMPLE = 20000
 _ROUNDS = 20

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from pipelines.geometry.camera import unproject_depth
-from pipelines.proxy.networks.letterbox import Letterbox
-from pipelines.proxy.networks.session import Network
-from pipelines.proxy.regions.voxels import normals_in_cam
-from pipelines.types import Intrinsics
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.geometry.camera import unproject_depth
+from msgs_slam.pipelines.proxy.networks.letterbox import Letterbox
+from msgs_slam.pipelines.proxy.networks.session import Network
+from msgs_slam.pipelines.proxy.regions.voxels import normals_in_cam
+from msgs_slam.pipelines.types import Intrinsics
 
 _ALIKE = np.radians(30)
 _LEAST_COSINE = 0.7

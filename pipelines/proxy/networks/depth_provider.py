@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from pipelines.proxy.networks.card import Card
-from pipelines.proxy.networks.depth import network_depth
-from pipelines.proxy.networks.identity import card_identity
-from pipelines.proxy.networks.network_pass import Arrays, NetworkPass, Workplace
-from pipelines.proxy.networks.session import Network
-from pipelines.proxy.providers import DepthEstimate
-from pipelines.types import Frame
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.proxy.networks.card import Card
+from msgs_slam.pipelines.proxy.networks.depth import network_depth
+from msgs_slam.pipelines.proxy.networks.identity import card_identity
+from msgs_slam.pipelines.proxy.networks.network_pass import Arrays, NetworkPass, Workplace
+from msgs_slam.pipelines.proxy.networks.session import Network
+from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.types import Frame
 
 
 class OnnxDepth:

@@ -6,10 +6,10 @@ import hashlib
 from dataclasses import replace
 from pathlib import Path
 
-from formats.digest import files_sha256
-from pipelines.proxy.networks.card import Card
-from pipelines.proxy.networks.onnx_file import external_locations, require_own_weights
-from pipelines.proxy.networks.runtime import is_tflite
+from msgs_slam.formats.digest import files_sha256
+from msgs_slam.pipelines.proxy.networks.card import Card
+from msgs_slam.pipelines.proxy.networks.onnx_file import external_locations, require_own_weights
+from msgs_slam.pipelines.proxy.networks.runtime import is_tflite
 
 
 def card_identity(card: Card) -> str:

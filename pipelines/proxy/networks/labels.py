@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from pipelines.proxy.networks.card import Card
-from pipelines.proxy.networks.letterbox import Letterbox
-from pipelines.proxy.networks.session import Network
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.proxy.networks.card import Card
+from msgs_slam.pipelines.proxy.networks.letterbox import Letterbox
+from msgs_slam.pipelines.proxy.networks.session import Network
 
 
 def network_probabilities(network: Network, output: NDArray, width: int, height: int, side: int = 0) -> NDArray:

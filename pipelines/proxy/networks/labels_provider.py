@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from pipelines.proxy.networks.card import Card
-from pipelines.proxy.networks.identity import card_identity
-from pipelines.proxy.networks.labels import best_classes, class_token, network_probabilities
-from pipelines.proxy.networks.network_pass import Arrays, NetworkPass, Workplace
-from pipelines.proxy.networks.session import Network
-from pipelines.proxy.palette import class_colors
-from pipelines.proxy.providers import DepthEstimate, LabelEstimate
-from pipelines.proxy.regions.named import NamedScene, Vocabulary
-from pipelines.proxy.regions.provider import SegmentLabels
-from pipelines.proxy.sequence import resample_linear
-from pipelines.types import VOID, ClassTable, Frame
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.proxy.networks.card import Card
+from msgs_slam.pipelines.proxy.networks.identity import card_identity
+from msgs_slam.pipelines.proxy.networks.labels import best_classes, class_token, network_probabilities
+from msgs_slam.pipelines.proxy.networks.network_pass import Arrays, NetworkPass, Workplace
+from msgs_slam.pipelines.proxy.networks.session import Network
+from msgs_slam.pipelines.proxy.palette import class_colors
+from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.regions.named import NamedScene, Vocabulary
+from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
+from msgs_slam.pipelines.proxy.sequence import resample_linear
+from msgs_slam.pipelines.types import VOID, ClassTable, Frame
 
 _LEAST_SHARE = 0.001
 """A class on a smaller share of all pixels is noise of the network and becomes void."""

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.atomic import atomic_path
-from formats.errors import InputError
-from formats.tensors import load_arrays
-from pipelines.progress import Progress, log
-from pipelines.proxy.scratch import load_scratch, save_scratch
-from pipelines.proxy.sequence import Sequence
-from pipelines.types import Frame
+from msgs_slam.formats.atomic import atomic_path
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.tensors import load_arrays
+from msgs_slam.pipelines.progress import Progress, log
+from msgs_slam.pipelines.proxy.scratch import load_scratch, save_scratch
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.types import Frame
 
 Arrays = dict[str, NDArray]
 _STAMP = "stamp"

@@ -9,10 +9,10 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from formats.reading import parsing
-from pipelines.progress import log
-from pipelines.proxy.networks.onnx_file import require_own_weights
-from pipelines.proxy.networks.runtime import Port
+from msgs_slam.formats.reading import parsing
+from msgs_slam.pipelines.progress import log
+from msgs_slam.pipelines.proxy.networks.onnx_file import require_own_weights
+from msgs_slam.pipelines.proxy.networks.runtime import Port
 
 _TYPES: dict[str, type[np.generic]] = {
     "tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(int64)": np.int64, "tensor(int32)": np.int32,

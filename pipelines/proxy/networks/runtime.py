@@ -42,9 +42,9 @@ def open_runtime(path: Path, outputs: Sequence[str], threads: int, device: str) 
     Raises InputError for a file that is none, or keeps weights outside its own folder.
     """
     if is_tflite(path):
-        from pipelines.proxy.networks.tflite_runtime import TfliteRuntime
+        from msgs_slam.pipelines.proxy.networks.tflite_runtime import TfliteRuntime
 
         return TfliteRuntime(path, outputs, threads)
-    from pipelines.proxy.networks.onnx_runtime import OnnxRuntime
+    from msgs_slam.pipelines.proxy.networks.onnx_runtime import OnnxRuntime
 
     return OnnxRuntime(path, threads, device)

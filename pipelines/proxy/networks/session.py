@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.digest import file_sha256
-from formats.errors import InputError
-from pipelines.proxy.networks.card import Card
-from pipelines.proxy.networks.head import LinearHead, load_linear_head
-from pipelines.proxy.networks.letterbox import Letterbox, choose_box
-from pipelines.proxy.networks.runtime import open_runtime
-from pipelines.proxy.networks.words import WordHead, load_word_head
+from msgs_slam.formats.digest import file_sha256
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.proxy.networks.card import Card
+from msgs_slam.pipelines.proxy.networks.head import LinearHead, load_linear_head
+from msgs_slam.pipelines.proxy.networks.letterbox import Letterbox, choose_box
+from msgs_slam.pipelines.proxy.networks.runtime import open_runtime
+from msgs_slam.pipelines.proxy.networks.words import WordHead, load_word_head
 
 _MAX_OUTPUT_VALUES = 200_000_000
 _IMAGENET_MEAN = (123.675, 116.28, 103.53)

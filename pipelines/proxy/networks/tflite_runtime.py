@@ -15,9 +15,9 @@ from ai_edge_litert import schema_py_generated as schema
 from ai_edge_litert.interpreter import Interpreter
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from formats.reading import parsing, read_bytes
-from pipelines.proxy.networks.runtime import Port
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.reading import parsing, read_bytes
+from msgs_slam.pipelines.proxy.networks.runtime import Port
 
 _MAGIC = b"TFL3"
 _MAX_BYTES = 1 << 30

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from formats.reading import require_file
-from formats.tensors import load_arrays
-from pipelines.proxy.networks.card import Card
-from pipelines.proxy.networks.runtime import open_runtime
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.reading import require_file
+from msgs_slam.formats.tensors import load_arrays
+from msgs_slam.pipelines.proxy.networks.card import Card
+from msgs_slam.pipelines.proxy.networks.runtime import open_runtime
 
 OTHER = "other"
 MOST_WORDS = 200

@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from pipelines.depth.resize import resample_nearest
-from pipelines.geometry.camera import unproject_depth
-from pipelines.proxy.providers import DepthEstimate, LabelEstimate
-from pipelines.proxy.regions.belonging import one_name_each, place_likelihood
-from pipelines.proxy.regions.parts import cut_parts, cut_patches
-from pipelines.proxy.regions.posture import name_likelihood
-from pipelines.proxy.regions.provider import SegmentLabels, label_pixels
-from pipelines.proxy.regions.voxels import Voxels, find, find_near, select, voxel_keys
-from pipelines.proxy.sequence import Sequence, resample_linear
-from pipelines.types import Frame
+from msgs_slam.pipelines.depth.resize import resample_nearest
+from msgs_slam.pipelines.geometry.camera import unproject_depth
+from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.regions.belonging import one_name_each, place_likelihood
+from msgs_slam.pipelines.proxy.regions.parts import cut_parts, cut_patches
+from msgs_slam.pipelines.proxy.regions.posture import name_likelihood
+from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels, label_pixels
+from msgs_slam.pipelines.proxy.regions.voxels import Voxels, find, find_near, select, voxel_keys
+from msgs_slam.pipelines.proxy.sequence import Sequence, resample_linear
+from msgs_slam.pipelines.types import Frame
 
 _LEAST_CONFIDENCE = 0.3
 _ALONE = 0.3

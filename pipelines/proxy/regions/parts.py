@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.proxy.graph_cut import cut_graph
-from pipelines.proxy.regions.voxels import Voxels, touching
+from msgs_slam.pipelines.proxy.graph_cut import cut_graph
+from msgs_slam.pipelines.proxy.regions.voxels import Voxels, touching
 
 _COLOR_UNIT = 12.0
 """Difference in CIE Lab that counts as much as a right angle between the normals."""

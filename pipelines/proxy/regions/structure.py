@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.proxy.regions.voxels import Voxels
+from msgs_slam.pipelines.proxy.regions.voxels import Voxels
 
 OTHER, FLOOR, CEILING, WALL, SURFACE = range(5)
 NAMES = {FLOOR: "floor", CEILING: "ceiling", WALL: "wall", SURFACE: "surface"}

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.camera import unproject_depth
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.geometry.camera import unproject_depth
+from msgs_slam.pipelines.types import Intrinsics
 
 _BITS = 21
 _HALF = 1 << (_BITS - 1)

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.proxy.graph_cut import cut_image
-from pipelines.proxy.regions.spread import spread_votes
+from msgs_slam.pipelines.proxy.graph_cut import cut_image
+from msgs_slam.pipelines.proxy.regions.spread import spread_votes
 
 SURE = 0.3
 """Confidence from which a depth is evidence and stays as it is."""

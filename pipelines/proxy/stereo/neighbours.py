@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.camera import project
-from pipelines.types import Intrinsics, SparseModel
+from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.types import Intrinsics, SparseModel
 
 _MAX_POINTS = 400
 _UNSEEN_WEIGHT = 0.3

@@ -16,20 +16,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from pipelines.progress import Progress
-from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.scratch import load_scratch, save_scratch
-from pipelines.proxy.sequence import Sequence, resize_area
-from pipelines.proxy.stereo.bands import Bands
-from pipelines.proxy.stereo.consistency import fuse_depths
-from pipelines.proxy.stereo.fill import fill_unsure
-from pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
-from pipelines.proxy.stereo.refine import refine_inverse_depth
-from pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
-from pipelines.proxy.stereo.sweep import sweep_cost, warps_to
-from pipelines.proxy.stereo.upsample import upsample_depth
-from pipelines.types import Frame, Intrinsics, SparseModel
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.scratch import load_scratch, save_scratch
+from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
+from msgs_slam.pipelines.proxy.stereo.bands import Bands
+from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
+from msgs_slam.pipelines.proxy.stereo.fill import fill_unsure
+from msgs_slam.pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
+from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth
+from msgs_slam.pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
+from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost, warps_to
+from msgs_slam.pipelines.proxy.stereo.upsample import upsample_depth
+from msgs_slam.pipelines.types import Frame, Intrinsics, SparseModel
 
 _CACHED_FRAMES = 48
 _VIEWS, _BEST, _FUSE_VIEWS = 6, 3, 8

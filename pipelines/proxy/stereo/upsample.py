@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.jit import kernel
-from pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.jit import kernel
+from msgs_slam.pipelines.proxy.providers import DepthEstimate
 
 _COLOR_SD = 10.0
 _SURFACE = 0.05

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.depth import align as alignment
-from pipelines.depth import solve
-from pipelines.depth.align import align_keyframes, fit_fields
-from pipelines.depth.fields import FINE, DepthFields, field_scales
-from pipelines.depth.posed import CANDIDATES, PosedDepth, overlaps
-from pipelines.depth.see_through import contradicted
-from pipelines.mapping.load import MappingInput
-from pipelines.run_folder import RunFolder, save_depth_fields
-from pipelines.types import Intrinsics, ProxyMaps, SparseModel
+from msgs_slam.pipelines.depth import align as alignment
+from msgs_slam.pipelines.depth import solve
+from msgs_slam.pipelines.depth.align import align_keyframes, fit_fields
+from msgs_slam.pipelines.depth.fields import FINE, DepthFields, field_scales
+from msgs_slam.pipelines.depth.posed import CANDIDATES, PosedDepth, overlaps
+from msgs_slam.pipelines.depth.see_through import contradicted
+from msgs_slam.pipelines.mapping.load import MappingInput
+from msgs_slam.pipelines.run_folder import RunFolder, save_depth_fields
+from msgs_slam.pipelines.types import Intrinsics, ProxyMaps, SparseModel
 
 Maps = dict[int, ProxyMaps]
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipelines.depth import scales
-from pipelines.depth.scales import COARSE
-from pipelines.types import Intrinsics, ProxyMaps
+from msgs_slam.pipelines.depth import scales
+from msgs_slam.pipelines.depth.scales import COARSE
+from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 
 CAMERA = Intrinsics(640, 480, 500, 500, 320, 240)
 

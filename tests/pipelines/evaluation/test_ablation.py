@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from formats.datasets import Sequence
-from formats.errors import InputError
-from msgs_cli.main import main
-from pipelines.config import Config, load_config
-from pipelines.evaluation import ablation
-from pipelines.evaluation.ablation import ABLATIONS, ablate
-from pipelines.progress import SilentProgress
+from msgs_slam.formats.datasets import Sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.msgs_cli.main import main
+from msgs_slam.pipelines.config import Config, load_config
+from msgs_slam.pipelines.evaluation import ablation
+from msgs_slam.pipelines.evaluation.ablation import ABLATIONS, ablate
+from msgs_slam.pipelines.progress import SilentProgress
 
 SETTINGS = (
     "run.threads=2", "frames.rate=4", "proxy.depth=files", "proxy.semantics=files", "mapping.max_side=120",

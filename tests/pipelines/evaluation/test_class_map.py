@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from formats.errors import InputError
-from pipelines.evaluation.class_map import match_classes, open_class_map, read_class_map, shipped_maps
-from pipelines.evaluation.label_cells import label_cells
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.evaluation.class_map import match_classes, open_class_map, read_class_map, shipped_maps
+from msgs_slam.pipelines.evaluation.label_cells import label_cells
 
 THEIRS = ("couch", "stool", "wall", "shoe")
 ADE20K = ("wall", "floor", "ceiling", "sofa", "armchair", "table", "cabinet", "painting", "windowpane", "rug", "tree")

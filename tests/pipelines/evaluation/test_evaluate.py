@@ -11,17 +11,17 @@ import trimesh
 from finished import note_finished
 from scipy.spatial.transform import Rotation
 
-from formats.datasets import Sequence, open_sequence
-from formats.errors import InputError
-from pipelines.evaluation.evaluate import evaluate_run, trajectory_cells
-from pipelines.evaluation.mesh_cells import mesh_cells
-from pipelines.evaluation.truth import match_truth, true_trajectory
-from pipelines.evaluation.write import write_evaluation
-from pipelines.geometry.alignment import Similarity
-from pipelines.outcome import load_outcome
-from pipelines.run_folder import RunFolder
-from pipelines.types import Frame
-from pipelines.upright.world import World, save_world
+from msgs_slam.formats.datasets import Sequence, open_sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.evaluation.evaluate import evaluate_run, trajectory_cells
+from msgs_slam.pipelines.evaluation.mesh_cells import mesh_cells
+from msgs_slam.pipelines.evaluation.truth import match_truth, true_trajectory
+from msgs_slam.pipelines.evaluation.write import write_evaluation
+from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.types import Frame
+from msgs_slam.pipelines.upright.world import World, save_world
 from tests.pipelines.part_of_sequence import part_of
 
 OracleRun = Callable[..., RunFolder]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from pipelines.evaluation.image_quality import psnr, ssim
+from msgs_slam.pipelines.evaluation.image_quality import psnr, ssim
 
 
 @pytest.mark.parametrize("noise", [2, 10, 40])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipelines.evaluation.label_score import (
+from msgs_slam.pipelines.evaluation.label_score import (
     count_labels,
     indices_by_name,
     matched_by_majority,
@@ -11,7 +11,7 @@ from pipelines.evaluation.label_score import (
     renamed,
     score,
 )
-from pipelines.types import VOID
+from msgs_slam.pipelines.types import VOID
 
 
 def test_same_as_scikit_learn() -> None:

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from formats.datasets import Sequence
-from pipelines.evaluation.evaluate import evaluate_run
-from pipelines.evaluation.perceptual import Lpips, open_lpips
-from pipelines.evaluation.table import evaluation_table
-from pipelines.run_folder import RunFolder
+from msgs_slam.formats.datasets import Sequence
+from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
+from msgs_slam.pipelines.evaluation.perceptual import Lpips, open_lpips
+from msgs_slam.pipelines.evaluation.table import evaluation_table
+from msgs_slam.pipelines.run_folder import RunFolder
 
 OracleRun = Callable[..., RunFolder]
 

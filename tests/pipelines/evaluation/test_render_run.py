@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from finished import note_finished
 
-from formats.datasets import Sequence, open_sequence
-from formats.errors import InputError
-from formats.images import list_images, read_rgb
-from formats.video import iter_video
-from formats.video_writer import write_video
-from pipelines.demo import TRUTH, VIDEO, demo_summary, run_demo, unpack_demo_clip
-from pipelines.evaluation.image_quality import psnr
-from pipelines.progress import SilentProgress
-from pipelines.render_run import render_run
-from pipelines.run_folder import RunFolder
+from msgs_slam.formats.datasets import Sequence, open_sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import list_images, read_rgb
+from msgs_slam.formats.video import iter_video
+from msgs_slam.formats.video_writer import write_video
+from msgs_slam.pipelines.demo import TRUTH, VIDEO, demo_summary, run_demo, unpack_demo_clip
+from msgs_slam.pipelines.evaluation.image_quality import psnr
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.render_run import render_run
+from msgs_slam.pipelines.run_folder import RunFolder
 from tests.world import make_world, render_frame
 from tests.world.demo_clip import OPTIONS, pack_clip
 

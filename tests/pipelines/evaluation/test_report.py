@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from finished import note_finished
 
-from formats.datasets import Sequence
-from formats.errors import InputError
-from pipelines.evaluation.facts import Capture, advice, lost_stretches
-from pipelines.evaluation.lengths import found_lengths
-from pipelines.evaluation.plots import Line, plot, ticks
-from pipelines.evaluation.report import write_report
-from pipelines.evaluation.write import PATH_FROM_ABOVE, write_evaluation
-from pipelines.outcome import load_outcome
-from pipelines.run_folder import RunFolder, save_trajectory
-from pipelines.types import LoopEdge, SparseModel
-from pipelines.upright.world import SAME, World, save_world
+from msgs_slam.formats.datasets import Sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.evaluation.facts import Capture, advice, lost_stretches
+from msgs_slam.pipelines.evaluation.lengths import found_lengths
+from msgs_slam.pipelines.evaluation.plots import Line, plot, ticks
+from msgs_slam.pipelines.evaluation.report import write_report
+from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, write_evaluation
+from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run_folder import RunFolder, save_trajectory
+from msgs_slam.pipelines.types import LoopEdge, SparseModel
+from msgs_slam.pipelines.upright.world import SAME, World, save_world
 
 OracleRun = Callable[..., RunFolder]
 VOID_TAGS = {"img", "meta", "rect", "line", "path", "circle"}

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipelines.evaluation.surface_error import (
+from msgs_slam.pipelines.evaluation.surface_error import (
     depth_points,
     sample_surface,
     seen_in_depth,
     surface_error,
     thinned,
 )
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.types import Intrinsics
 
 
 def test_samples_lie_on_the_surface_and_spread_by_area() -> None:

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from formats.gaussian_ply import write_gaussian_ply
-from formats.gaussians import isotropic_cloud
-from pipelines.viewer_door import is_welcome
+from msgs_slam.formats.gaussian_ply import write_gaussian_ply
+from msgs_slam.formats.gaussians import isotropic_cloud
+from msgs_slam.pipelines.viewer_door import is_welcome
 
 pytest.importorskip("viser")
 
 
 @pytest.fixture(scope="module")
 def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    from pipelines.viewer import open_viewer
+    from msgs_slam.pipelines.viewer import open_viewer
 
     path = tmp_path_factory.mktemp("scene") / "<img src=x onerror=alert(1)>{1+1}`.ply"
     rng = np.random.default_rng(0)

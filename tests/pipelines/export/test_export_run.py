@@ -12,18 +12,18 @@ import pytest
 import trimesh
 from evo.tools import file_interface
 
-from formats.datasets import open_sequence
-from formats.errors import InputError
-from formats.gaussian_glb import read_gaussian_glb
-from formats.spz import read_spz
-from pipelines.config import ExportConfig
-from pipelines.export import textured
-from pipelines.export.stage import export_run
-from pipelines.geometry.camera import project
-from pipelines.outcome import Outcome, load_outcome
-from pipelines.run_folder import RunFolder
-from pipelines.run_folder_names import EXPORTS
-from pipelines.upright.world import read_world
+from msgs_slam.formats.datasets import open_sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gaussian_glb import read_gaussian_glb
+from msgs_slam.formats.spz import read_spz
+from msgs_slam.pipelines.config import ExportConfig
+from msgs_slam.pipelines.export import textured
+from msgs_slam.pipelines.export.stage import export_run
+from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run_folder_names import EXPORTS
+from msgs_slam.pipelines.upright.world import read_world
 
 OracleRun = Callable[..., RunFolder]
 SETTINGS = ExportConfig(spz=True, splat_glb=True, texture=True, voxel=0.03)

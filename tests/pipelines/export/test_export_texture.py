@@ -5,13 +5,13 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from pipelines.depth.posed import PosedDepth
-from pipelines.export import texture
-from pipelines.export.atlas import Atlas, owners, simplified, unwrapped
-from pipelines.export.texture import Shot, paint_texture, texels_wanted, vertex_normals, view_weights
-from pipelines.gaussians.render.threads import get_threads, set_threads
-from pipelines.progress import SilentProgress
-from pipelines.types import VOID, Intrinsics, SemanticMesh
+from msgs_slam.pipelines.depth.posed import PosedDepth
+from msgs_slam.pipelines.export import texture
+from msgs_slam.pipelines.export.atlas import Atlas, owners, simplified, unwrapped
+from msgs_slam.pipelines.export.texture import Shot, paint_texture, texels_wanted, vertex_normals, view_weights
+from msgs_slam.pipelines.gaussians.render.threads import get_threads, set_threads
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.types import VOID, Intrinsics, SemanticMesh
 
 CAMERA = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
 FULL = CAMERA.resized(320, 240)

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from formats.images import write_rgb
-from pipelines.config import load_config
-from pipelines.progress import SilentProgress
-from pipelines.run_folder import RunFolder
-from pipelines.stages import StageContext
+from msgs_slam.formats.images import write_rgb
+from msgs_slam.pipelines.config import load_config
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.stages import StageContext
 
 WIDTH, HEIGHT = 320, 240
 FOCAL = 280.0

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.correspondence.bridges import LEAST, Picture, bridged, weak_keyframes
-from pipelines.correspondence.matching import VerifiedPair, match_features
-from pipelines.correspondence.retrieval import describe, learn_vocabulary
-from pipelines.types import Features
+from msgs_slam.pipelines.correspondence.bridges import LEAST, Picture, bridged, weak_keyframes
+from msgs_slam.pipelines.correspondence.matching import VerifiedPair, match_features
+from msgs_slam.pipelines.correspondence.retrieval import describe, learn_vocabulary
+from msgs_slam.pipelines.types import Features
 
 STEP = np.array([9.0, -4.0])
 """Pixels by which the scene moves from one picture to the next."""

@@ -10,10 +10,10 @@ import numpy as np
 import pycolmap
 import pytest
 
-from formats.datasets.camera import Camera
-from formats.errors import InputError
-from pipelines.structure.calibration import read_intrinsics
-from pipelines.structure.lens import distortion_of, make_lens, set_lens, to_pycolmap, unknown_camera
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.structure.calibration import read_intrinsics
+from msgs_slam.pipelines.structure.lens import distortion_of, make_lens, set_lens, to_pycolmap, unknown_camera
 
 
 def test_numbers_on_the_command_line() -> None:

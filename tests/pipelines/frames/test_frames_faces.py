@@ -12,15 +12,15 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from formats.datasets.camera import Camera
-from formats.errors import InputError
-from formats.images import write_rgb
-from formats.spherical import PART, WHOLE, image_sphere, video_sphere
-from pipelines.config import FramesConfig, load_config
-from pipelines.frames.faces import find_faces, fisheye_face, looks_like_panoramas, panorama_faces
-from pipelines.frames.source import open_source
-from pipelines.frames.stage import check
-from pipelines.geometry.rig import CUBE, ONE_CAMERA, Rig, rig_of
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import write_rgb
+from msgs_slam.formats.spherical import PART, WHOLE, image_sphere, video_sphere
+from msgs_slam.pipelines.config import FramesConfig, load_config
+from msgs_slam.pipelines.frames.faces import find_faces, fisheye_face, looks_like_panoramas, panorama_faces
+from msgs_slam.pipelines.frames.source import open_source
+from msgs_slam.pipelines.frames.stage import check
+from msgs_slam.pipelines.geometry.rig import CUBE, ONE_CAMERA, Rig, rig_of
 
 WIDTH = 320
 XML = "<GSpherical:ProjectionType>{}</GSpherical:ProjectionType><GSpherical:StereoMode>{}</GSpherical:StereoMode>"

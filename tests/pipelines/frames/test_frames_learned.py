@@ -14,14 +14,14 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-import pipelines.frames.learned as learned
-from formats.errors import InputError
-from pipelines.config import FramesConfig, load_config
-from pipelines.correspondence.matching import match_descriptors
-from pipelines.frames.learned import EXTRACTOR, MATCHER, LearnedFeatures, learned_inputs, open_learned
-from pipelines.frames.stage import check
-from pipelines.proxy.models.registry import ModelStore
-from pipelines.types import Features
+import msgs_slam.pipelines.frames.learned as learned
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.config import FramesConfig, load_config
+from msgs_slam.pipelines.correspondence.matching import match_descriptors
+from msgs_slam.pipelines.frames.learned import EXTRACTOR, MATCHER, LearnedFeatures, learned_inputs, open_learned
+from msgs_slam.pipelines.frames.stage import check
+from msgs_slam.pipelines.proxy.models.registry import ModelStore
+from msgs_slam.pipelines.types import Features
 
 STEP, SIDE = 16, 128
 """The stand-in has a feature in each cell; the picture it is made for has this side after padding."""

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from formats.images import read_grey_png, read_rgb, write_grey_png, write_rgb
-from pipelines.frames.stage import run
-from pipelines.geometry.alignment import align_points
-from pipelines.run_folder import load_sparse_model
-from pipelines.stages import StageContext
+from msgs_slam.formats.images import read_grey_png, read_rgb, write_grey_png, write_rgb
+from msgs_slam.pipelines.frames.stage import run
+from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.run_folder import load_sparse_model
+from msgs_slam.pipelines.stages import StageContext
 from tests.pipelines.frames.conftest import HEIGHT, WIDTH, Walk
 
 Moving = tuple[Path, Path, list[np.ndarray]]

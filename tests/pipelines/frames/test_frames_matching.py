@@ -10,11 +10,11 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pipelines.correspondence import retrieval
-from pipelines.correspondence.database import write_database
-from pipelines.correspondence.features import extract_features
-from pipelines.correspondence.matching import VerifiedPair, match_descriptors, verify_matches
-from pipelines.correspondence.retrieval import (
+from msgs_slam.pipelines.correspondence import retrieval
+from msgs_slam.pipelines.correspondence.database import write_database
+from msgs_slam.pipelines.correspondence.features import extract_features
+from msgs_slam.pipelines.correspondence.matching import VerifiedPair, match_descriptors, verify_matches
+from msgs_slam.pipelines.correspondence.retrieval import (
     Looks,
     describe,
     far_apart,
@@ -22,12 +22,12 @@ from pipelines.correspondence.retrieval import (
     loop_pairs,
     sequential_pairs,
 )
-from pipelines.correspondence.snapshots import Snapshots
-from pipelines.frames.keyframes import choose_keyframes
-from pipelines.geometry.rig import ONE_CAMERA
-from pipelines.structure.consistency import epipolar_error, judge, without_misplaced
-from pipelines.structure.parallax import rotation_residual
-from pipelines.types import Features
+from msgs_slam.pipelines.correspondence.snapshots import Snapshots
+from msgs_slam.pipelines.frames.keyframes import choose_keyframes
+from msgs_slam.pipelines.geometry.rig import ONE_CAMERA
+from msgs_slam.pipelines.structure.consistency import epipolar_error, judge, without_misplaced
+from msgs_slam.pipelines.structure.parallax import rotation_residual
+from msgs_slam.pipelines.types import Features
 from tests.pipelines.frames.conftest import FOCAL, HEIGHT, WIDTH, render, sideways, turn
 
 CAMERA = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, WIDTH, HEIGHT)

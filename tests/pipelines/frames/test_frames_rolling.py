@@ -9,17 +9,24 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from pipelines.config import TrackingConfig
-from pipelines.geometry import se3
-from pipelines.geometry.alignment import align_points
-from pipelines.geometry.camera import project
-from pipelines.structure.bundle import Bundle, adjust_bundle
-from pipelines.structure.lens import unknown_camera
-from pipelines.structure.rolling import LEAST_GAIN, Shutter, adjust_rolling, estimate, read_readout, velocities
-from pipelines.tracking.adjust import adjust_state
-from pipelines.tracking.state import Sightings, TrackState
-from pipelines.types import Intrinsics
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.config import TrackingConfig
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.structure.bundle import Bundle, adjust_bundle
+from msgs_slam.pipelines.structure.lens import unknown_camera
+from msgs_slam.pipelines.structure.rolling import (
+    LEAST_GAIN,
+    Shutter,
+    adjust_rolling,
+    estimate,
+    read_readout,
+    velocities,
+)
+from msgs_slam.pipelines.tracking.adjust import adjust_state
+from msgs_slam.pipelines.tracking.state import Sightings, TrackState
+from msgs_slam.pipelines.types import Intrinsics
 from tests.world.clip import ROWS, ClipOptions, make_world, render_frame, render_view, walk
 from tests.world.paths import look_at
 
@@ -135,7 +142,7 @@ def test_model_taken_at_once_stays_as_it_is() -> None:
 @pytest.mark.parametrize("together", [True, False])
 def test_tracked_frames_are_adjusted_with_the_readout(together: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not together:
-        monkeypatch.setattr("pipelines.tracking.adjust.MOST_FRAMES", 10)
+        monkeypatch.setattr("msgs_slam.pipelines.tracking.adjust.MOST_FRAMES", 10)
     bundle, points = seen_by(READOUT)
     errors = []
     for shutter in (Shutter(), Shutter((0.0, READOUT), TIMES)):

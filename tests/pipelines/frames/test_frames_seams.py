@@ -10,11 +10,11 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pipelines.frames.stage import warn_of_structure
-from pipelines.stages import StageContext
-from pipelines.structure.adjust import adjust
-from pipelines.structure.consistency import ModelReport
-from pipelines.structure.seams import (
+from msgs_slam.pipelines.frames.stage import warn_of_structure
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.structure.adjust import adjust
+from msgs_slam.pipelines.structure.consistency import ModelReport
+from msgs_slam.pipelines.structure.seams import (
     PairCheck,
     Seam,
     cut,
@@ -25,8 +25,8 @@ from pipelines.structure.seams import (
     tracks_of,
     worst_contradictions,
 )
-from pipelines.structure.sfm import Structure
-from pipelines.types import Vocabulary
+from msgs_slam.pipelines.structure.sfm import Structure
+from msgs_slam.pipelines.types import Vocabulary
 
 COUNT, REACH = 40, 4
 NO_WORDS = Vocabulary(np.zeros((1, 128)), np.zeros(128))

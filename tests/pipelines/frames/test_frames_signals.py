@@ -15,6 +15,7 @@ SETUP = {
 @pytest.mark.parametrize("before", SETUP)
 def test_sigterm_ends_quietly(before: str) -> None:
     setup, code, said = SETUP[before]
-    script = f"import os, signal, sys\n{setup}\nimport pipelines.frames.stage\nos.kill(os.getpid(), signal.SIGTERM)"
+    script = f"import os, signal, sys\n{setup}\n"
+    script += "import msgs_slam.pipelines.frames.stage\nos.kill(os.getpid(), signal.SIGTERM)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (code, said)

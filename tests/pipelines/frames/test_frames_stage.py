@@ -14,22 +14,22 @@ import numpy as np
 import pycolmap
 import pytest
 
-from formats.errors import DiskFullError, InputError
-from formats.images import read_rgb, write_rgb
-from formats.jsonfile import read_json
-from pipelines.config import load_config
-from pipelines.correspondence.snapshots import Snapshots
-from pipelines.frames.source import source_digest
-from pipelines.frames.stage import run
-from pipelines.geometry.alignment import align_points
-from pipelines.progress import SilentProgress
-from pipelines.run_folder import BACKBONE, SPARSE, RunFolder, load_sparse_model, save_sparse
-from pipelines.stages import StageContext
-from pipelines.stored import dataclass_from_json
-from pipelines.structure import sfm
-from pipelines.structure.adjust import adjust
-from pipelines.structure.window_size import windows_of
-from pipelines.types import Calibration
+from msgs_slam.formats.errors import DiskFullError, InputError
+from msgs_slam.formats.images import read_rgb, write_rgb
+from msgs_slam.formats.jsonfile import read_json
+from msgs_slam.pipelines.config import load_config
+from msgs_slam.pipelines.correspondence.snapshots import Snapshots
+from msgs_slam.pipelines.frames.source import source_digest
+from msgs_slam.pipelines.frames.stage import run
+from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.run_folder import BACKBONE, SPARSE, RunFolder, load_sparse_model, save_sparse
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.stored import dataclass_from_json
+from msgs_slam.pipelines.structure import sfm
+from msgs_slam.pipelines.structure.adjust import adjust
+from msgs_slam.pipelines.structure.window_size import windows_of
+from msgs_slam.pipelines.types import Calibration
 from tests.pipelines.frames.conftest import QUICK, WALK_FRAMES, Walk, render, sideways, turn, write_walk
 from tests.pipelines.travelling import Travelling
 

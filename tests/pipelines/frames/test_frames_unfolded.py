@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.config import FramesConfig
-from pipelines.correspondence.bridges import Picture
-from pipelines.correspondence.matching import VerifiedPair, verify_matches
-from pipelines.correspondence.snapshots import Snapshots
-from pipelines.geometry.alignment import align_points
-from pipelines.progress import SilentProgress
-from pipelines.streamed import Streamed
-from pipelines.structure.lens import unknown_camera
-from pipelines.structure.sfm import StructureFromMotion, _Views
-from pipelines.types import Features
+from msgs_slam.pipelines.config import FramesConfig
+from msgs_slam.pipelines.correspondence.bridges import Picture
+from msgs_slam.pipelines.correspondence.matching import VerifiedPair, verify_matches
+from msgs_slam.pipelines.correspondence.snapshots import Snapshots
+from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.streamed import Streamed
+from msgs_slam.pipelines.structure.lens import unknown_camera
+from msgs_slam.pipelines.structure.sfm import StructureFromMotion, _Views
+from msgs_slam.pipelines.types import Features
 
 SIDES, VIEWS, POINTS, REACH = 4, 48, 300, 8
 CAMERA = unknown_camera(480, 360, 400.0, is_prior=True)

@@ -9,18 +9,18 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.correspondence.matching import VerifiedPair
-from pipelines.geometry import se3
-from pipelines.geometry.alignment import Similarity, align_points
-from pipelines.geometry.camera import project
-from pipelines.structure.adjust import adjust, reprojection_errors
-from pipelines.structure.consistency import judge
-from pipelines.structure.lens import unknown_camera
-from pipelines.structure.mend import mended, resize_behind, size_ratio
-from pipelines.structure.rolling import NO_READOUT
-from pipelines.structure.window_size import SHARED, SIZE, window_size, windows_of
-from pipelines.structure.windows import WIDE, Joined, adjust_together, close_loops
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.correspondence.matching import VerifiedPair
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
+from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.structure.adjust import adjust, reprojection_errors
+from msgs_slam.pipelines.structure.consistency import judge
+from msgs_slam.pipelines.structure.lens import unknown_camera
+from msgs_slam.pipelines.structure.mend import mended, resize_behind, size_ratio
+from msgs_slam.pipelines.structure.rolling import NO_READOUT
+from msgs_slam.pipelines.structure.window_size import SHARED, SIZE, window_size, windows_of
+from msgs_slam.pipelines.structure.windows import WIDE, Joined, adjust_together, close_loops
+from msgs_slam.pipelines.types import Intrinsics
 from tests.world.paths import look_at
 
 Array = NDArray[np.float64]

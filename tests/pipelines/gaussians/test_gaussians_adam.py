@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pipelines.gaussians.adam import AdamTable, descend, gradients_of, plain_descend
+from msgs_slam.pipelines.gaussians.adam import AdamTable, descend, gradients_of, plain_descend
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import torch
 
-from pipelines.geometry.camera import pixel_centers, project, project_gaussians, unproject, unproject_depth
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.geometry.camera import pixel_centers, project, project_gaussians, unproject, unproject_depth
+from msgs_slam.pipelines.types import Intrinsics
 
 CAMERA = Intrinsics(64, 48, 51.0, 53.0, 31.3, 25.2)
 

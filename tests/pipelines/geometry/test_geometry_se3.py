@@ -6,7 +6,7 @@ import torch
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from pipelines.geometry import se3
+from msgs_slam.pipelines.geometry import se3
 
 ANGLES = [0.0, 1e-12, 1e-7, 9e-5, 1.1e-4, 1e-2, 1.0, 3.0, np.pi - 1e-3, np.pi - 1e-8]
 

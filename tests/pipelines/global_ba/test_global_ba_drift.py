@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.config import load_config
-from pipelines.depth.fields import FINE, DepthFields
-from pipelines.evaluation.depth_error import DepthErrorSum
-from pipelines.evaluation.views import view_map
-from pipelines.geometry import se3
-from pipelines.geometry.alignment import Similarity
-from pipelines.global_ba.stage import STAGE
-from pipelines.mapping.views import occurring_classes
-from pipelines.run_folder import (
+from msgs_slam.pipelines.config import load_config
+from msgs_slam.pipelines.depth.fields import FINE, DepthFields
+from msgs_slam.pipelines.evaluation.depth_error import DepthErrorSum
+from msgs_slam.pipelines.evaluation.views import view_map
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.global_ba.stage import STAGE
+from msgs_slam.pipelines.mapping.views import occurring_classes
+from msgs_slam.pipelines.run_folder import (
     RunFolder,
     save_depth_fields,
     save_exposure,
@@ -28,8 +28,8 @@ from pipelines.run_folder import (
     save_trajectory,
     write_json,
 )
-from pipelines.stages import StageContext
-from pipelines.types import SparseModel, Trajectory
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.types import SparseModel, Trajectory
 from tests.pipelines.global_ba.test_global_ba_stage import FIRST_AGAIN, seeded_map
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames
 from tests.world.clip import WorldFrame
@@ -104,7 +104,7 @@ def close(
     monkeypatch: pytest.MonkeyPatch,
 ) -> Callable[[str], tuple[RunFolder, dict]]:
     """close(joint): a run whose loop is closed, and the stage's figures."""
-    monkeypatch.setattr("pipelines.global_ba.candidates.LEAST_ALIKE", -1.0)
+    monkeypatch.setattr("msgs_slam.pipelines.global_ba.candidates.LEAST_ALIKE", -1.0)
 
     def run(joint: str) -> tuple[RunFolder, dict]:
         made = make_run(tmp_path / joint, keyframes=tuple(range(0, 24, 2)), backbone_scale=1.0, metric=False)

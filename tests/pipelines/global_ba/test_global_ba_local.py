@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.config import MappingConfig
-from pipelines.gaussian_map import GaussianMap
-from pipelines.gaussians.render import render
-from pipelines.geometry import se3
-from pipelines.global_ba.local import adjust_views, loop_keyframes
-from pipelines.global_ba.verify import Loop
-from pipelines.mapping.views import View, make_view
-from pipelines.tracking.state import NO_SIGHTINGS
-from pipelines.types import Intrinsics, LoopEdge, ProxyMaps
+from msgs_slam.pipelines.config import MappingConfig
+from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.gaussians.render import render
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.global_ba.local import adjust_views, loop_keyframes
+from msgs_slam.pipelines.global_ba.verify import Loop
+from msgs_slam.pipelines.mapping.views import View, make_view
+from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS
+from msgs_slam.pipelines.types import Intrinsics, LoopEdge, ProxyMaps
 
 CAMERA = Intrinsics(160, 120, 140.0, 140.0, 80.0, 60.0)
 OFF = se3.exp(np.array([0.02, -0.015, 0.02, 0.004, 0.006, -0.003]))

@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.config import GlobalBaConfig, TrackingConfig
-from pipelines.correspondence.retrieval import Looks, describe, learn_vocabulary
-from pipelines.geometry import se3
-from pipelines.geometry.alignment import align_points
-from pipelines.geometry.camera import project
-from pipelines.global_ba import loops
-from pipelines.global_ba.candidates import loop_candidates, shared_points
-from pipelines.global_ba.close import close_loops, reprojection_error
-from pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_found
-from pipelines.global_ba.semantics import summarise_labels
-from pipelines.global_ba.verify import KeyframeView, make_view, verify_loop
-from pipelines.tracking.state import TrackState
-from pipelines.types import Features, Intrinsics, SparseModel
+from msgs_slam.pipelines.config import GlobalBaConfig, TrackingConfig
+from msgs_slam.pipelines.correspondence.retrieval import Looks, describe, learn_vocabulary
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.global_ba import loops
+from msgs_slam.pipelines.global_ba.candidates import loop_candidates, shared_points
+from msgs_slam.pipelines.global_ba.close import close_loops, reprojection_error
+from msgs_slam.pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_found
+from msgs_slam.pipelines.global_ba.semantics import summarise_labels
+from msgs_slam.pipelines.global_ba.verify import KeyframeView, make_view, verify_loop
+from msgs_slam.pipelines.tracking.state import TrackState
+from msgs_slam.pipelines.types import Features, Intrinsics, SparseModel
 
 Array = NDArray[np.float64]
 CAMERA = Intrinsics(640, 480, 400, 400, 320, 240)

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry import se3
-from pipelines.global_ba.pose_graph import Edges, apply_step, optimise_pose_graph, residuals
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.global_ba.pose_graph import Edges, apply_step, optimise_pose_graph, residuals
 
 Array = NDArray[np.float64]
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipelines.correspondence.retrieval import describe, learn_vocabulary
-from pipelines.global_ba.semantics import richness, similarity, structure_similarity, summarise_labels
-from pipelines.types import Features
+from msgs_slam.pipelines.correspondence.retrieval import describe, learn_vocabulary
+from msgs_slam.pipelines.global_ba.semantics import richness, similarity, structure_similarity, summarise_labels
+from msgs_slam.pipelines.types import Features
 
 
 def stripes(count: int) -> np.ndarray:

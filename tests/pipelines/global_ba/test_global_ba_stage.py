@@ -12,15 +12,15 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from pipelines.config import Config, load_config
-from pipelines.depth.fields import DepthFields
-from pipelines.gaussian_map import GaussianMap
-from pipelines.geometry import se3
-from pipelines.geometry.alignment import align_points
-from pipelines.geometry.camera import unproject
-from pipelines.global_ba.stage import STAGE
-from pipelines.mapping.views import occurring_classes
-from pipelines.run_folder import (
+from msgs_slam.pipelines.config import Config, load_config
+from msgs_slam.pipelines.depth.fields import DepthFields
+from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.geometry.camera import unproject
+from msgs_slam.pipelines.global_ba.stage import STAGE
+from msgs_slam.pipelines.mapping.views import occurring_classes
+from msgs_slam.pipelines.run_folder import (
     RunFolder,
     save_depth_fields,
     save_exposure,
@@ -29,8 +29,8 @@ from pipelines.run_folder import (
     save_trajectory,
     write_json,
 )
-from pipelines.stages import StageContext
-from pipelines.types import SparseModel, Trajectory
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.types import SparseModel, Trajectory
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames, small_motion
 from tests.world.clip import WorldFrame
 
@@ -141,7 +141,7 @@ def error(poses: Array, truth: Array) -> float:
 def test_a_loop_is_closed_and_the_map_goes_along(
     mapped: Callable[[str], MadeRun], open_stage: Callable[..., StageContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipelines.global_ba.candidates.LEAST_ALIKE", -1.0)
+    monkeypatch.setattr("msgs_slam.pipelines.global_ba.candidates.LEAST_ALIKE", -1.0)
     made = mapped("run")
     before = error(made.run.load_trajectory("mapping").cam_from_world, made.cam_from_world)
     config = load_config(overrides=["global_ba.loop_gap=2", "global_ba.joint=never"])

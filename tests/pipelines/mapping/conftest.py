@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.config import MappingConfig
-from pipelines.mapping.load import MappingInput, load_views
-from pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.config import MappingConfig
+from msgs_slam.pipelines.mapping.load import MappingInput, load_views
+from msgs_slam.pipelines.run_folder import RunFolder
 from tests.pipelines.mapping.small_run import make_run
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from finished import note_finished
 from numpy.typing import NDArray
 
-from formats.images import read_rgb
-from pipelines.depth.fields import DepthFields
-from pipelines.run_folder import (
+from msgs_slam.formats.images import read_rgb
+from msgs_slam.pipelines.depth.fields import DepthFields
+from msgs_slam.pipelines.run_folder import (
     RunFolder,
     proxy_path,
     save_calibration,
@@ -22,7 +22,16 @@ from pipelines.run_folder import (
     save_trajectory,
     write_json,
 )
-from pipelines.types import VOID, Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, SparseModel, Trajectory
+from msgs_slam.pipelines.types import (
+    VOID,
+    Calibration,
+    ClassTable,
+    Frame,
+    Intrinsics,
+    ProxyMaps,
+    SparseModel,
+    Trajectory,
+)
 
 SIZE = (80, 60)
 

@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
-from pipelines.mapping.article.boundary_clip import beside_boundary, clip_beside_boundary
-from pipelines.mapping.article.mirrors import Mirrors, at, label_symmetry_loss, symmetry_loss
-from pipelines.types import VOID, Intrinsics, MirrorPairs
+from msgs_slam.pipelines.mapping.article.boundary_clip import beside_boundary, clip_beside_boundary
+from msgs_slam.pipelines.mapping.article.mirrors import Mirrors, at, label_symmetry_loss, symmetry_loss
+from msgs_slam.pipelines.types import VOID, Intrinsics, MirrorPairs
 
 
 def halves() -> torch.Tensor:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.config import MappingConfig
-from pipelines.mapping.article.label_choice import label_likeness
-from pipelines.mapping.load import MappingInput
-from pipelines.mapping.schedule import Schedule
-from pipelines.types import VOID
+from msgs_slam.pipelines.config import MappingConfig
+from msgs_slam.pipelines.mapping.article.label_choice import label_likeness
+from msgs_slam.pipelines.mapping.load import MappingInput
+from msgs_slam.pipelines.mapping.schedule import Schedule
+from msgs_slam.pipelines.types import VOID
 
 
 def test_likeness_is_the_mean_iou_of_labels(room: MappingInput) -> None:

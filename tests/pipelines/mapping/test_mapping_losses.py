@@ -5,14 +5,14 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from pipelines.gaussians.entropy import plain_entropy, weighted_entropy
-from pipelines.gaussians.ssim import ssim_map
-from pipelines.mapping import losses
-from pipelines.mapping.article.edge_term import edge_loss
-from pipelines.mapping.article.label_image import label_image_loss
-from pipelines.mapping.exposure import expose, fit_exposure
-from pipelines.mapping.photo_loss import photo_loss, plain_photo_loss
-from pipelines.types import VOID
+from msgs_slam.pipelines.gaussians.entropy import plain_entropy, weighted_entropy
+from msgs_slam.pipelines.gaussians.ssim import ssim_map
+from msgs_slam.pipelines.mapping import losses
+from msgs_slam.pipelines.mapping.article.edge_term import edge_loss
+from msgs_slam.pipelines.mapping.article.label_image import label_image_loss
+from msgs_slam.pipelines.mapping.exposure import expose, fit_exposure
+from msgs_slam.pipelines.mapping.photo_loss import photo_loss, plain_photo_loss
+from msgs_slam.pipelines.types import VOID
 
 
 def pictures(dtype: torch.dtype = torch.float32, size: tuple[int, int] = (24, 31)) -> tuple[torch.Tensor, torch.Tensor]:
@@ -137,7 +137,7 @@ def test_compiled_entropy_is_torchs(monkeypatch: pytest.MonkeyPatch) -> None:
     assert plain > 0.5
     torch.testing.assert_close(fast, plain, rtol=1e-6, atol=0)
     torch.testing.assert_close(by_fast, by_plain, rtol=1e-5, atol=1e-9)
-    monkeypatch.setattr("pipelines.gaussians.render.threads._state", {"threads": 3})
+    monkeypatch.setattr("msgs_slam.pipelines.gaussians.render.threads._state", {"threads": 3})
     assert weighted_entropy(features[..., 3:], channels, weight).item() == fast.item() / 2
 
 

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.config import ArticleConfig, MappingConfig
-from pipelines.gaussians.render import Rendering
-from pipelines.geometry import se3
-from pipelines.geometry.camera import project_gaussians
-from pipelines.mapping import growth, objective, optimise, schedule
-from pipelines.mapping.load import MappingInput
-from pipelines.mapping.measure import ViewFigures, measure_view
-from pipelines.mapping.optimise import MapOptimiser, OptimisedMap, optimise_map
-from pipelines.mapping.state import OptimiserState
-from pipelines.mapping.views import View
+from msgs_slam.pipelines.config import ArticleConfig, MappingConfig
+from msgs_slam.pipelines.gaussians.render import Rendering
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.camera import project_gaussians
+from msgs_slam.pipelines.mapping import growth, objective, optimise, schedule
+from msgs_slam.pipelines.mapping.load import MappingInput
+from msgs_slam.pipelines.mapping.measure import ViewFigures, measure_view
+from msgs_slam.pipelines.mapping.optimise import MapOptimiser, OptimisedMap, optimise_map
+from msgs_slam.pipelines.mapping.state import OptimiserState
+from msgs_slam.pipelines.mapping.views import View
 
 SETTINGS = MappingConfig(passes=6.0, min_iterations=0, snapshot_every=20, seed_stride=1)
 

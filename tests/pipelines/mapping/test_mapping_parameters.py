@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.gaussian_map import decided_channels
-from pipelines.gaussians.seeding import complete_depth, fill_smoothly, seed_gaussians, seed_grid, seed_spacing
-from pipelines.geometry.camera import project
-from pipelines.mapping import densify
-from pipelines.mapping.article.class_growth import wrong_classes
-from pipelines.mapping.parameters import KEYS, MapParameters, empty_map
-from pipelines.mapping.region_prior import with_region_prior
-from pipelines.types import VOID, Intrinsics
+from msgs_slam.pipelines.gaussian_map import decided_channels
+from msgs_slam.pipelines.gaussians.seeding import complete_depth, fill_smoothly, seed_gaussians, seed_grid, seed_spacing
+from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.mapping import densify
+from msgs_slam.pipelines.mapping.article.class_growth import wrong_classes
+from msgs_slam.pipelines.mapping.parameters import KEYS, MapParameters, empty_map
+from msgs_slam.pipelines.mapping.region_prior import with_region_prior
+from msgs_slam.pipelines.types import VOID, Intrinsics
 
 CAMERA = Intrinsics(40, 30, 35.0, 35.0, 20.0, 15.0)
 

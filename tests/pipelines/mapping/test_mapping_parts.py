@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.config import MappingConfig
-from pipelines.depth.resize import resize_depth
-from pipelines.geometry import se3
-from pipelines.mapping.covisibility import keyframe_weights
-from pipelines.mapping.load import MappingInput, load_views, split_frames
-from pipelines.mapping.poses import interpolate_rows, move_trajectory
-from pipelines.mapping.schedule import RATE_DECAY, Schedule, Seeding
-from pipelines.mapping.views import channel_table, halved, occurring_classes
-from pipelines.run_folder import RunFolder
-from pipelines.types import VOID, Intrinsics, Trajectory
+from msgs_slam.pipelines.config import MappingConfig
+from msgs_slam.pipelines.depth.resize import resize_depth
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.mapping.covisibility import keyframe_weights
+from msgs_slam.pipelines.mapping.load import MappingInput, load_views, split_frames
+from msgs_slam.pipelines.mapping.poses import interpolate_rows, move_trajectory
+from msgs_slam.pipelines.mapping.schedule import RATE_DECAY, Schedule, Seeding
+from msgs_slam.pipelines.mapping.views import channel_table, halved, occurring_classes
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.types import VOID, Intrinsics, Trajectory
 
 
 def walk(count: int = 6) -> Trajectory:

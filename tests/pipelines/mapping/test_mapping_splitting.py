@@ -3,10 +3,10 @@
 import numpy as np
 import torch
 
-from pipelines.gaussian_map import GaussianMap
-from pipelines.gaussians.render import blending_weights, render
-from pipelines.mapping.splitting import CHILDREN, Blame, blame, split
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.gaussians.render import blending_weights, render
+from msgs_slam.pipelines.mapping.splitting import CHILDREN, Blame, blame, split
+from msgs_slam.pipelines.types import Intrinsics
 
 CAMERA = Intrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0)
 POSE = torch.eye(4, dtype=torch.float64)

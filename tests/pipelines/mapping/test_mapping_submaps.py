@@ -13,24 +13,24 @@ from finished import note_finished
 from numpy.typing import NDArray
 from scipy import sparse
 
-from formats.gaussian_ply import read_gaussian_ply
-from formats.tensors import load_tensors
-from pipelines.config import Config, MappingConfig, RunConfig
-from pipelines.depth.posed import PosedDepth
-from pipelines.export.tiles import write_tiles
-from pipelines.gaussians.render import render
-from pipelines.geometry import se3
-from pipelines.mapping import gauge, submaps
-from pipelines.mapping import stage as mapping_stage
-from pipelines.mapping.divided import refine_divided
-from pipelines.mapping.gauge import SeenExposures, common_exposure
-from pipelines.mapping.submaps import BORDER, divide, nearest_seeing
-from pipelines.memory import LEAST_SUBMAP, submap_size
-from pipelines.outcome import load_outcome, maps_around
-from pipelines.progress import SilentProgress
-from pipelines.run_folder import RunFolder
-from pipelines.stages import StageContext
-from pipelines.types import Intrinsics
+from msgs_slam.formats.gaussian_ply import read_gaussian_ply
+from msgs_slam.formats.tensors import load_tensors
+from msgs_slam.pipelines.config import Config, MappingConfig, RunConfig
+from msgs_slam.pipelines.depth.posed import PosedDepth
+from msgs_slam.pipelines.export.tiles import write_tiles
+from msgs_slam.pipelines.gaussians.render import render
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.mapping import gauge, submaps
+from msgs_slam.pipelines.mapping import stage as mapping_stage
+from msgs_slam.pipelines.mapping.divided import refine_divided
+from msgs_slam.pipelines.mapping.gauge import SeenExposures, common_exposure
+from msgs_slam.pipelines.mapping.submaps import BORDER, divide, nearest_seeing
+from msgs_slam.pipelines.memory import LEAST_SUBMAP, submap_size
+from msgs_slam.pipelines.outcome import load_outcome, maps_around
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.types import Intrinsics
 
 CONFIG = Config(
     run=RunConfig(device="cpu"),

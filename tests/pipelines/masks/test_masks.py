@@ -10,25 +10,25 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from formats.images import read_rgb, write_grey_png, write_rgb
-from pipelines.config import ArticleConfig, MappingConfig, load_config
-from pipelines.correspondence.features import extract_features
-from pipelines.correspondence.flow import corners
-from pipelines.frames.keyframes import choose_keyframes
-from pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
-from pipelines.frames.source import open_source
-from pipelines.gaussians.render import Rendering
-from pipelines.mapping.objective import Objective
-from pipelines.mapping.views import View, make_view
-from pipelines.masks.files import open_masks
-from pipelines.masks.people import PeopleFinder, join_people, people_cards
-from pipelines.progress import SilentProgress
-from pipelines.proxy.models.registry import ModelStore
-from pipelines.proxy.providers import DepthEstimate, LabelEstimate
-from pipelines.proxy.stereo.bands import Bands
-from pipelines.proxy.stereo.sweep import sweep_cost
-from pipelines.types import VOID, Frame, Intrinsics
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import read_rgb, write_grey_png, write_rgb
+from msgs_slam.pipelines.config import ArticleConfig, MappingConfig, load_config
+from msgs_slam.pipelines.correspondence.features import extract_features
+from msgs_slam.pipelines.correspondence.flow import corners
+from msgs_slam.pipelines.frames.keyframes import choose_keyframes
+from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
+from msgs_slam.pipelines.frames.source import open_source
+from msgs_slam.pipelines.gaussians.render import Rendering
+from msgs_slam.pipelines.mapping.objective import Objective
+from msgs_slam.pipelines.mapping.views import View, make_view
+from msgs_slam.pipelines.masks.files import open_masks
+from msgs_slam.pipelines.masks.people import PeopleFinder, join_people, people_cards
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.proxy.models.registry import ModelStore
+from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.stereo.bands import Bands
+from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost
+from msgs_slam.pipelines.types import VOID, Frame, Intrinsics
 from tests.pipelines.proxy.tiny_tflite import write_tflite
 
 HEIGHT, WIDTH = 96, 128

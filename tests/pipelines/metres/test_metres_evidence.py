@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from formats.errors import InputError
-from msgs_cli.tables import scale_lines
-from pipelines.metres.evidence import Evidence, Mode, combine, measured
-from pipelines.metres.files import load_metres, save_metres
-from pipelines.metres.find import describe
-from pipelines.run_folder import RunFolder
+from msgs_slam.formats.errors import InputError
+from msgs_slam.msgs_cli.tables import scale_lines
+from msgs_slam.pipelines.metres.evidence import Evidence, Mode, combine, measured
+from msgs_slam.pipelines.metres.files import load_metres, save_metres
+from msgs_slam.pipelines.metres.find import describe
+from msgs_slam.pipelines.run_folder import RunFolder
 
 
 def gaussian(kind: str, at: float, sd: float, wrong: float = 1e-9, is_guess: bool = False) -> Evidence:

@@ -9,12 +9,12 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from formats.images import read_rgb
-from pipelines.metres.network import SMALL_SD, network_scale, retake
-from pipelines.metres.scene import SeenFrame
-from pipelines.proxy.models.registry import ModelStore
-from pipelines.proxy.networks.card import Card
-from pipelines.types import Intrinsics, ProxyMaps
+from msgs_slam.formats.images import read_rgb
+from msgs_slam.pipelines.metres.network import SMALL_SD, network_scale, retake
+from msgs_slam.pipelines.metres.scene import SeenFrame
+from msgs_slam.pipelines.proxy.models.registry import ModelStore
+from msgs_slam.pipelines.proxy.networks.card import Card
+from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 
 SIDE, NEAREST, SPAN = 64, 1.0, 3.0
 CAMERA = Intrinsics(200, 150, 160.0, 160.0, 104.0, 72.0)

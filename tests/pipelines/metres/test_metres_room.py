@@ -9,20 +9,28 @@ import pytest
 from finished import note_finished
 from numpy.typing import NDArray
 
-from formats.jsonfile import read_json, write_json
-from pipelines.config import Config, ExportConfig
-from pipelines.depth.fields import DepthFields
-from pipelines.export.stage import run as export
-from pipelines.geometry.alignment import Similarity
-from pipelines.metres.find import Found, Machine, contradiction, find_metres, known_evidence, load_seen, usual_evidence
-from pipelines.metres.heights import camera_height, floor_trust
-from pipelines.metres.scene import Scene
-from pipelines.metres.things import sizes_of_things
-from pipelines.progress import SilentProgress
-from pipelines.proxy.regions.structure import FLOOR, OTHER, Gravity
-from pipelines.proxy.regions.voxels import Voxels
-from pipelines.run_folder import RunFolder, save_depth_fields
-from pipelines.stages import StageContext
+from msgs_slam.formats.jsonfile import read_json, write_json
+from msgs_slam.pipelines.config import Config, ExportConfig
+from msgs_slam.pipelines.depth.fields import DepthFields
+from msgs_slam.pipelines.export.stage import run as export
+from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.metres.find import (
+    Found,
+    Machine,
+    contradiction,
+    find_metres,
+    known_evidence,
+    load_seen,
+    usual_evidence,
+)
+from msgs_slam.pipelines.metres.heights import camera_height, floor_trust
+from msgs_slam.pipelines.metres.scene import Scene
+from msgs_slam.pipelines.metres.things import sizes_of_things
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.proxy.regions.structure import FLOOR, OTHER, Gravity
+from msgs_slam.pipelines.proxy.regions.voxels import Voxels
+from msgs_slam.pipelines.run_folder import RunFolder, save_depth_fields
+from msgs_slam.pipelines.stages import StageContext
 
 STAGES_DONE = ("frames", "proxy", "tracking", "mapping")
 OracleRun = Callable[..., RunFolder]

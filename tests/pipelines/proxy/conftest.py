@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 from proxy_room import Room, perfect_backbone, write_source
 
-from formats.images import write_rgb
-from pipelines.config import load_config
-from pipelines.progress import SilentProgress
-from pipelines.run_folder import RunFolder, save_calibration, save_frames, save_sparse_model
-from pipelines.stages import StageContext
-from pipelines.types import Calibration, Frame
+from msgs_slam.formats.images import write_rgb
+from msgs_slam.pipelines.config import load_config
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.run_folder import RunFolder, save_calibration, save_frames, save_sparse_model
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.types import Calibration, Frame
 from tests.pipelines.kept import keep_correspondences
 from tests.world import ClipOptions, make_world, render_frame
 

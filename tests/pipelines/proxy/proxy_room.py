@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from formats.images import write_grey_png, write_rgb
-from pipelines.geometry.camera import project
-from pipelines.proxy.sequence import Sequence
-from pipelines.run_folder import write_json
-from pipelines.types import Calibration, Frame, Intrinsics, SparseModel
+from msgs_slam.formats.images import write_grey_png, write_rgb
+from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.run_folder import write_json
+from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics, SparseModel
 from tests.world import WorldFrame
 
 UNIT = 0.5

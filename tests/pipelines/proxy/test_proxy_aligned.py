@@ -8,11 +8,11 @@ import pytest
 from numpy.typing import NDArray
 from proxy_room import UNIT, Room
 
-from formats.errors import InputError
-from pipelines.proxy.aligned import AlignedDepth, fit_relative, to_depth
-from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.scale import measure_scale
-from pipelines.types import Frame
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.proxy.aligned import AlignedDepth, fit_relative, to_depth
+from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.scale import measure_scale
+from msgs_slam.pipelines.types import Frame
 
 
 class Relative:

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from formats.errors import InputError
-from pipelines.proxy.models import download
-from pipelines.proxy.models.download import fetch
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.proxy.models import download
+from msgs_slam.pipelines.proxy.models.download import fetch
 
 Serve = Callable[..., str]
 OK = b"HTTP/1.1 200 OK\r\n"

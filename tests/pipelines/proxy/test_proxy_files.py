@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from proxy_room import Room, write_source
 
-from formats.errors import InputError
-from formats.images import write_grey_png, write_rgb
-from pipelines.progress import SilentProgress
-from pipelines.proxy.files.classes import find_class_table, read_class_table
-from pipelines.proxy.files.depth import FilesDepth
-from pipelines.proxy.files.labels import FilesLabels
-from pipelines.proxy.files.matching import frame_key
-from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.sequence import Sequence
-from pipelines.types import VOID, Calibration, Frame, Intrinsics
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import write_grey_png, write_rgb
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.proxy.files.classes import find_class_table, read_class_table
+from msgs_slam.pipelines.proxy.files.depth import FilesDepth
+from msgs_slam.pipelines.proxy.files.labels import FilesLabels
+from msgs_slam.pipelines.proxy.files.matching import frame_key
+from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from formats.digest import file_sha256
-from formats.errors import DiskFullError, InputError
-from pipelines.proxy.models.download import fetch
-from pipelines.proxy.models.registry import Model, ModelStore
+from msgs_slam.formats.digest import file_sha256
+from msgs_slam.formats.errors import DiskFullError, InputError
+from msgs_slam.pipelines.proxy.models.download import fetch
+from msgs_slam.pipelines.proxy.models.registry import Model, ModelStore
 
 DATA = np.random.default_rng(0).bytes(700_000)
 SHA = hashlib.sha256(DATA).hexdigest()

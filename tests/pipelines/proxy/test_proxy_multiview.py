@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 from proxy_room import UNIT, Room, write_source
 
-from formats.errors import InputError
-from formats.images import write_grey_png
-from pipelines.config import ProxyConfig
-from pipelines.progress import SilentProgress
-from pipelines.proxy.fused import FusedDepth, fuse
-from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.regions.provider import SegmentLabels
-from pipelines.proxy.reliability import semantic_agreement, warp_labels
-from pipelines.proxy.scale import measure_scale
-from pipelines.proxy.selection import Surroundings, open_depth
-from pipelines.proxy.sequence import Sequence
-from pipelines.proxy.stereo.provider import MultiviewDepth
-from pipelines.types import VOID, Frame, Intrinsics
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import write_grey_png
+from msgs_slam.pipelines.config import ProxyConfig
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.proxy.fused import FusedDepth, fuse
+from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
+from msgs_slam.pipelines.proxy.reliability import semantic_agreement, warp_labels
+from msgs_slam.pipelines.proxy.scale import measure_scale
+from msgs_slam.pipelines.proxy.selection import Surroundings, open_depth
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.proxy.stereo.provider import MultiviewDepth
+from msgs_slam.pipelines.types import VOID, Frame, Intrinsics
 
 SIDE, PLANES = 256, 64
 

@@ -8,19 +8,19 @@ import pytest
 from numpy.typing import NDArray
 from proxy_room import UNIT, Room
 
-from pipelines.evaluation.label_score import count_labels, score
-from pipelines.progress import SilentProgress
-from pipelines.proxy.networks.labels import best_classes
-from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.regions import voxels
-from pipelines.proxy.regions.belonging import one_name_each, place_likelihood
-from pipelines.proxy.regions.named import NamedScene, Vocabulary
-from pipelines.proxy.regions.posture import name_likelihood
-from pipelines.proxy.regions.provider import SegmentLabels
-from pipelines.proxy.regions.structure import FLOOR, OTHER, Gravity
-from pipelines.proxy.regions.voxels import Voxels, merge, voxel_keys
-from pipelines.proxy.sequence import resample_linear
-from pipelines.types import VOID, Frame
+from msgs_slam.pipelines.evaluation.label_score import count_labels, score
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.proxy.networks.labels import best_classes
+from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.regions import voxels
+from msgs_slam.pipelines.proxy.regions.belonging import one_name_each, place_likelihood
+from msgs_slam.pipelines.proxy.regions.named import NamedScene, Vocabulary
+from msgs_slam.pipelines.proxy.regions.posture import name_likelihood
+from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
+from msgs_slam.pipelines.proxy.regions.structure import FLOOR, OTHER, Gravity
+from msgs_slam.pipelines.proxy.regions.voxels import Voxels, merge, voxel_keys
+from msgs_slam.pipelines.proxy.sequence import resample_linear
+from msgs_slam.pipelines.types import VOID, Frame
 from tests.world.room import CLASSES
 
 NAMES = tuple(name for name, _ in CLASSES)

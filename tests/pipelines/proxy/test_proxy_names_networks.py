@@ -9,21 +9,21 @@ from proxy_room import Room
 from test_proxy_names import depth_of
 from tiny_tflite import write_tflite
 
-from formats.datasets import open_sequence
-from formats.images import read_depth_png, read_rgb
-from pipelines.depth.resize import resample_nearest
-from pipelines.evaluation.class_map import match_classes
-from pipelines.evaluation.label_score import count_labels, score
-from pipelines.progress import SilentProgress
-from pipelines.proxy.models.registry import ModelStore
-from pipelines.proxy.networks.card import Card
-from pipelines.proxy.networks.labels import network_labels
-from pipelines.proxy.networks.labels_provider import OnnxLabels
-from pipelines.proxy.networks.network_pass import ResultCache, Workplace
-from pipelines.proxy.networks.session import Network
-from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.sequence import Sequence
-from pipelines.types import VOID, Calibration, Frame, Intrinsics, SparseModel
+from msgs_slam.formats.datasets import open_sequence
+from msgs_slam.formats.images import read_depth_png, read_rgb
+from msgs_slam.pipelines.depth.resize import resample_nearest
+from msgs_slam.pipelines.evaluation.class_map import match_classes
+from msgs_slam.pipelines.evaluation.label_score import count_labels, score
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.proxy.models.registry import ModelStore
+from msgs_slam.pipelines.proxy.networks.card import Card
+from msgs_slam.pipelines.proxy.networks.labels import network_labels
+from msgs_slam.pipelines.proxy.networks.labels_provider import OnnxLabels
+from msgs_slam.pipelines.proxy.networks.network_pass import ResultCache, Workplace
+from msgs_slam.pipelines.proxy.networks.session import Network
+from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics, SparseModel
 from tests.world.room import CLASSES
 
 KINDS = ("wall", "floor", "furniture")

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from proxy_room import Room
 
-from pipelines.progress import SilentProgress
-from pipelines.proxy.networks import network_pass
-from pipelines.proxy.networks.card import read_card
-from pipelines.proxy.networks.clusters_provider import OnnxClusters, spherical_kmeans
-from pipelines.proxy.networks.network_pass import Arrays, NetworkPass, ResultCache, Workplace
-from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.sequence import Sequence
-from pipelines.types import Calibration, Frame, Intrinsics
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.proxy.networks import network_pass
+from msgs_slam.pipelines.proxy.networks.card import read_card
+from msgs_slam.pipelines.proxy.networks.clusters_provider import OnnxClusters, spherical_kmeans
+from msgs_slam.pipelines.proxy.networks.network_pass import Arrays, NetworkPass, ResultCache, Workplace
+from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics
 
 
 class Counting:

@@ -3,9 +3,17 @@
 import numpy as np
 import pytest
 
-from pipelines.proxy.compact import compact
-from pipelines.proxy.reliability import EDGE_STEP, MIDDLE, mean_iou, reliability, semantic_agreement, theta, warp_labels
-from pipelines.types import VOID, Intrinsics, ProxyMaps
+from msgs_slam.pipelines.proxy.compact import compact
+from msgs_slam.pipelines.proxy.reliability import (
+    EDGE_STEP,
+    MIDDLE,
+    mean_iou,
+    reliability,
+    semantic_agreement,
+    theta,
+    warp_labels,
+)
+from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 
 RNG = np.random.default_rng(3)
 DEPTH = (2 + np.cumsum(RNG.normal(0, 0.02, (30, 40)), axis=1)).astype(np.float32)

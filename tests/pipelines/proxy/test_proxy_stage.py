@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from proxy_room import UNIT, Room
 
-from formats.errors import InputError
-from pipelines.proxy.files.depth import FilesDepth
-from pipelines.proxy.files.labels import FilesLabels
-from pipelines.proxy.providers import DepthEstimate, LabelEstimate
-from pipelines.proxy.stage import run
-from pipelines.run_folder import load_proxy_maps, proxy_path, read_json, save_calibration
-from pipelines.stages import StageContext
-from pipelines.types import VOID, Frame
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.proxy.files.depth import FilesDepth
+from msgs_slam.pipelines.proxy.files.labels import FilesLabels
+from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.stage import run
+from msgs_slam.pipelines.run_folder import load_proxy_maps, proxy_path, read_json, save_calibration
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.types import VOID, Frame
 
 Make = Callable[..., StageContext]
 FILES = ("proxy.depth=files", "proxy.semantics=files")

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.proxy.stereo.bands import Bands
-from pipelines.proxy.stereo.consistency import fuse_depths
-from pipelines.proxy.stereo.fill import SURE, fill_unsure
-from pipelines.proxy.stereo.refine import refine_inverse_depth
-from pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
-from pipelines.proxy.stereo.sweep import sweep_cost, warps_to
-from pipelines.proxy.stereo.upsample import upsample_depth
-from pipelines.proxy.stereo.window import LIKENESS, RADIUS, STEP, VARIANCE_FLOOR
+from msgs_slam.pipelines.proxy.stereo.bands import Bands
+from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
+from msgs_slam.pipelines.proxy.stereo.fill import SURE, fill_unsure
+from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth
+from msgs_slam.pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
+from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost, warps_to
+from msgs_slam.pipelines.proxy.stereo.upsample import upsample_depth
+from msgs_slam.pipelines.proxy.stereo.window import LIKENESS, RADIUS, STEP, VARIANCE_FLOOR
 
 HEIGHT, WIDTH, FOCAL = 40, 60, 50.0
 MATRIX = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])

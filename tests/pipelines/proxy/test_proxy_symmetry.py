@@ -9,18 +9,18 @@ import pytest
 from numpy.typing import NDArray
 from proxy_room import Room, perfect_backbone
 
-from pipelines.correspondence.features import extract_features, to_grey
-from pipelines.geometry.camera import project, unproject, unproject_depth
-from pipelines.progress import SilentProgress
-from pipelines.proxy import symmetry
-from pipelines.proxy.mirror_features import mirror_descriptors, mirrored_matches
-from pipelines.proxy.providers import DepthEstimate
-from pipelines.proxy.sequence import Sequence
-from pipelines.proxy.stage import run
-from pipelines.proxy.symmetry import MirrorPlane, find_mirror_planes, mirror_pairs
-from pipelines.run_folder import RunFolder, save_mirror_pairs
-from pipelines.stages import StageContext
-from pipelines.types import Calibration, Features, Frame, Intrinsics, MirrorPairs, SparseModel
+from msgs_slam.pipelines.correspondence.features import extract_features, to_grey
+from msgs_slam.pipelines.geometry.camera import project, unproject, unproject_depth
+from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.proxy import symmetry
+from msgs_slam.pipelines.proxy.mirror_features import mirror_descriptors, mirrored_matches
+from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.proxy.stage import run
+from msgs_slam.pipelines.proxy.symmetry import MirrorPlane, find_mirror_planes, mirror_pairs
+from msgs_slam.pipelines.run_folder import RunFolder, save_mirror_pairs
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.types import Calibration, Features, Frame, Intrinsics, MirrorPairs, SparseModel
 from tests.world import WorldFrame
 
 CAMERA = Intrinsics(320, 240, 260, 260, 160, 120)

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 from tiny_tflite import write_tflite
 
-from formats.errors import InputError
-from formats.images import read_rgb
-from pipelines.config import ProxyConfig
-from pipelines.proxy.models.registry import ModelStore
-from pipelines.proxy.networks.card import Card, read_card
-from pipelines.proxy.networks.depth import network_depth
-from pipelines.proxy.networks.identity import card_identity
-from pipelines.proxy.networks.labels import network_labels
-from pipelines.proxy.networks.person import person_probability
-from pipelines.proxy.networks.session import Network
-from pipelines.proxy.selection import choose_depth, choose_semantics, missing_networks
-from pipelines.types import Intrinsics
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import read_rgb
+from msgs_slam.pipelines.config import ProxyConfig
+from msgs_slam.pipelines.proxy.models.registry import ModelStore
+from msgs_slam.pipelines.proxy.networks.card import Card, read_card
+from msgs_slam.pipelines.proxy.networks.depth import network_depth
+from msgs_slam.pipelines.proxy.networks.identity import card_identity
+from msgs_slam.pipelines.proxy.networks.labels import network_labels
+from msgs_slam.pipelines.proxy.networks.person import person_probability
+from msgs_slam.pipelines.proxy.networks.session import Network
+from msgs_slam.pipelines.proxy.selection import choose_depth, choose_semantics, missing_networks
+from msgs_slam.pipelines.types import Intrinsics
 
 COLOURS = [[8.0, -4.0, -4.0], [-4.0, 8.0, -4.0], [-4.0, -4.0, 8.0]]
 CARD = Card(

@@ -16,19 +16,19 @@ from onnx import TensorProto, helper, numpy_helper
 from proxy_room import Room, write_source
 from tokenizers import Tokenizer, models, normalizers, pre_tokenizers
 
-from formats.errors import InputError
-from formats.tensors import save_arrays
-from msgs_cli.main import main
-from pipelines.config import load_config
-from pipelines.evaluation.label_score import count_labels, score
-from pipelines.proxy.inputs import check_proxy, proxy_inputs
-from pipelines.proxy.networks.card import read_card
-from pipelines.proxy.networks.labels import network_probabilities
-from pipelines.proxy.networks.session import Network
-from pipelines.proxy.networks.words import MOST_WORDS, with_words
-from pipelines.proxy.stage import run
-from pipelines.stages import StageContext
-from pipelines.types import VOID
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.tensors import save_arrays
+from msgs_slam.msgs_cli.main import main
+from msgs_slam.pipelines.config import load_config
+from msgs_slam.pipelines.evaluation.label_score import count_labels, score
+from msgs_slam.pipelines.proxy.inputs import check_proxy, proxy_inputs
+from msgs_slam.pipelines.proxy.networks.card import read_card
+from msgs_slam.pipelines.proxy.networks.labels import network_probabilities
+from msgs_slam.pipelines.proxy.networks.session import Network
+from msgs_slam.pipelines.proxy.networks.words import MOST_WORDS, with_words
+from msgs_slam.pipelines.proxy.stage import run
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.types import VOID
 from tests.world.room import CLASSES
 
 WORDS = ("wall", "floor", "side table")

@@ -6,12 +6,12 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pipelines.geometry import se3
-from pipelines.geometry.alignment import align_points
-from pipelines.structure import bundle_kernels as kernels
-from pipelines.structure.bundle import Bundle, Problem, adjust_bundle, adjust_pose
-from pipelines.tracking.pnp import colmap_camera
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.structure import bundle_kernels as kernels
+from msgs_slam.pipelines.structure.bundle import Bundle, Problem, adjust_bundle, adjust_pose
+from msgs_slam.pipelines.tracking.pnp import colmap_camera
+from msgs_slam.pipelines.types import Intrinsics
 from tests.pipelines.tracking.conftest import KnownBundle
 
 
@@ -99,7 +99,7 @@ def test_fixed_cameras_stay(known_bundle: KnownBundle) -> None:
 def test_sparse_and_dense_solve_the_same_system(known_bundle: KnownBundle, monkeypatch: pytest.MonkeyPatch) -> None:
     fixed = np.arange(12) == 3
     dense = adjust_bundle(known_bundle.bundle, known_bundle.intrinsics, 4, fixed=fixed).bundle
-    monkeypatch.setattr("pipelines.structure.bundle.DENSE_CAMERAS", 1)
+    monkeypatch.setattr("msgs_slam.pipelines.structure.bundle.DENSE_CAMERAS", 1)
     sparse = adjust_bundle(known_bundle.bundle, known_bundle.intrinsics, 4, fixed=fixed).bundle
     assert not np.array_equal(dense.points, sparse.points)
     assert np.allclose(dense.cam_from_world, sparse.cam_from_world, atol=1e-7)

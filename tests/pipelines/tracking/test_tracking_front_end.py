@@ -6,16 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.correspondence.features import extract_features
-from pipelines.correspondence.flow import corners, follow
-from pipelines.correspondence.matching import match_descriptors
-from pipelines.geometry import se3
-from pipelines.geometry.camera import project
-from pipelines.tracking.extend import triangulate
-from pipelines.tracking.motion import interpolate_pose, predict_pose
-from pipelines.tracking.pnp import solve_pose
-from pipelines.tracking.state import Sightings, TrackState
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.correspondence.features import extract_features
+from msgs_slam.pipelines.correspondence.flow import corners, follow
+from msgs_slam.pipelines.correspondence.matching import match_descriptors
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.tracking.extend import triangulate
+from msgs_slam.pipelines.tracking.motion import interpolate_pose, predict_pose
+from msgs_slam.pipelines.tracking.pnp import solve_pose
+from msgs_slam.pipelines.tracking.state import Sightings, TrackState
+from msgs_slam.pipelines.types import Intrinsics
 from tests.pipelines.tracking.conftest import KnownBundle
 
 

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.config import load_config
-from pipelines.geometry.alignment import align_points
-from pipelines.run_folder import save_sparse
-from pipelines.stages import StageContext
-from pipelines.tracking.stage import STAGE
+from msgs_slam.pipelines.config import load_config
+from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.run_folder import save_sparse
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.tracking.stage import STAGE
 from tests.pipelines.tracking.conftest import MadeRun
 
 OTHERS = (15, 18, 21, 23)

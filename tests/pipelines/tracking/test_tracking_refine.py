@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.config import FramesConfig
-from pipelines.geometry import se3
-from pipelines.tracking.front_end import RENDER_LOSS
-from pipelines.tracking.pictures import Pictures
-from pipelines.tracking.refine import RenderWeights, compare_frame
-from pipelines.tracking.state import TrackState
+from msgs_slam.pipelines.config import FramesConfig
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.tracking.front_end import RENDER_LOSS
+from msgs_slam.pipelines.tracking.pictures import Pictures
+from msgs_slam.pipelines.tracking.refine import RenderWeights, compare_frame
+from msgs_slam.pipelines.tracking.state import TrackState
 from tests.pipelines.tracking.conftest import MadeRun
 
 

@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.correspondence.features import extract_features
-from pipelines.geometry import se3
-from pipelines.geometry.alignment import Similarity
-from pipelines.geometry.camera import unproject
-from pipelines.tracking.relocalise import relocalise
-from pipelines.tracking.segments import agree
-from pipelines.tracking.state import Sightings, TrackState
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.correspondence.features import extract_features
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.geometry.camera import unproject
+from msgs_slam.pipelines.tracking.relocalise import relocalise
+from msgs_slam.pipelines.tracking.segments import agree
+from msgs_slam.pipelines.tracking.state import Sightings, TrackState
+from msgs_slam.pipelines.types import Intrinsics
 
 CAMERA = Intrinsics(320, 240, 280, 280, 160, 120)
 

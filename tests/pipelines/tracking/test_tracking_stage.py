@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from formats.errors import InputError
-from formats.images import read_rgb, write_rgb
-from pipelines.config import Config, load_config
-from pipelines.geometry import se3
-from pipelines.geometry.alignment import align_points
-from pipelines.run_folder import load_sparse_model, save_sparse_model
-from pipelines.stages import StageContext
-from pipelines.tracking import adjust, stage
-from pipelines.tracking.stage import STAGE, stretches
-from pipelines.types import SparseModel
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import read_rgb, write_rgb
+from msgs_slam.pipelines.config import Config, load_config
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.run_folder import load_sparse_model, save_sparse_model
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.tracking import adjust, stage
+from msgs_slam.pipelines.tracking.stage import STAGE, stretches
+from msgs_slam.pipelines.types import SparseModel
 from tests.pipelines.tracking.conftest import MadeRun
 
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipelines.config import Config
-from pipelines.geometry import se3
-from pipelines.stages import StageContext
-from pipelines.tracking.pictures import Pictures
-from pipelines.tracking.stage import STAGE
-from pipelines.tracking.turn import fit_rotation, turn_between
-from pipelines.types import Intrinsics, Trajectory
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.tracking.pictures import Pictures
+from msgs_slam.pipelines.tracking.stage import STAGE
+from msgs_slam.pipelines.tracking.turn import fit_rotation, turn_between
+from msgs_slam.pipelines.types import Intrinsics, Trajectory
 from tests.pipelines.tracking.conftest import MadeRun
 from tests.world.clip import ClipOptions, WorldFrame, develop, make_world, render_view
 

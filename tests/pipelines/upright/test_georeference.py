@@ -8,16 +8,16 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from formats.errors import InputError
-from formats.gps import enu_from_geodetic, photo_places, read_track
-from formats.images import list_images
-from pipelines.config import ExportConfig
-from pipelines.export.stage import export_run
-from pipelines.geometry.alignment import Similarity
-from pipelines.outcome import load_outcome
-from pipelines.run_folder import RunFolder
-from pipelines.upright.georeference import georeference
-from pipelines.upright.world import read_world
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gps import enu_from_geodetic, photo_places, read_track
+from msgs_slam.formats.images import list_images
+from msgs_slam.pipelines.config import ExportConfig
+from msgs_slam.pipelines.export.stage import export_run
+from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.upright.georeference import georeference
+from msgs_slam.pipelines.upright.world import read_world
 
 OracleRun = Callable[..., RunFolder]
 ORIGIN = np.array([55.698, 13.195, 37.0])

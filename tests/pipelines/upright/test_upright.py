@@ -10,18 +10,18 @@ from finished import note_finished
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from formats.datasets import Sequence
-from formats.errors import InputError
-from formats.images import write_rgb
-from pipelines.config import ExportConfig
-from pipelines.export.stage import export_run, find_world
-from pipelines.geometry.alignment import Similarity
-from pipelines.outcome import load_outcome
-from pipelines.run_folder import RunFolder, save_map
-from pipelines.types import Intrinsics
-from pipelines.upright.find import find_upright
-from pipelines.upright.lines import common_direction, line_planes
-from pipelines.upright.world import FIRST, World, load_world, read_world, save_world, upright_world
+from msgs_slam.formats.datasets import Sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import write_rgb
+from msgs_slam.pipelines.config import ExportConfig
+from msgs_slam.pipelines.export.stage import export_run, find_world
+from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run_folder import RunFolder, save_map
+from msgs_slam.pipelines.types import Intrinsics
+from msgs_slam.pipelines.upright.find import find_upright
+from msgs_slam.pipelines.upright.lines import common_direction, line_planes
+from msgs_slam.pipelines.upright.world import FIRST, World, load_world, read_world, save_world, upright_world
 
 OracleRun = Callable[..., RunFolder]
 MOVE = Similarity(1.0, Rotation.from_euler("xyz", [130, 25, -50], degrees=True).as_matrix(), np.array([3.0, -2, 5]))

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipelines.gaussians.render import rules
-from pipelines.types import Intrinsics
+from msgs_slam.pipelines.gaussians.render import rules
+from msgs_slam.pipelines.types import Intrinsics
 
 NAMES = ("u", "v", "sigma_px", "z", "opacity", "features")
 IMAGES = ("features", "depth_sum", "depth_silhouette", "silhouette")

@@ -5,9 +5,9 @@ import torch
 from render_scenes import IMAGES, NAMES, random_gaussians, random_proxy, room
 from torch import Tensor
 
-from pipelines.gaussians.render import composite, get_threads, render, set_threads
-from pipelines.gaussians.render.rendering import moved, project_map
-from pipelines.geometry import se3
+from msgs_slam.pipelines.gaussians.render import composite, get_threads, render, set_threads
+from msgs_slam.pipelines.gaussians.render.rendering import moved, project_map
+from msgs_slam.pipelines.geometry import se3
 
 
 @pytest.fixture(autouse=True)

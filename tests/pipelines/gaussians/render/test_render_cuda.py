@@ -15,7 +15,7 @@ pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip
 
 from render_scenes import IMAGES, NAMES, random_gaussians, random_proxy, room  # noqa: E402
 
-from pipelines.gaussians.render import composite, render  # noqa: E402
+from msgs_slam.pipelines.gaussians.render import composite, render  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[4]
 DEVICE = "cuda" if ON_CARD else "cpu"
@@ -97,7 +97,7 @@ COMPILE = """
 import triton
 from triton.compiler import ASTSource
 from triton.backends.compiler import GPUTarget
-from pipelines.gaussians.render import cuda_kernels
+from msgs_slam.pipelines.gaussians.render import cuda_kernels
 kernel = cuda_kernels.{name}
 constants = dict(GUIDED={guided}, PADDED={padded}, STEP=16, TILE=16, ALPHA_MAX=0.99, LIGHT_MIN=1e-4)
 kinds = dict(width="i32", height="i32", channels="i32", kappa="fp32", starts="*i64", members="*i64")

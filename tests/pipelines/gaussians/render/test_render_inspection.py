@@ -4,9 +4,16 @@ import pytest
 import torch
 from render_scenes import random_gaussians, room
 
-from pipelines.gaussians.render import blending_weights, in_view, median_and_seen, median_depth, render, set_threads
-from pipelines.gaussians.render.compositing import choose_backend
-from pipelines.geometry import se3
+from msgs_slam.pipelines.gaussians.render import (
+    blending_weights,
+    in_view,
+    median_and_seen,
+    median_depth,
+    render,
+    set_threads,
+)
+from msgs_slam.pipelines.gaussians.render.compositing import choose_backend
+from msgs_slam.pipelines.geometry import se3
 
 POSE = torch.eye(4, dtype=torch.float64)
 

@@ -5,7 +5,7 @@ import torch
 from render_scenes import IMAGES, NAMES, dense_composite, random_gaussians, random_proxy
 from torch import Tensor
 
-from pipelines.gaussians.render import composite, rules
+from msgs_slam.pipelines.gaussians.render import composite, rules
 
 WIDTH, HEIGHT = 23, 17
 

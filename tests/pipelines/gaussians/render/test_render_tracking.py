@@ -6,9 +6,9 @@ import torch
 from render_scenes import Room, room
 from torch import Tensor
 
-from pipelines.gaussians.render import render, set_threads, track_gn
-from pipelines.gaussians.render.tracking import _Problem
-from pipelines.geometry import se3
+from msgs_slam.pipelines.gaussians.render import render, set_threads, track_gn
+from msgs_slam.pipelines.gaussians.render.tracking import _Problem
+from msgs_slam.pipelines.geometry import se3
 
 TRUE_POSE = torch.eye(4, dtype=torch.float64)
 

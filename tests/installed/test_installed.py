@@ -1,0 +1,196 @@
+"""The command `msgs-slam` as a user has it: a process of its own, in an empty folder, without the checkout on its path.
+
+`make test` runs this against the built wheel and says so by MSGS_SLAM_CHECKOUT; in an editable install it is the same.
+"""
+
+import ast
+import importlib
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import trimesh
+
+import msgs_slam
+from msgs_slam.pipelines.run_folder_names import EXPORTS, STAGES
+from msgs_slam.pipelines.travel import TASK_MODULES
+
+PROGRAM = Path(sys.executable).with_name("msgs-slam")
+PACKAGE = Path(importlib.import_module("msgs_slam.pipelines").__file__ or "").parents[1]
+SMALL = (
+    "run.device=cpu", "frames.max_features=600", "frames.rate=5", "proxy.stereo_side=96", "proxy.stereo_planes=24",
+    "mapping.passes=1", "mapping.min_iterations=20", "mapping.max_gaussians=8000", "export.voxel=0.05",
+)  # fmt: skip
+FILES = {
+    "colmap": "sparse/0/images.bin", "ply": "point_cloud.ply", "spz": "point_cloud.spz", "sog": "point_cloud.sog",
+    "glb": "point_cloud.glb", "mesh": "mesh.ply", "texture": "mesh_textured.glb", "tum": "trajectory.txt",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("somewhere")
+
+
+def environment() -> dict[str, str]:
+    return {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
+
+
+def run(here: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+    words = [str(PROGRAM), *map(str, arguments)]
+    return subprocess.run(words, cwd=here, env=environment(), capture_output=True, text=True, timeout=900)
+
+
+def succeeds(here: Path, *arguments: object) -> str:
+    done = run(here, *arguments)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def demo(here: Path) -> Path:
+    """A finished run of the built-in clip, by the command for it."""
+    succeeds(here, "demo", *(word for setting in SMALL for word in ("--set", setting)), "-q")
+    return here / "msgs-demo" / "room.msgs"
+
+
+def test_it_is_the_wheel_where_that_is_what_is_tested() -> None:
+    checkout = os.environ.get("MSGS_SLAM_CHECKOUT")
+    if checkout is None:
+        pytest.skip("the program is not said to be installed from a wheel: `make test` does")
+    assert not PACKAGE.is_relative_to(Path(checkout))
+    assert PACKAGE == Path(msgs_slam.__file__).parent
+
+
+def test_every_file_of_the_package_is_imported_by_one_name() -> None:
+    """A name in a string or an import that an installed copy does not have breaks here, not at a user's."""
+    code = "import importlib, sys; [importlib.import_module(n) for n in sys.argv[1:]]; "
+    code += "print(sorted(n for n in sys.modules if n.split('.')[0] in ('pipelines', 'formats', 'msgs_cli')))"
+    names = [module_of(path) for path in sources() if path.name not in ("__main__.py", "cuda_kernels.py")]
+    assert len(names) > 200
+    done = subprocess.run([sys.executable, "-c", code, *names], capture_output=True, text=True, env=environment())
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.strip() == "[]"
+
+
+def sources() -> list[Path]:
+    return [p for n in ("msgs_cli", "pipelines", "formats") for p in sorted((PACKAGE / n).rglob("*.py"))]
+
+
+def module_of(path: Path) -> str:
+    """Import name of a file of the package."""
+    inside = path.relative_to(PACKAGE).with_suffix("").parts
+    parts = inside[:-1] if inside[-1] == "__init__" else inside
+    return "msgs_slam" if parts == ("msgs_cli", "msgs_slam") else ".".join(("msgs_slam", *parts))
+
+
+def test_names_of_modules_in_strings_are_modules() -> None:
+    named = {m for p in sources() for m in re.findall(r'"(msgs_slam(?:\.\w+)+)"', p.read_text(encoding="utf-8"))}
+    known = {module_of(path) for path in sources()} | {"msgs_slam.msgs_cli.log_format"}
+    assert named
+    assert named <= known
+    assert set(TASK_MODULES) <= known
+
+
+def test_every_task_is_defined_where_workers_look_for_it() -> None:
+    """What is handed to `in_portions` or `each` by name must be found by another process."""
+    defined = {
+        node.name
+        for name in TASK_MODULES
+        for node in ast.parse(Path(importlib.import_module(name).__file__ or "").read_text(encoding="utf-8")).body
+        if isinstance(node, ast.FunctionDef)
+    }
+    for path in sources():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("in_portions", "each"):
+                work = node.args[1] if ast.unparse(node.func).endswith("in_portions") else node.args[0]
+                if isinstance(work, ast.Name) and work.id != "work":
+                    assert work.id in defined, f"{path}:{node.lineno}"
+
+
+def test_the_demo_ends_with_every_file(demo: Path) -> None:
+    written = {str(p.relative_to(demo / "export")) for p in (demo / "export").rglob("*")}
+    assert {FILES[n] for n in ("colmap", "ply", "mesh", "tum")} <= written
+    mesh = trimesh.load(demo / "export" / "mesh.ply", process=False)
+    assert len(mesh.faces) > 1000
+
+
+def test_a_finished_run_is_up_to_date(demo: Path) -> None:
+    before = {p: p.stat().st_mtime_ns for n in STAGES for p in (demo / n).rglob("*")}
+    succeeds(demo.parent, "resume", demo.name, "-q")
+    assert {p: p.stat().st_mtime_ns for n in STAGES for p in (demo / n).rglob("*")} == before
+
+
+def test_two_processes_share_a_run(demo: Path, tmp_path: Path) -> None:
+    shared = tmp_path / "shared.msgs"
+    shutil.copytree(demo, shared)
+    shutil.rmtree(shared / "export")
+    words = [str(PROGRAM), "work", shared.name, "-q", "--shard"]
+    workers = [subprocess.Popen([*words, f"{k}/2"], cwd=tmp_path, env=environment()) for k in range(2)]
+    assert [w.wait(timeout=600) for w in workers] == [0, 0]
+    assert (shared / "export" / "mesh.ply").read_bytes() == (demo / "export" / "mesh.ply").read_bytes()
+
+
+def test_ray_is_a_place_to_work(demo: Path, tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    other = tmp_path / "ray.msgs"
+    shutil.copytree(demo, other)
+    shutil.rmtree(other / "export")
+    succeeds(tmp_path, "resume", other.name, "--engine", "ray", "-q")
+    assert (other / "export" / "mesh.ply").read_bytes() == (demo / "export" / "mesh.ply").read_bytes()
+
+
+@pytest.mark.parametrize("kind", EXPORTS)
+def test_each_export_alone(demo: Path, kind: str, tmp_path: Path) -> None:
+    succeeds(tmp_path, "export", demo, "--only", kind, "--to", tmp_path / kind, "-q")
+    assert (tmp_path / kind / FILES[kind]).stat().st_size > 0
+
+
+@pytest.fixture
+def port() -> Iterator[int]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        number = probe.getsockname()[1]
+    yield number
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
+def test_the_viewer_shows_a_page_and_ends(demo: Path, port: int, stop: signal.Signals, tmp_path: Path) -> None:
+    pytest.importorskip("viser")
+    said = tmp_path / "said.txt"
+    with said.open("w") as stream:
+        viewer = subprocess.Popen(
+            [str(PROGRAM), "view", str(demo), "--port", str(port)], cwd=tmp_path, env=environment(),
+            stdout=stream, stderr=stream,
+        )  # fmt: skip
+    try:
+        page = b""
+        for _ in range(240):
+            try:
+                found = re.search(r"http://\S+", said.read_text())
+                page = urllib.request.urlopen(found[0] if found else f"http://127.0.0.1:{port}/", timeout=5).read()
+                break
+            except OSError:
+                assert viewer.poll() is None, said.read_text()[-2000:]
+                time.sleep(0.5)
+        assert b"<html" in page.lower()
+        viewer.send_signal(stop)
+        assert viewer.wait(timeout=60) == 0
+        assert "Traceback" not in said.read_text()
+        assert "stack trace" not in said.read_text()
+    finally:
+        viewer.kill()
+        viewer.wait()
+
+
+def test_the_doctor_finds_nothing_amiss(here: Path) -> None:
+    assert "python" in succeeds(here, "doctor").lower()
