@@ -16,7 +16,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.jsonfile import read_toml
-from msgs_slam.pipelines.earlier_versions import explain_retired
+from msgs_slam.pipelines.retired_settings import explain_retired
 
 
 def setting(

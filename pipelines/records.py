@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import read_json_object, read_toml, write_json
+from msgs_slam.formats.jsonfile import read_json_object, write_json
 from msgs_slam.formats.reading import parsing
 from msgs_slam.pipelines.config import Config, config_to_dict, merge_known_settings, settings_of_stage
-from msgs_slam.pipelines.earlier_versions import migrated_stages
 from msgs_slam.pipelines.run_folder_names import SOURCE_LIST, STAGES
 from msgs_slam.pipelines.stored import dataclass_from_json
 
@@ -23,11 +22,7 @@ if TYPE_CHECKING:
     from msgs_slam.pipelines.run_folder import RunFolder
 
 FORMAT = 2
-"""Of manifest.json. 1, that of 0.1.0, had neither a checksum nor the settings of the records."""
-
-
-SETTINGS_MARK = "# Written by msgs-slam."
-"""How run.toml begins since format 2."""
+"""Of manifest.json."""
 
 
 @dataclass(frozen=True)
@@ -81,11 +76,10 @@ class StageRecord:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What the run was made from, and the finished stages by name, in their order; format of the file it came from."""
+    """What the run was made from, and the finished stages by name, in their order."""
 
     source: Source
     records: dict[str, StageRecord]
-    format: int = FORMAT
 
 
 def read_manifest(path: Path) -> Manifest:
@@ -102,18 +96,13 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def _manifest(path: Path, value: dict[str, Any]) -> Manifest:
-    format, stages = value.get("format", 1), value["stages"]
-    if format == 1:
-        settings = path.with_name("run.toml")
-        if settings.read_bytes().startswith(SETTINGS_MARK.encode()):
-            raise InputError(f"{path} is of version 0.1.0, but run.toml beside it is not: it is another run's")
-        stages = migrated_stages(value, read_toml(settings))
-    elif format != FORMAT:
-        raise InputError(f"{path}: its format is {str(format)[:20]}, this version of the program knows {FORMAT}")
-    elif value.pop("check", None) != _check(value):
+    if (found := value.get("format", 1)) != FORMAT:
+        raise InputError(f"{path}: its format is {str(found)[:20]}, this version of the program knows {FORMAT}")
+    if value.pop("check", None) != _check(value):
         raise ValueError("its checksum differs")
+    stages = value["stages"]
     records = {name: StageRecord.from_json(stages[name]) for name in STAGES if name in stages}
-    return Manifest(dataclass_from_json(Source, value["source"]), records, format)
+    return Manifest(dataclass_from_json(Source, value["source"]), records)
 
 
 def write_manifest(path: Path, manifest: Manifest) -> None:

@@ -46,7 +46,7 @@ def load_settings(run: RunFolder) -> Config:
     with opened(run.settings_file, MAX_TOML_BYTES, any_content=True) as file:
         text = file.read().decode("utf-8", errors="replace")
     mark = _MARK.match(text)
-    as_written = mark[1] == _check(run, text[mark.end() :]) if mark else _is_of_first_format(run)
+    as_written = mark is not None and mark[1] == _check(run, text[mark.end() :])
     if not as_written:
         raise InputError(
             f"{run.settings_file} is not as the program left it: damaged, or edited by hand. Delete it and type "
@@ -58,11 +58,6 @@ def load_settings(run: RunFolder) -> Config:
 
 def _check(run: RunFolder, text: str) -> str:
     return hashlib.sha256(f"{load_source(run).digest}\n{text}".encode()).hexdigest()
-
-
-def _is_of_first_format(run: RunFolder) -> bool:
-    manifest = run.manifest()
-    return manifest is not None and manifest.format == 1
 
 
 def _known(values: dict[str, Any], run: RunFolder) -> Config:

@@ -26,7 +26,7 @@ PACKAGE = "msgs_slam"
 PLUMBING = frozenset(
     [
         "msgs_slam.pipelines.config",
-        "msgs_slam.pipelines.earlier_versions",
+        "msgs_slam.pipelines.retired_settings",
         "msgs_slam.pipelines.stages",
         "msgs_slam.pipelines.progress",
         "msgs_slam.pipelines.stopping",

@@ -22,7 +22,6 @@ from msgs_slam.pipelines.journal import JOURNAL, Journal, empty
 from msgs_slam.pipelines.memory import give_back, memory_room
 from msgs_slam.pipelines.progress import Progress, log
 from msgs_slam.pipelines.records import (
-    FORMAT,
     Manifest,
     Source,
     StageRecord,
@@ -157,7 +156,7 @@ def run_stages(
     upstream = source_digest
     wanted = stages[: STAGES.index(until) + 1]
     inputs = _check_inputs(wanted, run, source, config, source_digest, same_source)
-    if (before := run.manifest()) is None or before.format != FORMAT:
+    if run.manifest() is None:
         write_manifest(run.manifest_file, Manifest(origin, records))
     save_settings(run, config)
     for stage in wanted:

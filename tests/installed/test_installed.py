@@ -14,7 +14,6 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -68,7 +67,7 @@ def test_it_is_the_wheel_where_that_is_what_is_tested() -> None:
     if checkout is None:
         pytest.skip("the program is not said to be installed from a wheel: `make test` does")
     assert not PACKAGE.is_relative_to(Path(checkout))
-    assert PACKAGE == Path(msgs_slam.__file__).parent
+    assert Path(msgs_slam.__file__).parent == PACKAGE
 
 
 def test_every_file_of_the_package_is_imported_by_one_name() -> None:
@@ -156,11 +155,11 @@ def test_each_export_alone(demo: Path, kind: str, tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def port() -> Iterator[int]:
+def port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         number = probe.getsockname()[1]
-    yield number
+    return number
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])

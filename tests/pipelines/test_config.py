@@ -8,7 +8,7 @@ import pytest
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config, config_to_dict, config_to_toml, load_config
-from msgs_slam.pipelines.earlier_versions import FIXED, GONE, MOVED
+from msgs_slam.pipelines.retired_settings import FIXED, GONE, MOVED
 
 
 @pytest.mark.parametrize("comments", [True, False])
@@ -65,7 +65,7 @@ def test_wrong_files_are_refused(tmp_path: Path) -> None:
         load_config(tmp_path / "missing.toml")
 
 
-def test_settings_of_earlier_versions_are_refused_with_what_became_of_them(tmp_path: Path) -> None:
+def test_settings_of_retired_settings_are_refused_with_what_became_of_them(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"mapping\.kappa is article\.kappa now"):
         load_config(overrides=["mapping.kappa=5"])
     file = tmp_path / "old.toml"

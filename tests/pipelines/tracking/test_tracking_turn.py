@@ -107,7 +107,7 @@ def test_a_rotation_is_found_among_wrong_matches() -> None:
     assert 0 < Rotation.from_matrix(rotation @ truth.T).magnitude() < np.radians(0.1)
 
 
-def test_of_trajectories_of_earlier_versions_every_pose_has_its_place() -> None:
+def test_of_trajectories_of_retired_settings_every_pose_has_its_place() -> None:
     poses = np.tile(np.eye(4), (3, 1, 1))
     old = Trajectory(np.arange(3), np.arange(3.0), poses, np.array([True, False, False]), ("", "", "lost"))
     assert old.is_placed.tolist() == [True, True, False]
