@@ -58,8 +58,9 @@ def batch(
     set_up_logging(quiet, verbose)
     require_engine(engine_name, address)
     from msgs_slam.formats.jsonfile import read_toml
-    from msgs_slam.pipelines.batch import Shard, find_recordings, run_batch, table_rows, write_table
+    from msgs_slam.pipelines.batch import find_recordings, run_batch, table_rows, write_table
     from msgs_slam.pipelines.config import load_config
+    from msgs_slam.pipelines.shards import Shard
 
     recordings = find_recordings(folder.resolve(), out.resolve())
     mine = Shard.parse(shard).of(recordings)

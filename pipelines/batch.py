@@ -67,26 +67,6 @@ class Job:
         return load_config(None, self.overrides, merge_settings(base, self.settings, "the settings file"))
 
 
-@dataclass(frozen=True)
-class Shard:
-    """The recordings whose number leaves the rest `index` when divided by `count`."""
-
-    index: int = 0
-    count: int = 1
-
-    @staticmethod
-    def parse(text: str) -> Shard:
-        """From `3/16`, counted from 0. Raises InputError for anything else."""
-        index, _, count = text.partition("/")
-        if not (index.isdecimal() and count.isdecimal() and int(index) < int(count)):
-            raise InputError(f"--shard {text}: expected K/N with K from 0 to N - 1, for example 3/16")
-        return Shard(int(index), int(count))
-
-    def of(self, recordings: Sequence[Recording]) -> list[Recording]:
-        """Its own."""
-        return list(recordings[self.index :: self.count])
-
-
 def find_recordings(folder: Path, runs: Path) -> list[Recording]:
     """The videos, image folders and data sets directly in a folder, by name. Raises InputError where there is none."""
     if not folder.is_dir():

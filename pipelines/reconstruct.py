@@ -20,6 +20,7 @@ from msgs_slam.pipelines.run_folder import RunFolder
 from msgs_slam.pipelines.run_folder_names import SOURCE_LIST, STAGES
 from msgs_slam.pipelines.settings_file import load_settings
 from msgs_slam.pipelines.stages import Stage, run_stages
+from msgs_slam.pipelines.threads import set_threads
 from msgs_slam.pipelines.workers import TaskWorkers
 
 
@@ -175,15 +176,3 @@ def _require_same_source(run: RunFolder, source: Path, digest: str) -> None:
 
 def _with_device(config: Config) -> Config:
     return replace(config, run=replace(config.run, device=settle_device(config.run.device)))
-
-
-def set_threads(threads: int) -> None:
-    """How many CPU threads this process uses."""
-    import cv2
-    import torch
-
-    from msgs_slam.pipelines.gaussians.render import set_threads
-
-    torch.set_num_threads(threads)
-    cv2.setNumThreads(threads)
-    set_threads(threads)

@@ -8,7 +8,6 @@ in any order; one that is killed leaves its task, or its lead, to the others.
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -19,12 +18,8 @@ from typing import Any, TypeVar
 
 from msgs_slam.formats.errors import InputError, RecoverableError
 from msgs_slam.formats.jsonfile import read_json, write_json
-from msgs_slam.pipelines.batch import Shard
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.lock import RunBusyError, take_lock
-from msgs_slam.pipelines.progress import Progress, log
-from msgs_slam.pipelines.reconstruct import resume
-from msgs_slam.pipelines.records import StageRecord
+from msgs_slam.pipelines.lock import take_lock
+from msgs_slam.pipelines.progress import Progress
 from msgs_slam.pipelines.run_folder import RunFolder
 from msgs_slam.pipelines.stopping import stop_if_asked
 from msgs_slam.pipelines.travel import TASK_MODULES, load_value, name_of, of_name, save_value
@@ -34,23 +29,28 @@ T = TypeVar("T")
 R = TypeVar("R")
 _TASKS = ".tasks"
 _READY = "ready.json"
-_BETWEEN_LOOKS = 0.5
+BETWEEN_LOOKS = 0.5
 """Seconds."""
 
 
-def work_on_run(
-    run: RunFolder, shard: Shard, config: Config, prepare: Callable[[str], Progress], until: str
-) -> dict[str, StageRecord]:
-    """Lead or help until the run is done up to a stage; its records. Raises InputError as `resume` does, and for a node
-    that cannot do a task (another version of the program, a full disk): the others go on."""
-    workers = SharedWorkers(shard, prepare, config.run.threads or os.cpu_count() or 1)
-    log.info("shard %d of %d", shard.index, shard.count)
-    while True:
-        with suppress(RunBusyError):
-            return resume(run, prepare("run"), config, until, workers, lambda: _withdraw_all(run))
-        if not any(posted.do_one(shard, prepare) for posted in _posted(run)):
-            stop_if_asked()
-            time.sleep(_BETWEEN_LOOKS)
+@dataclass(frozen=True)
+class Shard:
+    """Those of many things alike (recordings, tasks) whose number leaves the rest `index` when divided by `count`."""
+
+    index: int = 0
+    count: int = 1
+
+    @staticmethod
+    def parse(text: str) -> Shard:
+        """From `3/16`, counted from 0. Raises InputError for anything else."""
+        index, _, count = text.partition("/")
+        if not (index.isdecimal() and count.isdecimal() and int(index) < int(count)):
+            raise InputError(f"--shard {text}: expected K/N with K from 0 to N - 1, for example 3/16")
+        return Shard(int(index), int(count))
+
+    def of(self, things: Sequence[T]) -> list[T]:
+        """Its own."""
+        return list(things[self.index :: self.count])
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class SharedWorkers:
         while missing := posted.missing():
             stop_if_asked()
             if not posted.do_one(self.shard, self.prepare) and missing == posted.missing():
-                time.sleep(_BETWEEN_LOOKS)
+                time.sleep(BETWEEN_LOOKS)
         found = [load_value(posted.done(n)) for n in range(len(tasks))]
         posted.withdraw()
         return found
@@ -146,24 +146,24 @@ class Posted:
             with lock.open("ab") as stream:
                 while not take_lock(stream):
                     stop_if_asked()
-                    time.sleep(_BETWEEN_LOOKS)
+                    time.sleep(BETWEEN_LOOKS)
         for _ in range(20):  # whoever looks in at this moment may leave a lock; a disk may be slow to let go of one
             shutil.rmtree(self.folder, ignore_errors=True)
             if not self.folder.exists():
                 break
-            time.sleep(_BETWEEN_LOOKS / 5)
+            time.sleep(BETWEEN_LOOKS / 5)
         with suppress(OSError):
             self.folder.parent.rmdir()
 
 
-def _posted(run: RunFolder) -> Iterator[Posted]:
+def posted_in(run: RunFolder) -> Iterator[Posted]:
     found: list[Path] = []
     with suppress(FileNotFoundError):  # nothing is posted, or no longer
         found = sorted((run.root / _TASKS).iterdir())
     yield from map(Posted, found)
 
 
-def _withdraw_all(run: RunFolder) -> None:
+def withdraw_all(run: RunFolder) -> None:
     """What a leader before has left."""
-    for posted in _posted(run):
+    for posted in posted_in(run):
         posted.withdraw()

@@ -43,6 +43,11 @@ PLUMBING = frozenset(
 )
 
 
+def stage_file(name: str) -> Path:
+    """The module of a stage."""
+    return ROOT / "pipelines" / name / "stage.py"
+
+
 @functools.cache
 def stage_identity(name: str, file: Path) -> str:
     """The number of the last release, or a digest of the sources, of the stage whose module is `file`."""

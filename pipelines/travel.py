@@ -17,8 +17,13 @@ from msgs_slam.formats.reading import parsing
 from msgs_slam.formats.tensors import load_arrays, save_arrays
 
 _TREE = "tree"
-_OURS = f"{__name__.rpartition('.')[0]}."
-TASK_MODULES = tuple(_OURS + name for name in ("frames.begun", "proxy.tasks", "mapping.submap_tasks", "export.tasks"))
+_OURS = "msgs_slam.pipelines."
+TASK_MODULES = (
+    "msgs_slam.pipelines.frames.begun",
+    "msgs_slam.pipelines.proxy.tasks",
+    "msgs_slam.pipelines.mapping.submap_tasks",
+    "msgs_slam.pipelines.export.tasks",
+)
 """Where functions that do tasks are defined: a run from elsewhere could name any function of the program."""
 
 

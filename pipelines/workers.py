@@ -16,6 +16,9 @@ from msgs_slam.formats.errors import InputError, RecoverableError
 from msgs_slam.pipelines.engines import Call, Engine
 from msgs_slam.pipelines.journal import Journal
 from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.run_folder_names import STAGES
+from msgs_slam.pipelines.stage_identity import stage_file, stage_identity
+from msgs_slam.pipelines.threads import set_threads
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -75,8 +78,6 @@ def work_here(
     threads: int, code: str,
 ) -> tuple[str, Any]:  # fmt: skip
     """The task in this process, beside others that may write the same: (why it is refused or "", what it returns)."""
-    from msgs_slam.pipelines.reconstruct import set_threads
-
     progress = prepare(name)
     try:
         require_same_world([folder], code)
@@ -111,10 +112,7 @@ def require_same_world(folders: Sequence[Path], code: str) -> None:
 @functools.cache
 def code_identity() -> str:
     """Of what results depend on: the program's stages, Python, the libraries that compute; name=version of each."""
-    from msgs_slam.pipelines.reconstruct import all_stages
-    from msgs_slam.pipelines.stage_identity import stage_identity
-
-    stages = " ".join(stage_identity(stage.name, stage.file) for stage in all_stages())
+    stages = " ".join(stage_identity(name, stage_file(name)) for name in STAGES)
     program = hashlib.sha256(stages.encode()).hexdigest()
     found = {"msgs-slam": program, "Python": platform.python_version(), **{name: _version(name) for name in _COMPUTE}}
     return " ".join(f"{name}={value}" for name, value in found.items())

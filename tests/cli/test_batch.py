@@ -13,11 +13,12 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines import batch, workers
-from msgs_slam.pipelines.batch import DONE, ELSEWHERE, FAILED, Job, Recording, Shard, find_recordings, work_on
+from msgs_slam.pipelines.batch import DONE, ELSEWHERE, FAILED, Job, Recording, find_recordings, work_on
 from msgs_slam.pipelines.engines import Call, Ended
 from msgs_slam.pipelines.lock import locked
 from msgs_slam.pipelines.progress import SilentProgress
 from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.shards import Shard
 from tests.pipelines.frames.conftest import QUICK, render, sideways
 
 

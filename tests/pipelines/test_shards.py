@@ -15,9 +15,8 @@ import pytest
 
 from msgs_slam.formats.errors import InputError, RecoverableError
 from msgs_slam.pipelines import shards, travel, workers
-from msgs_slam.pipelines.batch import Shard
 from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.shards import Posted, SharedWorkers, _posted
+from msgs_slam.pipelines.shards import Posted, Shard, SharedWorkers, posted_in
 
 HOLDS = "import fcntl, sys; f = open(sys.argv[1], 'ab'); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()"
 
@@ -42,7 +41,7 @@ def helpers(folder: Path) -> Iterator[list[int]]:
 
     def help_out(n: int) -> None:
         while not ended.is_set():
-            done[n] += any(p.do_one(Shard(n + 1, 4), engine_calls.silent) for p in _posted(RunFolder(folder.parent)))
+            done[n] += any(p.do_one(Shard(n + 1, 4), engine_calls.silent) for p in posted_in(RunFolder(folder.parent)))
 
     threads = [threading.Thread(target=help_out, args=(n,)) for n in range(3)]
     for thread in threads:

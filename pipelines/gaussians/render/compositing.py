@@ -10,7 +10,7 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render import reference
+import msgs_slam.pipelines.gaussians.render.reference as reference
 
 
 @dataclass(frozen=True)
@@ -92,13 +92,13 @@ def choose_backend(backend: str | None, example: Tensor) -> ModuleType:
     if name == "reference":
         return reference
     if name == "cpu":
-        from msgs_slam.pipelines.gaussians.render import cpu  # importing numba takes a while: only where it is used
+        import msgs_slam.pipelines.gaussians.render.cpu as cpu  # importing numba takes a while: only where it is used
 
         return cpu
     if name == "cuda":
         if not _has_triton():
             raise ValueError("backend: 'cuda' needs triton >= 3.3, which comes with torch >= 2.7 built for CUDA")
-        from msgs_slam.pipelines.gaussians.render import cuda
+        import msgs_slam.pipelines.gaussians.render.cuda as cuda
 
         return cuda
     raise ValueError(f"backend: got {backend!r}, expected 'reference', 'cpu', 'cuda' or None")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.gaussians.render import rules
+import msgs_slam.pipelines.gaussians.render.rules as rules
 from msgs_slam.pipelines.gaussians.render.boxes import gradients_of_box
 from msgs_slam.pipelines.gaussians.render.cpu_bands import (
     BAND_ROWS,

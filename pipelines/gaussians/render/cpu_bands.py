@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.gaussians.render import rules
+import msgs_slam.pipelines.gaussians.render.rules as rules
 from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
 from msgs_slam.pipelines.gaussians.render.threads import for_each
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.gaussians.render import rules
+import msgs_slam.pipelines.gaussians.render.rules as rules
 from msgs_slam.pipelines.gaussians.render.cpu_backward import ALPHA, PLANES, weigh_rows
 from msgs_slam.pipelines.gaussians.render.cpu_bands import (
     BAND_ROWS,

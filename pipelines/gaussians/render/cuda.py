@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render import rules
+import msgs_slam.pipelines.gaussians.render.rules as rules
 from msgs_slam.pipelines.gaussians.render.cuda_kernels import backward_tile, forward_tile
 from msgs_slam.pipelines.gaussians.render.reference import inspect
 

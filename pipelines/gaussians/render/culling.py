@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render import rules
+import msgs_slam.pipelines.gaussians.render.rules as rules
 from msgs_slam.pipelines.gaussians.render.compositing import require_finite
 from msgs_slam.pipelines.gaussians.render.jit import kernel
 from msgs_slam.pipelines.geometry import se3

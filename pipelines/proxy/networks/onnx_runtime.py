@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.reading import parsing
 from msgs_slam.pipelines.progress import log
 from msgs_slam.pipelines.proxy.networks.onnx_file import require_own_weights
-from msgs_slam.pipelines.proxy.networks.runtime import Port
+from msgs_slam.pipelines.proxy.networks.port import Port
 
 _TYPES: dict[str, type[np.generic]] = {
     "tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(int64)": np.int64, "tensor(int32)": np.int32,

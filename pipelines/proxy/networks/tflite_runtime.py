@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.reading import parsing, read_bytes
-from msgs_slam.pipelines.proxy.networks.runtime import Port
+from msgs_slam.pipelines.proxy.networks.port import Port
 
 _MAGIC = b"TFL3"
 _MAX_BYTES = 1 << 30

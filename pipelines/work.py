@@ -1,0 +1,32 @@
+"""What the command `work` does: lead or help at a run that several processes work on."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.lock import RunBusyError
+from msgs_slam.pipelines.progress import Progress, log
+from msgs_slam.pipelines.reconstruct import resume
+from msgs_slam.pipelines.records import StageRecord
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.shards import BETWEEN_LOOKS, Shard, SharedWorkers, posted_in, withdraw_all
+from msgs_slam.pipelines.stopping import stop_if_asked
+
+
+def work_on_run(
+    run: RunFolder, shard: Shard, config: Config, prepare: Callable[[str], Progress], until: str
+) -> dict[str, StageRecord]:
+    """Lead or help until the run is done up to a stage; its records. Raises InputError as `resume` does, and for a node
+    that cannot do a task (another version of the program, a full disk): the others go on."""
+    workers = SharedWorkers(shard, prepare, config.run.threads or os.cpu_count() or 1)
+    log.info("shard %d of %d", shard.index, shard.count)
+    while True:
+        with suppress(RunBusyError):
+            return resume(run, prepare("run"), config, until, workers, lambda: withdraw_all(run))
+        if not any(posted.do_one(shard, prepare) for posted in posted_in(run)):
+            stop_if_asked()
+            time.sleep(BETWEEN_LOOKS)
