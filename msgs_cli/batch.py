@@ -24,7 +24,7 @@ from msgs_slam.msgs_cli.options import (
 from msgs_slam.msgs_cli.text import say
 
 if TYPE_CHECKING:
-    from msgs_slam.pipelines.engines import LocalEngine, RayEngine
+    from msgs_slam.pipelines.engine.engines import LocalEngine, RayEngine
 
 
 @click.command()
@@ -60,7 +60,7 @@ def batch(
     from msgs_slam.formats.jsonfile import read_toml
     from msgs_slam.pipelines.batch import find_recordings, run_batch, table_rows, write_table
     from msgs_slam.pipelines.config import load_config
-    from msgs_slam.pipelines.shards import Shard
+    from msgs_slam.pipelines.engine.shards import Shard
 
     recordings = find_recordings(folder.resolve(), out.resolve())
     mine = Shard.parse(shard).of(recordings)
@@ -89,7 +89,7 @@ def batch(
 def _open_engine(name: str, address: str, threads: int) -> tuple[LocalEngine | RayEngine, int, tuple[str, ...]]:
     """The engine, the CPUs of a recording, and the settings that follow: the same number of threads on every node, or
     the results would differ."""
-    from msgs_slam.pipelines.engines import LocalEngine, RayEngine
+    from msgs_slam.pipelines.engine.engines import LocalEngine, RayEngine
 
     if name == "local":
         return LocalEngine(), 1, ()

@@ -87,7 +87,7 @@ def view(path: Path, port: int, host: str) -> None:
 
     Needs the extra: pip install 'msgs-slam[viewer]'.
     """
-    from msgs_slam.pipelines.viewer import open_viewer
+    from msgs_slam.pipelines.viewer.server import open_viewer
 
     viewer = open_viewer(path, host, port)
     say(f"open {viewer.url} in a browser; Ctrl-C ends it", err=True)

@@ -38,7 +38,7 @@ from msgs_slam.msgs_cli.options import (
 )
 from msgs_slam.msgs_cli.text import flush_output, prepare_streams, printable, say
 from msgs_slam.msgs_cli.work import work
-from msgs_slam.pipelines.run_folder_names import EXPORTS
+from msgs_slam.pipelines.run.names import EXPORTS
 
 
 class FriendlyGroup(click.Group):
@@ -128,7 +128,7 @@ def reconstruct(
     from msgs_slam.pipelines.config import load_config
     from msgs_slam.pipelines.reconstruct import default_run_folder, existing_config, one_source
     from msgs_slam.pipelines.reconstruct import reconstruct as run_reconstruct
-    from msgs_slam.pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.run.folder import RunFolder
 
     run = RunFolder(out) if out else default_run_folder(sources[0])
     texts = source_settings(about_source)
@@ -164,8 +164,8 @@ def resume(
     from msgs_slam.pipelines.config import load_config
     from msgs_slam.pipelines.reconstruct import require_run
     from msgs_slam.pipelines.reconstruct import resume as run_resume
-    from msgs_slam.pipelines.run_folder import RunFolder
-    from msgs_slam.pipelines.settings_file import load_settings
+    from msgs_slam.pipelines.run.folder import RunFolder
+    from msgs_slam.pipelines.run.settings_file import load_settings
 
     run = RunFolder(run_path)
     require_run(run)
@@ -256,7 +256,7 @@ def demo(out: Path, config_file: Path | None, overrides: tuple[str, ...], quiet:
     from msgs_slam.pipelines.config import load_config
     from msgs_slam.pipelines.demo import demo_summary, run_demo
     from msgs_slam.pipelines.reconstruct import reconstruct as run_reconstruct
-    from msgs_slam.pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.run.folder import RunFolder
 
     config = load_config(config_file, overrides)
 

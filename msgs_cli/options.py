@@ -17,13 +17,13 @@ import click
 
 from msgs_slam.msgs_cli.json_lines import JsonHandler, JsonProgress
 from msgs_slam.msgs_cli.text import PrintableFormatter, say
-from msgs_slam.pipelines.run_folder_names import STAGES
+from msgs_slam.pipelines.run.names import STAGES
 
 if TYPE_CHECKING:
     from msgs_slam.pipelines.config import Config
-    from msgs_slam.pipelines.progress import Progress
-    from msgs_slam.pipelines.run_folder import RunFolder
-    from msgs_slam.pipelines.workers import Workers
+    from msgs_slam.pipelines.engine.workers import Workers
+    from msgs_slam.pipelines.run.folder import RunFolder
+    from msgs_slam.pipelines.system.progress import Progress
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 RUN_ARGUMENT = click.argument("run_path", metavar="RUN", type=FOLDER)
@@ -95,8 +95,8 @@ def cluster_workers(
     if name == "local":
         yield None, config
         return
-    from msgs_slam.pipelines.engines import RayEngine
-    from msgs_slam.pipelines.workers import Workers
+    from msgs_slam.pipelines.engine.engines import RayEngine
+    from msgs_slam.pipelines.engine.workers import Workers
 
     engine = RayEngine(address)
     try:
@@ -196,7 +196,7 @@ def set_up_logging(quiet: bool, verbose: bool, as_json: bool | None = None) -> N
 def make_progress(quiet: bool, as_json: bool | None = None) -> Progress:
     """Bars on stderr, or JSON lines, or nothing."""
     from msgs_slam.msgs_cli.progress import BarProgress
-    from msgs_slam.pipelines.progress import SilentProgress
+    from msgs_slam.pipelines.system.progress import SilentProgress
 
     if quiet:
         return SilentProgress()
@@ -211,7 +211,7 @@ def worker_setup(quiet: bool, verbose: bool, remote: bool) -> Callable[[str], Pr
 
 
 def _worker_progress(quiet: bool, verbose: bool, as_json: bool, remote: bool, name: str) -> Progress:
-    from msgs_slam.pipelines.progress import LineProgress
+    from msgs_slam.pipelines.system.progress import LineProgress
 
     set_up_logging(quiet, verbose, as_json)
     if remote and not quiet and not as_json:
@@ -223,7 +223,7 @@ def _worker_progress(quiet: bool, verbose: bool, as_json: bool, remote: bool, na
 def open_run(path: Path) -> RunFolder:
     """Raises InputError for a folder that is no run."""
     from msgs_slam.pipelines.reconstruct import require_run
-    from msgs_slam.pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.run.folder import RunFolder
 
     run = RunFolder(path)
     require_run(run)
@@ -234,7 +234,7 @@ def open_run(path: Path) -> RunFolder:
 def stopping_softly(how_to_go_on: str) -> Iterator[None]:
     """The first SIGINT, SIGTERM or SIGHUP ends the work in this block at its next snapshot, the second at once; then
     the process ends with 128 plus the signal's number, as shells expect."""
-    from msgs_slam.pipelines.stopping import soft_stop
+    from msgs_slam.pipelines.system.stopping import soft_stop
 
     def tell(number: int) -> None:
         # Not through click: a signal may come while it prints.

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from msgs_slam.pipelines.wording import lost_text
+from msgs_slam.pipelines.system.wording import lost_text
 
 if TYPE_CHECKING:
-    from msgs_slam.pipelines.records import StageRecord
+    from msgs_slam.pipelines.run.records import StageRecord
     from msgs_slam.pipelines.status import StageStatus
 
 
@@ -78,7 +78,7 @@ def format_figure(value: Any, key: str = "") -> str:
 def scale_lines(root: Path, records: dict[str, StageRecord]) -> list[str]:
     """How long the unit is, once the export has found it."""
     from msgs_slam.pipelines.metres.files import load_metres
-    from msgs_slam.pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.run.folder import RunFolder
 
     metres = load_metres(RunFolder(root)) if "export" in records else None
     return [] if metres is None else [f"\nScale: {metres.text}"]

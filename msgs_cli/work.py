@@ -31,8 +31,8 @@ def work(run_path: Path, shard: str, until: str, quiet: bool, verbose: bool) -> 
     Kubernetes indexed jobs and AWS Batch: docs/batch.md.
     """
     set_up_logging(quiet, verbose)
-    from msgs_slam.pipelines.settings_file import load_settings
-    from msgs_slam.pipelines.shards import Shard
+    from msgs_slam.pipelines.engine.shards import Shard
+    from msgs_slam.pipelines.run.settings_file import load_settings
     from msgs_slam.pipelines.work import work_on_run
 
     chosen, run = Shard.parse(shard), open_run(run_path)

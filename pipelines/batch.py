@@ -17,15 +17,15 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import list_images
 from msgs_slam.formats.jsonfile import write_json
 from msgs_slam.pipelines.config import Config, load_config, merge_settings
-from msgs_slam.pipelines.engines import Call, Engine
-from msgs_slam.pipelines.frames.recording import open_recording
-from msgs_slam.pipelines.lock import RunBusyError
-from msgs_slam.pipelines.progress import Progress, log
+from msgs_slam.pipelines.engine.engines import Call, Engine
+from msgs_slam.pipelines.engine.workers import code_identity, require_same_world
 from msgs_slam.pipelines.reconstruct import existing_config, reconstruct
-from msgs_slam.pipelines.records import load_records
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.run_folder_names import STAGES
-from msgs_slam.pipelines.workers import code_identity, require_same_world
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.lock import RunBusyError
+from msgs_slam.pipelines.run.names import STAGES
+from msgs_slam.pipelines.run.records import load_records
+from msgs_slam.pipelines.source.recording import open_recording
+from msgs_slam.pipelines.system.progress import Progress, log
 
 _VIDEOS = {
     ".3gp", ".avi", ".flv", ".insv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".sens",

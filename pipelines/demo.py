@@ -15,8 +15,8 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.video import iter_video
 from msgs_slam.pipelines.evaluation.table import evaluation_table
 from msgs_slam.pipelines.evaluation.write import write_evaluation
-from msgs_slam.pipelines.progress import Progress
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.progress import Progress
 
 VIDEO, TRUTH, RUN = "room.mp4", "room_truth", "room.msgs"
 CLIP = Path(__file__).with_name("demo_clip")

@@ -157,7 +157,7 @@ def _gpu() -> Finding:
 
 
 def _models() -> Finding:
-    from msgs_slam.pipelines.proxy.models.registry import ModelStore
+    from msgs_slam.pipelines.networks.registry import ModelStore
 
     store = ModelStore.open()
     here = [model.name for model in store.models if store.is_here(model)]
@@ -168,7 +168,7 @@ def _models() -> Finding:
 
 
 def _kernels() -> Finding:
-    from msgs_slam.pipelines.jit import cache_root
+    from msgs_slam.pipelines.system.jit import cache_root
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -11,17 +11,17 @@ from msgs_slam.formats.atomic import temporary_of, write_text
 from msgs_slam.formats.errors import InputError, RecoverableError
 from msgs_slam.formats.video import probe_video
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.device import settle_device
-from msgs_slam.pipelines.frames.source import source_digest
-from msgs_slam.pipelines.lock import LOCK, locked, make_folder
-from msgs_slam.pipelines.progress import Progress
-from msgs_slam.pipelines.records import StageRecord, load_records, load_source, recorded_config
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.run_folder_names import SOURCE_LIST, STAGES
-from msgs_slam.pipelines.settings_file import load_settings
-from msgs_slam.pipelines.stages import Stage, run_stages
-from msgs_slam.pipelines.threads import set_threads
-from msgs_slam.pipelines.workers import TaskWorkers
+from msgs_slam.pipelines.engine.stages import Stage, run_stages
+from msgs_slam.pipelines.engine.threads import set_threads
+from msgs_slam.pipelines.engine.workers import TaskWorkers
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.lock import LOCK, locked, make_folder
+from msgs_slam.pipelines.run.names import SOURCE_LIST, STAGES
+from msgs_slam.pipelines.run.records import StageRecord, load_records, load_source, recorded_config
+from msgs_slam.pipelines.run.settings_file import load_settings
+from msgs_slam.pipelines.source.opening import source_digest
+from msgs_slam.pipelines.system.device import settle_device
+from msgs_slam.pipelines.system.progress import Progress
 
 
 def all_stages() -> list[Stage]:

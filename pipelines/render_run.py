@@ -15,8 +15,8 @@ from msgs_slam.pipelines.evaluation.camera_paths import orbit, resampled, smooth
 from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.evaluation.pictures import Picture, depth_picture, depth_range, label_picture
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.progress import Progress, SilentProgress
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.progress import Progress, SilentProgress
 from msgs_slam.pipelines.upright.world import up_in_run
 
 KINDS = ("color", "depth", "labels", "side-by-side")

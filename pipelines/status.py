@@ -7,12 +7,12 @@ from typing import Any
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.memory import ALIGNED_TOGETHER, GAUSSIANS, NEEDS, memory_room, submap_size
-from msgs_slam.pipelines.records import StageRecord, differing_settings, load_records, load_source
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.run_folder_names import STAGES
-from msgs_slam.pipelines.settings_file import load_settings
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.names import STAGES
+from msgs_slam.pipelines.run.records import StageRecord, differing_settings, load_records, load_source
+from msgs_slam.pipelines.run.settings_file import load_settings
 from msgs_slam.pipelines.structure.window_size import window_size, windows_of
+from msgs_slam.pipelines.system.memory import ALIGNED_TOGETHER, GAUSSIANS, NEEDS, memory_room, submap_size
 
 _BEYOND = 0.3
 """MB for each keyframe that `frames` or tracking has not in work."""

@@ -8,13 +8,13 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.lock import RunBusyError
-from msgs_slam.pipelines.progress import Progress, log
+from msgs_slam.pipelines.engine.shards import BETWEEN_LOOKS, Shard, SharedWorkers, posted_in, withdraw_all
 from msgs_slam.pipelines.reconstruct import resume
-from msgs_slam.pipelines.records import StageRecord
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.shards import BETWEEN_LOOKS, Shard, SharedWorkers, posted_in, withdraw_all
-from msgs_slam.pipelines.stopping import stop_if_asked
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.lock import RunBusyError
+from msgs_slam.pipelines.run.records import StageRecord
+from msgs_slam.pipelines.system.progress import Progress, log
+from msgs_slam.pipelines.system.stopping import stop_if_asked
 
 
 def work_on_run(

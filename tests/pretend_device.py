@@ -16,7 +16,8 @@ import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_map
 
-from msgs_slam.pipelines import outcome, stages
+from msgs_slam.pipelines import outcome
+from msgs_slam.pipelines.engine import stages
 from msgs_slam.pipelines.gaussians.render import compositing, cpu, inspection
 
 DEVICE = "meta"

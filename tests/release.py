@@ -2,7 +2,7 @@
 
     python tests/release.py [--same mapping ...]
 
-Writes pipelines/stage_versions.toml for the version in pyproject.toml. A stage named with --same keeps its number: say
+Writes pipelines/system/stage_versions.toml for the version in pyproject.toml. A stage named with --same keeps its number: say
 so only where its results are known to be the same bytes, for users keep what an older release has made.
 """
 
@@ -11,8 +11,8 @@ import tomllib
 from pathlib import Path
 
 from msgs_slam.formats.atomic import write_text
-from msgs_slam.pipelines.run_folder_names import STAGES
-from msgs_slam.pipelines.stage_identity import ROOT, TABLE, source_digest
+from msgs_slam.pipelines.run.names import STAGES
+from msgs_slam.pipelines.system.identity import ROOT, TABLE, source_digest
 
 PYPROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"
 

@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -17,11 +18,13 @@ FORBIDDEN = {
 
 
 FLOORS = (
-    {"geometry"}, {"correspondence"}, {"depth"}, {"gaussians"}, {"structure"},
-    {"frames", "masks", "proxy"}, {"metres"}, {"tracking"}, {"mapping"}, {"global_ba"}, {"export", "upright"},
-    {"evaluation"},
+    {"retired_settings", "types"}, {"config", "geometry"}, {"gaussian_map", "system", "voxels"},
+    {"correspondence", "depth", "gaussians", "networks"}, {"doctor", "run", "structure"}, {"engine", "source"},
+    {"masks"}, {"frames", "proxy"}, {"mapping", "metres", "tracking"}, {"global_ba", "outcome", "status"}, {"upright"},
+    {"export"}, {"reconstruct", "viewer"}, {"batch", "evaluation", "work"}, {"demo", "render_run"},
 )  # fmt: skip
-"""The folders of pipelines/, each above those that it may import; on one floor, those that need each other."""
+"""The rooms of pipelines/: its folders and its flat files, each above all that it imports."""
+MOST_FLAT = 12
 
 
 def imported_packages(path: Path) -> set[str]:
@@ -50,28 +53,63 @@ def test_imports_go_one_way(room: str) -> None:
     assert not {name: bad for name, bad in wrong.items() if bad}
 
 
-def imported_folders(path: Path) -> set[str]:
-    """Folders of pipelines/ that a file imports from anywhere."""
+def modules() -> dict[str, Path]:
+    """Import name of every file below pipelines/."""
+    files = sorted((ROOT / "pipelines").rglob("*.py"))
+    return {
+        ".".join(("msgs_slam", *f.relative_to(ROOT).with_suffix("").parts)).removesuffix(".__init__"): f for f in files
+    }
+
+
+def imported_modules(path: Path, known: Iterable[str]) -> set[str]:
+    """Those of `known` that a file imports anywhere in it, in a function too; for annotations alone does not count."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    checks = [n for n in ast.walk(tree) if isinstance(n, ast.If) and "TYPE_CHECKING" in ast.unparse(n.test)]
+    idle = {id(inner) for check in checks for statement in check.body for inner in ast.walk(statement)}
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        names = [a.name for a in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
-        if isinstance(node, ast.ImportFrom):
-            names = [f"{node.module}.{name}" for name in names]
-        found |= {n.split(".")[2] for n in names if n.startswith("msgs_slam.pipelines.")}
-    return found
+    for node in ast.walk(tree):
+        if id(node) in idle:
+            continue
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            inside = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {name if name in known else node.module for name in inside}
+    return found & set(known)
 
 
-def test_every_folder_stands_on_one_floor() -> None:
-    folders = {p.parent.name for p in (ROOT / "pipelines").glob("*/__init__.py")}
-    assert sorted(name for floor in FLOORS for name in floor) == sorted(folders)
+def room_of(module: str) -> str:
+    """The folder or flat file of pipelines/."""
+    return module.split(".")[2]
+
+
+def test_every_file_stands_on_one_floor() -> None:
+    rooms = {room_of(m) for m in modules() if m.count(".") >= 2}
+    assert sorted(name for floor in FLOORS for name in floor) == sorted(rooms)
+    flat = [p for p in (ROOT / "pipelines").glob("*.py") if p.name != "__init__.py"]
+    assert len(flat) <= MOST_FLAT, "a newcomer opens these first: the others have a folder"
 
 
 @pytest.mark.parametrize("height", range(len(FLOORS)), ids=lambda h: "+".join(sorted(FLOORS[h])))
-def test_no_folder_imports_one_above_it(height: int) -> None:
-    above = set().union(*FLOORS[height + 1 :])
-    files = [f for folder in FLOORS[height] for f in sorted((ROOT / "pipelines" / folder).rglob("*.py"))]
-    wrong = {str(f.relative_to(ROOT)): imported_folders(f) & above for f in files}
+def test_no_room_imports_one_beside_or_above_it(height: int) -> None:
+    """Lazy imports count too: so no two rooms import each other, nor any more of them in a circle."""
+    known = modules()
+    below = {name for floor in FLOORS[:height] for name in floor}
+    wrong = {}
+    for module, path in known.items():
+        if module.count(".") >= 2 and (room := room_of(module)) in FLOORS[height]:
+            rooms = {room_of(m) for m in imported_modules(path, known) if m.count(".") >= 2}
+            wrong[module] = rooms - below - {room}
     assert not {name: bad for name, bad in wrong.items() if bad}
+
+
+def test_no_file_imports_itself_by_a_detour() -> None:
+    known = modules()
+    waiting = {m: imported_modules(path, known) - {m} for m, path in known.items()}
+    while free := [m for m, needs in waiting.items() if not needs & waiting.keys()]:
+        for module in free:
+            del waiting[module]
+    assert not sorted(waiting), "these are on a circle, or import one"
 
 
 def test_tests_and_benchmarks_import_what_there_is() -> None:
@@ -101,7 +139,7 @@ def test_nothing_is_unpickled() -> None:
 
 
 UNSAFE_IMPORTS = {"subprocess", "pty", "marshal", "shelve", "dill", "cloudpickle", "joblib", "yaml", "ctypes"}
-UNSAFE_BUT_HERE = {"pipelines/memory.py": {"ctypes"}}
+UNSAFE_BUT_HERE = {"pipelines/system/memory.py": {"ctypes"}}
 """It calls one function of the C library that runs anyway, with a number: nothing from outside reaches it."""
 UNSAFE_CALLS = re.compile(r"eval|exec|compile|__import__|os\.(system|popen|exec\w+|spawn\w+|posix_spawn\w*|fork)")
 
@@ -136,7 +174,7 @@ print(*(name if name.startswith("msgs_slam") else name.partition(".")[0] for nam
 """
 LIGHT = {
     "click", "msgs_slam", "msgs_slam.formats", "msgs_slam.formats.errors", "msgs_slam.pipelines",
-    "msgs_slam.pipelines.run_folder_names",
+    "msgs_slam.pipelines.run", "msgs_slam.pipelines.run.names",
 }  # fmt: skip
 """All that the help may load beside the standard library and the command line's own modules."""
 

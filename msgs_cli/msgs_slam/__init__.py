@@ -39,7 +39,7 @@ class Run:
     def outcome(self) -> Outcome:
         """All that the run has found; raises InputError where the folder is no run or its map is not done."""
         from msgs_slam.pipelines.outcome import load_outcome
-        from msgs_slam.pipelines.run_folder import RunFolder
+        from msgs_slam.pipelines.run.folder import RunFolder
         from msgs_slam.pipelines.upright.world import load_world
 
         found = load_outcome(RunFolder(self.path))
@@ -99,10 +99,10 @@ def reconstruct(source: Path | str, out: Path | str | None = None, settings: Ite
     the command line, e.g. "mapping.passes=6". Raises InputError for a source or setting that cannot be used.
     """
     from msgs_slam.pipelines.config import load_config
-    from msgs_slam.pipelines.progress import SilentProgress
     from msgs_slam.pipelines.reconstruct import default_run_folder, existing_config
     from msgs_slam.pipelines.reconstruct import reconstruct as run_reconstruct
-    from msgs_slam.pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.run.folder import RunFolder
+    from msgs_slam.pipelines.system.progress import SilentProgress
 
     source = Path(source)
     run = RunFolder(Path(out)) if out is not None else default_run_folder(source)

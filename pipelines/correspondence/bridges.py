@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.correspondence.flow import corners, follow
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair
 from msgs_slam.pipelines.correspondence.snapshots import Snapshots
-from msgs_slam.pipelines.streamed import Streamed
+from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import Features
 
 LEAST = 100

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.jit import kernel
+from msgs_slam.pipelines.system.jit import kernel
 from msgs_slam.pipelines.types import Features
 
 _SIFT, _LEARNED = (0.8, 0.7), (1.0, 0.555)

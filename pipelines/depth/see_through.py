@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.depth.posed import PosedDepth, neighbours
-from msgs_slam.pipelines.jit import kernel
+from msgs_slam.pipelines.system.jit import kernel
 
 STRIDE = 2
 AGREES = 0.03

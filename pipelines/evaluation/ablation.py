@@ -14,13 +14,13 @@ from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.jsonfile import read_json_object, write_json
-from msgs_slam.pipelines.branch import branch
 from msgs_slam.pipelines.config import Config, config_to_toml, load_config
+from msgs_slam.pipelines.evaluation.branch import branch
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
-from msgs_slam.pipelines.progress import Progress
 from msgs_slam.pipelines.reconstruct import all_stages, reconstruct
-from msgs_slam.pipelines.records import load_records
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.records import load_records
+from msgs_slam.pipelines.system.progress import Progress
 
 COMPLETE = "complete"
 ABLATIONS: dict[str, tuple[str, ...]] = {

@@ -23,8 +23,8 @@ from msgs_slam.pipelines.evaluation.trajectory_error import (
 )
 from msgs_slam.pipelines.evaluation.truth import MatchedTruth, match_truth
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.progress import Progress, SilentProgress
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.progress import Progress, SilentProgress
 
 PROTOCOL = (
     "Frames belong to the truth of the same {by}; the other frames count as picked and posed only.",

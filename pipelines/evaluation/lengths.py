@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.export.stage import on_earth
 from msgs_slam.pipelines.geometry.rig import rig_of
+from msgs_slam.pipelines.geometry.tape import tape_text
 from msgs_slam.pipelines.outcome import Outcome
 from msgs_slam.pipelines.upright.world import load_world
-from msgs_slam.pipelines.viewer_tape import tape_text
 
 Array = NDArray[np.float64]
 

@@ -18,11 +18,11 @@ from msgs_slam.pipelines.evaluation.perceptual import open_lpips
 from msgs_slam.pipelines.evaluation.trajectory_error import AbsoluteError
 from msgs_slam.pipelines.evaluation.truth import MatchedTruth
 from msgs_slam.pipelines.evaluation.views import MapView, view_map
-from msgs_slam.pipelines.frames.source_pixels import FramePixels
 from msgs_slam.pipelines.gaussians.render import track_gn
 from msgs_slam.pipelines.mapping.load import split_frames
 from msgs_slam.pipelines.outcome import Outcome, evenly
-from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.source.source_pixels import FramePixels
+from msgs_slam.pipelines.system.progress import Progress
 
 KEYFRAMES, BETWEEN, HELD_OUT = "keyframes", "between", "held out"
 AT_TRUE_POSES, AT_REFINED_POSES = " at true poses", " at refined poses"

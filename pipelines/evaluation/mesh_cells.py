@@ -20,7 +20,7 @@ from msgs_slam.pipelines.evaluation.surface_error import (
 from msgs_slam.pipelines.evaluation.trajectory_error import AbsoluteError
 from msgs_slam.pipelines.evaluation.truth import MatchedTruth
 from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.run_folder import MESH
+from msgs_slam.pipelines.run.folder import MESH
 from msgs_slam.pipelines.types import Intrinsics
 from msgs_slam.pipelines.upright.world import FIRST, load_world
 

@@ -22,12 +22,12 @@ from msgs_slam.pipelines.evaluation.table import evaluation_table
 from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, trajectory_plots
 from msgs_slam.pipelines.export.readme import lengths, readme
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.progress import Progress, SilentProgress
-from msgs_slam.pipelines.records import load_source
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.records import load_source
+from msgs_slam.pipelines.system.progress import Progress, SilentProgress
+from msgs_slam.pipelines.system.wording import lost_text
 from msgs_slam.pipelines.types import LoopEdge, SparseModel
 from msgs_slam.pipelines.upright.world import FIRST, load_world
-from msgs_slam.pipelines.wording import lost_text
 
 
 def write_report(run: RunFolder, path: Path | None = None, progress: Progress | None = None) -> Path:

@@ -16,7 +16,7 @@ from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.evaluation.pictures import depth_picture, depth_range, labels_on_photo
 from msgs_slam.pipelines.evaluation.plots import BLUE, GREEN, GREY, ORANGE, RED, Line, Marks, bars, plot
 from msgs_slam.pipelines.outcome import Outcome, evenly
-from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import VOID
 
 MEASURED_VIEWS = 60

@@ -12,7 +12,7 @@ from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.textfile import read_rows
 from msgs_slam.formats.trajectory import read_matrices
 from msgs_slam.pipelines.evaluation.trajectory_error import associate
-from msgs_slam.pipelines.frames.originals import written_name
+from msgs_slam.pipelines.source.originals import written_name
 from msgs_slam.pipelines.types import Frame
 
 _MOST_SECONDS_APART = 0.02

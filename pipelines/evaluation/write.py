@@ -25,11 +25,11 @@ from msgs_slam.pipelines.evaluation.pictures import (
 from msgs_slam.pipelines.evaluation.plots import BLUE, GREY, Line, plot
 from msgs_slam.pipelines.evaluation.table import evaluation_table
 from msgs_slam.pipelines.evaluation.truth import MatchedTruth, match_truth
-from msgs_slam.pipelines.frames.source_pixels import FramePixels
 from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
 from msgs_slam.pipelines.outcome import Outcome, evenly, load_outcome
-from msgs_slam.pipelines.progress import Progress
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.source.source_pixels import FramePixels
+from msgs_slam.pipelines.system.progress import Progress
 
 PATH_FROM_ABOVE, PATH_FROM_THE_SIDE = "trajectory_top.svg", "trajectory_side.svg"
 SHEET_VIEWS = 6

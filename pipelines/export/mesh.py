@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from msgs_slam.formats.mesh import MeshBlocks
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.export.depth_views import DrawnView, Shown, drawn_view
+from msgs_slam.pipelines.engine.travel import load_value, save_value
 from msgs_slam.pipelines.export.joined import Region
 from msgs_slam.pipelines.export.paint import paint
 from msgs_slam.pipelines.export.surface import chunk_surfaces, weld
 from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid
 from msgs_slam.pipelines.gaussians.render import get_threads
+from msgs_slam.pipelines.mapping.depth_views import DrawnView, Shown, drawn_view
 from msgs_slam.pipelines.outcome import Outcome, maps_around
-from msgs_slam.pipelines.progress import Progress
-from msgs_slam.pipelines.streamed import Streamed
-from msgs_slam.pipelines.travel import load_value, save_value
+from msgs_slam.pipelines.system.progress import Progress
+from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import VOID
 
 TRUNCATION = 4.0

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.export.depth_views import DrawnView
 from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.mapping.depth_views import DrawnView
 from msgs_slam.pipelines.types import VOID
 
 

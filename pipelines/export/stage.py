@@ -13,9 +13,10 @@ from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.gps import read_track
 from msgs_slam.formats.mesh import mesh_blocks, read_mesh_ply, write_mesh_glb, write_mesh_ply
 from msgs_slam.pipelines.config import Config, ExportConfig
-from msgs_slam.pipelines.export.depth_views import DrawnView, Shown
+from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.export.joined import joined
 from msgs_slam.pipelines.export.mesh import drawn_views, fused_regions, make_grid_of, mesh_figures
+from msgs_slam.pipelines.export.pieces import make_pieces
 from msgs_slam.pipelines.export.tasks import MeshWorkers, scratch_of
 from msgs_slam.pipelines.export.textured import make_textured, write_textured
 from msgs_slam.pipelines.export.tiles import write_tiles
@@ -29,18 +30,17 @@ from msgs_slam.pipelines.export.writers import (
     write_trajectory,
     write_world,
 )
-from msgs_slam.pipelines.journal import empty
-from msgs_slam.pipelines.memory import give_back
+from msgs_slam.pipelines.mapping.depth_views import DrawnView, Shown
 from msgs_slam.pipelines.metres.files import save_metres
 from msgs_slam.pipelines.metres.find import Machine, find_metres
+from msgs_slam.pipelines.networks.identity import card_identity
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.pieces import make_pieces
-from msgs_slam.pipelines.progress import Progress, SilentProgress
-from msgs_slam.pipelines.proxy.networks.identity import card_identity
 from msgs_slam.pipelines.proxy.selection import metric_card
-from msgs_slam.pipelines.records import load_records
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.stages import Stage, StageContext
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.journal import empty
+from msgs_slam.pipelines.run.records import load_records
+from msgs_slam.pipelines.system.memory import give_back
+from msgs_slam.pipelines.system.progress import Progress, SilentProgress
 from msgs_slam.pipelines.types import Metres, SemanticMesh
 from msgs_slam.pipelines.upright.find import find_upright
 from msgs_slam.pipelines.upright.places import AUTO, OFF, world_on_earth

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
 from msgs_slam.pipelines.export.volume import CHUNK, SIDE, Volume, chunk_keys
-from msgs_slam.pipelines.jit import kernel
+from msgs_slam.pipelines.system.jit import kernel
 
 _STEPS = 1000
 """Vertices within so small a part of a voxel are the same."""

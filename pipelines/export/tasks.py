@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from msgs_slam.pipelines.engine.portions import Portion, in_portions
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.export.mesh import drawn_views, fused_regions, keyframe_rows
 from msgs_slam.pipelines.export.volume import Grid
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.portions import Portion, in_portions
-from msgs_slam.pipelines.progress import Progress
-from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.system.progress import Progress
 
 
 def draw_views(task: Portion, progress: Progress) -> None:

@@ -14,8 +14,8 @@ from msgs_slam.pipelines.depth.posed import PosedDepth
 from msgs_slam.pipelines.export.atlas import Atlas, owners
 from msgs_slam.pipelines.gaussians.render.threads import for_each
 from msgs_slam.pipelines.geometry.camera import project
-from msgs_slam.pipelines.jit import kernel
-from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.system.jit import kernel
+from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Intrinsics
 
 AGREES = 0.03

@@ -17,8 +17,8 @@ from msgs_slam.pipelines.export.atlas import simplified, unwrapped
 from msgs_slam.pipelines.export.mesh import keyframe_rows
 from msgs_slam.pipelines.export.texture import Shot, paint_texture, texels_wanted
 from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.progress import Progress
-from msgs_slam.pipelines.streamed import Streamed
+from msgs_slam.pipelines.system.progress import Progress
+from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import Frame, SemanticMesh
 
 TEXTURE_SIDE = 4096

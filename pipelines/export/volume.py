@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.depth.posed import PosedDepth
 from msgs_slam.pipelines.gaussians.render.jit import kernel
 from msgs_slam.pipelines.geometry.camera import unproject_depth
-from msgs_slam.pipelines.proxy.regions.voxels import cells_of, voxel_keys
 from msgs_slam.pipelines.types import Intrinsics
+from msgs_slam.pipelines.voxels.voxels import cells_of, voxel_keys
 
 SIDE = 8
 """Voxels along the side of a block."""

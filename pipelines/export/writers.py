@@ -24,11 +24,11 @@ from msgs_slam.pipelines.export.readme import lengths, readme
 from msgs_slam.pipelines.geometry.rig import rig_of
 from msgs_slam.pipelines.metres.files import save_metres
 from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.run_folder import save_classes, save_left_out
-from msgs_slam.pipelines.streamed import Streamed
+from msgs_slam.pipelines.run.folder import save_classes, save_left_out
+from msgs_slam.pipelines.system.streamed import Streamed
+from msgs_slam.pipelines.system.wording import stretches
 from msgs_slam.pipelines.types import SparseModel
 from msgs_slam.pipelines.upright.world import World, save_world
-from msgs_slam.pipelines.wording import stretches
 
 _AT_ONCE, _PART = 1 << 16, 1 << 17
 """Gaussians whose probabilities are copied at a time, and those of a part that is written at a time."""

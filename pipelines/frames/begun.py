@@ -16,20 +16,20 @@ from msgs_slam.pipelines.correspondence.bridges import Picture
 from msgs_slam.pipelines.correspondence.features import to_grey
 from msgs_slam.pipelines.correspondence.matching import match_features
 from msgs_slam.pipelines.correspondence.snapshots import Snapshots
-from msgs_slam.pipelines.frames.faces import Faces, find_faces
+from msgs_slam.pipelines.engine.portions import Portion
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.learned import open_learned, picture_features
 from msgs_slam.pipelines.frames.masks import FrameMasks
-from msgs_slam.pipelines.frames.recording import RecordingSource
-from msgs_slam.pipelines.frames.sharpness import reduced_size
-from msgs_slam.pipelines.frames.source import FolderSource, VideoSource, open_source
 from msgs_slam.pipelines.geometry.rig import Rig, rig_of
-from msgs_slam.pipelines.portions import Portion
-from msgs_slam.pipelines.progress import Progress
-from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.source.faces import Faces, find_faces
+from msgs_slam.pipelines.source.opening import FolderSource, VideoSource, open_source
+from msgs_slam.pipelines.source.recording import RecordingSource
+from msgs_slam.pipelines.source.sharpness import reduced_size
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
 from msgs_slam.pipelines.structure.lens import to_pycolmap, unknown_camera
 from msgs_slam.pipelines.structure.sfm import Ahead, StructureFromMotion, nothing_ahead
 from msgs_slam.pipelines.structure.window_size import window_size
+from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Features, Frame
 
 AnySource = VideoSource | FolderSource | RecordingSource

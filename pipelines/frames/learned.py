@@ -15,8 +15,8 @@ from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.correspondence.features import extract_features, to_grey
-from msgs_slam.pipelines.proxy.models.registry import Model, ModelStore
-from msgs_slam.pipelines.proxy.networks.runtime import Runtime, open_runtime
+from msgs_slam.pipelines.networks.registry import Model, ModelStore
+from msgs_slam.pipelines.networks.runtime import Runtime, open_runtime
 from msgs_slam.pipelines.types import Features
 
 EXTRACTOR, MATCHER = "aliked-n16rot", "aliked-lightglue"

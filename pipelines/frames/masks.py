@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.frames.faces import Faces
-from msgs_slam.pipelines.frames.source import Source, open_source
 from msgs_slam.pipelines.geometry.rig import ONE_CAMERA, Rig
 from msgs_slam.pipelines.masks.files import MaskFiles, open_masks
 from msgs_slam.pipelines.masks.people import PeopleCards, PeopleFinder, people_cards
-from msgs_slam.pipelines.progress import Progress
-from msgs_slam.pipelines.proxy.models.registry import ModelStore
-from msgs_slam.pipelines.run_folder import load_left_out, save_left_out
+from msgs_slam.pipelines.networks.registry import ModelStore
+from msgs_slam.pipelines.run.folder import load_left_out, save_left_out
+from msgs_slam.pipelines.source.faces import Faces
+from msgs_slam.pipelines.source.opening import Source, open_source
 from msgs_slam.pipelines.structure.lens import Lens
+from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Frame, any_of
 
 

@@ -18,6 +18,8 @@ from msgs_slam.formats.jsonfile import read_json, write_json
 from msgs_slam.formats.video import VideoFrame
 from msgs_slam.pipelines.config import Config, FramesConfig
 from msgs_slam.pipelines.correspondence.bridges import Picture
+from msgs_slam.pipelines.engine.portions import in_portions
+from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.frames.begun import (
     AHEAD,
     AnySource,
@@ -27,16 +29,11 @@ from msgs_slam.pipelines.frames.begun import (
     picked,
     structure_from_motion,
 )
-from msgs_slam.pipelines.frames.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
 from msgs_slam.pipelines.frames.keyframes import KeyframeChoice, choose_keyframes
 from msgs_slam.pipelines.frames.learned import learned_inputs, open_learned
 from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
-from msgs_slam.pipelines.frames.pick import sharpest_of_windows
-from msgs_slam.pipelines.frames.sharpness import reduce_image
-from msgs_slam.pipelines.frames.source import FolderSource, open_source
 from msgs_slam.pipelines.geometry.rig import Rig, rig_of
-from msgs_slam.pipelines.portions import in_portions
-from msgs_slam.pipelines.run_folder import (
+from msgs_slam.pipelines.run.folder import (
     save_backbone,
     save_calibration,
     save_features,
@@ -44,7 +41,10 @@ from msgs_slam.pipelines.run_folder import (
     save_matching,
     save_sparse,
 )
-from msgs_slam.pipelines.stages import Stage, StageContext
+from msgs_slam.pipelines.source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
+from msgs_slam.pipelines.source.opening import FolderSource, open_source
+from msgs_slam.pipelines.source.pick import sharpest_of_windows
+from msgs_slam.pipelines.source.sharpness import reduce_image
 from msgs_slam.pipelines.structure.backbone import to_sparse_model
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
 from msgs_slam.pipelines.structure.lens import Lens, distortion_of, make_lens

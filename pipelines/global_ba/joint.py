@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import MappingConfig
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.mapping.measure import measure_view
 from msgs_slam.pipelines.mapping.optimise import optimise_map
 from msgs_slam.pipelines.mapping.views import View
-from msgs_slam.pipelines.stages import StageContext
 
 
 @dataclass(frozen=True)

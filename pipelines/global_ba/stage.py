@@ -12,6 +12,7 @@ from msgs_slam.formats.atomic import copy_file
 from msgs_slam.pipelines.correspondence.retrieval import Looks, describe_all, unit
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.depth.scales import sample_proxy
+from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.global_ba.candidates import loop_candidates
@@ -25,7 +26,7 @@ from msgs_slam.pipelines.global_ba.verify import KeyframeView, Loop, make_view
 from msgs_slam.pipelines.mapping.divided import refine_divided
 from msgs_slam.pipelines.mapping.load import load_views, with_rigid_panoramas
 from msgs_slam.pipelines.mapping.poses import move_trajectory
-from msgs_slam.pipelines.run_folder import (
+from msgs_slam.pipelines.run.folder import (
     MAP,
     RunFolder,
     save_depth_fields,
@@ -36,9 +37,8 @@ from msgs_slam.pipelines.run_folder import (
     save_sparse,
     save_trajectory,
 )
-from msgs_slam.pipelines.stages import Stage, StageContext
-from msgs_slam.pipelines.streamed import Streamed
 from msgs_slam.pipelines.structure.bundle import reprojection_errors
+from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.tracking.adjust import align_depths, without_dependent_depth
 from msgs_slam.pipelines.tracking.pictures import Pictures, load_shutter
 from msgs_slam.pipelines.tracking.result import to_sparse_model

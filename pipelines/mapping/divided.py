@@ -11,6 +11,7 @@ from torch import Tensor
 
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.depth.posed import PosedDepth, overlaps
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.mapping.load import split_frames
 from msgs_slam.pipelines.mapping.measure import ViewFigures
@@ -30,9 +31,8 @@ from msgs_slam.pipelines.mapping.submap_tasks import (
     refine_submap,
 )
 from msgs_slam.pipelines.mapping.submaps import Submap, divide
-from msgs_slam.pipelines.memory import submap_size
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.memory import submap_size
 from msgs_slam.pipelines.types import Trajectory
 
 

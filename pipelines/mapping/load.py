@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.config import ArticleConfig, MappingConfig
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.depth.see_through import contradicted
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.mapping.article.mirrors import Mirrors
 from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes
-from msgs_slam.pipelines.memory import VIEWS_SHARE
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.stages import StageContext
-from msgs_slam.pipelines.streamed import Streamed
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.memory import VIEWS_SHARE
+from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import Frame, Intrinsics, ProxyMaps, Trajectory
 
 

@@ -22,9 +22,9 @@ from msgs_slam.pipelines.mapping.schedule import Schedule, Seeding, Step
 from msgs_slam.pipelines.mapping.splitting import Blame, blame
 from msgs_slam.pipelines.mapping.state import Exposures, OptimisedMap, OptimiserState
 from msgs_slam.pipelines.mapping.views import View, halved
-from msgs_slam.pipelines.progress import Progress, SilentProgress
-from msgs_slam.pipelines.stopping import is_asked
-from msgs_slam.pipelines.streamed import Streamed
+from msgs_slam.pipelines.system.progress import Progress, SilentProgress
+from msgs_slam.pipelines.system.stopping import is_asked
+from msgs_slam.pipelines.system.streamed import Streamed
 
 MAP_RATES = {"means": 0.1, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2, "class_logits": 6e-2}
 """Learning rates of Adam, of positions in radii of the Gaussian: what is small has to be placed finely."""

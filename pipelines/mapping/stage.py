@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.mapping.divided import Mapped, map_divided
 from msgs_slam.pipelines.mapping.load import load_views, split_frames, survey, with_rigid_panoramas
 from msgs_slam.pipelines.mapping.measure import ViewFigures, mean_figures, measure_view
@@ -15,9 +16,8 @@ from msgs_slam.pipelines.mapping.optimise import OptimisedMap, optimise_map
 from msgs_slam.pipelines.mapping.poses import interpolate_rows, move_trajectory
 from msgs_slam.pipelines.mapping.submaps import submap_count
 from msgs_slam.pipelines.mapping.views import View
-from msgs_slam.pipelines.memory import submap_size
-from msgs_slam.pipelines.run_folder import save_exposure, save_figures, save_map, save_trajectory
-from msgs_slam.pipelines.stages import Stage, StageContext
+from msgs_slam.pipelines.run.folder import save_exposure, save_figures, save_map, save_trajectory
+from msgs_slam.pipelines.system.memory import submap_size
 from msgs_slam.pipelines.types import Trajectory
 
 

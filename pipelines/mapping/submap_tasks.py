@@ -20,7 +20,6 @@ from msgs_slam.formats.tensors import load_arrays, load_tensors, save_arrays, sa
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.device import settle_device
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.gaussians.render import blending_weights, median_depth
 from msgs_slam.pipelines.mapping.gauge import SeenExposures, common_exposure
@@ -31,9 +30,10 @@ from msgs_slam.pipelines.mapping.parameters import KEYS
 from msgs_slam.pipelines.mapping.state import Exposures, OptimisedMap
 from msgs_slam.pipelines.mapping.submaps import Submap, nearest_seeing
 from msgs_slam.pipelines.mapping.views import View
-from msgs_slam.pipelines.memory import memory_room
-from msgs_slam.pipelines.progress import Progress
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.device import settle_device
+from msgs_slam.pipelines.system.memory import memory_room
+from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Intrinsics, Trajectory
 
 MADE, JOINED, REFINED, AGREED = "made", "joined", "refined", "agreed"

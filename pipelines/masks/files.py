@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.digest import files_sha256
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import image_size, natural_key, read_rgb
-from msgs_slam.pipelines.frames.source import Source, VideoSource
+from msgs_slam.pipelines.source.opening import Source, VideoSource
 
 _LAST_NUMBER = re.compile(r"(\d+)(?!.*\d)")
 

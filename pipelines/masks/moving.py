@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.jit import kernel
-from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.system.jit import kernel
+from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Intrinsics
 
 SIDE = 160

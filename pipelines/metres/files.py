@@ -6,8 +6,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from msgs_slam.formats.jsonfile import read_json, read_json_object, write_json
-from msgs_slam.pipelines.run_folder import SCALE, RunFolder
-from msgs_slam.pipelines.stored import dataclass_from_json, reading
+from msgs_slam.pipelines.run.folder import SCALE, RunFolder
+from msgs_slam.pipelines.run.stored import dataclass_from_json, reading
 from msgs_slam.pipelines.types import Metres, MetresSource
 
 _FRAME_SCALES, _TRACKED = "frame_scales.json", "tracking.json"

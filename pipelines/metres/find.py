@@ -17,8 +17,8 @@ from msgs_slam.pipelines.metres.network import network_scale
 from msgs_slam.pipelines.metres.scene import Scene, SeenFrame, build_scene
 from msgs_slam.pipelines.metres.sizes import THINGS
 from msgs_slam.pipelines.metres.things import sizes_of_things
-from msgs_slam.pipelines.proxy.networks.card import Card
-from msgs_slam.pipelines.run_folder import DEPTH_FIELDS, RunFolder
+from msgs_slam.pipelines.networks.card import Card
+from msgs_slam.pipelines.run.folder import DEPTH_FIELDS, RunFolder
 from msgs_slam.pipelines.types import Intrinsics, Metres, MetresSource, Trajectory
 
 _MOST_FRAMES = 40

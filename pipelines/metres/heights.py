@@ -15,7 +15,7 @@ from msgs_slam.pipelines.metres.sizes import (
     FLOORS,
     FURNITURE,
 )
-from msgs_slam.pipelines.proxy.regions.structure import FLOOR
+from msgs_slam.pipelines.voxels.layout import FLOOR
 
 Array = NDArray[np.float64]
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.metres.evidence import Evidence, Mode
 from msgs_slam.pipelines.metres.scene import LEAST_CONFIDENCE, SeenFrame
-from msgs_slam.pipelines.proxy.networks.card import Card
-from msgs_slam.pipelines.proxy.networks.depth import network_depth
-from msgs_slam.pipelines.proxy.networks.letterbox import Letterbox
-from msgs_slam.pipelines.proxy.networks.session import Network
+from msgs_slam.pipelines.networks.card import Card
+from msgs_slam.pipelines.networks.depth import network_depth
+from msgs_slam.pipelines.networks.letterbox import Letterbox
+from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.depth.resize import resize_maps
 from msgs_slam.pipelines.geometry.camera import unproject_depth
-from msgs_slam.pipelines.proxy.regions.structure import (
+from msgs_slam.pipelines.proxy.sequence import resize_area
+from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
+from msgs_slam.pipelines.voxels.layout import (
     CEILING,
     FLOOR,
     FloorPlane,
@@ -20,9 +22,7 @@ from msgs_slam.pipelines.proxy.regions.structure import (
     floor_plane,
     name_structure,
 )
-from msgs_slam.pipelines.proxy.regions.voxels import Voxels, find, gather_frame, merge, select, voxel_keys
-from msgs_slam.pipelines.proxy.sequence import resize_area
-from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
+from msgs_slam.pipelines.voxels.voxels import Voxels, find, gather_frame, merge, select, voxel_keys
 
 Array = NDArray[np.float64]
 

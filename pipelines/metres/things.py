@@ -12,8 +12,8 @@ from msgs_slam.pipelines.metres.evidence import Evidence, measured
 from msgs_slam.pipelines.metres.heights import floor_trust, over_floor, stays_on_floor
 from msgs_slam.pipelines.metres.scene import Scene
 from msgs_slam.pipelines.metres.sizes import DOOR, DOORS, SURFACE, TOPS, Sizes
-from msgs_slam.pipelines.proxy.regions.structure import SURFACE as UNNAMED
-from msgs_slam.pipelines.proxy.regions.structure import levels
+from msgs_slam.pipelines.voxels.layout import SURFACE as UNNAMED
+from msgs_slam.pipelines.voxels.layout import levels
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.proxy.networks.depth_provider import OnnxDepth
+from msgs_slam.pipelines.proxy.learned.depth import OnnxDepth
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.scale import depth_at_points
 from msgs_slam.pipelines.proxy.sequence import Sequence

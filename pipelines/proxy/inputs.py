@@ -7,12 +7,9 @@ from typing import Any
 
 from msgs_slam.formats.digest import files_sha256
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.frames.recording import RecordingSource
-from msgs_slam.pipelines.frames.source import open_source
-from msgs_slam.pipelines.progress import SilentProgress, log
+from msgs_slam.pipelines.networks.identity import card_identity
 from msgs_slam.pipelines.proxy.files.depth import FilesDepth, require_sizes
 from msgs_slam.pipelines.proxy.files.labels import FilesLabels
-from msgs_slam.pipelines.proxy.networks.identity import card_identity
 from msgs_slam.pipelines.proxy.scale_reference import require_reference_in
 from msgs_slam.pipelines.proxy.selection import (
     Surroundings,
@@ -25,6 +22,9 @@ from msgs_slam.pipelines.proxy.selection import (
     open_learned_semantics,
 )
 from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.source.opening import open_source
+from msgs_slam.pipelines.source.recording import RecordingSource
+from msgs_slam.pipelines.system.progress import SilentProgress, log
 from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics
 
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.frames.source import open_source
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.proxy.providers import DepthEstimate, DepthProvider
 from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
 from msgs_slam.pipelines.proxy.scale import DepthScale
 from msgs_slam.pipelines.proxy.scale_reference import ReferenceScale, distance_scale, height_scale, parse_reference
 from msgs_slam.pipelines.proxy.sequence import Sequence
-from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.types import Frame
 
 

@@ -10,24 +10,24 @@ from statistics import median
 from msgs_slam.formats.datasets import Sequence as Recording
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import ProxyConfig
-from msgs_slam.pipelines.progress import Progress
+from msgs_slam.pipelines.networks.card import Card, read_card
+from msgs_slam.pipelines.networks.registry import ModelStore, default_cache
+from msgs_slam.pipelines.networks.words import with_words
 from msgs_slam.pipelines.proxy.aligned import AlignedDepth
 from msgs_slam.pipelines.proxy.files.depth import FilesDepth
 from msgs_slam.pipelines.proxy.files.labels import FilesLabels
 from msgs_slam.pipelines.proxy.files.recording import RecordingDepth, RecordingLabels
 from msgs_slam.pipelines.proxy.fused import FusedDepth
-from msgs_slam.pipelines.proxy.models.registry import ModelStore, default_cache
-from msgs_slam.pipelines.proxy.networks.card import Card, read_card
-from msgs_slam.pipelines.proxy.networks.clusters_provider import OnnxClusters
-from msgs_slam.pipelines.proxy.networks.depth_provider import OnnxDepth
-from msgs_slam.pipelines.proxy.networks.labels_provider import OnnxLabels
-from msgs_slam.pipelines.proxy.networks.network_pass import ResultCache, Workplace
-from msgs_slam.pipelines.proxy.networks.words import with_words
+from msgs_slam.pipelines.proxy.learned.clusters import OnnxClusters
+from msgs_slam.pipelines.proxy.learned.depth import OnnxDepth
+from msgs_slam.pipelines.proxy.learned.labels import OnnxLabels
+from msgs_slam.pipelines.proxy.learned.network_pass import ResultCache, Workplace
 from msgs_slam.pipelines.proxy.providers import DepthProvider, SemanticsProvider
 from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
 from msgs_slam.pipelines.proxy.scale import measure_scale
 from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.proxy.stereo.provider import MultiviewDepth
+from msgs_slam.pipelines.system.progress import Progress
 
 LEARNED_SPREAD = 0.02
 """Files whose depths stray by more from the triangulated points, relatively and within one frame, are taken for a

@@ -11,8 +11,8 @@ import numpy as np
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.correspondence.features import extract_features, to_grey
+from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.masks.moving import find_moving
-from msgs_slam.pipelines.progress import log
 from msgs_slam.pipelines.proxy.inputs import check_proxy, proxy_inputs
 from msgs_slam.pipelines.proxy.metres import reference_scale, scale_figures
 from msgs_slam.pipelines.proxy.providers import (
@@ -38,7 +38,7 @@ from msgs_slam.pipelines.proxy.tasks import (
     prepare_depths,
     surroundings,
 )
-from msgs_slam.pipelines.run_folder import (
+from msgs_slam.pipelines.run.folder import (
     load_proxy_maps,
     proxy_path,
     save_classes,
@@ -48,7 +48,7 @@ from msgs_slam.pipelines.run_folder import (
     save_left_out,
     save_mirror_pairs,
 )
-from msgs_slam.pipelines.stages import Stage, StageContext
+from msgs_slam.pipelines.system.progress import log
 from msgs_slam.pipelines.types import VOID, Features, Frame
 
 

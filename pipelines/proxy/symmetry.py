@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.geometry.camera import pixel_centers, project, unproject, unproject_depth
-from msgs_slam.pipelines.progress import Progress
 from msgs_slam.pipelines.proxy.mirror_features import MirroredMatches, mirrored_matches
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Features, Frame, Intrinsics, MirrorPairs
 
 Array = NDArray[np.float64]

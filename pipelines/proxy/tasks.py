@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.depth.resize import resample_nearest
-from msgs_slam.pipelines.frames.recording import open_recording
+from msgs_slam.pipelines.engine.portions import Portion, in_portions
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.masks.moving import SIDE, MovingView, look_once
-from msgs_slam.pipelines.portions import Portion, in_portions
-from msgs_slam.pipelines.progress import Progress
 from msgs_slam.pipelines.proxy.compact import compact
 from msgs_slam.pipelines.proxy.providers import (
     DepthEstimate,
@@ -24,15 +23,16 @@ from msgs_slam.pipelines.proxy.providers import (
     SemanticsProvider,
     take_prepared,
 )
-from msgs_slam.pipelines.proxy.regions.voxels import to_lab
 from msgs_slam.pipelines.proxy.reliability import reliability, semantic_agreement, theta, warp_labels
 from msgs_slam.pipelines.proxy.scale import DepthScale
 from msgs_slam.pipelines.proxy.scratch import load_scratch, save_scratch
 from msgs_slam.pipelines.proxy.selection import Surroundings, open_depth, open_semantics
 from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
-from msgs_slam.pipelines.run_folder import load_left_out, proxy_path, save_proxy_maps
-from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.run.folder import load_left_out, proxy_path, save_proxy_maps
+from msgs_slam.pipelines.source.recording import open_recording
+from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Frame, Intrinsics, ProxyMaps, any_of
+from msgs_slam.pipelines.voxels.voxels import to_lab
 
 R = TypeVar("R")
 

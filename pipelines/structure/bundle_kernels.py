@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from msgs_slam.pipelines.jit import kernel
+from msgs_slam.pipelines.system.jit import kernel
 
 MIN_DEPTH = 1e-6
 """Relative to nothing: a point behind the camera is treated as an outlier of zero weight."""

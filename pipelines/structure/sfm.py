@@ -29,9 +29,6 @@ from msgs_slam.pipelines.correspondence.retrieval import (
 )
 from msgs_slam.pipelines.correspondence.snapshots import Snapshots
 from msgs_slam.pipelines.geometry.rig import ONE_CAMERA
-from msgs_slam.pipelines.memory import give_back
-from msgs_slam.pipelines.progress import Progress
-from msgs_slam.pipelines.streamed import Streamed
 from msgs_slam.pipelines.structure.adjust import adjust
 from msgs_slam.pipelines.structure.consistency import ModelReport, check_pairs, judge, without_misplaced
 from msgs_slam.pipelines.structure.lens import set_lens
@@ -42,6 +39,9 @@ from msgs_slam.pipelines.structure.rolling import NO_READOUT, Readout, adjust_ro
 from msgs_slam.pipelines.structure.seams import cut, take_out
 from msgs_slam.pipelines.structure.window_size import SIZE, windows_of
 from msgs_slam.pipelines.structure.windows import Joined, adjust_joined
+from msgs_slam.pipelines.system.memory import give_back
+from msgs_slam.pipelines.system.progress import Progress
+from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import Features, Vocabulary
 
 _PAIRS_PER_BLOCK = 64

@@ -13,7 +13,7 @@ from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.correspondence.features import to_grey
 from msgs_slam.pipelines.correspondence.retrieval import describe
 from msgs_slam.pipelines.frames.learned import open_learned, picture_features
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.structure.rolling import Shutter
 from msgs_slam.pipelines.types import Features, ProxyMaps
 

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.geometry.rig import Rig, rig_of
-from msgs_slam.pipelines.memory import give_back
-from msgs_slam.pipelines.run_folder import save_depth_fields, save_figures, save_sparse, save_trajectory
-from msgs_slam.pipelines.stages import Stage, StageContext
-from msgs_slam.pipelines.stopping import is_asked
+from msgs_slam.pipelines.run.folder import save_depth_fields, save_figures, save_sparse, save_trajectory
 from msgs_slam.pipelines.structure.rolling import Shutter
+from msgs_slam.pipelines.system.memory import give_back
+from msgs_slam.pipelines.system.stopping import is_asked
+from msgs_slam.pipelines.system.wording import stretches
 from msgs_slam.pipelines.tracking.adjust import Report, adjust_state, align_depths, without_dependent_depth
 from msgs_slam.pipelines.tracking.front_end import FrontEnd
 from msgs_slam.pipelines.tracking.pictures import Pictures, load_shutter
@@ -24,7 +25,6 @@ from msgs_slam.pipelines.tracking.segments import join_segments, split_segments
 from msgs_slam.pipelines.tracking.state import FEATURE_SD, TrackState
 from msgs_slam.pipelines.tracking.turn import hold_turns
 from msgs_slam.pipelines.types import Frame
-from msgs_slam.pipelines.wording import stretches
 
 SNAPSHOT_EVERY, SNAPSHOTS = 50, 20
 """Frames between two; of a long recording no more are taken in all, since each holds all that is known so far."""

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.export.depth_views import depth_view
+from msgs_slam.pipelines.mapping.depth_views import depth_view
 from msgs_slam.pipelines.outcome import Outcome, evenly, maps_around
-from msgs_slam.pipelines.proxy.regions.structure import Gravity, find_gravity, floor_plane, name_structure
-from msgs_slam.pipelines.proxy.regions.voxels import Voxels, gather_frame, merge, select
 from msgs_slam.pipelines.upright.lines import up_of_lines
+from msgs_slam.pipelines.voxels.layout import Gravity, find_gravity, floor_plane, name_structure
+from msgs_slam.pipelines.voxels.voxels import Voxels, gather_frame, merge, select
 
 Array = NDArray[np.float64]
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gps import Track, photo_places, read_track
-from msgs_slam.pipelines.frames.source import FolderSource, open_source
 from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.progress import log
-from msgs_slam.pipelines.records import load_source
+from msgs_slam.pipelines.run.records import load_source
+from msgs_slam.pipelines.source.opening import FolderSource, open_source
+from msgs_slam.pipelines.system.progress import log
 from msgs_slam.pipelines.upright.georeference import georeference
 from msgs_slam.pipelines.upright.world import World
 

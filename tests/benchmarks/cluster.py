@@ -31,7 +31,7 @@ os.environ["RAY_memory_monitor_refresh_ms"] = "0"  # noqa: SIM112  Ray writes it
 os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112  with its 15 anything else starves the tasks
 
 from msgs_slam.pipelines.demo import unpack_demo_clip
-from msgs_slam.pipelines.run_folder_names import STAGES
+from msgs_slam.pipelines.run.names import STAGES
 from tests.benchmarks.shards import begin, beginning, contents, msgs_slam
 
 WITH_TASKS = {

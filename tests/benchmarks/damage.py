@@ -27,9 +27,9 @@ from click.testing import CliRunner, Result
 
 from msgs_slam.formats.digest import file_sha256
 from msgs_slam.msgs_cli.main import main as msgs_slam
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.run_folder_names import STAGES
-from msgs_slam.pipelines.viewer import Viewer
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.names import STAGES
+from msgs_slam.pipelines.viewer.server import Viewer
 
 PORT = 18097
 Damage = Callable[[Path, Path], None]

@@ -30,11 +30,11 @@ os.environ["PYTHONPATH"] = str(ROOT)  # of the nodes, as an installed program is
 
 from msgs_slam.msgs_cli.options import worker_setup
 from msgs_slam.pipelines.demo import unpack_demo_clip
-from msgs_slam.pipelines.engines import Call, Ended, Engine, RayEngine
-from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.engine.engines import Call, Ended, Engine, RayEngine
+from msgs_slam.pipelines.engine.workers import Workers
 from msgs_slam.pipelines.reconstruct import resume
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.workers import Workers
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.benchmarks.shards import SETTINGS, msgs_slam
 from tests.benchmarks.task_graph import makespan
 

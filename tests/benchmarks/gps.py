@@ -21,10 +21,10 @@ import pycolmap
 from numpy.typing import NDArray
 
 from msgs_slam.formats.gps import enu_from_geodetic, photo_places
-from msgs_slam.pipelines.frames.source import FolderSource, open_source
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.records import load_source
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.records import load_source
+from msgs_slam.pipelines.source.opening import FolderSource, open_source
 from msgs_slam.pipelines.upright.georeference import georeference
 from msgs_slam.pipelines.upright.world import load_world
 

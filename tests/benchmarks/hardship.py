@@ -196,7 +196,7 @@ def settings() -> list[str]:
 
 def digests_of(run: Path, stage: str) -> dict[str, str]:
     """Of the files of one stage."""
-    from msgs_slam.pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.run.folder import RunFolder
 
     return {name: digest for name, digest in digests(RunFolder(run)).items() if name.startswith(f"{stage}/")}
 
@@ -320,7 +320,7 @@ def prepare(work: Path) -> None:
 
 def begin_all(work: Path, source: Path) -> dict[str, Path]:
     """Stage → a run of which everything before that stage is done."""
-    from msgs_slam.pipelines.run_folder_names import STAGES
+    from msgs_slam.pipelines.run.names import STAGES
 
     whole, begun = work / "whole.msgs", {}
     shutil.rmtree(whole, ignore_errors=True)
@@ -361,7 +361,7 @@ def main() -> None:
     disk.mkdir(parents=True, exist_ok=True)
     os.environ["MSGS_SLAM_CACHE"] = str(work / "no_networks")
     from msgs_slam.pipelines.reconstruct import all_stages
-    from msgs_slam.pipelines.stage_identity import stage_identity
+    from msgs_slam.pipelines.system.identity import stage_identity
 
     for stage in all_stages():  # what every child would read again
         stage_identity(stage.name, stage.file)

@@ -33,12 +33,12 @@ from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.jsonfile import read_json_object, write_json
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.config import Config, load_config
-from msgs_slam.pipelines.progress import SilentProgress
 from msgs_slam.pipelines.reconstruct import all_stages, reconstruct, resume
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.run_folder_names import STAGES
-from msgs_slam.pipelines.settings_file import load_settings
-from msgs_slam.pipelines.stage_identity import stage_identity
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.names import STAGES
+from msgs_slam.pipelines.run.settings_file import load_settings
+from msgs_slam.pipelines.system.identity import stage_identity
+from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.world import ClipOptions, iter_clip, make_world
 
 SETTINGS = (

@@ -34,8 +34,8 @@ from numpy.typing import NDArray
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.geometry.alignment import align_points
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.run_folder_names import STAGES
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.names import STAGES
 from tests.world import ClipOptions, write_sequence
 from tests.world.building import Walk, around, frames
 

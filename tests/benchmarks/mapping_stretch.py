@@ -40,7 +40,7 @@ from msgs_slam.pipelines.evaluation.views import view_map
 from msgs_slam.pipelines.mapping.load import without_contradicted_depth
 from msgs_slam.pipelines.mapping.optimise import optimise_map
 from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes
-from msgs_slam.pipelines.streamed import Streamed
+from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 
 

@@ -27,13 +27,13 @@ from msgs_slam.formats.trajectory import read_matrices
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.metres.evidence import Evidence, combine
 from msgs_slam.pipelines.metres.find import Machine, Seen, describe, load_seen, usual_evidence
-from msgs_slam.pipelines.progress import SilentProgress
-from msgs_slam.pipelines.proxy.models.registry import ModelStore
-from msgs_slam.pipelines.proxy.networks.labels_provider import OnnxLabels
-from msgs_slam.pipelines.proxy.networks.network_pass import ResultCache, Workplace
+from msgs_slam.pipelines.networks.registry import ModelStore
+from msgs_slam.pipelines.proxy.learned.labels import OnnxLabels
+from msgs_slam.pipelines.proxy.learned.network_pass import ResultCache, Workplace
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.sequence import Sequence, map_intrinsics
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Trajectory
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"

@@ -44,15 +44,15 @@ from msgs_slam.pipelines.evaluation.label_score import count_labels, score
 from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.evaluation.pictures import Picture, label_picture
 from msgs_slam.pipelines.evaluation.truth import match_truth
-from msgs_slam.pipelines.frames.source_pixels import FramePixels
 from msgs_slam.pipelines.geometry.camera import unproject_depth
+from msgs_slam.pipelines.networks.labels import network_labels
+from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.proxy.networks.labels import network_labels
-from msgs_slam.pipelines.proxy.networks.session import Network
 from msgs_slam.pipelines.proxy.palette import class_colors
 from msgs_slam.pipelines.proxy.selection import choose_semantics
 from msgs_slam.pipelines.reconstruct import reconstruct
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.source.source_pixels import FramePixels
 from msgs_slam.pipelines.types import VOID, ClassTable
 from msgs_slam.pipelines.upright.world import FIRST, load_world
 

@@ -26,7 +26,7 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
 from msgs_slam.pipelines.geometry.rig import CUBE, rig_of
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.upright.world import load_world
 from tests.world.build import World
 from tests.world.clip import ClipOptions, make_world, render_frame, render_view, walk

@@ -34,16 +34,16 @@ from msgs_slam.formats.images import read_depth_png, read_rgb, write_grey_png, w
 from msgs_slam.pipelines.config import load_config
 from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.evaluation.measure import render_outcome
-from msgs_slam.pipelines.frames.source_pixels import FramePixels
 from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
 from msgs_slam.pipelines.geometry.camera import project, unproject_depth
+from msgs_slam.pipelines.networks.person import person_probability
+from msgs_slam.pipelines.networks.registry import ModelStore
+from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.progress import SilentProgress
-from msgs_slam.pipelines.proxy.models.registry import ModelStore
-from msgs_slam.pipelines.proxy.networks.person import person_probability
-from msgs_slam.pipelines.proxy.networks.session import Network
 from msgs_slam.pipelines.reconstruct import reconstruct
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.source.source_pixels import FramePixels
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Intrinsics
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"

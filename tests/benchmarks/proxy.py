@@ -40,7 +40,7 @@ from msgs_slam.pipelines.config import load_config
 from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.geometry.camera import project, unproject_depth
 from msgs_slam.pipelines.reconstruct import reconstruct
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import VOID, Frame, ProxyMaps
 
 DATA = ROOT.parent / "shared" / "data"
@@ -240,9 +240,9 @@ def flicker(run: RunFolder, labels_of: dict[int, NDArray[np.uint8]] | None = Non
 
 def measure_network(name: str, work: Path) -> dict[str, Any]:
     """DeepLab on a video: frames a second of the network alone, and its flicker before and after the votes."""
-    from msgs_slam.pipelines.proxy.networks.card import read_card
-    from msgs_slam.pipelines.proxy.networks.labels import network_labels
-    from msgs_slam.pipelines.proxy.networks.session import Network
+    from msgs_slam.pipelines.networks.card import read_card
+    from msgs_slam.pipelines.networks.labels import network_labels
+    from msgs_slam.pipelines.networks.session import Network
 
     card_file = write_deeplab_card(work)
     run = RunFolder(work / f"{name}_deeplab.msgs")

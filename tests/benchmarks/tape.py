@@ -21,9 +21,9 @@ from msgs_slam.formats.gaussians import GaussianCloud
 from msgs_slam.pipelines.evaluation.truth import MatchedTruth, match_truth
 from msgs_slam.pipelines.export.writers import map_cloud
 from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.geometry.tape import Touch, tape, touch
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.viewer_tape import Touch, tape, touch
+from msgs_slam.pipelines.run.folder import RunFolder
 
 Array = NDArray[np.float64]
 

@@ -42,8 +42,8 @@ from msgs_slam.pipelines.mapping.measure import mean_figures, measure_view
 from msgs_slam.pipelines.mapping.optimise import optimise_map, scene_depth
 from msgs_slam.pipelines.mapping.views import View
 from msgs_slam.pipelines.proxy.reliability import GAMMA, theta
-from msgs_slam.pipelines.records import load_source
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.records import load_source
 from msgs_slam.pipelines.types import Trajectory
 
 VARIANTS: dict[str, dict[str, Any]] = {

@@ -23,9 +23,9 @@ from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.geometry.camera import project
-from msgs_slam.pipelines.jit import kernel
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.jit import kernel
 from msgs_slam.pipelines.types import Intrinsics
 from msgs_slam.pipelines.upright.world import read_world
 

@@ -31,9 +31,9 @@ from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
 from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.progress import SilentProgress
 from msgs_slam.pipelines.reconstruct import reconstruct
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.world import ClipOptions, make_world, write_sequence
 from tests.world.stairwell import BAR
 

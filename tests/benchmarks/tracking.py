@@ -157,7 +157,7 @@ def write_walk(folder: Path, layout: str, frames: int, laps: float) -> Path:
 def measure_ours(name: str, work: Path, settings: Sequence[str], until: str) -> dict[str, Any]:
     """Run the stages and compare the trajectory with the truth."""
     from msgs_slam.pipelines.config import load_config
-    from msgs_slam.pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.run.folder import RunFolder
 
     case = walk_case(name, work) if name.startswith("walk_") else cases(work)[name]
     source = prepare(name, case, work)
@@ -185,10 +185,10 @@ def run_stages_timed(
     source: Path, run: Any, config: Any, until: str
 ) -> tuple[dict[str, Any], dict[str, dict[str, float]]]:
     """The stages' records, and what each took; of a stage that is up to date, what it took when it ran."""
-    from msgs_slam.pipelines.progress import SilentProgress
     from msgs_slam.pipelines.reconstruct import reconstruct
-    from msgs_slam.pipelines.records import load_records
-    from msgs_slam.pipelines.run_folder_names import STAGES
+    from msgs_slam.pipelines.run.names import STAGES
+    from msgs_slam.pipelines.run.records import load_records
+    from msgs_slam.pipelines.system.progress import SilentProgress
 
     stored = run.root.with_suffix(".seconds.json")
     seconds = json.loads(stored.read_text()) if stored.exists() else {}
@@ -289,7 +289,7 @@ def measure_colmap(name: str, work: Path, mapper: str) -> dict[str, Any]:
     """
     import pycolmap
 
-    from msgs_slam.pipelines.run_folder import RunFolder
+    from msgs_slam.pipelines.run.folder import RunFolder
 
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     case = cases(work)[name]

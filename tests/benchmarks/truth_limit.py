@@ -27,7 +27,7 @@ from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]

@@ -23,7 +23,7 @@ from msgs_slam.pipelines.evaluation.mesh_cells import true_surface
 from msgs_slam.pipelines.evaluation.trajectory_error import absolute_error
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.upright.find import find_upright
 from msgs_slam.pipelines.upright.world import upright_world
 

@@ -12,13 +12,14 @@ from click.testing import CliRunner, Result
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.msgs_cli.main import main
-from msgs_slam.pipelines import batch, workers
+from msgs_slam.pipelines import batch
 from msgs_slam.pipelines.batch import DONE, ELSEWHERE, FAILED, Job, Recording, find_recordings, work_on
-from msgs_slam.pipelines.engines import Call, Ended
-from msgs_slam.pipelines.lock import locked
-from msgs_slam.pipelines.progress import SilentProgress
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.shards import Shard
+from msgs_slam.pipelines.engine import workers
+from msgs_slam.pipelines.engine.engines import Call, Ended
+from msgs_slam.pipelines.engine.shards import Shard
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.lock import locked
+from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.pipelines.frames.conftest import QUICK, render, sideways
 
 

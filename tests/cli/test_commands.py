@@ -11,9 +11,9 @@ from msgs_slam.formats.atomic import temporary_of
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.reconstruct import existing_config
-from msgs_slam.pipelines.records import Manifest, Source, write_manifest
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.settings_file import save_settings
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.records import Manifest, Source, write_manifest
+from msgs_slam.pipelines.run.settings_file import save_settings
 
 
 def invoke(*arguments: object) -> Result:

@@ -9,9 +9,9 @@ import pytest
 from cli_runs import invoke
 
 from msgs_slam.msgs_cli.tables import format_figure, format_table
-from msgs_slam.pipelines.records import load_records
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.wording import lost_text, stretches
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.records import load_records
+from msgs_slam.pipelines.system.wording import lost_text, stretches
 
 USED_BY = {
     "frames/frames.json": "ply",

@@ -17,7 +17,7 @@ import pytest
 from cli_runs import elsewhere, files_below
 
 from msgs_slam.formats.video_writer import write_video
-from msgs_slam.pipelines.run_folder_names import STAGES
+from msgs_slam.pipelines.run.names import STAGES
 from tests.world import ClipOptions, iter_clip, make_world
 
 SETTINGS = (

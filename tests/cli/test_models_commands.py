@@ -8,7 +8,7 @@ from click.testing import CliRunner, Result
 from onnx import TensorProto, helper
 
 from msgs_slam.msgs_cli.main import main
-from msgs_slam.pipelines.proxy.models.registry import ModelStore
+from msgs_slam.pipelines.networks.registry import ModelStore
 
 
 @pytest.fixture

@@ -14,10 +14,11 @@ from cli_runs import FinishedRun, invoke
 
 from msgs_slam.formats.errors import DiskFullError, InputError
 from msgs_slam.formats.video_writer import write_video
-from msgs_slam.pipelines import lock, records, stages
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.stages import forget_peak, peak_memory_mb
-from msgs_slam.pipelines.stopping import Stopped, is_asked, soft_stop, stop_if_asked
+from msgs_slam.pipelines.engine import stages
+from msgs_slam.pipelines.engine.stages import forget_peak, peak_memory_mb
+from msgs_slam.pipelines.run import lock, records
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.stopping import Stopped, is_asked, soft_stop, stop_if_asked
 
 COMMAND = [sys.executable, "-m", "msgs_slam"]
 

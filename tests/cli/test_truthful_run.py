@@ -14,12 +14,12 @@ from cli_runs import OPTIONS, FinishedRun, invoke
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.frames.source import source_digest
-from msgs_slam.pipelines.lock import locked
-from msgs_slam.pipelines.progress import SilentProgress
 from msgs_slam.pipelines.reconstruct import made_with, reconstruct
-from msgs_slam.pipelines.records import load_records
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.lock import locked
+from msgs_slam.pipelines.run.records import load_records
+from msgs_slam.pipelines.source.opening import source_digest
+from msgs_slam.pipelines.system.progress import SilentProgress
 
 
 def interrupt_when(reached: Callable[[], bool], *arguments: object) -> subprocess.CompletedProcess[str]:

@@ -8,8 +8,8 @@ from pathlib import Path
 from cli_runs import invoke
 
 from msgs_slam.formats.digest import file_sha256
-from msgs_slam.pipelines.records import load_records
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.records import load_records
 
 DIVIDED = ("--set", "mapping.submap=5", "--until", "mapping", "-q")
 

@@ -29,8 +29,8 @@ from msgs_slam.formats.jsonfile import read_json, read_toml
 from msgs_slam.formats.mesh import read_mesh_glb, read_mesh_ply
 from msgs_slam.formats.tensors import load_arrays, load_safetensors, save_safetensors
 from msgs_slam.formats.trajectory import read_matrices, read_tum
-from msgs_slam.pipelines.frames.recording import RecordingSource
-from msgs_slam.pipelines.frames.source import FolderSource, open_source, source_digest
+from msgs_slam.pipelines.source.opening import FolderSource, open_source, source_digest
+from msgs_slam.pipelines.source.recording import RecordingSource
 
 Read = Callable[[Path], Any]
 DEEP = 100_000

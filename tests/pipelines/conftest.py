@@ -15,7 +15,7 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import Config, MappingConfig
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry.alignment import Similarity
-from msgs_slam.pipelines.run_folder import (
+from msgs_slam.pipelines.run.folder import (
     RunFolder,
     proxy_path,
     save_calibration,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from msgs_slam.formats.atomic import write_bytes
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.system.progress import SilentProgress
 
 
 def double(value: int) -> int:
@@ -30,7 +30,7 @@ def die(marker: str, times: int) -> str:
 
 def wait(marker: str) -> None:
     """Until stopped."""
-    from msgs_slam.pipelines.stopping import stop_if_asked
+    from msgs_slam.pipelines.system.stopping import stop_if_asked
 
     Path(marker).write_text(str(os.getpid()))
     for _ in range(600):

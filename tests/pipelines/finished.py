@@ -3,7 +3,8 @@
 from collections.abc import Iterable
 
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.records import (
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.records import (
     Manifest,
     Source,
     StageRecord,
@@ -12,8 +13,7 @@ from msgs_slam.pipelines.records import (
     settings_of,
     write_manifest,
 )
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.settings_file import save_settings
+from msgs_slam.pipelines.run.settings_file import save_settings
 
 
 def note_finished(

@@ -9,7 +9,7 @@ import numpy as np
 
 from msgs_slam.pipelines.correspondence.features import extract_features, to_grey
 from msgs_slam.pipelines.correspondence.retrieval import learn_vocabulary
-from msgs_slam.pipelines.run_folder import save_features, save_matching
+from msgs_slam.pipelines.run.folder import save_features, save_matching
 
 
 def keep_correspondences(folder: Path, pictures: Mapping[int, np.ndarray]) -> None:

@@ -13,8 +13,8 @@ import msgs_slam
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.trajectory import read_tum
 from msgs_slam.pipelines.export.stage import export_run
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.stage_identity import source_digest
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.identity import source_digest
 
 ROOT = Path(__file__).resolve().parents[2]
 OracleRun = Callable[..., RunFolder]

@@ -12,21 +12,21 @@ import torch
 
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.pipelines.config import Config, ExportConfig, GlobalBaConfig, MappingConfig, ProxyConfig
+from msgs_slam.pipelines.engine.stages import StageContext, run_stages
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.global_ba.move_map import move_map
 from msgs_slam.pipelines.mapping import growth
 from msgs_slam.pipelines.mapping import stage as mapping_stage
-from msgs_slam.pipelines.progress import SilentProgress
 from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.render_run import render_run
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.run_folder_names import STAGES
-from msgs_slam.pipelines.stages import StageContext, run_stages
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.names import STAGES
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.tracking.pictures import Pictures
 from msgs_slam.pipelines.tracking.refine import RenderWeights, compare_frame
 from msgs_slam.pipelines.tracking.state import FEATURE_SD, TrackState
-from msgs_slam.pipelines.viewer_scene import load_scenes
+from msgs_slam.pipelines.viewer.scene import load_scenes
 from tests.pipelines.mapping.small_run import make_run
 from tests.pretend_device import DEVICE, PretendTensor, WrongDeviceError, pretended
 

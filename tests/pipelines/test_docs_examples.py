@@ -14,9 +14,9 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import load_config
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.progress import SilentProgress
 from msgs_slam.pipelines.proxy import selection
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, Frame
 from tests.pipelines.proxy.proxy_room import UNIT, Room, perfect_backbone
 from tests.world import ClipOptions, make_world, render_frame

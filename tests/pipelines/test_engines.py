@@ -19,9 +19,9 @@ import engine_calls
 import pytest
 
 from msgs_slam.formats.errors import InputError, RecoverableError
-from msgs_slam.pipelines import engines
-from msgs_slam.pipelines.engines import Call, Engine, LocalEngine, RayEngine
-from msgs_slam.pipelines.stopping import Stopped, soft_stop
+from msgs_slam.pipelines.engine import engines
+from msgs_slam.pipelines.engine.engines import Call, Engine, LocalEngine, RayEngine
+from msgs_slam.pipelines.system.stopping import Stopped, soft_stop
 
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra msgs-slam[cluster]")
 
@@ -79,7 +79,7 @@ def test_a_signal_ends_the_calls(engine: Engine, tmp_path: Path) -> None:
 def test_a_killed_parent_leaves_no_process_behind(tmp_path: Path) -> None:
     marker = tmp_path / "begun"
     code = (
-        "import engine_calls\nfrom pipelines.engines import Call, LocalEngine\n"
+        "import engine_calls\nfrom pipelines.engine.engines import Call, LocalEngine\n"
         f"list(LocalEngine().run([Call('waits', engine_calls.wait, ({str(marker)!r},))]))\n"
     )
     paths = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}

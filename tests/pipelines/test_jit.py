@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from msgs_slam.pipelines import jit
+from msgs_slam.pipelines.system import jit
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -76,13 +76,13 @@ def test_a_folder_others_may_write_to_is_not_trusted(monkeypatch, tmp_path):
 def test_a_kernel_follows_what_other_files_put_into_it(tmp_path):
     """numba itself would go on using the machine code into which the older function is inlined."""
     room = tmp_path / "msgs_slam" / "pipelines"
-    room.mkdir(parents=True)
-    for name in ("jit.py", "stage_identity.py"):
-        shutil.copyfile(ROOT / "pipelines" / name, room / name)
+    (room / "system").mkdir(parents=True)
+    for name in ("__init__", "jit", "identity"):
+        shutil.copyfile(ROOT / "pipelines" / "system" / f"{name}.py", room / "system" / f"{name}.py")
     (room.parent / "__init__.py").write_text("")
     (room / "__init__.py").write_text("")
     (room / "kernel.py").write_text(
-        "from msgs_slam.pipelines.inlined import value\nfrom msgs_slam.pipelines.jit import kernel\n\n"
+        "from msgs_slam.pipelines.inlined import value\nfrom msgs_slam.pipelines.system.jit import kernel\n\n"
         "@kernel\ndef twice(x):\n    return 2 * value(x)\n\n"
         "print(twice(1.0), sum(twice.stats.cache_hits.values()))\n"
     )
@@ -90,7 +90,7 @@ def test_a_kernel_follows_what_other_files_put_into_it(tmp_path):
     said = []
     for factor in (3, 3, 5):
         (room / "inlined.py").write_text(
-            f"from msgs_slam.pipelines.jit import kernel\n\n@kernel\ndef value(x):\n    return {factor} * x\n"
+            f"from msgs_slam.pipelines.system.jit import kernel\n\n@kernel\ndef value(x):\n    return {factor} * x\n"
         )
         command = [sys.executable, "-m", "msgs_slam.pipelines.kernel"]
         done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)

@@ -15,8 +15,8 @@ from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.evaluation.report import write_report
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.viewer_scene import load_scenes
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.viewer.scene import load_scenes
 from tests.pipelines.frames.conftest import WALK_FRAMES, render, sideways, write_walk
 
 APART = 9

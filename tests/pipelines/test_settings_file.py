@@ -10,9 +10,9 @@ from finished import note_finished
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config, ExportConfig, config_to_toml
-from msgs_slam.pipelines.records import load_records, load_source
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.settings_file import load_settings, save_settings
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.records import load_records, load_source
+from msgs_slam.pipelines.run.settings_file import load_settings, save_settings
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def test_a_setting_that_is_no_more_does_not_stop_a_run(
     """As a version would leave it that still had one: with its checksum."""
     config = replace(Config(), export=ExportConfig(voxel=0.05))
     text = config_to_toml(config).replace("[frames]\n", "[frames]\npeak_threshold = 0.01\n")
-    monkeypatch.setattr("msgs_slam.pipelines.settings_file.config_to_toml", lambda _: text)
+    monkeypatch.setattr("msgs_slam.pipelines.run.settings_file.config_to_toml", lambda _: text)
     save_settings(run, config)
     with caplog.at_level(logging.WARNING):
         assert load_settings(RunFolder(run.root)) == config

@@ -14,9 +14,9 @@ import engine_calls
 import pytest
 
 from msgs_slam.formats.errors import InputError, RecoverableError
-from msgs_slam.pipelines import shards, travel, workers
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.shards import Posted, Shard, SharedWorkers, posted_in
+from msgs_slam.pipelines.engine import shards, travel, workers
+from msgs_slam.pipelines.engine.shards import Posted, Shard, SharedWorkers, posted_in
+from msgs_slam.pipelines.run.folder import RunFolder
 
 HOLDS = "import fcntl, sys; f = open(sys.argv[1], 'ab'); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()"
 

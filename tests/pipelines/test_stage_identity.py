@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from msgs_slam.pipelines.reconstruct import all_stages
-from msgs_slam.pipelines.run_folder_names import STAGES
-from msgs_slam.pipelines.stage_identity import ROOT, TABLE, source_digest, stage_identity, stage_sources
+from msgs_slam.pipelines.run.names import STAGES
+from msgs_slam.pipelines.system.identity import ROOT, TABLE, source_digest, stage_identity, stage_sources
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -18,7 +18,7 @@ def sources(stage: str) -> set[str]:
 
 def test_sources_are_what_the_stage_imports_and_nothing_else() -> None:
     assert {"pipelines/gaussians/render/cpu_forward.py", "pipelines/gaussians/render/__init__.py"} <= sources("mapping")
-    assert {"pipelines/structure/sfm.py", "formats/video.py", "pipelines/run_folder.py"} <= sources("frames")
+    assert {"pipelines/structure/sfm.py", "formats/video.py", "pipelines/run/folder.py"} <= sources("frames")
     assert "pipelines/structure/bundle_kernels.py" in sources("global_ba")
     for stage in STAGES:
         assert not {
@@ -64,7 +64,7 @@ def test_identity_is_a_number_only_where_the_sources_are_the_released_ones(
     for written, expected in ((digest, "7"), ("0" * 16, digest)):
         table = tmp_path / f"{expected}.toml"
         table.write_text(f'[export]\nnumber = 7\nsources = "{written}"\n')
-        monkeypatch.setattr("msgs_slam.pipelines.stage_identity.TABLE", table)
+        monkeypatch.setattr("msgs_slam.pipelines.system.identity.TABLE", table)
         stage_identity.cache_clear()
         assert stage_identity("export", file) == expected
     stage_identity.cache_clear()

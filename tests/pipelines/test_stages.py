@@ -9,12 +9,12 @@ import pytest
 from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.errors import DiskFullError, InputError
 from msgs_slam.pipelines.config import Config, MappingConfig, load_config
-from msgs_slam.pipelines.journal import JOURNAL
-from msgs_slam.pipelines.progress import SilentProgress
-from msgs_slam.pipelines.records import load_records
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.run_folder_names import STAGES
-from msgs_slam.pipelines.stages import SameSource, Stage, StageContext, run_stages
+from msgs_slam.pipelines.engine.stages import SameSource, Stage, StageContext, run_stages
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.journal import JOURNAL
+from msgs_slam.pipelines.run.names import STAGES
+from msgs_slam.pipelines.run.records import load_records
+from msgs_slam.pipelines.system.progress import SilentProgress
 
 
 class Recorder:

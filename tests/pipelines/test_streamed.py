@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from msgs_slam.pipelines import memory
-from msgs_slam.pipelines.memory import machine_memory, memory_room
-from msgs_slam.pipelines.streamed import Streamed
+from msgs_slam.pipelines.system import memory
+from msgs_slam.pipelines.system.memory import machine_memory, memory_room
+from msgs_slam.pipelines.system.streamed import Streamed
 
 
 def test_what_was_used_last_stays_and_the_rest_is_made_again() -> None:
@@ -67,7 +67,7 @@ def test_what_is_at_hand_is_taken_and_threads_get_what_they_ask_for() -> None:
 
 PEAKS = """
 import numpy as np
-from msgs_slam.pipelines.stages import forget_peak, peak_memory_mb
+from msgs_slam.pipelines.engine.stages import forget_peak, peak_memory_mb
 peaks = [peak_memory_mb()]
 block = np.ones(40_000_000)
 peaks.append(peak_memory_mb())

@@ -7,9 +7,9 @@ import engine_calls
 import pytest
 
 from msgs_slam.formats.errors import InputError, RecoverableError
-from msgs_slam.pipelines import workers
-from msgs_slam.pipelines.engines import LocalEngine
-from msgs_slam.pipelines.workers import Workers
+from msgs_slam.pipelines.engine import workers
+from msgs_slam.pipelines.engine.engines import LocalEngine
+from msgs_slam.pipelines.engine.workers import Workers
 
 WORKERS = Workers(LocalEngine(), engine_calls.silent, 1)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.jit import kernel
+from msgs_slam.pipelines.system.jit import kernel
 from tests.world.shapes import BOX, CYLINDER, FACE_COUNT, ROOM, SPHERE, Solid
 
 TILE = 8

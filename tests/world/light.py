@@ -9,7 +9,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.jit import kernel
+from msgs_slam.pipelines.system.jit import kernel
 from tests.world.cast import SolidArrays, point_on_face, surface, trace
 from tests.world.shapes import FACE_COUNT, Solid
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.images import write_grey_png, write_rgb
-from msgs_slam.pipelines.progress import Progress, SilentProgress
+from msgs_slam.pipelines.system.progress import Progress, SilentProgress
 from tests.world.build import World
 from tests.world.clip import ClipOptions, WorldFrame, render_frame
 

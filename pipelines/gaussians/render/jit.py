@@ -7,14 +7,14 @@ from typing import Any
 
 from numba.extending import register_jitable
 
-from msgs_slam.pipelines import jit
+from msgs_slam.pipelines.system import jit
 
 # No "nnan" or "ninf": comparisons with a NaN must stay what they are. "contract" lets a*b+c become one instruction.
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract", "nsz", "arcp"}, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """As `pipelines.jit.kernel`, with fused sums."""
+    """As `pipelines.system.jit.kernel`, with fused sums."""
     compiled: Callable[..., Any] = jit.kernel(function, **_OPTIONS)
     return compiled
 

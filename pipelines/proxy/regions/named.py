@@ -22,9 +22,9 @@ from msgs_slam.pipelines.proxy.regions.belonging import one_name_each, place_lik
 from msgs_slam.pipelines.proxy.regions.parts import cut_parts, cut_patches
 from msgs_slam.pipelines.proxy.regions.posture import name_likelihood
 from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels, label_pixels
-from msgs_slam.pipelines.proxy.regions.voxels import Voxels, find, find_near, select, voxel_keys
 from msgs_slam.pipelines.proxy.sequence import Sequence, resample_linear
 from msgs_slam.pipelines.types import Frame
+from msgs_slam.pipelines.voxels.voxels import Voxels, find, find_near, select, voxel_keys
 
 _LEAST_CONFIDENCE = 0.3
 _ALONE = 0.3

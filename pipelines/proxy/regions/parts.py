@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.proxy.graph_cut import cut_graph
-from msgs_slam.pipelines.proxy.regions.voxels import Voxels, touching
+from msgs_slam.pipelines.voxels.voxels import Voxels, touching
 
 _COLOR_UNIT = 12.0
 """Difference in CIE Lab that counts as much as a right angle between the normals."""

@@ -15,15 +15,17 @@ from numpy.typing import NDArray
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.geometry.camera import unproject_depth
-from msgs_slam.pipelines.jit import kernel
-from msgs_slam.pipelines.memory import give_back
-from msgs_slam.pipelines.progress import Progress
 from msgs_slam.pipelines.proxy.palette import class_colors
 from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
 from msgs_slam.pipelines.proxy.regions.parts import cut_parts
 from msgs_slam.pipelines.proxy.regions.spread import spread_votes
-from msgs_slam.pipelines.proxy.regions.structure import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
-from msgs_slam.pipelines.proxy.regions.voxels import (
+from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.system.jit import kernel
+from msgs_slam.pipelines.system.memory import give_back
+from msgs_slam.pipelines.system.progress import Progress
+from msgs_slam.pipelines.types import VOID, ClassTable, Frame
+from msgs_slam.pipelines.voxels.layout import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
+from msgs_slam.pipelines.voxels.voxels import (
     Voxels,
     find_near,
     gather_frame,
@@ -31,8 +33,6 @@ from msgs_slam.pipelines.proxy.regions.voxels import (
     select,
     voxel_keys,
 )
-from msgs_slam.pipelines.proxy.sequence import Sequence
-from msgs_slam.pipelines.types import VOID, ClassTable, Frame
 
 _VOXELS_PER_DEPTH = 60
 """A voxel is this fraction of the scene's median depth: 5 cm at 3 m."""

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.progress import Progress
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.scratch import load_scratch, save_scratch
 from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
@@ -29,6 +28,7 @@ from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth
 from msgs_slam.pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
 from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost, warps_to
 from msgs_slam.pipelines.proxy.stereo.upsample import upsample_depth
+from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Frame, Intrinsics, SparseModel
 
 _CACHED_FRAMES = 48

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.jit import kernel
 from msgs_slam.pipelines.proxy.stereo.bands import BAND_ROWS, Bands
 from msgs_slam.pipelines.proxy.stereo.window import RADIUS, best_mean, correlate_row, warp_row, weigh_windows
+from msgs_slam.pipelines.system.jit import kernel
 
 _ALIKE = 1e3
 """Likeness by which all pixels of a window count alike: it lies on the surface itself, and needs all of its texture."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.jit import kernel
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
+from msgs_slam.pipelines.system.jit import kernel
 
 _DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 

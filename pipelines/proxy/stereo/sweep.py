@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.jit import kernel
 from msgs_slam.pipelines.proxy.stereo.bands import BAND_ROWS, Bands
 from msgs_slam.pipelines.proxy.stereo.window import LIKENESS, RADIUS, best_mean, correlate_row, warp_row, weigh_windows
+from msgs_slam.pipelines.system.jit import kernel
 
 
 def warps_to(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.jit import kernel
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.system.jit import kernel
 
 _COLOR_SD = 10.0
 _SURFACE = 0.05

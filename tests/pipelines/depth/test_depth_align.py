@@ -14,7 +14,7 @@ from msgs_slam.pipelines.depth.fields import FINE, DepthFields, field_scales
 from msgs_slam.pipelines.depth.posed import CANDIDATES, PosedDepth, overlaps
 from msgs_slam.pipelines.depth.see_through import contradicted
 from msgs_slam.pipelines.mapping.load import MappingInput
-from msgs_slam.pipelines.run_folder import RunFolder, save_depth_fields
+from msgs_slam.pipelines.run.folder import RunFolder, save_depth_fields
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps, SparseModel
 
 Maps = dict[int, ProxyMaps]

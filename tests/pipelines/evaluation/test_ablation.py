@@ -15,7 +15,7 @@ from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.config import Config, load_config
 from msgs_slam.pipelines.evaluation import ablation
 from msgs_slam.pipelines.evaluation.ablation import ABLATIONS, ablate
-from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.system.progress import SilentProgress
 
 SETTINGS = (
     "run.threads=2", "frames.rate=4", "proxy.depth=files", "proxy.semantics=files", "mapping.max_side=120",

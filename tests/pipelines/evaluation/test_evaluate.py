@@ -19,7 +19,7 @@ from msgs_slam.pipelines.evaluation.truth import match_truth, true_trajectory
 from msgs_slam.pipelines.evaluation.write import write_evaluation
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Frame
 from msgs_slam.pipelines.upright.world import World, save_world
 from tests.pipelines.part_of_sequence import part_of

@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.pipelines.evaluation.lengths import camera_height, extents, found_lengths, path_length
 from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.geometry.tape import tape_text
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Metres
 from msgs_slam.pipelines.upright.world import World, save_world
-from msgs_slam.pipelines.viewer_tape import tape_text
 from tests.world.room import HEIGHT, LENGTH, WIDTH
 
 OracleRun = Callable[..., RunFolder]

@@ -15,7 +15,7 @@ from msgs_slam.formats.datasets import Sequence
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
 from msgs_slam.pipelines.evaluation.perceptual import Lpips, open_lpips
 from msgs_slam.pipelines.evaluation.table import evaluation_table
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
 
 OracleRun = Callable[..., RunFolder]
 

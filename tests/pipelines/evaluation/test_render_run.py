@@ -15,9 +15,9 @@ from msgs_slam.formats.video import iter_video
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.demo import TRUTH, VIDEO, demo_summary, run_demo, unpack_demo_clip
 from msgs_slam.pipelines.evaluation.image_quality import psnr
-from msgs_slam.pipelines.progress import SilentProgress
 from msgs_slam.pipelines.render_run import render_run
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.world import make_world, render_frame
 from tests.world.demo_clip import OPTIONS, pack_clip
 

@@ -18,7 +18,7 @@ from msgs_slam.pipelines.evaluation.plots import Line, plot, ticks
 from msgs_slam.pipelines.evaluation.report import write_report
 from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, write_evaluation
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.run_folder import RunFolder, save_trajectory
+from msgs_slam.pipelines.run.folder import RunFolder, save_trajectory
 from msgs_slam.pipelines.types import LoopEdge, SparseModel
 from msgs_slam.pipelines.upright.world import SAME, World, save_world
 

@@ -22,8 +22,8 @@ from scipy.spatial.transform import Rotation
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gaussian_ply import read_gaussian_ply
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.viewer_scene import load_scenes
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.viewer.scene import load_scenes
 
 OracleRun = Callable[..., RunFolder]
 
@@ -201,7 +201,7 @@ def test_page_shows_the_map_and_every_control_changes_it(
     oracle_run: OracleRun, truth: Sequence, tmp_path: Path
 ) -> None:
     pytest.importorskip("viser")
-    from msgs_slam.pipelines.viewer import open_viewer
+    from msgs_slam.pipelines.viewer.server import open_viewer
 
     # A browser without a GPU draws few Gaussians at a speed that a test can wait for.
     run = oracle_run(metric=False, pixel_stride=8, mesh=True)

@@ -9,14 +9,14 @@ import pytest
 
 from msgs_slam.formats.gaussian_ply import write_gaussian_ply
 from msgs_slam.formats.gaussians import isotropic_cloud
-from msgs_slam.pipelines.viewer_door import is_welcome
+from msgs_slam.pipelines.viewer.door import is_welcome
 
 pytest.importorskip("viser")
 
 
 @pytest.fixture(scope="module")
 def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    from msgs_slam.pipelines.viewer import open_viewer
+    from msgs_slam.pipelines.viewer.server import open_viewer
 
     path = tmp_path_factory.mktemp("scene") / "<img src=x onerror=alert(1)>{1+1}`.ply"
     rng = np.random.default_rng(0)

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.gaussian_ply import read_gaussian_ply
 from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.geometry.tape import Touch, tape, tape_text, touch
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Metres
-from msgs_slam.pipelines.viewer_scene import ViewerScene, load_scenes
-from msgs_slam.pipelines.viewer_tape import Touch, tape, tape_text, touch
+from msgs_slam.pipelines.viewer.scene import ViewerScene, load_scenes
 
 OracleRun = Callable[..., RunFolder]
 
@@ -105,7 +105,7 @@ def test_a_distance_is_told_in_the_units_there_are() -> None:
 @pytest.fixture(scope="module")
 def viewer(oracle_run: OracleRun) -> Iterator[Any]:
     pytest.importorskip("viser")
-    from msgs_slam.pipelines.viewer import open_viewer
+    from msgs_slam.pipelines.viewer.server import open_viewer
 
     opened = open_viewer(oracle_run(pixel_stride=8, mesh=True).root, port=0)
     yield opened

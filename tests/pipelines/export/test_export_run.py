@@ -21,8 +21,8 @@ from msgs_slam.pipelines.export import textured
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.run_folder_names import EXPORTS
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.names import EXPORTS
 from msgs_slam.pipelines.upright.world import read_world
 
 OracleRun = Callable[..., RunFolder]

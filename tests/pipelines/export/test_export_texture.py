@@ -10,7 +10,7 @@ from msgs_slam.pipelines.export import texture
 from msgs_slam.pipelines.export.atlas import Atlas, owners, simplified, unwrapped
 from msgs_slam.pipelines.export.texture import Shot, paint_texture, texels_wanted, vertex_normals, view_weights
 from msgs_slam.pipelines.gaussians.render.threads import get_threads, set_threads
-from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Intrinsics, SemanticMesh
 
 CAMERA = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import load_config
-from msgs_slam.pipelines.progress import SilentProgress
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.engine.stages import StageContext
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.progress import SilentProgress
 
 WIDTH, HEIGHT = 320, 240
 FOCAL = 280.0

@@ -13,20 +13,20 @@ from msgs_slam.formats.datasets import Camera, Sequence, open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import Config, load_config
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
 from msgs_slam.pipelines.frames.begun import known_camera
-from msgs_slam.pipelines.frames.recording import RecordingSource
-from msgs_slam.pipelines.frames.source import FolderSource, open_source
-from msgs_slam.pipelines.frames.source_pixels import FramePixels
-from msgs_slam.pipelines.progress import SilentProgress
 from msgs_slam.pipelines.proxy.files.recording import RecordingDepth, RecordingLabels
 from msgs_slam.pipelines.proxy.inputs import proxy_inputs
 from msgs_slam.pipelines.proxy.selection import Surroundings, open_depth_files, open_label_files
 from msgs_slam.pipelines.proxy.sequence import Sequence as ProxySequence
 from msgs_slam.pipelines.reconstruct import reconstruct
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.source.opening import FolderSource, open_source
+from msgs_slam.pipelines.source.recording import RecordingSource
+from msgs_slam.pipelines.source.source_pixels import FramePixels
 from msgs_slam.pipelines.structure.lens import distortion_of, make_lens, to_pycolmap
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics
 from tests.pipelines.part_of_sequence import part_of
 

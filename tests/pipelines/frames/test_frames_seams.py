@@ -10,8 +10,8 @@ import numpy as np
 import pycolmap
 import pytest
 
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import warn_of_structure
-from msgs_slam.pipelines.stages import StageContext
 from msgs_slam.pipelines.structure.adjust import adjust
 from msgs_slam.pipelines.structure.consistency import ModelReport
 from msgs_slam.pipelines.structure.seams import (

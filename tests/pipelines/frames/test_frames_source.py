@@ -13,12 +13,12 @@ from PIL import Image
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_grey_png, write_rgb
 from msgs_slam.formats.video_writer import write_video
-from msgs_slam.pipelines.frames.source import FolderSource, VideoSource, open_source
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.reconstruct import one_source, source_digest
-from msgs_slam.pipelines.records import Manifest, Source, load_source, write_manifest
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.records import Manifest, Source, load_source, write_manifest
+from msgs_slam.pipelines.source.opening import FolderSource, VideoSource, open_source
 
 
 def _noise(seed: int, size: tuple[int, int] = (48, 64)) -> np.ndarray:

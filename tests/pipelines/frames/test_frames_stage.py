@@ -19,16 +19,16 @@ from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.formats.jsonfile import read_json
 from msgs_slam.pipelines.config import load_config
 from msgs_slam.pipelines.correspondence.snapshots import Snapshots
-from msgs_slam.pipelines.frames.source import source_digest
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.geometry.alignment import align_points
-from msgs_slam.pipelines.progress import SilentProgress
-from msgs_slam.pipelines.run_folder import BACKBONE, SPARSE, RunFolder, load_sparse_model, save_sparse
-from msgs_slam.pipelines.stages import StageContext
-from msgs_slam.pipelines.stored import dataclass_from_json
+from msgs_slam.pipelines.run.folder import BACKBONE, SPARSE, RunFolder, load_sparse_model, save_sparse
+from msgs_slam.pipelines.run.stored import dataclass_from_json
+from msgs_slam.pipelines.source.opening import source_digest
 from msgs_slam.pipelines.structure import sfm
 from msgs_slam.pipelines.structure.adjust import adjust
 from msgs_slam.pipelines.structure.window_size import windows_of
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration
 from tests.pipelines.frames.conftest import QUICK, WALK_FRAMES, Walk, render, sideways, turn, write_walk
 from tests.pipelines.travelling import Travelling

@@ -12,10 +12,10 @@ from msgs_slam.pipelines.correspondence.bridges import Picture
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair, verify_matches
 from msgs_slam.pipelines.correspondence.snapshots import Snapshots
 from msgs_slam.pipelines.geometry.alignment import align_points
-from msgs_slam.pipelines.progress import SilentProgress
-from msgs_slam.pipelines.streamed import Streamed
 from msgs_slam.pipelines.structure.lens import unknown_camera
 from msgs_slam.pipelines.structure.sfm import StructureFromMotion, _Views
+from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import Features
 
 SIDES, VIEWS, POINTS, REACH = 4, 48, 300, 8

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import load_config
 from msgs_slam.pipelines.depth.fields import FINE, DepthFields
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.depth_error import DepthErrorSum
 from msgs_slam.pipelines.evaluation.views import view_map
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.global_ba.stage import STAGE
 from msgs_slam.pipelines.mapping.views import occurring_classes
-from msgs_slam.pipelines.run_folder import (
+from msgs_slam.pipelines.run.folder import (
     RunFolder,
     save_depth_fields,
     save_exposure,
@@ -28,7 +29,6 @@ from msgs_slam.pipelines.run_folder import (
     save_trajectory,
     write_json,
 )
-from msgs_slam.pipelines.stages import StageContext
 from msgs_slam.pipelines.types import SparseModel, Trajectory
 from tests.pipelines.global_ba.test_global_ba_stage import FIRST_AGAIN, seeded_map
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import Config, load_config
 from msgs_slam.pipelines.depth.fields import DepthFields
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.camera import unproject
 from msgs_slam.pipelines.global_ba.stage import STAGE
 from msgs_slam.pipelines.mapping.views import occurring_classes
-from msgs_slam.pipelines.run_folder import (
+from msgs_slam.pipelines.run.folder import (
     RunFolder,
     save_depth_fields,
     save_exposure,
@@ -29,7 +30,6 @@ from msgs_slam.pipelines.run_folder import (
     save_trajectory,
     write_json,
 )
-from msgs_slam.pipelines.stages import StageContext
 from msgs_slam.pipelines.types import SparseModel, Trajectory
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames, small_motion
 from tests.world.clip import WorldFrame

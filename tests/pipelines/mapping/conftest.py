@@ -6,7 +6,7 @@ import pytest
 
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.mapping.load import MappingInput, load_views
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
 from tests.pipelines.mapping.small_run import make_run
 
 

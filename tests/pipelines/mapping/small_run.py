@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.depth.fields import DepthFields
-from msgs_slam.pipelines.run_folder import (
+from msgs_slam.pipelines.run.folder import (
     RunFolder,
     proxy_path,
     save_calibration,

@@ -16,7 +16,7 @@ from msgs_slam.pipelines.mapping.load import MappingInput, load_views, split_fra
 from msgs_slam.pipelines.mapping.poses import interpolate_rows, move_trajectory
 from msgs_slam.pipelines.mapping.schedule import RATE_DECAY, Schedule, Seeding
 from msgs_slam.pipelines.mapping.views import channel_table, halved, occurring_classes
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import VOID, Intrinsics, Trajectory
 
 

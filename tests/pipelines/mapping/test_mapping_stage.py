@@ -14,14 +14,14 @@ from finished import note_finished
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.trajectory import read_tum
 from msgs_slam.pipelines.config import Config, ExportConfig, MappingConfig, RunConfig
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.export import stage as export_stage
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.export.volume import Grid
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.mapping import stage as mapping_stage
-from msgs_slam.pipelines.progress import SilentProgress
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID
 from msgs_slam.pipelines.upright.world import read_world
 from tests.pipelines.mapping.small_run import make_run

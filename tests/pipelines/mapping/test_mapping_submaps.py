@@ -17,6 +17,7 @@ from msgs_slam.formats.gaussian_ply import read_gaussian_ply
 from msgs_slam.formats.tensors import load_tensors
 from msgs_slam.pipelines.config import Config, MappingConfig, RunConfig
 from msgs_slam.pipelines.depth.posed import PosedDepth
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.export.tiles import write_tiles
 from msgs_slam.pipelines.gaussians.render import render
 from msgs_slam.pipelines.geometry import se3
@@ -25,11 +26,10 @@ from msgs_slam.pipelines.mapping import stage as mapping_stage
 from msgs_slam.pipelines.mapping.divided import refine_divided
 from msgs_slam.pipelines.mapping.gauge import SeenExposures, common_exposure
 from msgs_slam.pipelines.mapping.submaps import BORDER, divide, nearest_seeing
-from msgs_slam.pipelines.memory import LEAST_SUBMAP, submap_size
 from msgs_slam.pipelines.outcome import load_outcome, maps_around
-from msgs_slam.pipelines.progress import SilentProgress
-from msgs_slam.pipelines.run_folder import RunFolder
-from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.memory import LEAST_SUBMAP, submap_size
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Intrinsics
 
 CONFIG = Config(

@@ -17,17 +17,17 @@ from msgs_slam.pipelines.correspondence.features import extract_features
 from msgs_slam.pipelines.correspondence.flow import corners
 from msgs_slam.pipelines.frames.keyframes import choose_keyframes
 from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
-from msgs_slam.pipelines.frames.source import open_source
 from msgs_slam.pipelines.gaussians.render import Rendering
 from msgs_slam.pipelines.mapping.objective import Objective
 from msgs_slam.pipelines.mapping.views import View, make_view
 from msgs_slam.pipelines.masks.files import open_masks
 from msgs_slam.pipelines.masks.people import PeopleFinder, join_people, people_cards
-from msgs_slam.pipelines.progress import SilentProgress
-from msgs_slam.pipelines.proxy.models.registry import ModelStore
+from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
 from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost
+from msgs_slam.pipelines.source.opening import open_source
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame, Intrinsics
 from tests.pipelines.proxy.tiny_tflite import write_tflite
 

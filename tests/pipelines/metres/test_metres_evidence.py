@@ -10,7 +10,7 @@ from msgs_slam.msgs_cli.tables import scale_lines
 from msgs_slam.pipelines.metres.evidence import Evidence, Mode, combine, measured
 from msgs_slam.pipelines.metres.files import load_metres, save_metres
 from msgs_slam.pipelines.metres.find import describe
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
 
 
 def gaussian(kind: str, at: float, sd: float, wrong: float = 1e-9, is_guess: bool = False) -> Evidence:

@@ -12,8 +12,8 @@ from onnx import TensorProto, helper, numpy_helper
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.metres.network import SMALL_SD, network_scale, retake
 from msgs_slam.pipelines.metres.scene import SeenFrame
-from msgs_slam.pipelines.proxy.models.registry import ModelStore
-from msgs_slam.pipelines.proxy.networks.card import Card
+from msgs_slam.pipelines.networks.card import Card
+from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 
 SIDE, NEAREST, SPAN = 64, 1.0, 3.0

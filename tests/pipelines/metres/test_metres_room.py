@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.jsonfile import read_json, write_json
 from msgs_slam.pipelines.config import Config, ExportConfig
 from msgs_slam.pipelines.depth.fields import DepthFields
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.export.stage import run as export
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.metres.find import (
@@ -26,11 +27,10 @@ from msgs_slam.pipelines.metres.find import (
 from msgs_slam.pipelines.metres.heights import camera_height, floor_trust
 from msgs_slam.pipelines.metres.scene import Scene
 from msgs_slam.pipelines.metres.things import sizes_of_things
-from msgs_slam.pipelines.progress import SilentProgress
-from msgs_slam.pipelines.proxy.regions.structure import FLOOR, OTHER, Gravity
-from msgs_slam.pipelines.proxy.regions.voxels import Voxels
-from msgs_slam.pipelines.run_folder import RunFolder, save_depth_fields
-from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.run.folder import RunFolder, save_depth_fields
+from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.voxels.layout import FLOOR, OTHER, Gravity
+from msgs_slam.pipelines.voxels.voxels import Voxels
 
 STAGES_DONE = ("frames", "proxy", "tracking", "mapping")
 OracleRun = Callable[..., RunFolder]

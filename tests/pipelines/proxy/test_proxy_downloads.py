@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.proxy.models import download
-from msgs_slam.pipelines.proxy.models.download import fetch
+from msgs_slam.pipelines.networks import download
+from msgs_slam.pipelines.networks.download import fetch
 
 Serve = Callable[..., str]
 OK = b"HTTP/1.1 200 OK\r\n"

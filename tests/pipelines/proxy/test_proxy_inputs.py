@@ -13,11 +13,11 @@ from proxy_room import Room, write_source
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
 from msgs_slam.pipelines.config import Config, load_config
-from msgs_slam.pipelines.progress import SilentProgress
+from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.proxy.inputs import check_proxy, proxy_inputs
-from msgs_slam.pipelines.proxy.models.registry import ModelStore
 from msgs_slam.pipelines.reconstruct import reconstruct
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.progress import SilentProgress
 
 
 @pytest.fixture
@@ -138,7 +138,7 @@ def wrong_weights(folder: Path) -> str:
 def test_bad_input_is_refused_before_the_frames_are_picked(
     source: Path, tmp_path: Path, spoil: Callable[[Path], str], said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("msgs_slam.pipelines.stages._run_one", lambda *_: pytest.fail("a stage was run"))
+    monkeypatch.setattr("msgs_slam.pipelines.engine.stages._run_one", lambda *_: pytest.fail("a stage was run"))
     config = settings(spoil(source.parent))
     with pytest.raises(InputError, match=said):
         reconstruct(source, RunFolder(tmp_path / "run"), config, SilentProgress(), "proxy")

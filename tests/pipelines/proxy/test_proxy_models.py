@@ -13,8 +13,8 @@ import pytest
 
 from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.errors import DiskFullError, InputError
-from msgs_slam.pipelines.proxy.models.download import fetch
-from msgs_slam.pipelines.proxy.models.registry import Model, ModelStore
+from msgs_slam.pipelines.networks.download import fetch
+from msgs_slam.pipelines.networks.registry import Model, ModelStore
 
 DATA = np.random.default_rng(0).bytes(700_000)
 SHA = hashlib.sha256(DATA).hexdigest()

@@ -10,7 +10,6 @@ from proxy_room import UNIT, Room, write_source
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
 from msgs_slam.pipelines.config import ProxyConfig
-from msgs_slam.pipelines.progress import SilentProgress
 from msgs_slam.pipelines.proxy.fused import FusedDepth, fuse
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
@@ -19,6 +18,7 @@ from msgs_slam.pipelines.proxy.scale import measure_scale
 from msgs_slam.pipelines.proxy.selection import Surroundings, open_depth
 from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.proxy.stereo.provider import MultiviewDepth
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame, Intrinsics
 
 SIDE, PLANES = 256, 64

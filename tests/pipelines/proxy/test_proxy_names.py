@@ -9,18 +9,18 @@ from numpy.typing import NDArray
 from proxy_room import UNIT, Room
 
 from msgs_slam.pipelines.evaluation.label_score import count_labels, score
-from msgs_slam.pipelines.progress import SilentProgress
-from msgs_slam.pipelines.proxy.networks.labels import best_classes
+from msgs_slam.pipelines.networks.labels import best_classes
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.regions import voxels
 from msgs_slam.pipelines.proxy.regions.belonging import one_name_each, place_likelihood
 from msgs_slam.pipelines.proxy.regions.named import NamedScene, Vocabulary
 from msgs_slam.pipelines.proxy.regions.posture import name_likelihood
 from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
-from msgs_slam.pipelines.proxy.regions.structure import FLOOR, OTHER, Gravity
-from msgs_slam.pipelines.proxy.regions.voxels import Voxels, merge, voxel_keys
 from msgs_slam.pipelines.proxy.sequence import resample_linear
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame
+from msgs_slam.pipelines.voxels import voxels
+from msgs_slam.pipelines.voxels.layout import FLOOR, OTHER, Gravity
+from msgs_slam.pipelines.voxels.voxels import Voxels, merge, voxel_keys
 from tests.world.room import CLASSES
 
 NAMES = tuple(name for name, _ in CLASSES)

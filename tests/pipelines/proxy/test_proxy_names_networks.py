@@ -14,15 +14,15 @@ from msgs_slam.formats.images import read_depth_png, read_rgb
 from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.evaluation.class_map import match_classes
 from msgs_slam.pipelines.evaluation.label_score import count_labels, score
-from msgs_slam.pipelines.progress import SilentProgress
-from msgs_slam.pipelines.proxy.models.registry import ModelStore
-from msgs_slam.pipelines.proxy.networks.card import Card
-from msgs_slam.pipelines.proxy.networks.labels import network_labels
-from msgs_slam.pipelines.proxy.networks.labels_provider import OnnxLabels
-from msgs_slam.pipelines.proxy.networks.network_pass import ResultCache, Workplace
-from msgs_slam.pipelines.proxy.networks.session import Network
+from msgs_slam.pipelines.networks.card import Card
+from msgs_slam.pipelines.networks.labels import network_labels
+from msgs_slam.pipelines.networks.registry import ModelStore
+from msgs_slam.pipelines.networks.session import Network
+from msgs_slam.pipelines.proxy.learned.labels import OnnxLabels
+from msgs_slam.pipelines.proxy.learned.network_pass import ResultCache, Workplace
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics, SparseModel
 from tests.world.room import CLASSES
 

@@ -14,17 +14,17 @@ from onnx import TensorProto, helper, numpy_helper
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb
-from msgs_slam.pipelines.progress import SilentProgress
-from msgs_slam.pipelines.proxy.networks.card import Card, read_card
-from msgs_slam.pipelines.proxy.networks.depth import network_depth, solve_shift, solve_shift_and_focal
-from msgs_slam.pipelines.proxy.networks.depth_provider import OnnxDepth
-from msgs_slam.pipelines.proxy.networks.head import load_linear_head
-from msgs_slam.pipelines.proxy.networks.labels import class_token, network_labels
-from msgs_slam.pipelines.proxy.networks.letterbox import choose_box
-from msgs_slam.pipelines.proxy.networks.network_pass import ResultCache, Workplace
-from msgs_slam.pipelines.proxy.networks.onnx_file import external_locations, require_own_weights
-from msgs_slam.pipelines.proxy.networks.session import Network
+from msgs_slam.pipelines.networks.card import Card, read_card
+from msgs_slam.pipelines.networks.depth import network_depth, solve_shift, solve_shift_and_focal
+from msgs_slam.pipelines.networks.head import load_linear_head
+from msgs_slam.pipelines.networks.labels import class_token, network_labels
+from msgs_slam.pipelines.networks.letterbox import choose_box
+from msgs_slam.pipelines.networks.onnx_file import external_locations, require_own_weights
+from msgs_slam.pipelines.networks.session import Network
+from msgs_slam.pipelines.proxy.learned.depth import OnnxDepth
+from msgs_slam.pipelines.proxy.learned.network_pass import ResultCache, Workplace
 from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)

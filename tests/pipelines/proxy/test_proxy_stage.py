@@ -10,12 +10,12 @@ import pytest
 from proxy_room import UNIT, Room
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.proxy.files.depth import FilesDepth
 from msgs_slam.pipelines.proxy.files.labels import FilesLabels
 from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
 from msgs_slam.pipelines.proxy.stage import run
-from msgs_slam.pipelines.run_folder import load_proxy_maps, proxy_path, read_json, save_calibration
-from msgs_slam.pipelines.stages import StageContext
+from msgs_slam.pipelines.run.folder import load_proxy_maps, proxy_path, read_json, save_calibration
 from msgs_slam.pipelines.types import VOID, Frame
 
 Make = Callable[..., StageContext]

@@ -9,8 +9,8 @@ from proxy_room import Room
 from test_proxy_stage import tree
 from tiny_tflite import write_tflite
 
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.proxy.stage import run
-from msgs_slam.pipelines.stages import StageContext
 from tests.pipelines.travelling import Travelling
 
 KINDS = {"prepare_depths", "make_depths", "look_for_moving", "look_at_pictures", "make_maps"}

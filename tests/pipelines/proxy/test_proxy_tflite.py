@@ -10,13 +10,13 @@ from tiny_tflite import write_tflite
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.config import ProxyConfig
-from msgs_slam.pipelines.proxy.models.registry import ModelStore
-from msgs_slam.pipelines.proxy.networks.card import Card, read_card
-from msgs_slam.pipelines.proxy.networks.depth import network_depth
-from msgs_slam.pipelines.proxy.networks.identity import card_identity
-from msgs_slam.pipelines.proxy.networks.labels import network_labels
-from msgs_slam.pipelines.proxy.networks.person import person_probability
-from msgs_slam.pipelines.proxy.networks.session import Network
+from msgs_slam.pipelines.networks.card import Card, read_card
+from msgs_slam.pipelines.networks.depth import network_depth
+from msgs_slam.pipelines.networks.identity import card_identity
+from msgs_slam.pipelines.networks.labels import network_labels
+from msgs_slam.pipelines.networks.person import person_probability
+from msgs_slam.pipelines.networks.registry import ModelStore
+from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.proxy.selection import choose_depth, choose_semantics, missing_networks
 from msgs_slam.pipelines.types import Intrinsics
 

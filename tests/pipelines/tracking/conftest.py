@@ -15,9 +15,9 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.correspondence.features import to_grey
 from msgs_slam.pipelines.correspondence.flow import corners
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry.camera import project, unproject
-from msgs_slam.pipelines.progress import SilentProgress
-from msgs_slam.pipelines.run_folder import (
+from msgs_slam.pipelines.run.folder import (
     RunFolder,
     proxy_path,
     save_calibration,
@@ -27,8 +27,8 @@ from msgs_slam.pipelines.run_folder import (
     save_sparse_model,
     write_json,
 )  # fmt: skip
-from msgs_slam.pipelines.stages import StageContext
 from msgs_slam.pipelines.structure.bundle import Bundle
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, SparseModel
 from tests.pipelines.kept import keep_correspondences
 from tests.world.clip import ClipOptions, WorldFrame, make_world, render_frame

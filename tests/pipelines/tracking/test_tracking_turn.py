@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.stages import StageContext
 from msgs_slam.pipelines.tracking.pictures import Pictures
 from msgs_slam.pipelines.tracking.stage import STAGE
 from msgs_slam.pipelines.tracking.turn import fit_rotation, turn_between

@@ -15,7 +15,7 @@ from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.upright.georeference import georeference
 from msgs_slam.pipelines.upright.world import read_world
 

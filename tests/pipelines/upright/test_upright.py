@@ -17,7 +17,7 @@ from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.stage import export_run, find_world
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.run_folder import RunFolder, save_map
+from msgs_slam.pipelines.run.folder import RunFolder, save_map
 from msgs_slam.pipelines.types import Intrinsics
 from msgs_slam.pipelines.upright.find import find_upright
 from msgs_slam.pipelines.upright.lines import common_direction, line_planes

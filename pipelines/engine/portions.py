@@ -1,0 +1,60 @@
+"""A stage's work on many things alike (keyframes, blocks of pairs), portion by portion, by its workers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, TypeVar
+
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.engine.stages import StageContext
+from msgs_slam.pipelines.engine.travel import load_value, save_value
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.progress import Progress
+
+R = TypeVar("R")
+_PORTIONS = 3
+"""Tasks a worker, so that all end at about the same time."""
+
+
+@dataclass(frozen=True)
+class Portion:
+    """The things first to last - 1, in a stage's unfinished `folder`; `file` tells what is known of all of them."""
+
+    run: RunFolder
+    source: Path
+    config: Config
+    folder: Path
+    file: Path
+    first: int
+    last: int
+
+    @property
+    def numbers(self) -> range:
+        """Which they are."""
+        return range(self.first, self.last)
+
+    @cached_property
+    def known(self) -> dict[str, Any]:
+        """Of all of them."""
+        return load_value(self.file)
+
+    def context(self, progress: Progress) -> StageContext:
+        """The stage's, without workers."""
+        return StageContext(self.run, self.source, self.config, self.folder, progress)
+
+
+def in_portions(context: StageContext, work: Callable[[Portion, Progress], R], count: int, **known: Any) -> list[R]:
+    """What `work` returns of each portion of `count` things, with what is known of all; nothing where there are no
+    workers: then this process does it its own way, without going over the disk."""
+    if context.workers is None or count == 0:
+        return []
+    file = context.snapshot / f"{work.__name__}.npz"
+    save_value(file, known)
+    parts = min(_PORTIONS * context.workers.at_once, count)
+    ends = [count * n // parts for n in range(parts + 1)]
+    task = Portion(context.run, context.source, context.config, context.folder, file, 0, 0)
+    return context.each(work, [replace(task, first=a, last=b) for a, b in pairwise(ends)])

@@ -1,0 +1,311 @@
+"""Running the stages: what is up to date stays, what is not runs, what was interrupted goes on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from msgs_slam.formats.atomic import is_disk_full, watched_by, write_text
+from msgs_slam.formats.errors import DiskFullError, InputError, RecoverableError
+from msgs_slam.pipelines.config import Config, settings_of_stage
+from msgs_slam.pipelines.engine.workers import TaskWorkers
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.journal import JOURNAL, Journal, empty
+from msgs_slam.pipelines.run.names import STAGES
+from msgs_slam.pipelines.run.records import (
+    Manifest,
+    Source,
+    StageRecord,
+    checksums,
+    content_digest,
+    load_records,
+    plain,
+    settings_of,
+    write_manifest,
+)
+from msgs_slam.pipelines.run.settings_file import save_settings
+from msgs_slam.pipelines.system.device import settle_device
+from msgs_slam.pipelines.system.identity import stage_identity
+from msgs_slam.pipelines.system.memory import give_back, memory_room
+from msgs_slam.pipelines.system.progress import Progress, log
+from msgs_slam.pipelines.system.stopping import stop_if_asked
+
+T = TypeVar("T")
+R = TypeVar("R")
+_PROCESS = Path("/proc/self")
+FINGERPRINT = "fingerprint"
+"""File of an unfinished folder: the work it belongs to."""
+SameSource = Callable[[], None]
+
+
+def _trusted() -> None:
+    """A source that nobody asks about."""
+
+
+@dataclass(frozen=True)
+class StageContext:
+    """What a stage is given.
+
+    `folder` is the stage's own unfinished folder: it writes its result there, and may keep snapshots under
+    `folder / "snapshot"`, which is removed when the stage ends well. What an interrupted attempt with the same
+    settings and inputs has left in `folder` is still there when the stage starts again. `stages` are all of the run;
+    `same_source` raises RecoverableError where the source is not, or no longer, what the run was begun from; `workers`
+    take the tasks that a stage is divided into, None for this process.
+    """
+
+    run: RunFolder
+    source: Path
+    config: Config
+    folder: Path
+    progress: Progress
+    warnings: list[str] = field(default_factory=list)
+    stages: list[Stage] = field(default_factory=list)
+    same_source: SameSource = _trusted
+    workers: TaskWorkers | None = None
+
+    @property
+    def snapshot(self) -> Path:
+        """Folder for snapshots; made on first use."""
+        path = self.folder / "snapshot"
+        path.mkdir(exist_ok=True)
+        return path
+
+    @property
+    def threads(self) -> int:
+        """How many CPU threads to use."""
+        return self.config.run.threads or os.cpu_count() or 1
+
+    @property
+    def memory_room(self) -> float:
+        """How many bytes of memory to plan with."""
+        return memory_room(self.config.run.memory_mb)
+
+    @property
+    def device(self) -> str:
+        """ "cpu" or "cuda"."""
+        return settle_device(self.config.run.device)
+
+    def each(self, work: Callable[[T, Progress], R], tasks: Sequence[T]) -> list[R]:
+        """What `work`, a function of a module's top level, returns of every task, in their order: done here, one after
+        the other, or by the workers. A task leaves files below `folder`, and does nothing where they are."""
+        if self.workers is None:
+            return [self._done(work, task) for task in tasks]
+        return self.workers.each(work, tasks, self.folder)
+
+    def _done(self, work: Callable[[T, Progress], R], task: T) -> R:
+        result = work(task, self.progress)
+        give_back()
+        return result
+
+    def warn(self, message: str) -> None:
+        """A degraded result: logged now, counted and kept for the report."""
+        log.warning(message)
+        self.warnings.append(message)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """`run` does the work and returns its key figures; what code it is follows from its module (`stage_identity`).
+
+    A stage that reads more than the stages before it says so by `inputs`: plain values that change with what it reads
+    (files, models). `check` refuses what it could not use. Both see (source, config) before the first stage runs, so
+    that a mistake is told of before anything slow.
+    """
+
+    name: str
+    run: Callable[[StageContext], dict[str, Any]]
+    summary: str
+    inputs: Callable[[Path, Config], Any] | None = None
+    check: Callable[[Path, Config], None] | None = None
+
+    @property
+    def file(self) -> Path:
+        """The module of `run`."""
+        return Path(self.run.__code__.co_filename)
+
+
+def run_stages(
+    stages: list[Stage],
+    run: RunFolder,
+    source: Path,
+    source_digest: str,
+    config: Config,
+    progress: Progress,
+    until: str = STAGES[-1],
+    same_source: SameSource = _trusted,
+    workers: TaskWorkers | None = None,
+) -> dict[str, StageRecord]:
+    """Bring every stage up to `until` up to date; returns their records.
+
+    A stage is up to date when its fingerprint (code, own settings, seed, own inputs, content of the stages before
+    it) and its files are unchanged. Nothing of the run changes before everything that can be checked is; then the
+    settings are written, and a stage that has to run again is taken out of the manifest, with those after it, before
+    it starts. Raises InputError as the stages do.
+    """
+    records = load_records(run)
+    origin = Source(str(source), source_digest)
+    upstream = source_digest
+    wanted = stages[: STAGES.index(until) + 1]
+    inputs = _check_inputs(wanted, run, source, config, source_digest, same_source)
+    if run.manifest() is None:
+        write_manifest(run.manifest_file, Manifest(origin, records))
+    save_settings(run, config)
+    for stage in wanted:
+        fingerprint = stage_fingerprint(stage, config, upstream, inputs[stage.name])
+        record = records.get(stage.name)
+        if record is None or record.fingerprint != fingerprint or run.damaged(stage.name):
+            if _drop(records, stage.name):
+                write_manifest(run.manifest_file, Manifest(origin, records))
+            folder = run.partial(stage.name)
+            context = StageContext(run, source, config, folder, progress, [], stages, same_source, workers)
+            record = _run_one(stage, context, fingerprint, inputs[stage.name])
+            records[stage.name] = record
+            write_manifest(run.manifest_file, Manifest(origin, records))
+            for later in STAGES[STAGES.index(stage.name) + 1 :]:  # made from what is no longer there
+                shutil.rmtree(run.stage(later), ignore_errors=True)
+        else:
+            log.info("%s: up to date", stage.name)
+        upstream = next_upstream(upstream, record)
+    return records
+
+
+def _drop(records: dict[str, StageRecord], name: str) -> bool:
+    """Take out this stage and those after it; whether there was any."""
+    dropped = [records.pop(later, None) for later in STAGES[STAGES.index(name) :]]
+    return any(record is not None for record in dropped)
+
+
+def _check_inputs(
+    stages: list[Stage], run: RunFolder, source: Path, config: Config, upstream: str, same_source: SameSource
+) -> dict[str, Any]:
+    """What each stage reads beside the stages before it; raises InputError where one has work to do and cannot.
+
+    A finished stage whose inputs are gone (files deleted, a model removed) stays as it is.
+    """
+    inputs, records = {}, load_records(run)
+    settled = True
+    for stage in stages:
+        record = records.get(stage.name)
+        if record is None or record.fingerprint != stage_fingerprint(stage, config, upstream, record.inputs):
+            settled = False
+        settled = settled and not run.damaged(stage.name)
+        kept = record.inputs if record is not None and settled else None
+        upstream = next_upstream(upstream, record) if record else upstream
+        try:
+            inputs[stage.name] = stage.inputs(source, config) if stage.inputs else None
+        except InputError as error:
+            if not settled:
+                raise
+            log.warning("%s: keeps what it was made from (%s)", stage.name, error)
+            inputs[stage.name] = kept
+        settled &= inputs[stage.name] == kept
+        if stage is stages[0] and not settled:
+            same_source()
+        if stage.check and not settled:
+            stage.check(source, config)
+    return inputs
+
+
+def next_upstream(upstream: str, record: StageRecord) -> str:
+    """What the stages after `record` are made from, as one digest."""
+    return hashlib.sha256((upstream + record.content).encode()).hexdigest()
+
+
+def _run_one(stage: Stage, context: StageContext, fingerprint: str, inputs: Any) -> StageRecord:
+    stop_if_asked()
+    run, folder = context.run, context.folder
+    journal = _open_partial(folder, fingerprint)
+    started = time.monotonic()
+    forget_peak()
+    try:
+        with watched_by(journal):
+            figures = stage.run(context)
+    except InputError as error:
+        if stage.name == STAGES[0] and not isinstance(error, RecoverableError):
+            context.same_source()  # if it is not, that is what is wrong
+        raise
+    except OSError as error:
+        if is_disk_full(error, run.root):
+            raise DiskFullError(
+                f"{run.root}: the disk is full. Free some space and type `msgs-slam resume {run.root}`"
+            ) from error
+        raise
+    shutil.rmtree(folder / "snapshot", ignore_errors=True)
+    (folder / FINGERPRINT).unlink()
+    files = checksums(folder, but=(JOURNAL,))
+    journal.close(files)
+    shutil.rmtree(run.stage(stage.name), ignore_errors=True)
+    os.replace(folder, run.stage(stage.name))
+    _flush_folder(run.root)
+    return StageRecord(
+        fingerprint,
+        files,
+        time.monotonic() - started,
+        peak_memory_mb(),
+        plain(figures),
+        context.warnings,
+        content_digest(files),
+        inputs,
+        settings_of(context.config, stage.name),
+    )
+
+
+def _open_partial(folder: Path, fingerprint: str) -> Journal:
+    """The unfinished folder: what is whole in it where it belongs to exactly this work, else empty."""
+    stamp, journal = folder / FINGERPRINT, Journal(folder)
+    if not (stamp.exists() and stamp.read_text(encoding="utf-8", errors="replace") == fingerprint):
+        empty(folder)
+    elif damaged := journal.discard_damaged(keep=(FINGERPRINT,)):
+        log.warning(
+            "%s: %d files of the interrupted attempt are damaged and made again, the first is %s",
+            folder.name, len(damaged), damaged[0],
+        )  # fmt: skip
+    write_text(stamp, fingerprint)
+    return journal
+
+
+def _flush_folder(folder: Path) -> None:
+    """Make a rename survive a power cut."""
+    if hasattr(os, "O_DIRECTORY"):
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        os.fsync(descriptor)
+        os.close(descriptor)
+
+
+def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) -> str:
+    """Digest of what a stage's result depends on: its code, its settings, the seed, its inputs, what is before."""
+    own = settings_of_stage(config, stage.name)
+    beside = [] if inputs is None else [inputs]
+    text = json.dumps(
+        [stage.name, stage_identity(stage.name, stage.file), own, config.run.seed, upstream, *beside], sort_keys=True
+    )
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def forget_peak() -> None:
+    """From now on `peak_memory_mb` is what comes, where the system can do that (Linux)."""
+    with suppress(OSError):
+        (_PROCESS / "clear_refs").write_text("5", encoding="ascii")
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process since `forget_peak`, in MB; since it began where the system has no such
+    thing, 0 where it tells nothing (Windows)."""
+    with suppress(OSError, ValueError, StopIteration):
+        lines = (_PROCESS / "status").read_text(encoding="ascii").splitlines()
+        return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) / 1024
+    try:
+        import resource
+    except ImportError:
+        return 0.0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)

@@ -1,0 +1,79 @@
+"""Pieces: each stretch that nothing joins to the rest of a run becomes a small run inside it, RUN/piece_2 and so on.
+
+A piece has its own frames, world and unit of length. Its first stage takes them out of the run around it, the others
+are those of any run, and so is all that reads it.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from hashlib import sha256
+from typing import Any
+
+import numpy as np
+
+from msgs_slam.formats.atomic import copy_file
+from msgs_slam.formats.errors import InputError, RecoverableError
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.engine.stages import Stage, StageContext, run_stages
+from msgs_slam.pipelines.run.folder import (
+    RunFolder,
+    save_backbone,
+    save_calibration,
+    save_features,
+    save_frames,
+    save_left_out,
+    save_matching,
+)
+from msgs_slam.pipelines.run.records import load_records
+
+
+def make_pieces(context: StageContext) -> list[RunFolder]:
+    """Bring the pieces that tracking has found up to date, largest first, and remove those it no longer finds; a piece
+    of which no map can be made is told of."""
+    run, names = context.run, context.run.pieces("tracking")
+    for old in run.root.glob("piece_*"):
+        if old.name not in names:
+            shutil.rmtree(old)
+    records, made = load_records(run), []
+    for name in names:
+        piece = RunFolder(run.root / name)
+        piece.root.mkdir(exist_ok=True)
+        origin = sha256(f"{name} {records['frames'].content} {records['tracking'].content}".encode()).hexdigest()
+        stages = [Stage("frames", take_frames, "the frames of the piece"), *context.stages[1:]]
+        try:
+            run_stages(stages, piece, context.source, origin, _settings(context.config), context.progress)
+        except RecoverableError:
+            raise
+        except InputError as error:
+            context.warn(f"{name} is posed, and could not be made whole: {error}")
+        made.append(piece)
+    return made
+
+
+def _settings(config: Config) -> Config:
+    """Those of the run around it; a length that is known in one picture tells nothing of another world."""
+    height = config.proxy.scale_ref.strip().startswith("height")
+    return config if height else replace(config, proxy=replace(config.proxy, scale_ref=""))
+
+
+def take_frames(context: StageContext) -> dict[str, Any]:
+    """The stage `frames` of a piece: its frames counted anew, and what the run around it knows of them."""
+    around, name = RunFolder(context.run.root.parent), context.run.root.name
+    posed = np.flatnonzero(around.load_trajectory("tracking", name).is_posed).tolist()
+    frames, number = around.load_frames(), {old: new for new, old in enumerate(posed)}
+    for frame in (frames[i] for i in posed):
+        copy_file(around.image_file(frame), context.folder / frame.name)
+        if (mask := around.mask(frame, "frames")) is not None:
+            save_left_out(context.folder / "masks", frame, mask)
+    save_frames(context.folder, [replace(frames[old], id=new) for old, new in number.items()])
+    save_calibration(context.folder, around.load_calibration())
+    model = around.load_sparse("tracking", name)
+    save_backbone(context.folder, replace(model, frame_ids=np.array([number[i] for i in model.frame_ids.tolist()])))
+    for old, new in number.items():
+        if (features := around.load_features(old)) is not None:
+            save_features(context.folder, new, features)
+    tried = {(number[i], number[j]): n for (i, j), n in around.load_tried().items() if i in number and j in number}
+    save_matching(context.folder, around.load_vocabulary(), tried)
+    return {"frames": len(posed), "keyframes": len(model.frame_ids), "of_the_run": [posed[0], posed[-1]]}

@@ -1,0 +1,23 @@
+"""What a network is, as one hash: two runs of the same one give the same results."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+from msgs_slam.formats.digest import files_sha256
+from msgs_slam.pipelines.networks.card import Card
+from msgs_slam.pipelines.networks.onnx_file import external_locations, require_own_weights
+from msgs_slam.pipelines.networks.runtime import is_tflite
+
+
+def card_identity(card: Card) -> str:
+    """The contract and the bytes of the network and of all that it loads. InputError for weights elsewhere."""
+    beside = []
+    if not is_tflite(card.model):  # those carry all of their weights
+        require_own_weights(card.model)
+        beside = [card.model.parent / name for name in external_locations(card.model)]
+    files = [*filter(None, (card.model, card.head, card.text, card.tokenizer)), *beside]
+    contract = repr(replace(card, model=Path(card.model.name), head=None, text=None, tokenizer=None))
+    return hashlib.sha256((contract + files_sha256((p.name, p) for p in files)).encode()).hexdigest()

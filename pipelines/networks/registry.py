@@ -1,0 +1,256 @@
+"""The table of models and the cache folder that holds their files."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from msgs_slam.formats.atomic import atomic_path
+from msgs_slam.formats.digest import file_sha256
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.jsonfile import read_json_object, write_json
+from msgs_slam.formats.reading import reaching, require_file
+from msgs_slam.pipelines.networks.card import Card, card_from_values
+from msgs_slam.pipelines.networks.download import fetch
+
+_TABLE = Path(__file__).with_name("registry.toml")
+_NOT_IN_CARDS = ("suffix", "ade20k", "metres_only")
+"""Keys of a family that are the table's own."""
+_ADE20K = Path(__file__).with_name("ade20k.toml")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+
+
+@dataclass(frozen=True)
+class Model:
+    """One row of the table. `sha256` is "" and `bytes` 0 while unknown; `needs` names another model it works with.
+
+    `revision` is the commit that the addresses name, "" where they name a branch whose file may be replaced. `pull`
+    says what brings it without its name: "default" a plain pull, "best" a pull of the large ones.
+    """
+
+    name: str
+    family: str
+    urls: tuple[str, ...]
+    bytes: int
+    sha256: str
+    licence: str
+    commercial: bool
+    needs: str = ""
+    revision: str = ""
+    pull: str = ""
+
+
+@dataclass(frozen=True)
+class ModelStore:
+    """Known models over a cache folder."""
+
+    cache: Path
+    models: tuple[Model, ...]
+    families: dict[str, dict[str, Any]]
+
+    @staticmethod
+    def open(cache: Path | None = None, table: Path = _TABLE) -> ModelStore:
+        """The store of this user. `MSGS_SLAM_CACHE` names another cache folder."""
+        values = tomllib.loads(table.read_text(encoding="utf-8"))
+        rows = [Model(**{**row, "urls": _addresses(row)}) for row in values["model"]]
+        store = ModelStore(cache or default_cache(), tuple(rows), values["family"])
+        own = store._load_own()
+        pinned = own["pinned"]
+        rows = [replace(r, sha256=r.sha256 or pinned.get(r.name, "")) for r in rows]
+        added = [store._own_model(row) for row in own["added"]]
+        return replace(store, models=(*added, *rows))
+
+    def path(self, model: Model) -> Path:
+        """Where the model's file lies, or would lie."""
+        return self.cache / f"{model.name}{self.families[model.family].get('suffix', '.onnx')}"
+
+    def is_here(self, model: Model) -> bool:
+        """Whether the file is there with the right size (the content is checked when it is opened)."""
+        path = self.path(model)
+        whole = path.is_file() and path.stat().st_size == (model.bytes or path.stat().st_size) and bool(model.sha256)
+        return whole and (not model.needs or self.is_here(self.get(model.needs)))
+
+    def get(self, name: str) -> Model:
+        """Raises InputError for an unknown name."""
+        for model in self.models:
+            if model.name == name:
+                return model
+        raise InputError(f"there is no model {name!r}; known: {', '.join(m.name for m in self.models)}")
+
+    def with_needed(self, names: Sequence[str], best: bool = False) -> list[Model]:
+        """The named models and those they work with; without names the small ones, or the `best`."""
+        wanted = "best" if best else "default"
+        chosen = [self.get(n) for n in names] if names else [m for m in self.models if m.pull == wanted]
+        both = [m for model in chosen for m in (model, *([self.get(model.needs)] if model.needs else []))]
+        return list(dict.fromkeys(both))
+
+    def card(self, model: Model) -> Card:
+        """The contract of the model's family, for its file in the cache."""
+        values = self._contract(model.family) | {"model": self.path(model), "sha256": model.sha256}
+        if model.needs:
+            values["head"] = self.path(self.get(model.needs))
+        return card_from_values(values, _TABLE)
+
+    def _contract(self, family: str) -> dict[str, Any]:
+        """The keys of a family's card."""
+        values = {k: v for k, v in self.families[family].items() if k not in _NOT_IN_CARDS}
+        count = self.families[family].get("ade20k")
+        return values | (_room_classes(count) if count else {})
+
+    def first_here(self, task: str, metres_only: bool = False) -> Model | None:
+        """The best model of a task whose file is in the cache; with `metres_only` also one that is good for nothing
+        but the scale."""
+        for model in self.models:
+            family = self.families[model.family]
+            if family["task"] == task and self.is_here(model) and (metres_only or not family.get("metres_only")):
+                return model
+        return None
+
+    def first_metric(self) -> Model | None:
+        """The best network for depth in the cache that tells metres: by itself, or as its training camera saw them."""
+        for model in self.models:
+            family = self.families[model.family]
+            tells = not family.get("relative") or "focal" in family
+            if family["task"] == "depth" and tells and self.is_here(model):
+                return model
+        return None
+
+    def take(self, folder: Path, models: Sequence[Model]) -> list[Model]:
+        """Copy the files of `models` that lie in `folder` into the cache; they are known by their content, whatever
+        they are called. Returns those that were found. Raises InputError when there is no such folder."""
+        of_size: dict[int, list[Path]] = {}
+        with reaching(folder):
+            files = sorted(p for p in folder.iterdir() if p.is_file())
+        for file in files:
+            of_size.setdefault(file.stat().st_size, []).append(file)
+        found = []
+        for model in models:
+            same = (f for f in of_size.get(model.bytes, []) if model.sha256 and file_sha256(f) == model.sha256)
+            if (source := next(same, None)) is not None:
+                with atomic_path(self.path(model)) as temporary:
+                    shutil.copyfile(source, temporary)
+                found.append(model)
+        return found
+
+    def pull(
+        self, model: Model, progress: Callable[[int, int], None], trust: bool = False, offline: bool = False
+    ) -> Path:
+        """Download the model's file unless it is here and whole; a row without a hash only with `trust`, which pins it.
+
+        Raises InputError when no mirror delivers it, when it is not what the table says, and when offline.
+        """
+        path = self.path(model)
+        if model.sha256 and path.is_file() and file_sha256(path) == model.sha256:
+            return path
+        if not model.sha256 and not trust:
+            raise InputError(f"{model.name}: its sha256 is unknown. Pull it with --trust to accept the first download")
+        if offline:
+            raise InputError(
+                f"{model.name} is not in {self.cache} and this is offline. Pull it where there is a network"
+            )
+        try:
+            actual = fetch(model.urls, path, model.bytes, model.sha256, progress)
+        except InputError as error:
+            if model.revision or not model.sha256 or "expected" not in str(error):
+                raise
+            raise InputError(
+                f"{error}\nIts makers may have replaced the file since its hash was recorded. If you trust the new "
+                f"one, download it yourself and type: msgs-slam models add FILE --family {model.family}"
+            ) from error
+        if not model.sha256:
+            own = self._load_own()
+            own["pinned"][model.name] = actual
+            self._save_own(own)
+        return path
+
+    def add(self, file: Path, family: str, name: str = "") -> Model:
+        """Copy the user's own file into the cache as a model of `family`. InputError unless it fits the family."""
+        known = [name for name, keys in self.families.items() if "input" in keys and name != "dinov2-ade20k"]
+        if family not in known:
+            raise InputError(f"there is no family {family!r}; known: {', '.join(known)}")
+        require_file(file)
+        from msgs_slam.pipelines.networks.session import Network
+
+        digest, size = file_sha256(file), file.stat().st_size
+        model = Model(name or file.stem, family, (), size, digest, "the user's own file", False)
+        if any(m.name == model.name and m.urls for m in self.models):
+            raise InputError(f"{model.name} is the name of a known model. Give another with --name")
+        if not _NAME.fullmatch(model.name):
+            raise InputError(f"{model.name!r} is no name for a model: letters, digits, dot, dash and underscore")
+        values = self._contract(family) | {"model": file.resolve(), "sha256": digest}
+        Network(card_from_values(values, _TABLE), 1, "cpu")
+        with atomic_path(self.path(model)) as temporary:
+            shutil.copyfile(file, temporary)
+        own = self._load_own()
+        row = {k: getattr(model, k) for k in ("name", "family", "bytes", "sha256", "licence", "commercial")}
+        own["added"] = [r for r in own["added"] if r["name"] != model.name] + [row]
+        self._save_own(own)
+        return model
+
+    def verify(self) -> dict[str, str]:
+        """Name → "ok", "not pulled" or what is wrong, for every model."""
+        found = {}
+        for model in self.models:
+            path = self.path(model)
+            if not path.is_file():
+                found[model.name] = "not pulled"
+            elif not model.sha256:
+                found[model.name] = "no known sha256"
+            else:
+                found[model.name] = "ok" if file_sha256(path) == model.sha256 else "damaged: pull it again"
+        return found
+
+    def _load_own(self) -> dict[str, Any]:
+        path = self.cache / "own.json"
+        with reaching(path):
+            if not path.exists():
+                return {"pinned": {}, "added": []}
+        own = read_json_object(path)
+        pinned, added = own.get("pinned"), own.get("added")
+        if not isinstance(pinned, dict) or not all(isinstance(v, str) for v in pinned.values()):
+            pinned = None
+        if pinned is None or not isinstance(added, list):
+            raise InputError(f"{path}: is damaged. Delete it and add your models again")
+        return {"pinned": pinned, "added": added}
+
+    def _own_model(self, row: Any) -> Model:
+        """A model that the user added, from the list in the cache. Raises InputError where it is not as it was left."""
+        kinds = {"name": str, "family": str, "bytes": int, "sha256": str, "licence": str, "commercial": bool}
+        known = isinstance(row, dict) and row.keys() == kinds.keys()
+        if not known or not all(isinstance(row[k], kind) for k, kind in kinds.items()):
+            raise InputError(f"{self.cache / 'own.json'}: is damaged. Delete it and add your models again")
+        model = Model(**row, urls=())
+        if not _NAME.fullmatch(model.name) or model.family not in self.families:
+            raise InputError(
+                f"{self.cache / 'own.json'}: {model.name!r} is no model of a known family. Delete the file"
+            )
+        return model
+
+    def _save_own(self, own: dict[str, Any]) -> None:
+        write_json(self.cache / "own.json", own)
+
+
+def _addresses(row: dict[str, Any]) -> tuple[str, ...]:
+    return tuple(url.format(revision=row.get("revision") or "main") for url in row["urls"])
+
+
+def _room_classes(count: int) -> dict[str, list[str]]:
+    """The first `count` of ADE20K's classes, "other" before them unless it is all of them, and for each the kind of
+    thing in a room that it counts for."""
+    values = tomllib.loads(_ADE20K.read_text(encoding="utf-8"))
+    kind_of = {name: kind for kind, names in values["groups"].items() for name in names}
+    names = values["classes"] if count == len(values["classes"]) else ["other", *values["classes"][:count]]
+    return {"classes": names, "groups": [kind_of.get(name, "other") for name in names]}
+
+
+def default_cache() -> Path:
+    """`$MSGS_SLAM_CACHE`, else `msgs-slam` in the user's cache folder."""
+    if own := os.environ.get("MSGS_SLAM_CACHE"):
+        return Path(own)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "msgs-slam"

@@ -1,0 +1,27 @@
+"""Opening a network's file: the same few lines whatever its format."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from msgs_slam.pipelines.networks.port import Runtime
+
+
+def is_tflite(path: Path) -> bool:
+    """Whether a file is meant as a TensorFlow Lite network, by its name."""
+    return path.suffix.lower() == ".tflite"
+
+
+def open_runtime(path: Path, outputs: Sequence[str], threads: int, device: str) -> Runtime:
+    """Open a network's file, told by its name: .tflite, else ONNX. `outputs` are those that will be asked for.
+
+    Raises InputError for a file that is none, or keeps weights outside its own folder.
+    """
+    if is_tflite(path):
+        from msgs_slam.pipelines.networks.tflite_runtime import TfliteRuntime
+
+        return TfliteRuntime(path, outputs, threads)
+    from msgs_slam.pipelines.networks.onnx_runtime import OnnxRuntime
+
+    return OnnxRuntime(path, threads, device)

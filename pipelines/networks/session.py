@@ -1,0 +1,148 @@
+"""Running a network that a card describes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_slam.formats.digest import file_sha256
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.networks.card import Card
+from msgs_slam.pipelines.networks.head import LinearHead, load_linear_head
+from msgs_slam.pipelines.networks.letterbox import Letterbox, choose_box
+from msgs_slam.pipelines.networks.runtime import open_runtime
+from msgs_slam.pipelines.networks.words import WordHead, load_word_head
+
+_MAX_OUTPUT_VALUES = 200_000_000
+_IMAGENET_MEAN = (123.675, 116.28, 103.53)
+_TOKENS = (1200, 3600)
+
+
+class Network:
+    """An opened network that a card describes."""
+
+    def __init__(self, card: Card, threads: int, device: str) -> None:
+        """Raises InputError for a file that is not what the card says, before anything is computed."""
+        self.card = card
+        _require_whole(card)
+        self.head: LinearHead | WordHead | None = None
+        if card.head is not None:
+            self.head = load_linear_head(card.head, len(card.classes))
+        elif card.text is not None:
+            self.head = load_word_head(card, threads, device)
+        wanted = list(_outputs(card).values())
+        bonus = {k: n for k, n in (("normals", card.normals), ("kappa", card.normal_confidence)) if n}
+        self._runtime = open_runtime(card.model, [*wanted, *bonus.values()], threads, device)
+        inputs, outputs = self._runtime.inputs, self._runtime.outputs
+        if set(inputs) != set(filter(None, (card.input, card.tokens))):
+            raise InputError(f"{card.model}: its inputs are {', '.join(inputs)}; the card says {card.input}")
+        for name in {**dict.fromkeys(wanted), card.output: None}:
+            if name not in outputs:
+                raise InputError(
+                    f"{card.model}: it has no output {name!r}, only {', '.join(outputs)}. Correct the card"
+                )
+            _require_bounded(card.model, name, outputs[name].shape)
+        _require_fitting(card, outputs[card.output].shape)
+        kind = inputs[card.input].dtype
+        if kind is None or not issubclass(kind, np.floating):
+            raise InputError(f"{card.model}: input {card.input} is not of float or float16. Correct the card")
+        self._dtype = kind
+        # A bonus: exports of the same family without them work as well.
+        self._extras = {k: n for k, n in bonus.items() if n in outputs}
+        if card.metadata:
+            self.card = card = _with_metadata(card, self._runtime.metadata)
+        shape = inputs[card.input].shape
+        fixed = tuple(s for s in shape[2:] if isinstance(s, int) and s > 0) if len(shape) == 4 else ()
+        if len(fixed) == 2 and all(card.size) and card.size != fixed:
+            raise InputError(f"{card.model}: takes {fixed[0]}x{fixed[1]}, the card says {card.size}. Correct the card")
+        self._size = fixed if len(fixed) == 2 else card.size
+
+    def box(self, width: int, height: int) -> Letterbox:
+        """How a picture of width x height goes into the network."""
+        return choose_box(width, height, self._size, self.card.multiple, self.card.pixels)
+
+    def run(self, image: NDArray[np.uint8], box: Letterbox) -> dict[str, NDArray]:
+        """The outputs that the card names (output, confidence, mask, metric_scale, and normals, kappa where the file
+        has them) without the batch axis, for an RGB image (h, w, 3).
+
+        Raises InputError when the network fails on it or answers with something huge.
+        """
+        card = self.card
+        mean, std = np.array(card.mean, np.float32), np.array(card.std, np.float32)
+        # Padding of the mean colour: 0 after normalisation, here or in the graph.
+        pad = mean * 255 if any(card.mean) else np.array(_IMAGENET_MEAN, np.float32)
+        values = (box.put(image, pad) * np.float32(card.white / 255) - mean * card.white) / (std * _std_unit(card))
+        batch = np.ascontiguousarray(values.transpose(2, 0, 1)[None]).astype(self._dtype)
+        feed: dict[str, NDArray] = {card.input: batch}
+        if card.tokens:
+            tokens = round(box.box_width * box.box_height / card.multiple**2)
+            feed[card.tokens] = np.array(min(max(tokens, _TOKENS[0]), _TOKENS[1]), np.int64)
+        names = {**_outputs(card), **self._extras}
+        try:
+            outputs = self._runtime.run(list(names.values()), feed)
+        except RuntimeError as error:
+            size = f"{box.box_width}x{box.box_height}"
+            raise InputError(f"{card.model}: does not run on an input of {size} ({error}). Correct the card") from error
+        for output in outputs:
+            if output.size > _MAX_OUTPUT_VALUES or output.size == 0:
+                raise InputError(f"{card.model}: gave an output of shape {output.shape}. Correct the card")
+        return {role: np.asarray(o[0]) for role, o in zip(names, outputs, strict=True)}
+
+
+def _outputs(card: Card) -> dict[str, str]:
+    """Role → name of what the card asks for."""
+    roles = ("output", "confidence", "mask", "metric_scale")
+    return {role: name for role in roles if (name := getattr(card, role))}
+
+
+def _with_metadata(card: Card, metadata: dict[str, str]) -> Card:
+    """The card with the mean and std that the file itself states, in units of white; its own where there are none.
+
+    Keys that hold the words and three numbers are taken, whatever else they are called; numbers over 5 are of 0..255.
+    """
+    found: dict[str, tuple[float, ...]] = {}
+    for word in ("mean", "std"):
+        for key, text in sorted(metadata.items()):
+            numbers = [float(n) for n in re.findall(r"-?\d+\.?\d*(?:[eE]-?\d+)?", text)]
+            if word in key.lower() and len(numbers) == 3 and min(numbers) > 0:
+                found[word] = tuple(n / 255 if max(numbers) > 5 else n for n in numbers)
+                break
+    return replace(card, mean=found["mean"], std=found["std"]) if len(found) == 2 else card
+
+
+def _std_unit(card: Card) -> float:
+    """std is in units of white too; a std of 1 (the default) means that nothing is divided."""
+    return 1.0 if all(s == 1.0 for s in card.std) else card.white
+
+
+def _require_whole(card: Card) -> None:
+    if not card.model.is_file():
+        raise InputError(f"{card.model}: there is no such file. Pull or download it again")
+    if not card.sha256:
+        return
+    actual = file_sha256(card.model)
+    if actual != card.sha256.lower():
+        raise InputError(f"{card.model}: its sha256 is {actual}, the card says {card.sha256}. Download it again")
+
+
+def _require_bounded(path: Path, name: str, shape: Sequence[int | str | None]) -> None:
+    fixed = [s for s in shape if isinstance(s, int)]
+    if np.prod([float(s) for s in fixed]) > _MAX_OUTPUT_VALUES or any(s <= 0 for s in fixed):
+        raise InputError(f"{path}: output {name} has the shape {list(shape)}, which is too large to be an image")
+
+
+def _require_fitting(card: Card, shape: Sequence[int | str | None]) -> None:
+    """What a file of fixed shapes tells of its output before it runs: 1 x channels x rows x columns."""
+    if card.kind in ("tokens", "points", "features") or len(shape) != 4 or not isinstance(shape[1], int):
+        return
+    planes = 1 if card.task != "segmentation" or card.kind == "argmax" else len(card.classes)
+    if shape[1] != planes:
+        wanted = f"{planes} classes" if planes > 1 else "one plane"
+        raise InputError(
+            f"{card.model}: output {card.output} has {shape[1]} channels, the card is for {wanted}. Correct the card"
+        )

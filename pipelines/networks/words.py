@@ -1,0 +1,143 @@
+"""Classes as words, for a network whose features lie in one space with those of texts.
+
+CLIP (Radford et al., ICML 2021) and its kin compare pictures with texts: a word's probability at a pixel is the softmax
+of the cosines between the pixel's feature and the words' embeddings, over a temperature. A word must win against the
+card's background phrases too (as in LERF, Kerr et al., ICCV 2023), which together are "other": without them a room in
+which a lamp and a shelf are asked for would consist of lamps and shelves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.reading import require_file
+from msgs_slam.formats.tensors import load_arrays
+from msgs_slam.pipelines.networks.card import Card
+from msgs_slam.pipelines.networks.runtime import open_runtime
+
+OTHER = "other"
+MOST_WORDS = 200
+"""Labels are bytes, and numbered objects need some too."""
+_MAX_TOKENIZER_BYTES = 1 << 26
+
+
+@dataclass(frozen=True)
+class WordHead:
+    """Scores of words: weight (C, F) unit vectors, of which each is compared with a feature of any length."""
+
+    weight: NDArray[np.float32]
+    temperature: float
+
+    def scores(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(..., F) → (..., C) cosines over the temperature."""
+        length = np.maximum(np.linalg.norm(features, axis=-1, keepdims=True), 1e-9)
+        return np.asarray((features / length) @ self.weight.T / self.temperature, np.float32)
+
+
+def with_words(card: Card, text: str) -> Card:
+    """The card with the comma-separated words as its classes, behind them the background phrases as one class, "other".
+
+    Raises InputError for no words, too many, or one of them twice.
+    """
+    words = [word for part in text.split(",") if (word := " ".join(part.split()))]
+    if not words:
+        raise InputError(f'{card.model.name} finds what it is asked for: --classes "radiator, bookshelf, lamp"')
+    known = [word.casefold() for word in words]
+    twice = [word for i, word in enumerate(words) if known[i] in known[:i]]
+    if twice or len(words) > MOST_WORDS:
+        problem = f"{twice[0]!r} stands there twice" if twice else f"{len(words)} words, at most {MOST_WORDS}"
+        raise InputError(f"proxy.classes: {problem}. Name every class once")
+    background = tuple(phrase for phrase in card.background if phrase.casefold() not in known)
+    card = replace(card, classes=(*words, *background), groups=(*words, *(OTHER for _ in background)))
+    return replace(card, void=tuple(i for i, label in enumerate(card.labels) if label == OTHER))
+
+
+def load_word_head(card: Card, threads: int, device: str) -> WordHead:
+    """The embeddings of the card's classes, from its table of words or by its text encoder.
+
+    Raises InputError for a table or encoder that is none, and for words that it does not have.
+    """
+    assert card.text is not None
+    if card.text.suffix.lower() == ".npz":
+        found = _from_table(card.text, card.classes)
+    else:
+        encode = _open_encoder(card, threads, device)
+        found = [np.mean([_unit(card.text, encode(p.replace("{}", c))) for p in card.prompts], 0) for c in card.classes]
+    return WordHead(np.stack([_unit(card.text, vector) for vector in found]), card.temperature)
+
+
+def _unit(path: Path, vector: NDArray) -> NDArray[np.float32]:
+    length = float(np.linalg.norm(vector.astype(np.float64)))
+    if vector.ndim != 1 or not 0 < length < np.inf:
+        raise InputError(f"{path}: a word's embedding has shape {vector.shape}, length {length}. Correct the card")
+    return (vector / length).astype(np.float32)
+
+
+def _from_table(path: Path, words: tuple[str, ...]) -> list[NDArray]:
+    stored = load_arrays(path)
+    names, rows = stored.get("words"), stored.get("embeddings")
+    if names is None or rows is None or names.dtype.kind != "U" or rows.dtype.kind != "f" or rows.ndim != 2:
+        raise InputError(f"{path}: no table of words. It holds words (K,), of text, and embeddings (K, F), of numbers")
+    if names.shape != rows.shape[:1]:
+        raise InputError(f"{path}: {names.size} words and {len(rows)} embeddings. Make the table again")
+    row_of = {str(name).casefold(): row for name, row in zip(names, rows, strict=True)}
+    if missing := [word for word in words if word.casefold() not in row_of]:
+        raise InputError(
+            f"{path}: it has no embedding of {', '.join(missing[:10])}; it knows {', '.join(map(str, names[:20]))}"
+            f"{' …' if len(names) > 20 else ''}. Add them to the table, or leave them out"
+        )
+    return [row_of[word.casefold()] for word in words]
+
+
+def _open_encoder(card: Card, threads: int, device: str) -> Callable[[str], NDArray]:
+    """What gives the embedding (F,) of a text."""
+    assert card.text is not None
+    assert card.tokenizer is not None
+    path, tokenizer = card.text, open_tokenizer(card.tokenizer)
+    runtime = open_runtime(path, [card.text_output], threads, device)
+    mask = next((name for name in runtime.inputs if name != card.text_input and "mask" in name), None)
+    if set(runtime.inputs) - {mask} != {card.text_input} or card.text_output not in runtime.outputs:
+        raise InputError(
+            f"{path}: takes {', '.join(runtime.inputs)}, gives {', '.join(runtime.outputs)}; the card says text_input "
+            f"{card.text_input}, text_output {card.text_output}. Correct the card"
+        )
+    port = runtime.inputs[card.text_input]
+    fixed = port.shape[-1] if port.shape and isinstance(port.shape[-1], int) else 0
+
+    def encode(text: str) -> NDArray:
+        ids = tokenizer.encode(text).ids
+        if not ids or len(ids) > (fixed or len(ids)):
+            raise InputError(f"{path}: {text!r} has {len(ids)} tokens; it takes 1 to {fixed or 'many'}. Shorten it")
+        padded = np.zeros((1, fixed or len(ids)), port.dtype or np.int64)
+        padded[0, : len(ids)] = ids
+        is_text = (np.arange(padded.shape[1]) < len(ids)).astype(padded.dtype)[None]
+        try:
+            feed: dict[str, NDArray] = {card.text_input: padded, **({mask: is_text} if mask else {})}
+            return np.squeeze(runtime.run([card.text_output], feed)[0])
+        except RuntimeError as error:
+            raise InputError(f"{path}: does not run on a text ({error}). Correct the card") from error
+
+    return encode
+
+
+def open_tokenizer(path: Path) -> Any:
+    """A `tokenizers.Tokenizer`. Raises InputError without that package, and for a file that is none."""
+    try:
+        from tokenizers import Tokenizer
+    except ImportError as error:
+        raise InputError(
+            "a text encoder needs a package that is not here: pip install 'msgs-slam[words]'. Or give the card a table "
+            'of embeddings: text = "words.npz"'
+        ) from error
+    require_file(path, _MAX_TOKENIZER_BYTES)
+    try:
+        return Tokenizer.from_file(str(path))
+    except Exception as error:  # the library's errors share no narrower base class
+        raise InputError(f"{path}: no tokenizer.json of `tokenizers` ({error}). Download it again") from error

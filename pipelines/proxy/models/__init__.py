@@ -1,1 +1,0 @@
-"""The learned models that are known, where to get them, and where they lie."""

@@ -1,1 +1,0 @@
-"""Learned depth and classes: any ONNX network that a card describes."""

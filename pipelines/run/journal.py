@@ -1,0 +1,90 @@
+"""What an unfinished stage has written, so that an attempt that goes on can tell what is whole."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from msgs_slam.formats.digest import file_sha256
+from msgs_slam.formats.errors import RecoverableError
+from msgs_slam.pipelines.system.stopping import stop_if_asked
+
+JOURNAL = ".written"
+
+
+@dataclass(frozen=True)
+class Journal:
+    """A line `sha256 path` for every file that is written atomically below `folder`, before it takes its name.
+
+    Handed to `formats.atomic.watched_by`, so that no stage has to think of it. A file may have several lines: one that
+    was killed between the line and the renaming still has the content of an earlier line, which is a whole one too.
+    """
+
+    folder: Path
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+
+    def writing(self, path: Path, temporary: Path) -> None:
+        """Note the file that is about to be renamed to `path`."""
+        if path.is_relative_to(self.folder):
+            # The end of line comes first: a line that a full disk has cut must not swallow the one after it.
+            line = f"\n{file_sha256(temporary)} {path.relative_to(self.folder).as_posix()}"
+            with self._lock, (self.folder / JOURNAL).open("a", encoding="utf-8") as stream:
+                stream.write(line)
+
+    def written(self, path: Path) -> None:
+        """The moment at which nothing is lost: here the work stops where the user has asked for it."""
+        if path.is_relative_to(self.folder):
+            stop_if_asked()
+
+    def discard_damaged(self, keep: tuple[str, ...] = ()) -> list[str]:
+        """Remove every file that is not as some line says, and folders left empty; returns the names of those that
+        have a line. What has none was being written when the attempt ended, or is no file of the stage."""
+        known = self._known()
+        damaged = []
+        for path in sorted(p for p in self.folder.rglob("*") if p.is_file() or p.is_symlink()):
+            name = path.relative_to(self.folder).as_posix()
+            if name in (JOURNAL, *keep) or (not path.is_symlink() and _digest(path) in known.get(name, ())):
+                continue
+            damaged += [name] if name in known else []
+            path.unlink()
+        for folder in sorted((p for p in self.folder.rglob("*") if p.is_dir()), reverse=True):
+            if not any(folder.iterdir()):
+                folder.rmdir()
+        return damaged
+
+    def close(self, files: dict[str, tuple[int, str]]) -> None:
+        """End the journal of a stage that has left these files.
+
+        Raises RecoverableError where one is not what was written: a full or failing disk may keep less than it said.
+        """
+        known = self._known()
+        torn = [name for name, (_, digest) in files.items() if digest not in known.get(name, ())]
+        if torn:
+            raise RecoverableError(
+                f"{self.folder / torn[0]} is not what was written there ({len(torn)} such files): the disk may be full "
+                f"or failing. Type `msgs-slam resume {self.folder.parent}`"
+            )
+        (self.folder / JOURNAL).unlink(missing_ok=True)
+
+    def _known(self) -> dict[str, set[str]]:
+        path = self.folder / JOURNAL
+        known: dict[str, set[str]] = {}
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []:
+            digest, _, name = line.partition(" ")
+            known.setdefault(name, set()).add(digest)
+        return known
+
+
+def _digest(path: Path) -> str:
+    try:
+        return file_sha256(path)
+    except OSError:
+        return ""
+
+
+def empty(folder: Path) -> None:
+    """Make the folder, with nothing in it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)

@@ -1,0 +1,179 @@
+"""What a run says of itself: manifest.json, one record a finished stage."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from msgs_slam.formats.digest import file_sha256
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.jsonfile import read_json_object, write_json
+from msgs_slam.formats.reading import parsing
+from msgs_slam.pipelines.config import Config, config_to_dict, merge_known_settings, settings_of_stage
+from msgs_slam.pipelines.run.names import SOURCE_LIST, STAGES
+from msgs_slam.pipelines.run.stored import dataclass_from_json
+
+if TYPE_CHECKING:
+    from msgs_slam.pipelines.run.folder import RunFolder
+
+FORMAT = 2
+"""Of manifest.json."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What the run was made from: the path, and the identity of what was there (`source_digest`)."""
+
+    path: str
+    digest: str
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """One finished stage. files: relative path → [bytes, sha256]; settings: {"run": ..., its own section: ...}, those
+    that it was made with, whatever run.toml says by now."""
+
+    fingerprint: str
+    files: dict[str, tuple[int, str]]
+    seconds: float
+    peak_memory_mb: float
+    figures: dict[str, Any]
+    warnings: list[str]
+    content: str
+    inputs: Any = None
+    settings: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        wanted: dict[str, Any] = {
+            "fingerprint": str,
+            "content": str,
+            "seconds": int | float,
+            "peak_memory_mb": int | float,
+        }
+        wanted |= {"figures": dict, "files": dict, "settings": dict, "warnings": list}
+        for name, kind in wanted.items():
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(f"{name} is {str(getattr(self, name))[:40]!r}")
+
+    @staticmethod
+    def from_json(value: Any) -> StageRecord:
+        """Inverse of `asdict` after JSON. Raises TypeError, ValueError or KeyError for anything else."""
+        files = {str(name): (int(size), str(digest)) for name, (size, digest) in value["files"].items()}
+        return StageRecord(
+            **{
+                **value,
+                "files": files,
+                "seconds": float(value["seconds"]),
+                "peak_memory_mb": float(value["peak_memory_mb"]),
+            }
+        )
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What the run was made from, and the finished stages by name, in their order."""
+
+    source: Source
+    records: dict[str, StageRecord]
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Raises InputError when it is missing, damaged, or of a newer version."""
+    try:
+        value = read_json_object(path)
+        with parsing(path, "manifest of a run", "it was damaged or edited"):
+            return _manifest(path, value)
+    except InputError as error:
+        raise InputError(
+            f"{error}\nWithout it nothing in the run can be trusted. Its settings are kept beside it: "
+            f"msgs-slam reconstruct SOURCE --out NEW --config {path.with_name('run.toml')}"
+        ) from error
+
+
+def _manifest(path: Path, value: dict[str, Any]) -> Manifest:
+    if (found := value.get("format", 1)) != FORMAT:
+        raise InputError(f"{path}: its format is {str(found)[:20]}, this version of the program knows {FORMAT}")
+    if value.pop("check", None) != _check(value):
+        raise ValueError("its checksum differs")
+    stages = value["stages"]
+    records = {name: StageRecord.from_json(stages[name]) for name in STAGES if name in stages}
+    return Manifest(dataclass_from_json(Source, value["source"]), records)
+
+
+def write_manifest(path: Path, manifest: Manifest) -> None:
+    """Atomically, with a checksum over itself. Raises InputError when the disk refuses."""
+    stages = {name: asdict(manifest.records[name]) for name in STAGES if name in manifest.records}
+    value = {"format": FORMAT, "source": asdict(manifest.source), "stages": stages}
+    value = json.loads(json.dumps(value, allow_nan=False))  # tuples are lists when it is read again
+    write_json(path, {**value, "check": _check(value)})
+
+
+def _check(value: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def load_records(run: RunFolder) -> dict[str, StageRecord]:
+    """The finished stages by name."""
+    manifest = run.manifest()
+    return {} if manifest is None else dict(manifest.records)
+
+
+def load_source(run: RunFolder) -> Source:
+    """What the run was made from. Raises InputError for a folder that is no run."""
+    source = read_manifest(run.manifest_file).source
+    inside = run.root / SOURCE_LIST
+    # The list of several videos lies in the run, wherever that has been moved to.
+    return replace(source, path=str(inside)) if Path(source.path).name == SOURCE_LIST and inside.is_file() else source
+
+
+def recorded_config(records: Mapping[str, StageRecord], config: Config) -> Config:
+    """The settings that each finished stage was made with; of the stages that are not, those of `config`."""
+    for name in STAGES:
+        if name in records:
+            config, _ = merge_known_settings(config, records[name].settings)
+    return config
+
+
+def settings_of(config: Config, stage: str) -> dict[str, dict[str, Any]]:
+    """What a record keeps of the settings."""
+    kept: dict[str, dict[str, Any]] = {"run": config_to_dict(config.run)}
+    for key, value in settings_of_stage(config, stage).items():
+        section, _, name = key.rpartition(".")
+        kept.setdefault(section or stage, {})[name] = value
+    return kept
+
+
+def differing_settings(record: StageRecord, config: Config) -> list[str]:
+    """`section.key=value` of each setting of its own section that `config` has otherwise than the record."""
+    return [
+        f"{section}.{key}={value}"
+        for section, values in record.settings.items()
+        if section != "run"
+        for key, value in config_to_dict(getattr(config, section)).items()
+        if values.get(key, value) != value
+    ]
+
+
+def checksums(folder: Path, but: tuple[str, ...] = ()) -> dict[str, tuple[int, str]]:
+    """Relative path, with slashes, → (bytes, sha256) of every file below, but for those of these names."""
+    paths = sorted(p for p in folder.rglob("*") if p.is_file() and not p.is_symlink() and p.name not in but)
+    return {p.relative_to(folder).as_posix(): (p.stat().st_size, file_sha256(p)) for p in paths}
+
+
+def content_digest(files: Mapping[str, tuple[int, str]]) -> str:
+    """One digest of what a stage has left."""
+    return hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()
+
+
+def plain(figures: Any) -> Any:
+    """The same with None for what JSON has no number for (infinite, NaN)."""
+    if isinstance(figures, dict):
+        return {k: plain(v) for k, v in figures.items()}
+    if isinstance(figures, list | tuple):
+        return [plain(v) for v in figures]
+    return None if isinstance(figures, float) and not math.isfinite(figures) else figures

@@ -1,0 +1,71 @@
+"""run.toml: the settings with which a run goes on, and a first line by which damage shows."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from typing import TYPE_CHECKING, Any
+
+from msgs_slam.formats.atomic import write_text
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.jsonfile import MAX_TOML_BYTES, read_toml
+from msgs_slam.formats.reading import opened
+from msgs_slam.pipelines.config import Config, config_to_toml, merge_known_settings
+from msgs_slam.pipelines.run.records import load_records, load_source, recorded_config
+from msgs_slam.pipelines.system.progress import log
+
+if TYPE_CHECKING:
+    from msgs_slam.pipelines.run.folder import RunFolder
+
+_MARK = re.compile(r"# Written by msgs-slam\. Change settings with --set or --config\. Check: ([0-9a-f]{64})\n")
+
+
+def save_settings(run: RunFolder, config: Config) -> None:
+    """Atomically. The checksum in the first line is over the rest and the run's source, so that neither an emptied
+    file nor that of another run is taken for this one's. Raises InputError when the disk refuses."""
+    text = config_to_toml(config)
+    mark = f"# Written by msgs-slam. Change settings with --set or --config. Check: {_check(run, text)}\n"
+    write_text(run.settings_file, mark + text)
+
+
+def load_settings(run: RunFolder) -> Config:
+    """The settings with which the run goes on. Raises InputError for a file that is not as the program left it.
+
+    Where it is gone, what the finished stages were made with is taken, and defaults for the others; InputError where
+    none is finished.
+    """
+    if not run.settings_file.exists():
+        if not (records := load_records(run)):
+            raise InputError(
+                f"{run.root} was stopped before its settings were written, or {run.settings_file.name} is gone, and "
+                f"nothing is finished: type `msgs-slam reconstruct {load_source(run).path} --out {run.root}` with the "
+                "options it had"
+            )
+        log.warning("%s is gone: stages that are not done get default settings", run.settings_file)
+        return recorded_config(records, Config())
+    with opened(run.settings_file, MAX_TOML_BYTES, any_content=True) as file:
+        text = file.read().decode("utf-8", errors="replace")
+    mark = _MARK.match(text)
+    as_written = mark is not None and mark[1] == _check(run, text[mark.end() :])
+    if not as_written:
+        raise InputError(
+            f"{run.settings_file} is not as the program left it: damaged, or edited by hand. Delete it and type "
+            f"`msgs-slam resume {run.root}`: what the finished stages were made with is kept in manifest.json. "
+            "(Settings are changed with --set SECTION.KEY=VALUE, or with --config FILE, which may be a copy of it)"
+        )
+    return _known(read_toml(run.settings_file), run)
+
+
+def _check(run: RunFolder, text: str) -> str:
+    return hashlib.sha256(f"{load_source(run).digest}\n{text}".encode()).hexdigest()
+
+
+def _known(values: dict[str, Any], run: RunFolder) -> Config:
+    """Settings of an earlier version that are no more, or whose value is none any longer, are told of and left out."""
+    config, dropped = merge_known_settings(Config(), values)
+    if dropped:
+        log.warning(
+            "%s is of an earlier version: %d settings in it are none any more (%s%s)",
+            run.settings_file, len(dropped), ", ".join(dropped[:3]), ", ..." if len(dropped) > 3 else "",
+        )  # fmt: skip
+    return config

@@ -1,0 +1,1 @@
+"""Where images come from: videos, folders, panoramas, data sets."""

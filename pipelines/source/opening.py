@@ -1,0 +1,264 @@
+"""The kinds of source, a video file, a folder of images or a data set, read alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_slam.formats.digest import file_sha256, files_sha256
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.image_times import read_image_times, times_file
+from msgs_slam.formats.images import exif_focal_px, image_size, is_depth_map, list_images, read_rgb
+from msgs_slam.formats.reading import reaching, require_file
+from msgs_slam.formats.textfile import read_text
+from msgs_slam.formats.video import VideoFrame, VideoReader, probe_video
+from msgs_slam.pipelines.source.originals import reusable, written_names
+from msgs_slam.pipelines.source.recording import RecordingSource, open_recording
+
+Warn = Callable[[str], None]
+LIST_SUFFIX = ".videos"
+_LONGEST_LIST = 100_000
+_PAUSE = 10.0
+"""Seconds on the clock of the run between two videos: no velocity goes on from one to the next."""
+
+
+class Source(Protocol):
+    """Pictures in the order of time, all of one size.
+
+    `expected_frames` is an estimate before reading, 0 = unknown; `has_times` says whether the timestamps are real.
+    """
+
+    width: int
+    height: int
+    expected_frames: int
+    has_times: bool
+
+    def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
+        """Decode from start to end, and hand out the wanted frames (None = all) one at a time."""
+        ...
+
+    def name(self, frame_id: int, index: int) -> str:
+        """File name of picked frame `frame_id`, which is picture `index` of the source."""
+        ...
+
+    def original(self, index: int) -> Path | None:
+        """The file of picture `index` when it can serve as a frame as it is, else None."""
+        ...
+
+    def exif_focal(self) -> float | None:
+        """Focal length in pixels of the source that its metadata states, or None."""
+        ...
+
+
+@dataclass
+class VideoSource:
+    """A video file, or several of one place by one camera: see `video_files`. Their frames are counted on."""
+
+    path: Path
+    files: tuple[Path, ...] = field(init=False)
+    width: int = field(init=False)
+    height: int = field(init=False)
+    expected_frames: int = field(init=False)
+    has_times: bool = field(init=False, default=True)
+
+    def __post_init__(self) -> None:
+        self.files = video_files(self.path)
+        found = {str(file): probe_video(file) for file in self.files}
+        _require_one_size(self.path, {name: (i.width, i.height) for name, i in found.items()}, "videos")
+        self.width, self.height = next((i.width, i.height) for i in found.values())
+        self.expected_frames = sum(i.frame_count_claimed for i in found.values())
+
+    def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
+        """See `Source.read`; a truncated or damaged file is told to `warn` at the end."""
+        first, start = 0, 0.0
+        for file in self.files:
+            with VideoReader(file, None if wanted is None else lambda i, n=first: n + i in wanted) as reader:  # type: ignore[misc]
+                for index, time, rgb in reader:
+                    _require_size(rgb, self.width, self.height, f"frame {index} of {file}")
+                    yield VideoFrame(first + index, start + time, rgb)
+                if warn is not None:
+                    _warn_of_the_file(file, reader, warn)
+                first, start = first + len(reader.timestamps), start + reader.timestamps[-1] + _PAUSE
+
+    def name(self, frame_id: int, index: int) -> str:
+        """000000.jpg, 000001.jpg, ..."""
+        return f"{frame_id:06d}.jpg"
+
+    def original(self, index: int) -> Path | None:
+        """A video has no files of single frames."""
+        return None
+
+    def exif_focal(self) -> float | None:
+        """Videos state none."""
+        return None
+
+
+def video_files(path: Path) -> tuple[Path, ...]:
+    """The videos that a text file of the suffix .videos names, one a line, seen from its folder; of any other file
+    itself."""
+    if path.suffix != LIST_SUFFIX:
+        return (path,)
+    lines = [line.strip() for line in read_text(path, _LONGEST_LIST).splitlines()]
+    files = tuple(path.parent / line for line in lines if line)
+    if not files or LIST_SUFFIX in {file.suffix for file in files}:
+        raise InputError(f"{path} names no videos: write the name of one on each line")
+    return files
+
+
+@dataclass
+class FolderSource:
+    """The images directly in a folder, in natural order of their names; depth maps among them are left out."""
+
+    path: Path
+    width: int = field(init=False)
+    height: int = field(init=False)
+    expected_frames: int = field(init=False)
+    has_times: bool = field(init=False)
+    unreadable: list[str] = field(init=False, default_factory=list)
+    _images: list[Path] = field(init=False)
+    _names: tuple[str, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._images = _without_depth_maps(list_images(self.path))
+        self._names = written_names([path.name for path in self._images], self.path)
+        sizes = self._sizes()
+        if not sizes:
+            raise InputError(
+                f"none of the {len(self._images)} images in {self.path} can be read: they are damaged, copy them again"
+            )
+        _require_one_size(self.path, sizes, "images")
+        self.width, self.height = next(iter(sizes.values()))
+        times = read_image_times(self._images)
+        self.has_times = times is not None
+        self._times = np.arange(len(self._images), dtype=np.float64) if times is None else times
+        self.expected_frames = len(self._images)
+
+    def _sizes(self) -> dict[str, tuple[int, int]]:
+        sizes = {}
+        for path in self._images:
+            try:
+                sizes[path.name] = image_size(path)
+            except InputError:
+                self.unreadable.append(path.name)
+        return sizes
+
+    def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
+        """See `Source.read`; images that cannot be read are left out and told to `warn`."""
+        for index, path in enumerate(self._images):
+            if wanted is not None and index not in wanted:
+                continue
+            try:
+                rgb = read_rgb(path)
+            except InputError as error:
+                if warn is not None:
+                    warn(f"left out: {error}")
+                continue
+            _require_size(rgb, self.width, self.height, str(path))
+            yield VideoFrame(index, float(self._times[index]), rgb)
+
+    def name(self, frame_id: int, index: int) -> str:
+        """The image's own name; formats that are not written here become .png."""
+        return self._names[index]
+
+    def original(self, index: int) -> Path | None:
+        """The image's file, unless other programs would see it turned, transparent or not at all."""
+        path = self._images[index]
+        return path if reusable(path) else None
+
+    def file(self, index: int) -> Path:
+        """The image of that number, however it is turned."""
+        return self._images[index]
+
+    def exif_focal(self) -> float | None:
+        """That of the first readable image."""
+        for path in self._images:
+            if path.name not in self.unreadable:
+                return exif_focal_px(path, self.width, self.height)
+        return None
+
+
+def _without_depth_maps(images: list[Path]) -> list[Path]:
+    """All but images of 16 bits in one channel, if there are others: some data sets keep depth beside colour."""
+    depth = {path for path in images if path.suffix.lower() in (".png", ".tif", ".tiff") and is_depth_map(path)}
+    return images if len(depth) == len(images) else [path for path in images if path not in depth]
+
+
+def open_source(path: Path, format: str = "auto") -> VideoSource | FolderSource | RecordingSource:
+    """A video file, a folder of images, or a data set (see `open_recording` for the format).
+
+    Raises InputError when there is no such file, it is no video, it holds no image, or images differ in size.
+    """
+    require_source(path)
+    recording = open_recording(path, format)
+    if recording is not None:
+        return RecordingSource(recording)
+    return FolderSource(path) if path.is_dir() else VideoSource(path)
+
+
+def require_source(path: Path) -> None:
+    """Raise InputError unless the path is a folder or a file with something in it, and may be read."""
+    with reaching(path):
+        if path.is_dir():
+            next(path.iterdir(), None)
+            return
+    require_file(path)
+
+
+def source_digest(source: Path, format: str) -> str:
+    """Identity of a source: a video's bytes; names and bytes of the pictures of a folder or data set, and their times.
+
+    What else lies in the folder does not count. Raises InputError where there is nothing to read.
+    """
+    require_source(source)
+    recording = open_recording(source, format)
+    if recording is not None and recording.image_paths:
+        head = f"{recording.format} {recording.camera}".encode() + recording.timestamps.tobytes()
+        return files_sha256(zip(recording.names, recording.image_paths, strict=True), head)
+    if source.is_file():
+        files = video_files(source)
+        return file_sha256(source) if files == (source,) else files_sha256((str(i), f) for i, f in enumerate(files))
+    images, times = list_images(source), times_file(source)
+    return files_sha256(sorted((p.name, p) for p in [*images, *([times] if times else [])]))
+
+
+def _require_one_size(folder: Path, sizes: dict[str, tuple[int, int]], what: str) -> None:
+    first_name, first = next(iter(sizes.items()))
+    others = [name for name, size in sizes.items() if size != first]
+    if others:
+        width, height = sizes[others[0]]
+        raise InputError(
+            f"the {what} of {folder} differ in size: {first_name} is {first[0]}x{first[1]}, {others[0]} is "
+            f"{width}x{height} ({len(others)} of {len(sizes)} differ from the first): keep the {what} of one camera "
+            "and one orientation together"
+        )
+
+
+def _require_size(rgb: NDArray[np.uint8], width: int, height: int, what: str) -> None:
+    if rgb.shape[:2] != (height, width):
+        raise InputError(
+            f"{what} is {rgb.shape[1]}x{rgb.shape[0]}, the pictures before it are {width}x{height}: convert the source "
+            "to one size first"
+        )
+
+
+def _warn_of_the_file(path: Path, reader: VideoReader, warn: Warn) -> None:
+    decoded = len(reader.timestamps)
+    if reader.tone_mapped:
+        warn(f"{path.name} is HDR ({reader.hdr}): its light is brought to the range of ordinary pictures")
+    elif reader.hdr:
+        warn(f"{path.name} is HDR ({reader.hdr}), its colours come out flat: pip install 'msgs-slam[hdr]' mends that")
+    # Containers count a frame or two too many in passing; that is no damage.
+    if reader.missing_frames > max(2, reader.info.frame_count_claimed // 50):
+        warn(
+            f"{path.name} is truncated: its header promises {reader.info.frame_count_claimed} frames, {decoded} "
+            "decode; going on with those"
+        )
+    if reader.unreadable_frames:
+        warn(f"{path.name}: {reader.unreadable_frames} damaged frames were left out")
+    if reader.repaired_timestamps:
+        warn(f"{path.name}: {reader.repaired_timestamps} of {decoded} timestamps were missing or went back; repaired")

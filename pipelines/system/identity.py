@@ -1,0 +1,98 @@
+"""Which code a stage's result was made by: something that cannot be forgotten when the code changes.
+
+The identity is part of a stage's fingerprint. It is a digest of the stage's own sources: its module and all that it
+imports in this project, directly or not, but for `PLUMBING`, which says how a stage is run and not what it computes. A
+comment counts as a change too: a stage run once too often does no harm. At a release `python tests/release.py` writes
+the digests to `stage_versions.toml`, and raises the number of every stage whose sources have changed, unless it is told
+that the results have not. Where the sources are those of the table, the identity is that number, so that a release that
+changes no result of a stage keeps the users' runs; in any other state of the code it is the digest.
+
+Libraries are not part of it: another numpy or COLMAP may give other bytes, and does not make a run out of date.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import os
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+TABLE = Path(__file__).with_name("stage_versions.toml")
+PACKAGE = "msgs_slam"
+"""The import name of `ROOT`: of the repository in an editable install, of a folder of site-packages in any other."""
+PLUMBING = frozenset(
+    [
+        "msgs_slam.pipelines.config",
+        "msgs_slam.pipelines.retired_settings",
+        "msgs_slam.pipelines.engine.stages",
+        "msgs_slam.pipelines.system.progress",
+        "msgs_slam.pipelines.system.stopping",
+        "msgs_slam.pipelines.run.records",
+        "msgs_slam.pipelines.run.settings_file",
+        "msgs_slam.pipelines.run.finished_files",
+        "msgs_slam.pipelines.run.journal",
+        "msgs_slam.pipelines.system.identity",
+        "msgs_slam.pipelines.run.names",
+        "msgs_slam.formats.errors",
+        "msgs_slam.formats.atomic",
+        "msgs_slam.formats.reading",
+    ]
+)
+
+
+def stage_file(name: str) -> Path:
+    """The module of a stage."""
+    return ROOT / "pipelines" / name / "stage.py"
+
+
+@functools.cache
+def stage_identity(name: str, file: Path) -> str:
+    """The number of the last release, or a digest of the sources, of the stage whose module is `file`."""
+    digest = source_digest(file)
+    released = tomllib.loads(TABLE.read_text(encoding="utf-8")).get(name, {})
+    return str(released["number"]) if released.get("sources") == digest else digest
+
+
+def source_digest(file: Path, root: Path = ROOT) -> str:
+    """Over the names and contents of `stage_sources`; line ends do not count, as git may change them."""
+    digest = hashlib.sha256()
+    named = {os.path.relpath(path, root).replace(os.sep, "/"): path for path in stage_sources(file, root)}
+    for name, path in sorted(named.items()):
+        content = path.read_bytes().replace(b"\r\n", b"\n")
+        digest.update(f"{name}\0{hashlib.sha256(content).hexdigest()}\n".encode())
+    return digest.hexdigest()[:16]
+
+
+def stage_sources(file: Path, root: Path = ROOT) -> set[Path]:
+    """The module and what it imports of this project, directly or not, without importing any of it."""
+    found: set[Path] = set()
+    waiting = [file.resolve()]
+    while waiting:
+        path = waiting.pop()
+        if path not in found:
+            found.add(path)
+            waiting += _imported_files(path, root)
+    return found
+
+
+@functools.cache
+def _imported_files(path: Path, root: Path) -> tuple[Path, ...]:
+    """Files of the modules that a file imports anywhere in it, and of the packages they lie in."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    inside = {n for n in names if n.startswith(f"{PACKAGE}.")}
+    inside |= {n.rsplit(".", k)[0] for n in inside for k in range(1, n.count("."))}
+    files = (file for name in sorted(inside - PLUMBING) for file in _files_of(name, root))
+    return tuple(file for file in files if file.is_file())
+
+
+def _files_of(name: str, root: Path) -> tuple[Path, Path]:
+    base = root.joinpath(*name.split(".")[1:])
+    return base.with_suffix(".py"), base / "__init__.py"

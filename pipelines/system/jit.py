@@ -1,0 +1,86 @@
+"""Compiling kernels: how, and where the machine code is kept between runs. The one way to numba in this project."""
+
+from __future__ import annotations
+
+import functools
+import os
+import stat
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+
+from msgs_slam.pipelines.system.identity import source_digest
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def kernel(function: F | None = None, **options: Any) -> Any:
+    """Compile to machine code that runs without the GIL, cached on disk between runs.
+
+    Floats are taken literally: none of numba's fastmath, for reordered sums have been seen to break equal bytes over
+    thread counts; a division by zero gives an infinity or NaN, as in numpy. `options` are numba's, for example
+    parallel=True. Used as @kernel or @kernel(parallel=True).
+    """
+    if function is None:
+        return functools.partial(kernel, **options)
+    root = cache_root()
+    # numba looks only at the file of the function that it compiles, and would go on using machine code into which an
+    # older version of another file is inlined: the folder's name follows all files that this one imports.
+    directory = None if root is None else root / source_digest(Path(function.__code__.co_filename))
+    with _numba_cache_in(directory):
+        return numba.njit(**{"nogil": True, "error_model": "numpy", "cache": root is not None, **options})(function)
+
+
+@functools.cache
+def cache_root() -> Path | None:
+    """Where compiled kernels are kept: the first writable of NUMBA_CACHE_DIR, the user's cache folder and a private
+    folder in the system's temporary one; None, said once, if there is no such place."""
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "msgs-slam"
+    first = (Path(given) if given else home) / "kernels"
+    if _is_private(first):
+        return first
+    second = Path(tempfile.gettempdir()) / f"msgs-slam-{os.getuid() if hasattr(os, 'getuid') else 'user'}-kernels"
+    if _is_private(second):
+        warnings.warn(f"cannot write to {first.parent}: compiled kernels are kept in {second}", stacklevel=3)
+        return second
+    warnings.warn(
+        f"cannot write to {first.parent} nor {second.parent}: kernels are compiled at every start", stacklevel=3
+    )
+    return None
+
+
+def _is_private(directory: Path) -> bool:
+    """Makes the folder if need be; whether it can be written, is ours, and nobody else may write there.
+
+    The cache is executable code: in a shared temporary folder another user could have put it there first.
+    """
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = directory.lstat()
+        foreign = hasattr(os, "getuid") and (
+            status.st_uid != os.getuid() or status.st_mode & (stat.S_IWOTH | stat.S_IWGRP)
+        )
+        if foreign or not stat.S_ISDIR(status.st_mode):
+            return False
+        with tempfile.TemporaryFile(dir=directory):
+            return True
+    except OSError:
+        return False
+
+
+@contextmanager
+def _numba_cache_in(directory: Path | None) -> Iterator[None]:
+    """numba reads its cache setting when a function is decorated; other users of numba keep theirs."""
+    config: Any = numba.config  # its settings are made at run time
+    before = config.CACHE_DIR
+    config.CACHE_DIR = str(directory or "")
+    try:
+        yield
+    finally:
+        config.CACHE_DIR = before

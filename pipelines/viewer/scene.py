@@ -1,0 +1,175 @@
+"""What the viewer shows, as plain arrays: from a run, or from a splat file by any program."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gaussian_files import read_gaussians
+from msgs_slam.formats.gaussians import GaussianCloud
+from msgs_slam.formats.reading import reaching
+from msgs_slam.pipelines.export.stage import on_earth
+from msgs_slam.pipelines.export.writers import map_cloud
+from msgs_slam.pipelines.gaussian_map import decided_channels
+from msgs_slam.pipelines.outcome import Outcome, evenly, labels_of_channels, load_outcome
+from msgs_slam.pipelines.proxy.palette import class_colors
+from msgs_slam.pipelines.run.folder import MESH, WORLD, RunFolder
+from msgs_slam.pipelines.types import Frame, Metres
+from msgs_slam.pipelines.upright.world import load_world, read_world, up_in_run
+
+MODES = ("colour", "classes", "depth")
+MOST_CAMERAS = 60
+_USUAL_SIZE = 5.0
+"""The scene is shown this large: covariances travel in half precision, which has few digits for small numbers."""
+
+
+@dataclass(frozen=True)
+class ViewerCamera:
+    """world_from_cam (4, 4), vertical field of view in radians, width over height; frame of the run."""
+
+    frame: Frame
+    world_from_cam: NDArray[np.float64]
+    fov: float
+    aspect: float
+
+
+@dataclass(frozen=True)
+class ViewerScene:
+    """cloud: the M Gaussians in the world of the exported files; labels (M,) uint8 indices into `class_names`, VOID for
+    none, or None without classes; `scale` multiplies the world's lengths for show; up (3,); path (N, 3) camera centres
+    as shown; mesh_file of the run, if there is one; is_metric, metres: what a unit of the world is."""
+
+    title: str
+    cloud: GaussianCloud
+    scale: float
+    up: NDArray[np.float64]
+    labels: NDArray[np.uint8] | None = None
+    class_names: tuple[str, ...] = ()
+    class_colors: tuple[tuple[int, int, int], ...] = ()
+    cameras: list[ViewerCamera] = field(default_factory=list)
+    path: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    mesh_file: Path | None = None
+    run: RunFolder | None = None
+    is_metric: bool = False
+    metres: Metres | None = None
+
+    @cached_property
+    def centers(self) -> NDArray[np.float32]:
+        """(M, 3) as shown."""
+        return (self.cloud.means * self.scale).astype(np.float32)
+
+    @cached_property
+    def covariances(self) -> NDArray[np.float32]:
+        """(M, 3, 3) as shown."""
+        turn = Rotation.from_quat(self.cloud.quat_wxyz[:, [1, 2, 3, 0]]).as_matrix()
+        axes = turn * (np.exp(self.cloud.log_scales) * self.scale)[:, None, :]
+        return (axes @ axes.transpose(0, 2, 1)).astype(np.float32)
+
+    @cached_property
+    def opacities(self) -> NDArray[np.float32]:
+        """(M, 1)."""
+        return (1 / (1 + np.exp(-self.cloud.opacity_logits)))[:, None].astype(np.float32)
+
+    @cached_property
+    def colors(self) -> dict[str, NDArray[np.uint8]]:
+        """Mode → (M, 3), of all modes but depth, which is seen from somewhere."""
+        colors = {"colour": np.round(np.clip(self.cloud.colors, 0, 1) * 255).astype(np.uint8)}
+        if self.labels is not None and self.class_colors:
+            table = np.full((256, 3), 128, np.uint8)
+            table[: len(self.class_colors)] = np.array(self.class_colors, np.uint8)
+            colors["classes"] = table[self.labels]
+        return colors
+
+    def depth_colors(self, position: NDArray[np.float64], forward: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """(M, 3) near red, far blue: the depth of each Gaussian along the unit vector `forward` from `position` (3,),
+        both as shown. Behind the viewer it is as near as can be."""
+        depth = (self.centers - position.astype(np.float32)) @ forward.astype(np.float32)
+        seen = depth[depth > 0]
+        near, far = np.quantile(seen, (0.02, 0.98)) if len(seen) else (0.0, 1.0)
+        # Inverse depth, as in the pictures of the report: what is near has the finer steps.
+        low, high = 1 / max(float(far), 1e-6), 1 / max(float(near), 1e-6)
+        share = (1 / np.maximum(depth, max(float(near), 1e-6)) - low) / max(high - low, 1e-9)
+        shades = np.clip(share * 255, 0, 255).astype(np.uint8)
+        colors = np.asarray(cv2.applyColorMap(shades[:, None], cv2.COLORMAP_TURBO), np.uint8)
+        return np.ascontiguousarray(colors.reshape(-1, 3)[:, ::-1])
+
+
+def load_scenes(path: Path) -> list[ViewerScene]:
+    """Of a run folder and its pieces, largest first, or of a file of Gaussians. Raises InputError for anything else, or
+    a run without a map."""
+    with reaching(path):
+        is_file, is_folder = path.is_file(), path.is_dir()
+    if is_file:
+        return [_from_file(path)]
+    if not is_folder:
+        raise InputError(f"{path}: there is no such run folder or splat file")
+    outcome = load_outcome(RunFolder(path))
+    return [_from_run(outcome), *(_from_run(piece) for piece in outcome.pieces() if piece.gaussian_map is not None)]
+
+
+def _from_run(outcome: Outcome) -> ViewerScene:
+    world, up, run = load_world(outcome.run), up_in_run(outcome), outcome.run
+    outcome = outcome if world is None else on_earth(outcome.moved(world.exported_from_run), world)
+    m, cloud = outcome.require_map(), map_cloud(outcome)
+    t, k = outcome.trajectory, outcome.calibration.intrinsics
+    centers = t.centers[t.is_posed]
+    scale = _scale(cloud.means, centers)
+    fov, aspect = 2 * float(np.arctan(k.height / 2 / k.fy)), k.width / k.height
+    ids = evenly(t.frame_ids[t.is_keyframe].tolist(), MOST_CAMERAS)
+    world_from_cam = t.world_from_cam
+    channels = decided_channels(m.class_logits).cpu().numpy()
+    return ViewerScene(
+        title=f"{run.root.parent.name}, {run.root.name.replace('_', ' ')}" if run.is_piece else run.root.name,
+        cloud=cloud,
+        scale=scale,
+        up=up if world is None else world.exported_from_run.rotation @ up,
+        labels=labels_of_channels(channels, outcome.label_of_channel) if m.class_logits.shape[1] else None,
+        class_names=outcome.classes.names,
+        class_colors=outcome.classes.colors,
+        cameras=[
+            ViewerCamera(outcome.frames[row], world_from_cam[row], fov, aspect)
+            for row in (outcome.frame_row(i) for i in ids)
+        ],
+        path=centers * scale,
+        mesh_file=outcome.run.file("export", MESH) if outcome.run.has("export", MESH) else None,
+        run=outcome.run,
+        is_metric=outcome.metric,
+        metres=outcome.metres,
+    )
+
+
+def _from_file(path: Path) -> ViewerScene:
+    cloud = read_gaussians(path)
+    if len(cloud) == 0:
+        raise InputError(f"{path}: holds no Gaussians")
+    classes = 0 if cloud.class_ids is None else int(cloud.class_ids.max()) + 1
+    return ViewerScene(
+        title=path.name,
+        cloud=cloud,
+        scale=_scale(cloud.means, np.zeros((0, 3))),
+        up=_up_of_file(path),
+        labels=cloud.class_ids,
+        class_names=tuple(f"class {i}" for i in range(classes)),
+        class_colors=class_colors(classes),
+    )
+
+
+def _up_of_file(path: Path) -> NDArray[np.float64]:
+    """z in a PLY of this program's export, as world.json beside it says; else y points down, as in most splat files."""
+    world = path.with_name(WORLD)
+    stands = path.suffix in (".ply", ".safetensors") and world.is_file() and read_world(world).axes == "up"
+    return np.array([0.0, 0, 1] if stands else [0.0, -1, 0])
+
+
+def _scale(means: NDArray, centers: NDArray) -> float:
+    """So that most of the scene spans `_USUAL_SIZE`."""
+    points = np.concatenate([means.astype(np.float64), centers])
+    low, high = np.quantile(points, (0.05, 0.95), axis=0)
+    return _USUAL_SIZE / max(float((high - low).max()), 1e-9)

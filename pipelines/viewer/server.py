@@ -1,0 +1,247 @@
+"""An interactive view of a map in the browser, on viser (the optional extra `viewer`)."""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.pipelines.viewer.door import guarding
+from msgs_slam.pipelines.viewer.scene import MODES, ViewerCamera, ViewerScene, load_scenes
+from msgs_slam.pipelines.viewer.tools import Selection, Tape
+
+_FRUSTUM = 0.09
+_PREVIEW_WIDTH = 480
+
+
+def open_viewer(path: Path, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
+    """Serve a run folder or a Gaussian PLY at http://host:port; returns at once.
+
+    Raises InputError without viser, for a path that cannot be shown, or a port that is taken.
+    """
+    scenes = load_scenes(path)
+    try:
+        import viser
+    except ImportError as error:
+        raise InputError("the viewer needs viser: pip install 'msgs-slam[viewer]'") from error
+    try:
+        with guarding(host):
+            server = viser.ViserServer(host=host, port=port, label=f"MSGS-SLAM {plain(scenes[0].title)}", verbose=False)
+    except OSError as error:
+        raise InputError(f"port {port} cannot be used ({error.strerror}): choose another with --port") from error
+    return Viewer(server, scenes)
+
+
+class Viewer:
+    """The map as splats, the camera path with a frustum a keyframe, the mesh, the controls for them and the tools; of
+    one scene at a time, the first of `scenes` to begin with."""
+
+    def __init__(self, server: Any, scenes: list[ViewerScene]) -> None:
+        self.server, self.scenes = server, scenes
+        server.gui.configure_theme(show_logo=False)
+        self.boxes: dict[str, Any] = {}
+        self._sending = threading.Lock()
+        self.selection: Selection | None = None
+        self._load(scenes[0])
+        self._add_controls()
+        self._add_tools()
+        server.on_client_connect(self._place)
+
+    def _load(self, scene: ViewerScene) -> None:
+        """Everything of the scene, and nothing else."""
+        self.scene = scene
+        self.server.scene.reset()
+        self.server.scene.set_up_direction(scene.up)
+        self.show(MODES[0])
+        self._cameras = [self._add_camera(i, camera) for i, camera in enumerate(scene.cameras)]
+        self._path = self._add_path()
+        self._mesh = self._add_mesh()
+
+    def choose(self, number: int) -> None:
+        """Show another scene, as it begins."""
+        self._remove_tools()
+        self._load(self.scenes[number])
+        self._add_tools()
+        self.mode.value = MODES[0]
+        for name, box in self.boxes.items():
+            box.value = name != "Mesh"
+        for client in self.server.get_clients().values():
+            self._place(client)
+
+    @property
+    def url(self) -> str:
+        """Where to look."""
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def show(self, mode: str, client: Any = None) -> None:
+        """Colour the Gaussians by one of `MODES`; depth is seen from where `client` looks, else the first camera."""
+        s = self.scene
+        colors = s.depth_colors(*self._eye(client)) if mode == "depth" else s.colors[mode]
+        with self._sending:
+            rows = np.arange(len(s.cloud)) if self.selection is None else np.flatnonzero(self.selection.rows)
+            box = self.boxes.get("Show Gaussians")
+            visible = len(rows) > 0 and (box is None or bool(box.value))
+            rows = rows if len(rows) else np.zeros(1, np.int64)  # a page cannot be sent none
+            self._splats = self.server.scene.add_gaussian_splats(
+                "/map", s.centers[rows], s.covariances[rows], colors[rows].astype(np.float32) / 255,
+                s.opacities[rows], visible=visible,
+            )  # fmt: skip
+
+    def _eye(self, client: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(position, direction of view) as shown."""
+        if client is not None:
+            turn = Rotation.from_quat(np.asarray(client.camera.wxyz)[[1, 2, 3, 0]]).as_matrix()
+            return np.asarray(client.camera.position), turn[:, 2]
+        if self.scene.cameras:
+            world_from_cam = self.scene.cameras[0].world_from_cam
+            return world_from_cam[:3, 3] * self.scene.scale, world_from_cam[:3, 2]
+        outside, middle = self._outside()
+        return outside, (middle - outside) / np.linalg.norm(middle - outside)
+
+    def _outside(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where to look from at a scene without cameras, and where to: in front of it and a little above."""
+        middle, up = np.median(self.scene.centers, axis=0).astype(np.float64), self.scene.up
+        ahead = np.array([0.0, 1, 0]) if abs(up[2]) > 0.5 else np.array([0.0, 0, 1])
+        return middle + 2 * up - 7 * ahead, middle
+
+    def wait(self) -> None:
+        """Until the process is interrupted."""
+        self.server.sleep_forever()
+
+    def stop(self) -> None:
+        """End the server."""
+        self._remove_tools()
+        self.server.stop()
+
+    def _add_controls(self) -> None:
+        gui = self.server.gui
+        titles = [f"{plain(s.title)}: {len(s.centers):,} Gaussians" for s in self.scenes]
+        if len(titles) == 1:
+            gui.add_markdown("**{}**: {}".format(*titles[0].rsplit(": ", 1)))
+        else:
+            self.pieces = gui.add_dropdown("Piece", titles)
+            self.pieces.on_update(lambda _: self.choose(titles.index(self.pieces.value)))
+        modes = tuple(m for m in MODES if m in self.scene.colors or m == "depth")
+        self.mode = gui.add_dropdown("Gaussians", modes)
+        self.mode.on_update(lambda event: self.show(self.mode.value, event.client))
+        depth_here = gui.add_button("Depth from here", hint="Colour by depth, seen from the present view")
+        depth_here.on_click(self._show_depth)
+        self._checkbox("Show Gaussians", True, lambda on: setattr(self._splats, "visible", on))
+        if self._cameras:
+            self._checkbox("Cameras", True, self._show_cameras)
+        if any(scene.mesh_file for scene in self.scenes):
+            self._checkbox("Mesh", False, self._show_mesh)
+        if self.scene.cameras:
+            blank = np.full((30, 40, 3), 235, np.uint8)
+            self.preview = gui.add_image(blank, label="frame (click a camera)", format="jpeg")
+
+    def _add_tools(self) -> None:
+        self._tools = self.server.gui.add_folder("Tools")
+        with self._tools:
+            self.selection = Selection(self.server, self.scene, lambda: self.show(self.mode.value))
+            self.tape = Tape(self.server, self.scene, self.selection)
+
+    def _remove_tools(self) -> None:
+        if self.selection is not None:
+            self.tape.switch.value = False
+            self.selection.rest()
+            self._tools.remove()
+            self.selection = None
+
+    def _show_depth(self, event: Any) -> None:
+        self.mode.value = "depth"
+        self.show("depth", event.client)
+
+    def _checkbox(self, name: str, start: bool, change: Callable[[bool], None]) -> None:
+        box = self.boxes[name] = self.server.gui.add_checkbox(name, start)
+        box.on_update(lambda _: change(bool(box.value)))
+
+    def _show_cameras(self, on: bool) -> None:
+        for handle in [*self._cameras, *([self._path] if self._path is not None else [])]:
+            handle.visible = on
+
+    def _show_mesh(self, on: bool) -> None:
+        if self._mesh is not None:
+            self._mesh.visible = on
+
+    def _add_camera(self, number: int, camera: ViewerCamera) -> Any:
+        wxyz, position = self._pose(camera)
+        handle = self.server.scene.add_camera_frustum(
+            f"/cameras/{number:05d}", camera.fov, camera.aspect, scale=_FRUSTUM, color=(37, 99, 235),
+            thickness=1.5, thickness_units="screen", wxyz=wxyz, position=position,
+        )  # fmt: skip
+        handle.on_click(lambda event: None if self.tape.switch.value else self.visit(camera, event.client))
+        return handle
+
+    def _pose(self, camera: ViewerCamera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(wxyz, position) in the scene's size; viser's cameras look along +z with y down, as ours do."""
+        quat_xyzw = Rotation.from_matrix(camera.world_from_cam[:3, :3]).as_quat()
+        return quat_xyzw[[3, 0, 1, 2]], camera.world_from_cam[:3, 3] * self.scene.scale
+
+    def visit(self, camera: ViewerCamera, client: Any) -> None:
+        """Look from a camera, as after a click on it, and show its frame."""
+        if client is not None:
+            self._move(client, camera)
+            if self.mode.value == "depth":
+                self.show("depth", client)
+        if self.scene.run is not None:
+            label = f"{plain(camera.frame.name)}, {camera.frame.timestamp:.2f} s"
+            try:
+                self.preview.image = _reduced(self.scene.run.image(camera.frame))
+            except InputError as error:  # this frame alone: what else is shown was checked
+                label = plain(str(error))
+            self.preview.label = label
+
+    def _move(self, client: Any, camera: ViewerCamera) -> None:
+        wxyz, position = self._pose(camera)
+        with client.atomic():
+            client.camera.wxyz, client.camera.position = wxyz, position
+            client.camera.fov = camera.fov
+
+    def _place(self, client: Any) -> None:
+        """Behind and above the first camera, or outside a scene without cameras."""
+        if self.scene.cameras:
+            _, position = self._pose(self.scene.cameras[0])
+            forward = self.scene.cameras[0].world_from_cam[:3, 2]
+            with client.atomic():
+                client.camera.position = position - 0.9 * forward + 0.5 * self.scene.up
+                client.camera.look_at = position + 1.5 * forward
+            return
+        client.camera.position, client.camera.look_at = self._outside()
+
+    def _add_path(self) -> Any:
+        if len(self.scene.path) < 2:
+            return None
+        pairs = np.stack([self.scene.path[:-1], self.scene.path[1:]], axis=1).astype(np.float32)
+        return self.server.scene.add_line_segments(
+            "/path", pairs, (234, 88, 12), thickness=2.0, thickness_units="screen"
+        )
+
+    def _add_mesh(self) -> Any:
+        if self.scene.mesh_file is None:
+            return None
+        found = read_mesh_ply(self.scene.mesh_file)
+        mesh = trimesh.Trimesh(found.vertices, found.faces, vertex_colors=found.colors, process=False)
+        return self.server.scene.add_mesh_trimesh("/mesh", mesh, scale=self.scene.scale, visible=False)
+
+
+def plain(name: str) -> str:
+    """A name without what Markdown, HTML or the page's scripts could take for their own."""
+    return re.sub(r"[^\w .,()-]", "?", name)
+
+
+def _reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    if picture.shape[1] <= _PREVIEW_WIDTH:
+        return picture
+    size = (_PREVIEW_WIDTH, round(_PREVIEW_WIDTH * picture.shape[0] / picture.shape[1]))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)

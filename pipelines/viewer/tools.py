@@ -1,0 +1,183 @@
+"""The viewer's tools: which Gaussians are shown (classes, a box), what is saved of them, and a measuring tape."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from msgs_slam.formats.gaussian_ply import write_gaussian_ply
+from msgs_slam.pipelines.geometry.tape import Touch, tape, tape_text, touch
+from msgs_slam.pipelines.types import VOID
+from msgs_slam.pipelines.viewer.scene import ViewerScene
+
+_SETTLE_SECONDS = 0.25
+"""A slider is dragged through many values; the map is sent again once it rests."""
+_RED = (220, 38, 38)
+_LIFT = 0.06
+"""Of the scene as shown, which is about five long."""
+
+
+class Selection:
+    """Switches for classes and a box; `changed` is called when what is shown has changed."""
+
+    def __init__(self, server: Any, scene: ViewerScene, changed: Callable[[], None]) -> None:
+        self._server, self._scene, self._changed = server, scene, changed
+        self.classes: dict[int, Any] = {}
+        self._pending: threading.Timer | None = None
+        if scene.labels is not None:
+            with server.gui.add_folder("Classes", expand_by_default=False):
+                self._add_classes(scene.labels)
+        with server.gui.add_folder("Crop", expand_by_default=False):
+            self._add_box()
+        save = server.gui.add_button("Export what I see", hint="The Gaussians shown, as a splat PLY, where they are")
+        save.on_click(lambda event: self.save(event.client))
+
+    @property
+    def rows(self) -> NDArray[np.bool_]:
+        """(M,) which Gaussians are shown."""
+        shown = np.ones(len(self._scene.cloud), bool)
+        if self._scene.labels is not None:
+            table = np.ones(256, bool)
+            for label, switch in self.classes.items():
+                table[label] = switch.value
+            shown &= table[self._scene.labels]
+        if self.crop.value:
+            low, high = np.array([s.value for s in self.box]).T
+            shown &= ((self._scene.cloud.means >= low) & (self._scene.cloud.means <= high)).all(axis=1)
+        return shown
+
+    def ply(self) -> bytes:
+        """What is shown as the bytes of a splat PLY, in the world of the exported files."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "seen.ply"
+            write_gaussian_ply(path, self._scene.cloud.only(self.rows), self._scene.class_names)
+            return path.read_bytes()
+
+    def save(self, client: Any) -> None:
+        """The browser gets it as a download."""
+        if self.rows.any():
+            client.send_file_download(f"{Path(self._scene.title).stem}-seen.ply", self.ply(), save_immediately=True)
+
+    def _add_classes(self, labels: NDArray[np.uint8]) -> None:
+        counts = np.bincount(labels, minlength=256)
+        buttons = self._server.gui.add_button_group("All", ("on", "off"))
+        buttons.on_click(lambda _: self._switch_all(buttons.value == "on"))
+        for label in sorted(np.flatnonzero(counts).tolist(), key=lambda k: -counts[k]):
+            names = self._scene.class_names
+            name = "unknown" if label == VOID or label >= len(names) else names[label]
+            switch = self._server.gui.add_checkbox(f"{name} ({counts[label]:,})", True)
+            switch.on_update(lambda _: self._soon())
+            self.classes[label] = switch
+
+    def _switch_all(self, on: bool) -> None:
+        for switch in self.classes.values():
+            switch.value = on
+        self._soon()
+
+    def _add_box(self) -> None:
+        gui = self._server.gui
+        low, high = np.quantile(self._scene.cloud.means, (0.001, 0.999), axis=0).tolist()
+        self.crop = gui.add_checkbox("Only what is in the box", False)
+        self.crop.on_update(lambda _: self._soon())
+        self.box = []
+        for axis, a, b in zip("xyz", low, high, strict=True):
+            step = max((b - a) / 200, 1e-6)
+            top = a + 200 * step
+            slider = gui.add_multi_slider(axis, a, top, step, (a, top))
+            slider.on_update(lambda _: self._soon())
+            self.box.append(slider)
+
+    def rest(self) -> None:
+        """Nothing is sent any more of what was changed a moment ago."""
+        if self._pending is not None:
+            self._pending.cancel()
+
+    def _soon(self) -> None:
+        self.rest()
+        self._draw_box()
+        self._pending = threading.Timer(_SETTLE_SECONDS, self._changed)
+        self._pending.daemon = True
+        self._pending.start()
+
+    def _draw_box(self) -> None:
+        low, high = np.array([s.value for s in self.box]).T * self._scene.scale
+        size = tuple(float(v) for v in high - low)
+        self._server.scene.add_box(
+            "/crop", _RED, size, wireframe=True, position=(low + high) / 2, visible=bool(self.crop.value)
+        )
+
+
+class Tape:
+    """Two clicks on the map: a line with the distance and its standard deviation.
+
+    viser 1.1 takes no finger's tap on the scene for a click (a touched canvas holds its pointer from the start), so a
+    button marks what is in the middle of the view.
+    """
+
+    def __init__(self, server: Any, scene: ViewerScene, selection: Selection) -> None:
+        self._server, self._scene, self._selection = server, scene, selection
+        self._first: Touch | None = None
+        self.result = ""
+        with server.gui.add_folder("Measure"):
+            self.switch = server.gui.add_checkbox("Measuring tape", False, hint="Click two places of the map")
+            self._middle = server.gui.add_button(
+                "Mark the middle", hint="Instead of a click; for fingers", visible=False
+            )
+            self.told = server.gui.add_markdown("")
+        self._middle.on_click(lambda event: self.mark_middle(event.client))
+        self.switch.on_update(lambda _: self._turn(bool(self.switch.value)))
+
+    def click(self, event: Any) -> None:
+        """A place that the event's line of sight meets."""
+        self._place(np.asarray(event.ray_origin, np.float64), np.asarray(event.ray_direction, np.float64), event.client)
+
+    def mark_middle(self, client: Any) -> None:
+        """What is in the middle of the client's view."""
+        turn = Rotation.from_quat(np.asarray(client.camera.wxyz)[[1, 2, 3, 0]]).as_matrix()
+        self._place(np.asarray(client.camera.position, np.float64), turn[:, 2], client)
+
+    def _place(self, origin: NDArray[np.float64], direction: NDArray[np.float64], client: Any) -> None:
+        """The first end of the tape, or the second."""
+        pixel = float(client.camera.fov) / max(int(client.camera.image_height), 1)
+        cloud = self._scene.cloud.only(self._selection.rows)
+        found = touch(cloud, origin / self._scene.scale, direction / np.linalg.norm(direction), pixel)
+        if found is None:
+            self.told.content = "Nothing is there: click on the map."
+        elif self._first is None:
+            self._first = found
+            self._mark("/tape/first", found)
+            self.told.content = "And the second place."
+        else:
+            self._mark("/tape/second", found)
+            self._tell(self._first, found)
+            self._first = None
+
+    def _turn(self, on: bool) -> None:
+        self._server.scene.remove_click_callback()
+        self._server.scene.remove_by_name("/tape")
+        self._middle.visible = on
+        self._first, self.result, self.told.content = None, "", "Click two places of the map." if on else ""
+        if on:
+            self._server.scene.on_click()(self.click)
+
+    def _tell(self, first: Touch, second: Touch) -> None:
+        length, sd = tape(first, second)
+        self.result = tape_text(length, sd, self._scene.is_metric, self._scene.metres)
+        self.told.content = f"**{self.result}**"
+        # A little towards the eye, else what it is stretched over covers it.
+        ends = np.stack([t.point * self._scene.scale - _LIFT * t.direction for t in (first, second)]).astype(np.float32)
+        scene = self._server.scene
+        scene.add_line_segments("/tape/line", ends[None], _RED, thickness=3.0, thickness_units="screen")
+        scene.add_label("/tape/text", self.result, position=ends.mean(axis=0))
+
+    def _mark(self, name: str, found: Touch) -> None:
+        self._server.scene.remove_by_name("/tape" if name.endswith("first") else name)
+        place = found.point * self._scene.scale
+        self._server.scene.add_icosphere(name, 0.03, _RED, position=place)

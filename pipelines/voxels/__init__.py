@@ -1,0 +1,1 @@
+"""Voxels of the reconstructed room, and its floor, walls and ceiling."""
