@@ -2,8 +2,8 @@
 
     python tests/release.py [--same mapping ...]
 
-Writes pipelines/system/stage_versions.toml for the version in pyproject.toml. A stage named with --same keeps its number: say
-so only where its results are known to be the same bytes, for users keep what an older release has made.
+Writes pipelines/system/stage_versions.toml for the version in pyproject.toml. A stage named with --same keeps its
+number: say so only where its results are known to be the same bytes, for users keep what an older release has made.
 """
 
 import argparse
