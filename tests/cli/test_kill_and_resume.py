@@ -13,25 +13,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
-from cli_runs import elsewhere, files_below
+from cli_runs import QUICK, FinishedRun, elsewhere, files_below
 
-from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.run.names import STAGES
-from tests.world import ClipOptions, iter_clip, make_world
 
-SETTINGS = (
-    "run.threads=2", "mapping.passes=2", "mapping.min_iterations=40", "mapping.snapshot_every=15",
-    "mapping.max_gaussians=30000",
-)  # fmt: skip
 COMPARED = ("frames", "proxy", "tracking", "mapping", "global_ba", "export")
-
-
-@pytest.fixture(scope="module")
-def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    options = ClipOptions(frames=24, width=240, height=180, fps=10.0, laps=0.4)
-    path = tmp_path_factory.mktemp("clip") / "room.avi"
-    return write_video(path, [f.rgb for f in iter_clip(make_world(texel=0.01), options)], options.fps)
 
 
 def start(environment: dict[str, str], *arguments: object) -> subprocess.Popen[bytes]:
@@ -72,13 +58,11 @@ def finished_at(run: Path) -> dict[str, float]:
     return {name: (run / name).stat().st_mtime for name in stages}
 
 
-def test_killed_in_every_stage_the_run_ends_as_an_unbroken_one(clip: Path, tmp_path: Path) -> None:
-    options = [x for s in SETTINGS for x in ("--set", s)]
-    whole, broken, places = tmp_path / "whole.msgs", tmp_path / "broken.msgs", elsewhere(tmp_path)
-    finish(start(places, "reconstruct", clip, "--out", whole, *options))
-
+def test_killed_in_every_stage_the_run_ends_as_an_unbroken_one(finished_run: FinishedRun, tmp_path: Path) -> None:
+    options = [x for s in QUICK for x in ("--set", s)]
+    broken, places = tmp_path / "broken.msgs", elsewhere(tmp_path)
     killed = []
-    process = start(places, "reconstruct", clip, "--out", broken, *options)
+    process = start(places, "reconstruct", finished_run.video, "--out", broken, *options)
     for stage in STAGES:
         if kill_when(process, written(broken / f"{stage}.partial", 1)):
             killed.append(stage)
@@ -89,11 +73,11 @@ def test_killed_in_every_stage_the_run_ends_as_an_unbroken_one(clip: Path, tmp_p
     after = finished_at(broken)
     assert {name: after[name] for name in before} == before, "a finished stage was done again"
     assert set(killed) >= set(STAGES[:4]), f"killed only in {killed}: the others were too quick to catch"
-    assert digests(broken) == digests(whole)
+    assert digests(broken) == digests(finished_run.folder)
 
     # A changed setting of mapping: mapping and what follows are done again, nothing before.
-    finish(start(places, "resume", broken, "--set", "mapping.min_iterations=41"))
+    finish(start(places, "resume", broken, "--set", "mapping.min_iterations=21"))
     later = finished_at(broken)
     assert [name for name in STAGES if later[name] != after[name]] == ["mapping", "global_ba", "export"]
     assert files_below(*(tmp_path / name for name in ("home", "temporary", "here"))) == {}
-    assert {p.name for p in tmp_path.iterdir()} == {"whole.msgs", "broken.msgs", "home", "temporary", "here"}
+    assert {p.name for p in tmp_path.iterdir()} == {"broken.msgs", "home", "temporary", "here"}

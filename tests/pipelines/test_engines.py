@@ -79,7 +79,7 @@ def test_a_signal_ends_the_calls(engine: Engine, tmp_path: Path) -> None:
 def test_a_killed_parent_leaves_no_process_behind(tmp_path: Path) -> None:
     marker = tmp_path / "begun"
     code = (
-        "import engine_calls\nfrom pipelines.engine.engines import Call, LocalEngine\n"
+        "import engine_calls\nfrom msgs_slam.pipelines.engine.engines import Call, LocalEngine\n"
         f"list(LocalEngine().run([Call('waits', engine_calls.wait, ({str(marker)!r},))]))\n"
     )
     paths = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
@@ -116,7 +116,7 @@ def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) ->
 class NotInstalled(OSError):
     """As Ray tells of what goes wrong before a function begins."""
 
-    ip, cause = "10.0.0.7", ModuleNotFoundError("No module named 'pipelines'")
+    ip, cause = "10.0.0.7", ModuleNotFoundError("No module named 'msgs_slam'")
 
 
 class LosingRay:
