@@ -172,16 +172,10 @@ def test_the_viewer_shows_a_page_and_ends(demo: Path, port: int, stop: signal.Si
             stdout=stream, stderr=stream,
         )  # fmt: skip
     try:
-        page = b""
-        for _ in range(240):
-            try:
-                found = re.search(r"http://\S+", said.read_text())
-                page = urllib.request.urlopen(found[0] if found else f"http://127.0.0.1:{port}/", timeout=5).read()
-                break
-            except OSError:
-                assert viewer.poll() is None, said.read_text()[-2000:]
-                time.sleep(0.5)
-        assert b"<html" in page.lower()
+        while not (found := re.search(r"open (http://\S+)", said.read_text())):
+            assert viewer.poll() is None, said.read_text()[-2000:]
+            time.sleep(0.2)
+        assert b"<html" in urllib.request.urlopen(found[1], timeout=30).read().lower()
         viewer.send_signal(stop)
         assert viewer.wait(timeout=60) == 0
         assert "Traceback" not in said.read_text()
