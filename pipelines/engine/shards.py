@@ -122,21 +122,28 @@ class Posted:
         return any(self._do(n, about, prepare) for n in numbers)
 
     def _do(self, number: int, about: dict[str, Any], prepare: Callable[[str], Progress]) -> bool:
-        with suppress(FileNotFoundError), (self.folder / f"{number:04d}.lock").open("ab") as stream:
+        try:
+            stream = (self.folder / f"{number:04d}.lock").open("ab")
+        except FileNotFoundError:  # withdrawn
+            return False
+        with stream:
             if self.done(number).exists() or not take_lock(stream):
                 return False
             if self.done(number).exists() or not (self.folder / _READY).exists():
                 return False
-            if about["work"].partition(":")[0] not in TASK_MODULES:
-                raise InputError(f"{self.folder / _READY}: {about['work']} is no work on a task. Delete the folder")
-            work, folder = of_name(about["work"]), self.folder.parents[1] / about["folder"]
-            name, task = f"{work.__name__} {number + 1}", load_value(self.task(number))
-            refused, value = work_here(work, task, name, prepare, folder, about["threads"], about["code"])
-            if refused:
-                raise RecoverableError(f"{name}: {refused}")
-            save_value(self.done(number), value)
-            return True
-        return False
+            self._do_locked(number, about, prepare)
+        return True
+
+    def _do_locked(self, number: int, about: dict[str, Any], prepare: Callable[[str], Progress]) -> None:
+        """What the work raises is the work's own, a file that is missing above all: nobody tries again for it."""
+        if about["work"].partition(":")[0] not in TASK_MODULES:
+            raise InputError(f"{self.folder / _READY}: {about['work']} is no work on a task. Delete the folder")
+        work, folder = of_name(about["work"]), self.folder.parents[1] / about["folder"]
+        name, task = f"{work.__name__} {number + 1}", load_value(self.task(number))
+        refused, value = work_here(work, task, name, prepare, folder, about["threads"], about["code"])
+        if refused:
+            raise RecoverableError(f"{name}: {refused}")
+        save_value(self.done(number), value)
 
     def withdraw(self) -> None:
         """Nobody takes one up any more; waits for those who are at one."""

@@ -68,3 +68,10 @@ def halve_noted(task: tuple[Path, int], progress: SilentProgress) -> int:
     with path.open("a") as stream:
         stream.write("x")
     return halve(value, progress)
+
+
+def read_missing(path: Path, progress: SilentProgress) -> str:
+    """A bug: nobody has written the file that it reads."""
+    with path.with_name("attempts").open("a") as attempts:
+        attempts.write("x")
+    return path.read_text()

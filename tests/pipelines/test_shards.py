@@ -116,3 +116,12 @@ def test_a_run_cannot_name_other_work(folder: Path, monkeypatch: pytest.MonkeyPa
     posted = Posted.post(engine_calls.halve, [4], folder, 1)
     with pytest.raises(InputError, match="is no work on a task"):
         posted.do_one(Shard(0, 1), engine_calls.silent)
+
+
+def test_a_missing_file_inside_a_task_is_told_at_once(folder: Path) -> None:
+    posted = Posted.post(engine_calls.read_missing, [folder / "nowhere.txt"], folder, 1)
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.txt"):
+        posted.do_one(Shard(), engine_calls.silent)
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.txt"):
+        shared(0, 2).each(engine_calls.read_missing, [folder / "nowhere.txt"], folder)
+    assert (folder / "attempts").read_text() == "xx"
