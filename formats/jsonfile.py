@@ -26,10 +26,11 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
-def read_json(path: Path, most: int = MAX_JSON_BYTES) -> Any:
+def read_json(path: Path, most: int | None = MAX_JSON_BYTES) -> Any:
     """What a JSON file holds: numbers are finite and of at most 40 digits, texts are whole Unicode.
 
-    Raises InputError when it is missing, larger than `most` bytes, damaged, or nested too deep.
+    Raises InputError when it is missing, larger than `most` bytes (None, for what a run holds: of any size), damaged,
+    or nested too deep.
     """
     text = read_text(path, most)
     with parsing(path, "valid JSON", "was it cut short or edited by hand?"):
@@ -39,9 +40,9 @@ def read_json(path: Path, most: int = MAX_JSON_BYTES) -> Any:
     return value
 
 
-def read_json_object(path: Path) -> dict[str, Any]:
+def read_json_object(path: Path, most: int | None = MAX_JSON_BYTES) -> dict[str, Any]:
     """The object in a JSON file. Raises InputError as `read_json`, and when it holds something else."""
-    value = read_json(path)
+    value = read_json(path, most)
     if not isinstance(value, dict):
         raise InputError(f"{path} holds a {type(value).__name__}, expected an object in braces")
     return value

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import torch
 
 MAX_ARRAY_BYTES = 16 * 1024**3
-"""A file of arrays as they lie in memory that is larger is refused."""
+"""A foreign file of arrays as they lie in memory that is larger is refused."""
 
 _DTYPES = {
     "float64": "F64", "float32": "F32", "float16": "F16", "int64": "I64", "int32": "I32", "int16": "I16", "int8": "I8",
@@ -28,7 +28,8 @@ _DTYPES = {
 }  # fmt: skip
 
 MAX_UNPACKED_BYTES = 1024**3
-"""A packed file whose arrays would take more memory in total is refused: a few kilobytes can unpack to anything."""
+"""A foreign packed file whose arrays would take more memory in total is refused: a few kilobytes can unpack to
+anything."""
 
 
 def save_arrays(path: Path, arrays: Mapping[str, NDArray], *, compress: bool = True) -> None:
@@ -50,16 +51,17 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray], *, compress: bool = T
                     np.lib.format.write_array(file, np.asanyarray(arrays[name]), allow_pickle=False)
 
 
-def load_arrays(path: Path) -> dict[str, NDArray]:
-    """The arrays of an .npz file.
+def load_arrays(path: Path, *, own: bool = False) -> dict[str, NDArray]:
+    """The arrays of an .npz file; `own`: one of a run, which a checksum says that this program has written.
 
-    Raises InputError when it is missing, damaged, holds objects, or unpacks to more than `MAX_UNPACKED_BYTES`.
+    Raises InputError when it is missing, damaged, or holds objects; a foreign one too when it unpacks to more than
+    `MAX_UNPACKED_BYTES`: what was written of a long recording has to be read again, however large.
     """
     require_file(path)
     with parsing(path, ".npz file of plain arrays", "make it again"):
         with zipfile.ZipFile(path) as archive:
             total = sum(entry.file_size for entry in archive.infolist())
-        if total > MAX_UNPACKED_BYTES:
+        if total > MAX_UNPACKED_BYTES and not own:
             raise InputError(f"{path} would unpack to {total / 1e9:.0f} GB: it is not a file of this program")
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -74,10 +76,10 @@ def save_tensors(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
 
 
 def load_tensors(path: Path) -> dict[str, torch.Tensor]:
-    """All tensors of a .safetensors file, on the CPU. Raises InputError as `load_safetensors` does."""
+    """All tensors of a run's .safetensors file, of any size, on the CPU. Raises InputError as `load_safetensors`."""
     import safetensors.torch
 
-    require_file(path, MAX_ARRAY_BYTES)
+    require_file(path)
     with parsing(path, ".safetensors file", "make it again"):
         return safetensors.torch.load_file(path)
 

@@ -15,7 +15,7 @@ MAX_TEXT_BYTES = 48 * 1024 * 1024
 """150,000 poses of 16 numbers with all their digits. Taken apart into words, text needs twenty times its size."""
 
 
-def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
+def read_text(path: Path, most: int | None = MAX_TEXT_BYTES) -> str:
     """The text of a UTF-8 file. Raises InputError when it is missing, binary, or larger than `most` bytes."""
     text = read_bytes(path, most).removeprefix(codecs.BOM_UTF8).decode("utf-8", errors="replace")
     if "\0" in text[:4096]:

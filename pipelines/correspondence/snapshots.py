@@ -39,7 +39,7 @@ class Snapshots:
             features = compute()
             save_arrays(path, {"keypoints": features.keypoints, "descriptors": features.descriptors})
             return features
-        return Features(**load_arrays(path))
+        return Features(**load_arrays(path, own=True))
 
     def pairs(self, block: int, compute: Callable[[], list[VerifiedPair]]) -> list[VerifiedPair]:
         """One block of verified pairs, computed unless they are stored."""
@@ -48,7 +48,7 @@ class Snapshots:
             pairs = compute()
             save_arrays(path, _pack(pairs))
             return pairs
-        return _unpack(load_arrays(path))
+        return _unpack(load_arrays(path, own=True))
 
     def model(
         self, name: str, compute: Callable[[Path], pycolmap.Reconstruction | None]

@@ -36,7 +36,7 @@ def save_value(path: Path, value: Any) -> None:
 
 def load_value(path: Path) -> Any:
     """Inverse of `save_value`. Raises InputError for a file that is missing or damaged, or names a class of others."""
-    arrays = load_arrays(path)
+    arrays = load_arrays(path, own=True)
     with parsing(path, "value of this program", "delete it"):
         return _value(json.loads(arrays[_TREE].tobytes()), arrays)
 

@@ -124,7 +124,7 @@ def _require_several(source: AnySource) -> None:
 def _pick(context: StageContext, source: AnySource, faces: Faces | None) -> list[Frame]:
     table = context.snapshot / "picked.json"
     if table.exists():
-        stored = read_json(table)
+        stored = read_json(table, None)
         frames = [Frame(**row) for row in stored["frames"]]
         if all(picked(context, f.name).exists() for f in frames):
             for message in stored["warnings"]:
@@ -183,7 +183,7 @@ def _keyframes(context: StageContext, frames: list[Frame], masks: FrameMasks, ri
     table = context.snapshot / "keyframes.json"
     if not table.exists():
         write_json(table, rig.frames_of(_choose(context, frames, masks, rig).keyframes))
-    return read_json(table)
+    return read_json(table, None)
 
 
 def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks, rig: Rig) -> KeyframeChoice:

@@ -148,7 +148,7 @@ def save_found(path: Path, found: FoundLoops) -> None:
 
 def load_found(path: Path) -> FoundLoops:
     """Inverse of `save_found`."""
-    a = load_arrays(path)
+    a = load_arrays(path, own=True)
     ends = np.cumsum(a["lengths"])
     sides = [
         Sightings(a["point"][e - n : e], a["xy"][e - n : e], a["sd"][e - n : e])

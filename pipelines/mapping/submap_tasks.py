@@ -151,7 +151,7 @@ def join_submap(task: SubmapTask, progress: Progress) -> None:
 
 def _in_common_exposure(task: SubmapTask, result: SubmapResult) -> SubmapResult:
     """The same with the colours, and the exposures of its keyframes, that all submaps have in common."""
-    seen = [SeenExposures(**load_arrays(path)) for path in sorted(task.files.glob("exposures_*.npz"))]
+    seen = [SeenExposures(**load_arrays(path, own=True)) for path in sorted(task.files.glob("exposures_*.npz"))]
     log_gain, offset = (values[task.number] for values in common_exposure(seen))
     m = result.gaussian_map
     gain, shift = (torch.from_numpy(x).to(m.colors) for x in (np.exp(log_gain), offset))

@@ -18,10 +18,10 @@ def load_scale_spreads(run: RunFolder) -> tuple[list[float], float]:
     make the world agree with metric depth; ([], 0) where nothing of that is known."""
     sd, spreads = None, []
     if run.has("tracking", _TRACKED):
-        sd = read_json_object(run.file("tracking", _TRACKED)).get("scale_relative_sd")
+        sd = read_json_object(run.file("tracking", _TRACKED), None).get("scale_relative_sd")
     if run.has("proxy", _FRAME_SCALES):
         path = run.file("proxy", _FRAME_SCALES)
-        rows = read_json(path)
+        rows = read_json(path, None)
         with reading(path, "table of scales"):
             spreads = [float(r["spread"]) for r in rows]
     return spreads, float(sd or 0.0)

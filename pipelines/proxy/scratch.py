@@ -21,6 +21,6 @@ def save_scratch(path: Path, **arrays: NDArray) -> None:
 def load_scratch(path: Path) -> dict[str, NDArray]:
     """Inverse of `save_scratch`. Raises InputError when the file is damaged."""
     try:
-        return load_arrays(path)
+        return load_arrays(path, own=True)
     except InputError as error:
         raise InputError(f"{error}; delete it and type `msgs-slam resume`") from error

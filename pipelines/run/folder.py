@@ -63,7 +63,7 @@ class RunFolder(FinishedFiles):
     def load_frames(self) -> list[Frame]:
         """All picked frames in order."""
         path = self.file("frames", FRAMES)
-        rows = read_json(path)
+        rows = read_json(path, None)
         with reading(path, "table of frames"):
             frames = [dataclass_from_json(Frame, row) for row in rows]
             if [f.id for f in frames] != list(range(len(frames))):
@@ -73,7 +73,7 @@ class RunFolder(FinishedFiles):
     def load_calibration(self) -> Calibration:
         """The camera of the undistorted frames."""
         path = self.file("frames", CALIBRATION)
-        value = read_json(path)
+        value = read_json(path, None)
         with reading(path, "calibration"):
             return dataclass_from_json(Calibration, value)
 
@@ -117,7 +117,7 @@ class RunFolder(FinishedFiles):
     def load_classes(self) -> ClassTable:
         """Names and colours of the labels."""
         path = self.file("proxy", CLASSES)
-        rows = read_json(path)
+        rows = read_json(path, None)
         with reading(path, "table of classes"):
             colors = [(int(r), int(g), int(b)) for r, g, b in (row["color"] for row in rows)]
             if not all(0 <= value <= 255 for color in colors for value in color):
@@ -207,20 +207,20 @@ class RunFolder(FinishedFiles):
     def load_class_ids(self) -> tuple[int, ...]:
         """The label of each class channel of the map."""
         with reading(path := self.file("mapping", "mapping.json"), "table of class channels"):
-            ids = tuple(int(i) for i in read_json_object(path)["class_ids"])
+            ids = tuple(int(i) for i in read_json_object(path, None)["class_ids"])
             stored.require_indices("class_ids", np.array(ids, np.int64), VOID)
             return ids
 
     def load_submaps(self) -> list[dict[str, NDArray[np.int64]]]:
         """Of each submap the frame ids "own" and "border" and the numbers "beside" it; [] of a map made whole."""
         with reading(path := self.file("mapping", "mapping.json"), "table of submaps"):
-            rows = read_json_object(path).get("submaps", [])
+            rows = read_json_object(path, None).get("submaps", [])
             return [{k: np.array(row[k], np.int64).reshape(-1) for k in ("own", "border", "beside")} for row in rows]
 
     def load_loops(self) -> list[LoopEdge]:
         """The verified loops of the global adjustment."""
         path = self.file("global_ba", LOOPS)
-        rows = read_json(path)
+        rows = read_json(path, None)
         with reading(path, "table of loops"):
             edges = [dataclass_from_json(LoopEdge, row) for row in rows]
             for edge in edges:

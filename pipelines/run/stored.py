@@ -53,7 +53,7 @@ def reading(path: Path, what: str) -> Any:
 
 def load_layout(path: Path, layout: Mapping[str, str]) -> dict[str, NDArray]:
     """The arrays of an .npz file, every one of the layout and no other. Raises InputError for anything else."""
-    arrays = load_arrays(path)
+    arrays = load_arrays(path, own=True)
     with reading(path, "file of this program"):
         _require_layout(arrays, layout)
     return arrays

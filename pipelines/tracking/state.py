@@ -160,7 +160,7 @@ class TrackState:
     @staticmethod
     def load(path: Path, rig: Rig = ONE_CAMERA, shutter: Shutter | None = None) -> TrackState:
         """Inverse of `save`."""
-        a = load_arrays(path)
+        a = load_arrays(path, own=True)
         ends = np.cumsum(a["counts"])
         ids = [int(i) for i in a["ids"]]
         sightings = {
