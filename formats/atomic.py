@@ -44,12 +44,16 @@ def watched_by(watcher: Watcher) -> Iterator[None]:
         _watchers.remove(watcher)
 
 
+def process_mark() -> str:
+    """Of this process: on one disk no other has the same, on this machine or another."""
+    return f"{hashlib.sha256(platform.node().encode()).hexdigest()[:8]}-{os.getpid()}"
+
+
 @contextmanager
 def own_temporaries() -> Iterator[None]:
     """In this block temporary files have names that no other process gives, on this machine or another: several may
     write the same file at the same time, and the last one renamed stays. What a killed process leaves, stays too."""
-    machine = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
-    _own_mark.append(f"-{machine}-{os.getpid()}")
+    _own_mark.append(f"-{process_mark()}")
     try:
         yield
     finally:

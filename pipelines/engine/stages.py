@@ -19,7 +19,7 @@ from msgs_slam.formats.errors import DiskFullError, InputError, RecoverableError
 from msgs_slam.pipelines.config import Config, settings_of_stage
 from msgs_slam.pipelines.engine.workers import TaskWorkers
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.journal import JOURNAL, Journal, empty
+from msgs_slam.pipelines.run.journal import Journal, empty
 from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.run.records import (
     Manifest,
@@ -241,7 +241,7 @@ def _run_one(stage: Stage, context: StageContext, fingerprint: str, inputs: Any)
         raise
     shutil.rmtree(folder / "snapshot", ignore_errors=True)
     (folder / FINGERPRINT).unlink()
-    files = checksums(folder, but=(JOURNAL,))
+    files = checksums(folder, but=tuple(path.name for path in journal.files()))
     journal.close(files)
     shutil.rmtree(run.stage(stage.name), ignore_errors=True)
     os.replace(folder, run.stage(stage.name))

@@ -7,6 +7,7 @@ import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from msgs_slam.formats.atomic import process_mark
 from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.errors import RecoverableError
 from msgs_slam.pipelines.system.stopping import stop_if_asked
@@ -17,6 +18,9 @@ JOURNAL = ".written"
 @dataclass(frozen=True)
 class Journal:
     """A line `sha256 path` for every file that is written atomically below `folder`, before it takes its name.
+
+    Each process has a file of its own for its lines: where several machines append to one over a network disk, one's
+    line may be written over another's.
 
     Handed to `formats.atomic.watched_by`, so that no stage has to think of it. A file may have several lines: one that
     was killed between the line and the renaming still has the content of an earlier line, which is a whole one too.
@@ -30,7 +34,7 @@ class Journal:
         if path.is_relative_to(self.folder):
             # The end of line comes first: a line that a full disk has cut must not swallow the one after it.
             line = f"\n{file_sha256(temporary)} {path.relative_to(self.folder).as_posix()}"
-            with self._lock, (self.folder / JOURNAL).open("a", encoding="utf-8") as stream:
+            with self._lock, (self.folder / f"{JOURNAL}-{process_mark()}").open("a", encoding="utf-8") as stream:
                 stream.write(line)
 
     def written(self, path: Path) -> None:
@@ -38,14 +42,19 @@ class Journal:
         if path.is_relative_to(self.folder):
             stop_if_asked()
 
+    def files(self) -> list[Path]:
+        """The journals of all processes that have written here; one without a mark is of an earlier version."""
+        return sorted(self.folder.glob(f"{JOURNAL}*"))
+
     def discard_damaged(self, keep: tuple[str, ...] = ()) -> list[str]:
         """Remove every file that is not as some line says, and folders left empty; returns the names of those that
         have a line. What has none was being written when the attempt ended, or is no file of the stage."""
         known = self._known()
+        keep = (*keep, *(path.name for path in self.files()))
         damaged = []
         for path in sorted(p for p in self.folder.rglob("*") if p.is_file() or p.is_symlink()):
             name = path.relative_to(self.folder).as_posix()
-            if name in (JOURNAL, *keep) or (not path.is_symlink() and _digest(path) in known.get(name, ())):
+            if name in keep or (not path.is_symlink() and _digest(path) in known.get(name, ())):
                 continue
             damaged += [name] if name in known else []
             path.unlink()
@@ -66,14 +75,15 @@ class Journal:
                 f"{self.folder / torn[0]} is not what was written there ({len(torn)} such files): the disk may be full "
                 f"or failing. Type `msgs-slam resume {self.folder.parent}`"
             )
-        (self.folder / JOURNAL).unlink(missing_ok=True)
+        for path in self.files():
+            path.unlink(missing_ok=True)
 
     def _known(self) -> dict[str, set[str]]:
-        path = self.folder / JOURNAL
         known: dict[str, set[str]] = {}
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []:
-            digest, _, name = line.partition(" ")
-            known.setdefault(name, set()).add(digest)
+        for path in self.files():
+            for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+                digest, _, name = line.partition(" ")
+                known.setdefault(name, set()).add(digest)
         return known
 
 

@@ -11,7 +11,7 @@ from msgs_slam.formats.errors import DiskFullError, InputError
 from msgs_slam.pipelines.config import Config, MappingConfig, load_config
 from msgs_slam.pipelines.engine.stages import SameSource, Stage, StageContext, run_stages
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.journal import JOURNAL
+from msgs_slam.pipelines.run.journal import Journal
 from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.system.progress import SilentProgress
@@ -178,7 +178,7 @@ def test_line_of_the_journal_that_a_full_disk_has_cut_costs_no_other_file(record
     recorder.fail_in = "mapping"
     with pytest.raises(KeyboardInterrupt):
         bring_up_to_date(recorder, tmp_path / "r")
-    journal = RunFolder(tmp_path / "r").partial("mapping") / JOURNAL
+    (journal,) = Journal(RunFolder(tmp_path / "r").partial("mapping")).files()
     with journal.open("a") as file:
         file.write("\n0123456789abcdef")
     recorder.fail_in = ""
