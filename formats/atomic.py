@@ -46,7 +46,15 @@ def watched_by(watcher: Watcher) -> Iterator[None]:
 
 def process_mark() -> str:
     """Of this process: on one disk no other has the same, on this machine or another."""
-    return f"{hashlib.sha256(platform.node().encode()).hexdigest()[:8]}-{os.getpid()}"
+    return f"{machine_mark()}-{os.getpid()}"
+
+
+def machine_mark() -> str:
+    """Of this machine, or of the container where processes are counted apart from the machine's."""
+    counted = ""
+    with suppress(OSError):
+        counted = os.readlink("/proc/self/ns/pid")
+    return hashlib.sha256(f"{platform.node()}{counted}".encode()).hexdigest()[:8]
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from msgs_slam.pipelines.engine.stages import Stage, run_stages
 from msgs_slam.pipelines.engine.threads import set_threads
 from msgs_slam.pipelines.engine.workers import TaskWorkers
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock import LOCK, locked, make_folder
+from msgs_slam.pipelines.run.lock import LEADER, LOCK, locked, make_folder
 from msgs_slam.pipelines.run.names import SOURCE_LIST, STAGES
 from msgs_slam.pipelines.run.records import StageRecord, load_records, load_source, recorded_config
 from msgs_slam.pipelines.run.settings_file import load_settings
@@ -158,7 +158,7 @@ def _require_run_or_empty(run: RunFolder) -> None:
     if not run.root.is_dir() or run.manifest_file.exists():
         return
     # All that there is when the first file is being written.
-    begun = {LOCK, SOURCE_LIST, temporary_of(run.manifest_file).name}
+    begun = {LOCK, LEADER, SOURCE_LIST, temporary_of(run.manifest_file).name}
     if any(p.name not in begun for p in run.root.iterdir()):
         raise InputError(f"{run.root} exists and is not a run folder. Choose another with --out FOLDER")
 

@@ -11,9 +11,10 @@ from typing import IO
 
 from msgs_slam.formats.errors import InputError, RecoverableError
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.lock_file import leading
 from msgs_slam.pipelines.run.records import load_records
 
-LOCK = ".lock"
+LOCK, LEADER = ".lock", ".leader"
 
 
 class RunBusyError(InputError):
@@ -22,7 +23,8 @@ class RunBusyError(InputError):
 
 @contextmanager
 def locked(run: RunFolder) -> Iterator[None]:
-    """Hold the run's lock; the system lets go of it when the process ends, however it ends.
+    """Hold the run's lock; the system lets go of it when the process ends, however it ends. On a disk without locks a
+    file that only one process can make does the same (`lock_file`).
 
     The folder is made where it is missing, and removed again when the block ends with an error before the work began,
     or with an InputError, but for a RecoverableError, before a stage is done: what cannot be used leaves nothing
@@ -30,8 +32,8 @@ def locked(run: RunFolder) -> Iterator[None]:
     another process does, or when the folder cannot be written.
     """
     made = make_folder(run.root)
-    with _open(run.root / LOCK) as stream:
-        if not take_lock(stream) or not _still_there(stream, run.root / LOCK):
+    with _open(run.root / LOCK) as stream, _alone(stream, run.root) as alone:
+        if not alone or not _still_there(stream, run.root / LOCK):
             raise RunBusyError(f"{run.root}: another msgs-slam process is working on this run. Wait for it to end")
         try:
             yield
@@ -68,9 +70,25 @@ def _open(path: Path) -> IO[bytes]:
         ) from error
 
 
+@contextmanager
+def _alone(stream: IO[bytes], root: Path) -> Iterator[bool]:
+    """Whether no other process leads."""
+    taken = _take(stream)
+    if taken is not None:
+        yield taken
+        return
+    with leading(root / LEADER) as alone:
+        yield alone
+
+
 def take_lock(stream: IO[bytes]) -> bool:
-    """Whether the lock of an open file could be had; it is held until the file is closed. A system with neither kind of
-    lock leaves it to the user."""
+    """Whether the lock of an open file could be had, or there are no locks here; it is held until the file is closed.
+    For work that may be done twice."""
+    return _take(stream) is not False
+
+
+def _take(stream: IO[bytes]) -> bool | None:
+    """None where the disk or the system has no locks."""
     try:
         import fcntl
     except ImportError:
@@ -80,15 +98,15 @@ def take_lock(stream: IO[bytes]) -> bool:
     except BlockingIOError:
         return False
     except OSError:  # a network disk without locks
-        return True
+        return None
     return True
 
 
-def _take_on_windows(stream: IO[bytes]) -> bool:
+def _take_on_windows(stream: IO[bytes]) -> bool | None:
     try:
         import msvcrt
     except ImportError:
-        return True
+        return None
     stream.seek(0)
     try:
         msvcrt.locking(stream.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
