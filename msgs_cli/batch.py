@@ -68,12 +68,12 @@ def batch(
     texts = (*overrides, *source_settings(about_source))
     config = load_config(config_file, texts)
     out.mkdir(parents=True, exist_ok=True)
-    engine, cpus, more = _open_engine(engine_name, address, config.run.threads)
+    engine, cpus, threads = _open_engine(engine_name, address, config.run.threads)
     gpus = int(config.run.device == "cuda")
     prepare = worker_setup(quiet, verbose, engine_name == "ray")
     try:
         with stopping_softly("The same command goes on with it."):
-            failed = run_batch(mine, engine, settings, (*texts, *more), until, prepare, cpus, gpus)
+            failed = run_batch(mine, engine, settings, texts, until, prepare, cpus, gpus, threads)
     finally:
         rows = table_rows(recordings)
         write_table(out, rows)
@@ -86,16 +86,16 @@ def batch(
         sys.exit(1)
 
 
-def _open_engine(name: str, address: str, threads: int) -> tuple[LocalEngine | RayEngine, int, tuple[str, ...]]:
-    """The engine, the CPUs of a recording, and the settings that follow: the same number of threads on every node, or
-    the results would differ."""
+def _open_engine(name: str, address: str, threads: int) -> tuple[LocalEngine | RayEngine, int, int]:
+    """The engine, the CPUs of a recording, and the threads that follow: as many on every node, or the results would
+    differ; 0 for all of the machine's."""
     from msgs_slam.pipelines.engine.engines import LocalEngine, RayEngine
 
     if name == "local":
-        return LocalEngine(), 1, ()
+        return LocalEngine(), 1, threads
     engine = RayEngine(address)
     cpus = threads or engine.smallest_node
-    return engine, cpus, (f"run.threads={cpus}",)
+    return engine, cpus, cpus
 
 
 def _print(rows: list[dict[str, object]]) -> None:

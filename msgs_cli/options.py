@@ -8,7 +8,6 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -89,8 +88,8 @@ def require_engine(name: str, address: str) -> None:
 def cluster_workers(
     name: str, address: str, config: Config, quiet: bool, verbose: bool
 ) -> Iterator[tuple[Workers | None, Config]]:
-    """The workers that take a run's tasks, None for this process, and the settings that follow: the same number of
-    threads on every node, or the results would differ."""
+    """The workers that take a run's tasks, None for this process, each with as many threads, or the results would
+    differ; and the settings, as they were asked for: the next process may work elsewhere."""
     require_engine(name, address)
     if name == "local":
         yield None, config
@@ -102,10 +101,7 @@ def cluster_workers(
     try:
         threads = config.run.threads or engine.smallest_node
         setup, gpus = worker_setup(quiet, verbose, True), int(config.run.device == "cuda")
-        yield (
-            Workers(engine, setup, threads, gpus, engine.room(threads)),
-            replace(config, run=replace(config.run, threads=threads)),
-        )
+        yield Workers(engine, setup, threads, gpus, engine.room(threads)), config
     finally:
         engine.close()
 

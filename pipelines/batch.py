@@ -52,7 +52,8 @@ class Recording:
 @dataclass(frozen=True)
 class Job:
     """What travels to wherever a recording is worked on. `settings`: of a file, by section; `prepare` sets logging up
-    there and makes the progress; `code`: identity of the stages' code here."""
+    there and makes the progress; `code`: identity of the stages' code here; `threads`: how many it takes where the
+    settings leave that open, 0 for all."""
 
     recording: Recording
     settings: Mapping[str, Any]
@@ -60,6 +61,7 @@ class Job:
     until: str
     prepare: Callable[[str], Progress]
     code: str
+    threads: int = 0
 
     def config(self) -> Config:
         """The settings: those that the run has already, then the file's, then the overrides."""
@@ -99,12 +101,14 @@ def run_batch(
     prepare: Callable[[str], Progress],
     cpus: int = 1,
     gpus: int = 0,
+    threads: int = 0,
 ) -> list[Recording]:
     """Bring the runs of these recordings up to date; returns those that failed. What another process works on is left
-    to it. Raises InputError before anything slow for settings that cannot be."""
+    to it; each takes so many `threads` where the settings leave that open. Raises InputError before anything slow for
+    settings that cannot be."""
     load_config(None, overrides, merge_settings(Config(), settings, "the settings file"))
     code = code_identity()
-    jobs = {r.name: Job(r, settings, overrides, until, prepare, code) for r in recordings}
+    jobs = {r.name: Job(r, settings, overrides, until, prepare, code, threads) for r in recordings}
     calls = [Call(name, work_on, (job,), cpus, gpus) for name, job in jobs.items()]
     failed = []
     for ended in engine.run(calls):
@@ -125,7 +129,7 @@ def work_on(job: Job) -> str:
     recording, progress = job.recording, job.prepare(job.recording.name)
     try:
         require_same_world([recording.source, recording.run.parent], job.code)
-        reconstruct(recording.source, RunFolder(recording.run), job.config(), progress, job.until)
+        reconstruct(recording.source, RunFolder(recording.run), job.config(), progress, job.until, threads=job.threads)
     except RunBusyError:
         return ELSEWHERE
     except InputError as error:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from msgs_slam.formats.atomic import temporary_of, write_text
@@ -86,18 +85,22 @@ def reconstruct(
     progress: Progress,
     until: str = STAGES[-1],
     workers: TaskWorkers | None = None,
+    threads: int = 0,
 ) -> dict[str, StageRecord]:
-    """Make, or bring up to date, the run of `source`.
+    """Make, or bring up to date, the run of `source`; with so many `threads` where the settings leave it open.
+
+    What is open in the settings (`run.device=auto`, `run.threads=0`) is decided anew by every process that works on the
+    run, and stays open in run.toml: the next one may be on another machine.
 
     Raises InputError for a source that cannot be used and for a folder that holds something else; a folder made by
     this call is removed again when the source turns out to be unusable.
     """
     digest = source_digest(source, config.run.format)
     _require_run_or_empty(run)
-    config = _with_device(config)
+    settle_device(config.run.device)  # refused before anything is written
     with locked(run):
         _require_same_source(run, source, digest)
-        return _run(run, source.resolve(), digest, config, progress, until, workers)
+        return _run(run, source.resolve(), digest, config, progress, until, workers, threads)
 
 
 def resume(
@@ -114,7 +117,8 @@ def resume(
         raise InputError(f"{run.root} is a piece of {run.root.parent}: type `msgs-slam resume {run.root.parent}`")
     origin = load_source(run)
     source = Path(origin.path)
-    config = _with_device(config or load_settings(run))
+    config = config or load_settings(run)
+    settle_device(config.run.device)
     with locked(run):
         once_locked()
         return _run(run, source, origin.digest, config, progress, until, workers)
@@ -136,6 +140,7 @@ def _run(
     progress: Progress,
     until: str,
     workers: TaskWorkers | None,
+    threads: int = 0,
 ) -> dict[str, StageRecord]:
     def same_source() -> None:
         kept = f"What is done so far is kept: bring it back, then type `msgs-slam resume {run.root}`"
@@ -149,8 +154,9 @@ def _run(
                 "folder: --out NEW"
             )
 
-    set_threads(config.run.threads or os.cpu_count() or 1)
-    return run_stages(all_stages(), run, source, digest, config, progress, until, same_source, workers)
+    threads = config.run.threads or (workers.threads if workers else threads) or os.cpu_count() or 1
+    set_threads(threads)
+    return run_stages(all_stages(), run, source, digest, config, progress, until, same_source, workers, threads)
 
 
 def _require_run_or_empty(run: RunFolder) -> None:
@@ -172,7 +178,3 @@ def _require_same_source(run: RunFolder, source: Path, digest: str) -> None:
             f"{run.root} is the run of another source ({origin.path}), not of {source}. "
             "Choose another folder with --out FOLDER, or delete it"
         )
-
-
-def _with_device(config: Config) -> Config:
-    return replace(config, run=replace(config.run, device=settle_device(config.run.device)))

@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -143,8 +143,11 @@ def run_stages(
     until: str = STAGES[-1],
     same_source: SameSource = _trusted,
     workers: TaskWorkers | None = None,
+    threads: int = 0,
 ) -> dict[str, StageRecord]:
     """Bring every stage up to `until` up to date; returns their records.
+
+    `config` is what was asked for, and is saved; the stages work with so many `threads` where it leaves that open.
 
     A stage is up to date when its fingerprint (code, own settings, seed, own inputs, content of the stages before
     it) and its files are unchanged. Nothing of the run changes before everything that can be checked is; then the
@@ -166,8 +169,10 @@ def run_stages(
             if _drop(records, stage.name):
                 write_manifest(run.manifest_file, Manifest(origin, records))
             folder = run.partial(stage.name)
-            context = StageContext(run, source, config, folder, progress, [], stages, same_source, workers)
+            settled = replace(config, run=replace(config.run, threads=config.run.threads or threads))
+            context = StageContext(run, source, settled, folder, progress, [], stages, same_source, workers)
             record = _run_one(stage, context, fingerprint, inputs[stage.name])
+            record = replace(record, settings=settings_of(config, stage.name))
             records[stage.name] = record
             write_manifest(run.manifest_file, Manifest(origin, records))
             for later in STAGES[STAGES.index(stage.name) + 1 :]:  # made from what is no longer there
@@ -255,7 +260,6 @@ def _run_one(stage: Stage, context: StageContext, fingerprint: str, inputs: Any)
         context.warnings,
         content_digest(files),
         inputs,
-        settings_of(context.config, stage.name),
     )
 
 

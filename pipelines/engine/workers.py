@@ -33,6 +33,11 @@ class TaskWorkers(Protocol):
         """How many tasks may run at the same time."""
         ...
 
+    @property
+    def threads(self) -> int:
+        """How many threads each takes: the same everywhere, or the results would differ."""
+        ...
+
     def each(self, work: Callable[[T, Progress], R], tasks: Sequence[T], folder: Path) -> list[R]:
         """What `work` returns of every task, in their order; they write below `folder`, a stage's unfinished one."""
         ...

@@ -114,7 +114,7 @@ def surroundings(context: StageContext, sequence: Sequence) -> Surroundings:
         context.config.proxy,
         lambda name: context.snapshot / name,
         context.threads,
-        context.config.run.device,
+        context.device,
         context.progress,
         open_recording(context.source, context.config.run.format),
         context.config.run.cache_mb,

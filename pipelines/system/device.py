@@ -1,6 +1,8 @@
-"""Where dense work runs: decided here, once a command."""
+"""Where dense work runs: decided here, by every process for itself."""
 
 from __future__ import annotations
+
+import functools
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.system.progress import log
@@ -17,5 +19,10 @@ def settle_device(wanted: str = "auto") -> str:
         )
     if wanted != "auto":
         return wanted
-    log.info("device: %s", "cuda" if found else "cpu")
-    return "cuda" if found else "cpu"
+    return _told("cuda" if found else "cpu")
+
+
+@functools.cache
+def _told(device: str) -> str:
+    log.info("device: %s", device)  # once
+    return device

@@ -12,9 +12,9 @@ import pytest
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.run import lock_file
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import LEADER, RunBusyError, locked
 from msgs_slam.pipelines.run.lock_file import SILENT, leading
-from msgs_slam.pipelines.run.folder import RunFolder
 
 
 @pytest.fixture
