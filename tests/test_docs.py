@@ -122,6 +122,9 @@ def test_site_is_built_without_a_broken_link(tmp_path: Path) -> None:
     # Nothing is fetched from elsewhere: the site works from the disk.
     for name, page in pages.items():
         assert not re.findall(r'(?:src|<link[^>]* href)="https?://[^"]*"', page), name
+        assert not re.findall(r"8 ?(?:&lt;|<)", re.sub(r"<[^>]+>", "", page)), f"{name}: a snippet was not put in"
+    assert "def write_class_boxes" in re.sub(r"<[^>]+>", "", pages["extending"])
+    assert (tmp_path / "search" / "search_index.js").is_file()  # as a script, which pages opened from the disk can load
 
 
 def test_settings_page_has_every_setting() -> None:

@@ -1,0 +1,77 @@
+"""The wide picture at the top of the README: a frame of a run, and map, classes and mesh from the same place.
+
+python tests/benchmarks/first_picture.py RUN.msgs docs/pictures/wide.jpg [--frame 12]
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.pipelines.evaluation.measure import render_outcome
+from msgs_slam.pipelines.evaluation.pictures import label_picture
+from msgs_slam.pipelines.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.upright.world import read_world
+from tests.benchmarks.textured_mesh import VertexColours
+
+WIDTH = 400
+"""Pixels of one of the four."""
+_LIGHT = np.array([0.4, -0.5, 0.77])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("target", type=Path)
+    parser.add_argument("--frame", type=int, help="a row of the run's frames; default: the middle one")
+    args = parser.parse_args()
+    outcome = load_outcome(RunFolder(args.run))
+    row = args.frame if args.frame is not None else len(outcome.frames) // 2
+    panels = {"video": outcome.run.image(outcome.frames[row]), **drawn(outcome, row)}
+    strip = np.concatenate([titled(name, picture) for name, picture in panels.items()], axis=1)
+    cv2.imwrite(str(args.target), cv2.cvtColor(strip, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 88])
+
+
+def drawn(outcome: Outcome, row: int) -> dict[str, NDArray[np.uint8]]:
+    """Map, classes and mesh as the camera of that frame sees them."""
+    cam_from_world = outcome.trajectory.cam_from_world[row]
+    view = render_outcome(outcome, cam_from_world)
+    world = read_world(outcome.run.file("export", "world.json"))
+    mesh = read_mesh_ply(outcome.run.file("export", "mesh.ply"))
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    normals = np.zeros_like(mesh.vertices, dtype=np.float64)
+    for k in range(3):
+        np.add.at(normals, mesh.faces[:, k], np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    light = (150 + 90 * normals @ _LIGHT)[:, None].clip(40, 250)
+    shaded = (light * np.array([0.98, 0.97, 0.94])).astype(np.uint8)
+    moved = outcome.moved(world.exported_from_run).trajectory.cam_from_world[row]
+    color, covered = VertexColours(mesh.vertices, mesh.faces, shaded).draw(moved, outcome.calibration.intrinsics)
+    surface = np.where(covered[..., None], np.round(255 * color.clip(0, 1)), 255).astype(np.uint8)
+    return {
+        "Gaussian map": view.exposed(outcome.exposure, outcome.frames[row].timestamp),
+        "classes": label_picture(view.labels, outcome.classes.colors),
+        "mesh": surface,
+    }
+
+
+def titled(name: str, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """At `WIDTH`, with its name in the corner and a gap on the right."""
+    size = (WIDTH, round(WIDTH * picture.shape[0] / picture.shape[1]))
+    resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if picture.shape[1] > WIDTH else cv2.INTER_CUBIC)
+    for thickness, shade in ((3, (0, 0, 0)), (1, (255, 255, 255))):
+        cv2.putText(resized, name, (10, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.62, shade, thickness, cv2.LINE_AA)
+    return np.pad(resized, ((0, 0), (0, 4), (0, 0)), constant_values=255)
+
+
+if __name__ == "__main__":
+    main()
