@@ -42,6 +42,10 @@ def on_post_page(output: str, **_: Any) -> str:
     return output.replace(_SHIM, "disk_worker.js")
 
 
+on_post_template = on_post_page
+"""The page for addresses that are not there."""
+
+
 def _mathml(found: re.Match[str]) -> str:
     return convert(html.unescape(found[2]), display="inline" if found[1] == "span" else "block")
 
