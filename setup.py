@@ -14,5 +14,5 @@ setup(
         *(f"{name}.{sub}" for name, folder in FOLDERS.items() for sub in find_packages(folder, exclude=["msgs_slam"])),
     ],
     package_dir=FOLDERS,
-    package_data={"msgs_slam.pipelines": ["**/*.toml", "**/*.json", "demo_clip/*"]},
+    package_data={"msgs_slam.pipelines": ["**/*.toml", "**/*.json", "demo_clip/*", "export/page/*"]},
 )

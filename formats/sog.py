@@ -37,7 +37,7 @@ def write_sog(path: Path, cloud: GaussianCloud) -> None:
     if len(cloud) == 0:
         raise ValueError("write_sog: a cloud without Gaussians cannot be written")
     means = cloud.means.astype(np.float64)
-    order = _morton_order(means)
+    order = morton_order(means)
     logs = np.sign(means) * np.log1p(np.abs(means))
     low, high = logs.min(axis=0), logs.max(axis=0)
     steps = np.round((logs - low) / np.maximum(high - low, 1e-12) * 65535).astype(np.uint16)
@@ -86,7 +86,7 @@ def _quaternion_bytes(quat_wxyz: Array) -> NDArray[np.uint8]:
     return np.column_stack([parts, _FIRST_QUATERNION_KIND + largest]).astype(np.uint8)
 
 
-def _morton_order(means: Array) -> NDArray[np.int64]:
+def morton_order(means: Array) -> NDArray[np.int64]:
     """(M,) rows along a curve that leaves small cubes last; ties as they came."""
     low, high = means.min(axis=0), means.max(axis=0)
     cells = ((means - low) / np.maximum(high - low, 1e-12) * ((1 << _MORTON_BITS) - 1)).astype(np.int64)

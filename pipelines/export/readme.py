@@ -25,6 +25,8 @@ point_cloud.spz           only with --set export.spz=true: the colours of the ma
 point_cloud.sog           only by `msgs-slam export RUN --only sog`: the same, smaller still (PlayCanvas, SuperSplat).
 point_cloud.glb           only with --set export.splat_glb=true: the map in glTF (KHR_gaussian_splatting), classes as
                           attribute _LABEL; programs that do not know the extension show coloured points.
+map.html                  only by `msgs-slam export RUN --only html`: the map to look at in any browser, without a
+                          server or a network, on a computer or a phone.
 mesh.ply, mesh.glb        the surface with a colour and a label (PLY: property label, GLB: attribute _LABEL) at each
                           vertex. MeshLab, Blender, trimesh.
 mesh_textured.obj, .mtl, .png, mesh_textured.glb   only with --set export.texture=true: a tenth of the mesh's vertices,

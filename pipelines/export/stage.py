@@ -20,6 +20,7 @@ from msgs_slam.pipelines.export.pieces import make_pieces
 from msgs_slam.pipelines.export.tasks import MeshWorkers, scratch_of
 from msgs_slam.pipelines.export.textured import make_textured, write_textured
 from msgs_slam.pipelines.export.tiles import write_tiles
+from msgs_slam.pipelines.export.web_page import write_web_page
 from msgs_slam.pipelines.export.writers import (
     write_colmap,
     write_glb_file,
@@ -254,6 +255,7 @@ def export_run(
         "spz": lambda: write_spz_file(outcome, world, settings.spz_version, folder),
         "sog": lambda: write_sog_file(outcome, world, folder),
         "glb": lambda: write_glb_file(outcome, world, folder),
+        "html": lambda: write_web_page(outcome, world, folder),
         "mesh": lambda: mesh("mesh"),
         "texture": lambda: mesh("texture"),
         "tum": lambda: write_trajectory(outcome, folder),

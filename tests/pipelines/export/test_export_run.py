@@ -137,6 +137,7 @@ def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
         "spz": "point_cloud.spz",
         "sog": "point_cloud.sog",
         "glb": "point_cloud.glb",
+        "html": "map.html",
         "tum": "trajectory.txt",
     }
     for only in set(EXPORTS) - {"mesh", "texture"}:

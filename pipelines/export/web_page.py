@@ -1,0 +1,141 @@
+"""The map as one HTML file that opens from the disk, without a server or a network, on a computer and on a phone.
+
+The page holds the Gaussians and a renderer of its own for them (`page/`, WebGL 2): isotropic ones are circles on the
+screen, a square each, sorted by depth. What it draws is what `gaussians/render` draws, up to the 8 bits of a screen.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import re
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_slam.formats.atomic import write_text
+from msgs_slam.formats.gaussians import GaussianCloud
+from msgs_slam.formats.sog import morton_order
+from msgs_slam.pipelines.export.writers import map_cloud
+from msgs_slam.pipelines.geometry.rig import rig_of
+from msgs_slam.pipelines.outcome import Outcome, evenly
+from msgs_slam.pipelines.types import VOID
+from msgs_slam.pipelines.upright.world import World
+
+WEB_PAGE = "map.html"
+MOST_GAUSSIANS = 1_500_000
+"""About 20 MB of page, what can be sent by mail; of larger maps the least visible are left out."""
+MOST_CAMERAS = 120
+_PARTS = Path(__file__).parent / "page"
+_SCRIPTS = ("cloud.js", "draw.js", "moves.js", "tape.js", "page.js")
+_Z_UP_FROM_IMAGE_AXES = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+
+
+def write_web_page(outcome: Outcome, world: World, folder: Path) -> list[Path]:
+    """map.html; nothing where there are no Gaussians. `outcome` stands in `world`."""
+    cloud = map_cloud(outcome)
+    if len(cloud) == 0:
+        return []
+    upright = np.eye(3) if world.axes == "up" else _Z_UP_FROM_IMAGE_AXES
+    about, packed = pack_cloud(cloud, upright)
+    about |= _classes(cloud, outcome) | _cameras(outcome, upright) | _unit(outcome, world)
+    write_text(folder / WEB_PAGE, _page(outcome.run.root.stem, about, packed))
+    return [folder / WEB_PAGE]
+
+
+def pack_cloud(cloud: GaussianCloud, upright: NDArray[np.float64]) -> tuple[dict[str, Any], bytes]:
+    """What `cloud.js` unpacks: ranges for reading it, and 12 bytes a Gaussian, a plane a byte, under gzip.
+
+    A place is 16 bits of a logarithm an axis, as a difference to the Gaussian before it on a curve that leaves small
+    cubes last; radius, opacity, colour and class 8 bits each. The same cloud gives the same bytes.
+    """
+    total, opacity = len(cloud), 1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))
+    if total > MOST_GAUSSIANS:
+        visible = opacity * np.exp(2 * cloud.log_scales[:, 0].astype(np.float64))
+        cloud = cloud.only(np.sort(np.argsort(-visible, kind="stable")[:MOST_GAUSSIANS]))
+    means = cloud.means.astype(np.float64) @ upright.T
+    order = morton_order(means)
+    cloud, means = cloud.only(order), means[order]
+    logs, radii = np.sign(means) * np.log1p(np.abs(means)), cloud.log_scales[:, 0].astype(np.float64)
+    low, high, smallest, largest = logs.min(axis=0), logs.max(axis=0), radii.min(), radii.max()
+    steps = np.round((logs - low) / np.maximum(high - low, 1e-12) * 65535).astype(np.uint16)
+    differences = np.diff(steps, axis=0, prepend=np.zeros((1, 3), np.uint16))  # modulo 65536
+    planes = [plane for k in range(3) for plane in (differences[:, k] >> 8, differences[:, k] & 255)]
+    planes.append(np.round((radii - smallest) / max(largest - smallest, 1e-12) * 255))
+    planes += list(np.round(255 * cloud.colors.clip(0, 1)).T)
+    planes.append(np.round(255 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))))
+    planes.append(np.full(len(cloud), VOID, np.uint8) if cloud.class_ids is None else cloud.class_ids)
+    packed = gzip.compress(np.stack(planes).astype(np.uint8).tobytes(), compresslevel=9, mtime=0)
+    about = {
+        "count": len(cloud),
+        "total": total,
+        "low": low.tolist(),
+        "high": high.tolist(),
+        "log_radii": [float(smallest), float(largest)],
+        "middle": np.median(means, axis=0).tolist(),
+    }
+    return about, packed
+
+
+def _classes(cloud: GaussianCloud, outcome: Outcome) -> dict[str, Any]:
+    """Name, colour and share of the Gaussians of each class; none where the map has no classes."""
+    if cloud.class_ids is None:
+        return {"classes": []}
+    shares = np.bincount(cloud.class_ids, minlength=256) / len(cloud)
+    table = zip(outcome.classes.names, outcome.classes.colors, strict=True)
+    return {
+        "classes": [
+            {"name": name, "color": list(color), "share": round(float(shares[k]), 5)}
+            for k, (name, color) in enumerate(table)
+        ]
+    }
+
+
+def _cameras(outcome: Outcome, upright: NDArray[np.float64]) -> dict[str, Any]:
+    """Some cameras in order, all their places, and the frame of a picture: sides over focal length."""
+    t, k = outcome.trajectory, outcome.calibration.intrinsics
+    stations = rig_of(outcome.calibration.directions, len(outcome.frames)).stations
+    rows = [int(row) for row in np.flatnonzero(t.is_placed) if t.frame_ids[row] < stations]
+    centers = t.centers @ upright.T
+    means = outcome.require_map().means.cpu().numpy().astype(np.float64) @ upright.T
+    middle = np.median(means, axis=0) if not rows else centers[rows[0]]
+    return {
+        "path": np.round(centers[rows], 4).tolist(),
+        "cameras": [
+            {
+                "p": np.round(centers[row], 6).tolist(),
+                "r": np.round(t.cam_from_world[row][:3, :3] @ upright.T, 7).ravel().tolist(),
+                "t": round(float(t.timestamps[row]), 3),
+            }
+            for row in evenly(rows, MOST_CAMERAS)
+        ],
+        "slope": [k.width / k.fx, k.height / k.fy],
+        "shift": [(k.cx - k.width / 2) / k.fx, (k.cy - k.height / 2) / k.fy],
+        "depth": float(np.median(np.linalg.norm(means - middle, axis=1))),
+    }
+
+
+def _unit(outcome: Outcome, world: World) -> dict[str, Any]:
+    metres = outcome.metres
+    metric = outcome.metric or world.earth is not None
+    unit: dict[str, Any] = {"metric": metric}
+    if metres is not None:
+        text = f"{metres.text[0].upper()}{metres.text[1:]}."
+        unit |= {"per_unit": metres.per_unit, "relative_sd": metres.relative_sd, "text": text}
+    return {"unit": unit, "floor": world.has_floor}
+
+
+def _page(title: str, about: dict[str, Any], packed: bytes) -> str:
+    parts = {
+        "title": escape(title),
+        "style": (_PARTS / "style.css").read_text(encoding="utf-8"),
+        "about": json.dumps(about, separators=(",", ":")).replace("<", "\\u003c"),
+        "map": base64.b64encode(packed).decode("ascii"),
+        "script": "\n".join((_PARTS / name).read_text(encoding="utf-8") for name in _SCRIPTS),
+    }
+    frame = (_PARTS / "page.html").read_text(encoding="utf-8")
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], frame)

@@ -1,0 +1,132 @@
+"""The map as one HTML file: unpacked again here, and drawn by a browser beside our own renderer."""
+
+import base64
+import gzip
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import read_rgb
+from msgs_slam.pipelines.config import ExportConfig
+from msgs_slam.pipelines.evaluation.image_quality import psnr
+from msgs_slam.pipelines.evaluation.views import view_map
+from msgs_slam.pipelines.export import web_page
+from msgs_slam.pipelines.export.stage import export_run
+from msgs_slam.pipelines.export.writers import map_cloud
+from msgs_slam.pipelines.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.upright.world import FIRST, read_world
+
+OracleRun = Callable[..., RunFolder]
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+SIZE = (640, 480)
+
+
+@pytest.fixture(scope="module")
+def page(oracle_run: OracleRun, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
+    """The page, and the outcome in its world."""
+    run, folder = oracle_run(), tmp_path_factory.mktemp("web")
+    assert [p.name for p in export_run(run, folder, "html")] == ["map.html", "world.json"]
+    world = read_world(folder / "world.json")
+    return folder / "map.html", load_outcome(run).moved(world.exported_from_run)
+
+
+def part(text: str, name: str) -> str:
+    found = re.search(rf'<script [^>]*id="{name}">(.*?)</script>', text, re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
+def unpacked(text: str) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
+    """What the page's script makes of it: about, (M, 4) places and radii, (M, 5) colours, opacities and classes."""
+    about = json.loads(part(text, "about"))
+    planes = np.frombuffer(gzip.decompress(base64.b64decode(part(text, "map"))), np.uint8).reshape(12, about["count"])
+    steps = np.cumsum(planes[0:6:2].astype(np.int64) * 256 + planes[1:6:2], axis=1) % 65536
+    low, high = np.array(about["low"])[:, None], np.array(about["high"])[:, None]
+    logs = low + (high - low) * steps / 65535
+    smallest, largest = about["log_radii"]
+    radii = np.exp(smallest + (largest - smallest) * planes[6] / 255)
+    return about, np.column_stack([*(np.sign(logs) * np.expm1(np.abs(logs))), radii]), planes[7:].T
+
+
+def test_nothing_is_fetched_and_the_map_is_whole(page: tuple[Path, Outcome]) -> None:
+    path, outcome = page
+    text = path.read_text(encoding="utf-8")
+    assert not re.findall(r"https?://", text)
+    assert "default-src 'none'" in text
+    about, places, rest = unpacked(text)
+    m = outcome.require_map()
+    assert about["count"] == about["total"] == len(m)
+    size = np.ptp(m.means.numpy(), axis=0).max()
+    near = np.sort(m.means.numpy(), axis=0), np.sort(places[:, :3], axis=0)
+    assert 0 < np.abs(near[0] - near[1]).max() < 1e-4 * size
+    np.testing.assert_allclose(np.sort(places[:, 3]), np.sort(m.radii.numpy()), rtol=0.02)
+    classes = np.bincount(rest[:, 4], minlength=len(outcome.classes))[: len(outcome.classes)] / len(m)
+    np.testing.assert_allclose([c["share"] for c in about["classes"]], classes, atol=1e-5)
+    assert len(text) < 20 * len(m) + 60_000
+
+
+def test_names_cannot_become_a_part_of_the_page(oracle_run: OracleRun, tmp_path: Path) -> None:
+    outcome = load_outcome(oracle_run())
+    bad = "</script><script>alert(1)</script>{{script}}"
+    classes = replace(outcome.classes, names=(bad, *outcome.classes.names[1:]))
+    folder = tmp_path / "run"
+    outcome = replace(outcome, classes=classes, run=RunFolder(folder / "<b>{{map}}.msgs"))
+    path = web_page.write_web_page(outcome, FIRST, tmp_path)[0]
+    text = path.read_text(encoding="utf-8")
+    assert "alert(1)</script>" not in text
+    assert json.loads(part(text, "about"))["classes"][0]["name"] == bad
+    assert "<title>&lt;b&gt;{{map}}</title>" in text
+
+
+def test_a_large_map_keeps_what_is_seen_most(page: tuple[Path, Outcome], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(web_page, "MOST_GAUSSIANS", 500)
+    cloud = map_cloud(page[1])
+    about, packed = web_page.pack_cloud(cloud, np.eye(3))
+    assert (about["count"], about["total"]) == (500, len(cloud))
+    assert len(gzip.decompress(packed)) == 12 * 500
+    assert about["log_radii"][0] > np.median(cloud.log_scales)
+
+
+def test_a_run_without_a_map_is_refused(oracle_run: OracleRun, tmp_path: Path) -> None:
+    run = oracle_run()
+    (run.stage("mapping") / "map.safetensors").unlink()
+    with pytest.raises(InputError, match="msgs-slam resume"):
+        export_run(run, tmp_path / "out", "html", settings=ExportConfig())
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed here to open the page with")
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_a_browser_draws_what_we_draw(page: tuple[Path, Outcome], tmp_path: Path, share: float) -> None:
+    path, outcome = page
+    cameras = json.loads(part(path.read_text(encoding="utf-8"), "about"))["cameras"]
+    number = round(share * (len(cameras) - 1))
+    shot = read_rgb(screenshot(f"{path.as_uri()}#camera={number}&bare", tmp_path))
+    t, k = outcome.trajectory, outcome.calibration.intrinsics
+    row = int(np.argmin(np.linalg.norm(t.centers - cameras[number]["p"], axis=1)))
+    (width, height), focal = SIZE, min(SIZE[0] * k.fx / k.width, SIZE[1] * k.fy / k.height)
+    cx, cy = width / 2 + focal * (k.cx - k.width / 2) / k.fx, height / 2 + focal * (k.cy - k.height / 2) / k.fy
+    intrinsics = replace(k, width=width, height=height, fx=focal, fy=focal, cx=cx, cy=cy)
+    drawn = view_map(outcome.require_map(), outcome.label_of_channel, intrinsics, t.cam_from_world[row])
+    assert 30 < psnr(shot, drawn.exposed(None, 0.0)) < 80
+
+
+def screenshot(address: str, folder: Path) -> Path:
+    target = folder / "shot.png"
+    words = ["--headless", "--no-sandbox", "--no-first-run", "--disable-background-networking", "--disable-sync"]
+    words += ["--disable-component-update", "--disable-quic", "--hide-scrollbars", f"--user-data-dir={folder / 'user'}"]
+    words += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--virtual-time-budget=20000"]
+    words += ["--window-size={},{}".format(*SIZE), f"--screenshot={target}", address]
+    done = subprocess.run([str(CHROMIUM), *words], capture_output=True, text=True, timeout=180)
+    assert target.exists(), done.stderr[-1000:]
+    return target
