@@ -19,7 +19,7 @@ from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.evaluation.pictures import label_picture
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.upright.world import read_world
 from tests.benchmarks.textured_mesh import VertexColours
 

@@ -23,7 +23,7 @@ from msgs_slam.pipelines.export import web_page
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.export.writers import map_cloud
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.run_folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.upright.world import FIRST, read_world
 
 OracleRun = Callable[..., RunFolder]
