@@ -99,8 +99,9 @@ def _open_engine(name: str, address: str, threads: int) -> tuple[LocalEngine | R
 
 
 def _print(rows: list[dict[str, object]]) -> None:
-    from msgs_slam.msgs_cli.tables import format_figure, format_table, terminal_width
+    from msgs_slam.msgs_cli.tables import format_table, terminal_width
+    from msgs_slam.pipelines.system.wording import figure_text
 
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    cells = [[format_figure(row[c]) if c in row else "" for c in columns] for row in rows]
+    cells = [[figure_text(row[c]) if c in row else "" for c in columns] for row in rows]
     say(format_table(columns, cells, terminal_width()))

@@ -7,9 +7,9 @@ import sys
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from msgs_slam.pipelines.system.wording import lost_text
+from msgs_slam.pipelines.system.wording import figure_text
 
 if TYPE_CHECKING:
     from msgs_slam.pipelines.run.records import StageRecord
@@ -55,24 +55,13 @@ def status_table(stages: Sequence[StageStatus], everything: bool = False) -> str
             rows.append([stage.name, stage.state, "", "", expected, ""])
             continue
         wanted = record.figures if everything else [k for k in KEY_FIGURES[stage.name] if k in record.figures]
-        figures = ", ".join(f"{key} {format_figure(record.figures[key], key)}" for key in wanted)
+        figures = ", ".join(f"{key} {figure_text(record.figures[key], key)}" for key in wanted)
         rows.append(
             [stage.name, stage.state, f"{record.seconds:.1f}", f"{record.peak_memory_mb:.0f}", expected, figures]
         )
     header = ["stage", "state", "seconds", "peak MB", "expected MB", "figures"]
     shown = [n for n in range(len(header)) if n != 4 or any(row[n] for row in rows)]
     return format_table([header[n] for n in shown], [[row[n] for n in shown] for row in rows], terminal_width())
-
-
-def format_figure(value: Any, key: str = "") -> str:
-    """Short text of a figure; lost frames together by their cause."""
-    if key == "lost" and isinstance(value, dict):
-        return lost_text(value)
-    if isinstance(value, bool) or value is None:
-        return {True: "yes", False: "no", None: "-"}[value]
-    if isinstance(value, dict):
-        return " ".join(f"{key} {format_figure(v)}" for key, v in value.items()) or "none"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def scale_lines(root: Path, records: dict[str, StageRecord]) -> list[str]:

@@ -172,9 +172,9 @@ def _about_camera(outcome: Outcome) -> list[str]:
             "know it, or film with more movement to the side."
         )
     if not outcome.metric:
-        known = "Lengths have no unit" if outcome.metres is None else "How long a metre is, is a guess"
+        known = "Lengths have no unit" if outcome.metres is None else "Scale is estimated"
         found.append(
-            f"{known}: nothing in a single moving camera tells metres. Give a known distance (--scale-ref) or metric "
-            "depth (--depth files or a metric network) to get them."
+            f"{known}: one moving camera cannot observe absolute size. Give a known distance (--scale-ref) or metric "
+            "depth (--depth files or a metric network) for real metres."
         )
     return found

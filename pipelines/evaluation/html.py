@@ -34,7 +34,17 @@ summary{cursor:pointer;color:var(--accent)}
 .grid{display:grid;grid-template-columns:repeat(4,1fr);gap:6px}
 .grid div{font-size:12px;color:var(--soft)}
 code{background:#f3f4f6;padding:1px 5px;border-radius:4px}
-@media print{body{background:#fff}section{break-inside:avoid}}
+.legend{display:flex;flex-wrap:wrap;gap:4px 16px;margin-top:12px;font-size:13px}
+.legend i{display:inline-block;width:13px;height:13px;border-radius:3px;margin-right:6px;vertical-align:-2px}
+.legend.scale i{width:220px;margin:3px 6px}
+.legend span{color:var(--soft)}
+details{margin-top:10px}pre{white-space:pre-wrap;overflow-wrap:anywhere}
+@media (max-width:700px){.grid{grid-template-columns:repeat(2,1fr)}.two{grid-template-columns:1fr}}
+@media print{@page{margin:14mm}
+body{background:#fff;font-size:11px;print-color-adjust:exact;-webkit-print-color-adjust:exact}
+main{max-width:none;padding:0}section{border:0;padding:6px 0;margin:8px 0}
+.chip{padding:4px 8px;min-width:0}.chip b{font-size:14px}.two{grid-template-columns:1fr 1fr}
+h2{break-after:avoid}.chip,tr,img,.plot,.grid div,li{break-inside:avoid}details:not([open]){display:none}}
 """
 
 
@@ -71,6 +81,15 @@ def chips(pairs: Iterable[tuple[str, str]]) -> str:
     """(name, value) pairs as a row of little cards."""
     cards = (f'<div class="chip"><b>{escape(value)}</b><span>{escape(name)}</span></div>' for name, value in pairs)
     return f'<div class="chips">{"".join(cards)}</div>'
+
+
+def legend(entries: Iterable[tuple[str, str, str]]) -> str:
+    """(name, CSS colour, text beside it) as a line of swatches."""
+    swatches = (
+        f'<div><i style="background:{escape(color)}"></i>{escape(name)} <span>{escape(text)}</span></div>'
+        for name, color, text in entries
+    )
+    return f'<div class="legend">{"".join(swatches)}</div>'
 
 
 def drawing(svg: bytes, description: str) -> str:

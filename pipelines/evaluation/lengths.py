@@ -33,9 +33,7 @@ def found_lengths(outcome: Outcome) -> list[tuple[str, str]]:
     if world.axes == "up" and shown.gaussian_map is not None:
         rows += list(zip(("length", "width", "height"), extents(shown), strict=False))
     texts = [(what, tape_text(*found, shown.metric, shown.metres)) for what, found in rows if found is not None]
-    return [
-        (what if what not in ("length", "width", "height") else f"{what} of what is mapped", t) for what, t in texts
-    ]
+    return [(what if what not in ("length", "width", "height") else f"map extent, {what}", t) for what, t in texts]
 
 
 def path_length(outcome: Outcome) -> tuple[float, float] | None:

@@ -145,20 +145,3 @@ def _legend(frame: _Frame, names: Sequence[tuple[str, str]]) -> str:
         parts.append(f'<text x="{x + 16}" y="31" fill="#374151">{escape(name)}</text>')
         x += 30 + 6.2 * len(name)
     return "".join(parts)
-
-
-def bars(title: str, rows: Sequence[tuple[str, float, str, str]], width: int = 560) -> str:
-    """Horizontal bars: rows of (name, value >= 0, text beside the bar, colour)."""
-    height = 30 + 20 * len(rows)
-    largest = max((v for _, v, _, _ in rows), default=0.0) or 1.0
-    parts = [
-        f'<svg viewBox="0 0 {width} {height}" class="plot" role="img" aria-label="{escape(title)}" '
-        'xmlns="http://www.w3.org/2000/svg" font-family="system-ui, sans-serif" font-size="11">',
-        f'<text x="4" y="16" font-size="13" font-weight="600">{escape(title)}</text>',
-    ]
-    for i, (name, value, text, color) in enumerate(rows):
-        y, length = 28 + 20 * i, (width - 250) * value / largest
-        parts.append(f'<text x="126" y="{y + 11}" text-anchor="end">{escape(name)}</text>')
-        parts.append(f'<rect x="132" y="{y}" width="{length:.1f}" height="14" rx="2" fill="{color}" stroke="#9ca3af"/>')
-        parts.append(f'<text x="{138 + length:.1f}" y="{y + 11}" fill="#374151">{escape(text)}</text>')
-    return "".join([*parts, "</svg>"])

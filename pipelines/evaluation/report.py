@@ -17,15 +17,16 @@ from msgs_slam.pipelines.evaluation.facts import Capture, advice, lost_stretches
 from msgs_slam.pipelines.evaluation.html import bullets, chips, drawing, page, section, table
 from msgs_slam.pipelines.evaluation.lengths import found_lengths
 from msgs_slam.pipelines.evaluation.plots import RED, Line, plot
-from msgs_slam.pipelines.evaluation.report_views import RenderedViews, class_section, quality_section, render_views
+from msgs_slam.pipelines.evaluation.report_views import RenderedViews, class_legend, quality_section, render_views
 from msgs_slam.pipelines.evaluation.table import evaluation_table
 from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, trajectory_plots
 from msgs_slam.pipelines.export.readme import lengths, readme
+from msgs_slam.pipelines.export.stage import on_earth
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_source
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress
-from msgs_slam.pipelines.system.wording import lost_text
+from msgs_slam.pipelines.system.wording import figure_text
 from msgs_slam.pipelines.types import LoopEdge, SparseModel
 from msgs_slam.pipelines.upright.world import FIRST, load_world
 
@@ -43,13 +44,12 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
     body = "".join(
         [
             _heading(outcome, views, loops),
+            "" if views is None else section("What the map shows", views.sheet, class_legend(outcome, views)),
             _advice_section(outcome, capture, sparse, loops, views),
             _found_section(outcome, sparse, loops),
             _path_section(outcome),
             quality_section(outcome, capture, views),
             "" if evaluation is None else _truth_section(evaluation, run),
-            "" if views is None else section("What the map shows", views.sheet),
-            "" if views is None else class_section(outcome, views),
             *(_piece_section(piece, progress or SilentProgress()) for piece in outcome.pieces()),
             _time_section(outcome),
             _export_section(outcome),
@@ -87,8 +87,15 @@ def _heading(outcome: Outcome, views: RenderedViews | None, loops: list[LoopEdge
         pairs.append(("loops closed", str(len(loops))))
     pairs.append(("seconds", f"{sum(r.seconds for r in outcome.records.values()):.0f}"))
     source = escape(str(load_source(outcome.run).path))
-    stage = outcome.map_stage or outcome.pose_stage
-    return f'<h1>{escape(outcome.run.root.name)}</h1><p class="sub">from {source}, as {stage} left it</p>{chips(pairs)}'
+    after = _AFTER.get(outcome.map_stage or outcome.pose_stage, "")
+    return f'<h1>{escape(outcome.run.root.name)}</h1><p class="sub">Source: {source}{after}</p>{chips(pairs)}'
+
+
+_AFTER = {
+    "tracking": " (after tracking: no map yet)",
+    "mapping": " (after mapping, before the global adjustment)",
+    "global_ba": " (after global bundle adjustment)",
+}
 
 
 def _advice_section(
@@ -96,8 +103,8 @@ def _advice_section(
 ) -> str:
     lines = advice(outcome, capture, sparse, loops, float(np.mean(views.psnr)) if views and views.psnr else None)
     if not lines:
-        return section("Advice", "<p>Nothing to complain of in this capture.</p>", kind="fine")
-    return section("Advice", bullets(lines), kind="advice")
+        return section("What would improve it", "<p>Nothing stands out in this capture.</p>", kind="fine")
+    return section("What would improve it", bullets(lines), kind="advice")
 
 
 def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[LoopEdge]) -> str:
@@ -123,9 +130,9 @@ def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[Loo
         text = ", ".join(f"{e.frame1_id}–{e.frame2_id} ({e.inliers} matches)" for e in loops[:12])
         rows.append(("loops", f"{len(loops)}: {text}" if loops else "none"))
     lost = [f"frames {s.first}–{s.last} ({s.start:.2f}–{s.end:.2f} s): {s.reason}" for s in lost_stretches(outcome)]
-    rows.append(("lost stretches", f"{len(lost)}, below" if lost else f"none of {len(t.frame_ids)} frames"))
+    rows.append(("frames without a pose", f"{len(lost)} stretches, below" if lost else f"none of {len(t.frame_ids)}"))
     warnings = [f"{stage}: {w}" for stage, record in outcome.records.items() for w in record.warnings]
-    listed = {"Lost stretches": lost, "Warnings": warnings}
+    listed = {"Frames without a pose": lost, "Warnings": warnings}
     extra = "".join(f"<h3>{title}</h3>{bullets(lines)}" for title, lines in listed.items() if lines)
     return section("What was found", table(("", ""), rows), extra)
 
@@ -153,7 +160,12 @@ def _piece_section(piece: Outcome, progress: Progress) -> str:
 
 
 def _path_section(outcome: Outcome) -> str:
-    return section("Camera path", '<div class="two">', *trajectory_plots(outcome, None), "</div>")
+    """In the axes of the exported files, where there are any."""
+    world = load_world(outcome.run) if "export" in outcome.records and outcome.move is None else None
+    if world is not None:
+        outcome = on_earth(outcome.moved(world.exported_from_run), world)
+    upright = world is not None and world.axes == "up"
+    return section("Camera path", '<div class="two">', *trajectory_plots(outcome, None, upright), "</div>")
 
 
 def _truth_section(evaluation: dict[str, Any], run: RunFolder) -> str:
@@ -180,15 +192,11 @@ def _time_section(outcome: Outcome) -> str:
             name,
             f"{r.seconds:.1f}",
             f"{r.peak_memory_mb:.0f}",
-            ", ".join(f"{k} {lost_text(v) if k == 'lost' else _short(v)}" for k, v in r.figures.items()),
+            ", ".join(f"{key} {figure_text(value, key)}" for key, value in r.figures.items()),
         )
         for name, r in outcome.records.items()
     ]
     return section("Stages", table(("stage", "seconds", "peak MB", "figures"), rows))
-
-
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _export_section(outcome: Outcome) -> str:

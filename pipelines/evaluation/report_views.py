@@ -10,17 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.evaluation.facts import Capture
-from msgs_slam.pipelines.evaluation.html import image, section
+from msgs_slam.pipelines.evaluation.html import image, legend, section
 from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.evaluation.pictures import depth_picture, depth_range, labels_on_photo
-from msgs_slam.pipelines.evaluation.plots import BLUE, GREEN, GREY, ORANGE, RED, Line, Marks, bars, plot
+from msgs_slam.pipelines.evaluation.plots import BLUE, GREEN, GREY, ORANGE, RED, Line, Marks, plot
+from msgs_slam.pipelines.evaluation.write import unit_name
 from msgs_slam.pipelines.outcome import Outcome, evenly
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import VOID
 
 MEASURED_VIEWS = 60
 SHOWN_VIEWS = 8
+_ROWS = 3
+"""Of four pictures, seen at once; the others unfold."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ def render_views(outcome: Outcome, progress: Progress) -> RenderedViews:
     shown = set(evenly(keyframes, SHOWN_VIEWS))
     values: list[float] = []
     tiles: list[str] = []
+    reach = _reach(outcome, sorted(shown))
     counts = np.zeros(256, np.int64)
     for frame_id in progress.track(keyframes, "rendering", len(keyframes)):
         row = outcome.frame_row(frame_id)
@@ -49,11 +53,31 @@ def render_views(outcome: Outcome, progress: Progress) -> RenderedViews:
         values.append(psnr(picture, photo))
         counts += np.bincount(view.labels.ravel(), minlength=256)
         if frame_id in shown:
-            depth = depth_picture(view.depth, *depth_range(view.depth))
+            depth = depth_picture(view.depth, *reach)
             labels = labels_on_photo(photo, view.labels, outcome.classes.colors)
-            pairs = ((photo, "frame"), (picture, "map"), (depth, "depth"), (labels, "classes"))
+            pairs = ((photo, "image"), (picture, "map"), (depth, "depth"), (labels, "classes"))
             tiles += [_tile(p, f"{what}, {frame.timestamp:.2f} s") for p, what in pairs]
-    return RenderedViews(keyframes, values, counts, f'<div class="grid">{"".join(tiles)}</div>')
+    first, rest = "".join(tiles[: 4 * _ROWS]), "".join(tiles[4 * _ROWS :])
+    more = f'<details><summary>More views</summary><div class="grid">{rest}</div></details>' if rest else ""
+    scale = _depth_scale(*reach, unit_name(outcome))
+    return RenderedViews(keyframes, values, counts, f'<div class="grid">{first}</div>{more}{scale}')
+
+
+def _depth_scale(nearest: float, farthest: float, unit: str) -> str:
+    """The colours of depth, with the depths of both ends and of the middle."""
+    depths = 1 / np.linspace(1 / nearest, 1 / farthest, 9)
+    colors = ",".join("rgb({},{},{})".format(*c) for c in depth_picture(depths[None], nearest, farthest)[0].tolist())
+    low, middle, high = (f"{depths[k]:.2g}" for k in (0, 4, 8))
+    bar = f'<i style="background:linear-gradient(to right,{colors})"></i>'
+    told = f"depth, {escape(unit)}: {low} {bar} {high} <span>({middle} in the middle)</span>"
+    return f'<div class="legend scale">{told}</div>'
+
+
+def _reach(outcome: Outcome, ids: list[int]) -> tuple[float, float]:
+    """Nearest and farthest of most pixels of a few of the views: one range for all, so that colours compare."""
+    rows = [outcome.frame_row(frame_id) for frame_id in ids[:: max(1, len(ids) // 3)]]
+    ranges = [depth_range(render_outcome(outcome, outcome.trajectory.cam_from_world[row]).depth) for row in rows]
+    return (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else (1.0, 2.0)
 
 
 def _tile(picture: NDArray[np.uint8], caption: str) -> str:
@@ -89,14 +113,13 @@ def _over_frames(name: str, unit: str, ids: NDArray, values: NDArray, color: str
     return plot(name, "frame", unit, [Line(points, color, "")], marks, height=240)
 
 
-def class_section(outcome: Outcome, views: RenderedViews) -> str:
-    """Shares of the classes in the rendered keyframes, largest first."""
+def class_legend(outcome: Outcome, views: RenderedViews) -> str:
+    """Colour, name and share of each class in the rendered keyframes, largest first."""
     shares = views.class_pixels / max(int(views.class_pixels.sum()), 1)
     rows = [
-        (name, float(shares[i]), f"{shares[i]:.1%}", "rgb({},{},{})".format(*color))
+        (float(shares[i]), name, "rgb({},{},{})".format(*color))
         for i, (name, color) in enumerate(zip(outcome.classes.names, outcome.classes.colors, strict=True))
         if shares[i] > 0
     ]
-    rows.sort(key=lambda row: -row[1])
-    rows.append(("unknown", float(shares[VOID]), f"{shares[VOID]:.1%}", "#d1d5db"))
-    return section("Classes in the rendered keyframes", bars("share of the pixels", rows, width=760))
+    rows = [*sorted(rows, key=lambda row: -row[0]), (float(shares[VOID]), "unknown", "rgb(40,40,40)")]
+    return legend([(name, color, f"{share:.1%}") for share, name, color in rows])

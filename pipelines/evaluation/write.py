@@ -62,19 +62,20 @@ def write_evaluation(
     return result
 
 
-def trajectory_plots(outcome: Outcome, matched: MatchedTruth | None) -> tuple[str, str]:
+def trajectory_plots(outcome: Outcome, matched: MatchedTruth | None, upright: bool = False) -> tuple[str, str]:
     """SVGs of the camera path from above and from the side, with the truth where there is one.
 
-    The axes are the path's own: its plane of largest extent is looked at from above.
+    The axes are the path's own: its plane of largest extent is looked at from above; those of the world, where it
+    stands `upright`.
     """
     t = outcome.trajectory
     centers = np.where(t.is_posed[:, None], t.centers, np.nan)
-    truth, unit = np.full_like(centers, np.nan), "m" if outcome.metric else "unit of the run"
+    truth, unit = np.full_like(centers, np.nan), unit_name(outcome)
     if matched is not None and (both := t.is_posed & matched.has_pose).sum() >= 3:
         found = _aligned(centers[both], matched.world_from_cam[both, :3, 3], not outcome.metric)
         if found is not None:
             centers, truth, unit = found.apply(centers), matched.world_from_cam[:, :3, 3], "m"
-    axes = _main_axes(centers[np.isfinite(centers).all(axis=1)])
+    axes = np.eye(3) if upright else _main_axes(centers[np.isfinite(centers).all(axis=1)])
     plots = []
     for name, x, y in (("Camera path from above", 0, 1), ("Camera path from the side", 0, 2)):
         lines = [Line(_projected(centers, axes, x, y), BLUE, "this run")]
@@ -84,6 +85,13 @@ def trajectory_plots(outcome: Outcome, matched: MatchedTruth | None) -> tuple[st
             lines.insert(0, Line(_projected(known, axes, x, y), GREY, "truth", dashed=True))
         plots.append(plot(name, unit, unit, lines, equal=True))
     return plots[0], plots[1]
+
+
+def unit_name(outcome: Outcome) -> str:
+    """That of the world's lengths, with the metres that it is estimated to be."""
+    if outcome.metric:
+        return "m"
+    return "units" if outcome.metres is None else f"units (1 ≈ {outcome.metres.per_unit:.2g} m)"
 
 
 def _aligned(centers: np.ndarray, truth: np.ndarray, with_scale: bool) -> Similarity | None:

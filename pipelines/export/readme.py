@@ -66,7 +66,7 @@ def lengths(metres: Metres | None, metric: bool) -> str:
         return f"Lengths are metres: {metres.text}."
     return (
         f"{metres.text[0].upper()}{metres.text[1:]}.\n"
-        f"Nothing is rescaled by this: multiply lengths by {metres.per_unit:.3g} to have them in metres."
+        f"Coordinates are not rescaled: multiply lengths by {metres.per_unit:.3g} to have them in metres."
     )
 
 

@@ -1,8 +1,9 @@
-"""Numbers of frames in few words."""
+"""Figures and numbers of frames in few words."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 MOST_STRETCHES = 8
 
@@ -26,3 +27,16 @@ def lost_text(lost: Mapping[str, str]) -> str:
         causes.setdefault(str(cause), []).append(int(frame))
     listed = "; ".join(f"{cause} {stretches(ids)}" for cause, ids in causes.items())
     return f"{len(lost)} ({listed})" if lost else "none"
+
+
+def figure_text(value: Any, key: str = "") -> str:
+    """Short text of a figure of a stage; lost frames together by their cause."""
+    if key == "lost" and isinstance(value, dict):
+        return lost_text(value)
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "-"}[value]
+    if isinstance(value, dict):
+        return " ".join(f"{name} {figure_text(v)}" for name, v in value.items()) or "none"
+    if isinstance(value, list | tuple):
+        return ", ".join(figure_text(v) for v in value) or "none"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from cli_runs import invoke
 
-from msgs_slam.msgs_cli.tables import format_figure, format_table
+from msgs_slam.msgs_cli.tables import format_table
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_records
-from msgs_slam.pipelines.system.wording import lost_text, stretches
+from msgs_slam.pipelines.system.wording import figure_text, lost_text, stretches
 
 USED_BY = {
     "frames/frames.json": "ply",
@@ -97,7 +97,7 @@ def test_lost_frames_of_one_cause_are_told_together() -> None:
     assert stretches(range(0, 100, 2), most=3) == "0, 2, 4 and 47 more stretches"
     lost = {str(i): "blurred" if i == 8 else "too few matches" for i in range(5, 12)}
     assert lost_text(lost) == "7 (too few matches 5-7, 9-11; blurred 8)"
-    assert format_figure({}, "lost") == "none"
-    assert len(format_figure({str(2 * i): "too few matches" for i in range(5000)}, "lost")) < 200
+    assert figure_text({}, "lost") == "none"
+    assert len(figure_text({str(2 * i): "too few matches" for i in range(5000)}, "lost")) < 200
     table = format_table(["stage", "figures"], [["tracking", "posed 3, lost none, " * 20]], width=60)
     assert max(map(len, table.splitlines())) <= 60

@@ -66,9 +66,24 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
     parsed.feed(html)
     assert parsed.open == []
     assert parsed.images == 4 * 8 + 1
-    for heading in ("Advice", "What was found", "Camera path", "Against the truth", "Stages", "Settings"):
+    for heading in (
+        "What would improve it",
+        "What the map shows",
+        "What was found",
+        "Camera path",
+        "Against the truth",
+        "Stages",
+        "Settings",
+    ):
         assert heading in parsed.text
+    assert parsed.text.index("What the map shows") < parsed.text.index("What would improve it")
+    assert parsed.text.index("What would improve it") < parsed.text.index("What was found")
+    assert "depth, m: " in parsed.text
     assert "ATE Sim(3)" in parsed.text
+    assert not re.search(r"\b(True|False|None)\b|[\[{]'", re.sub(r"<pre>.*?</pre>", "", html, flags=re.DOTALL))
+    swatches = re.findall(r'<i style="background:rgb\((\d+),(\d+),(\d+)\)"></i>([^<]*) <span>([\d.]+)%', html)
+    assert sum(float(share) for *_, share in swatches) == pytest.approx(100, abs=0.5)
+    assert len(swatches) > 3
     lengths = found_lengths(load_outcome(run))
     assert len(lengths) == 5
     assert all(what in parsed.text and text in parsed.text for what, text in lengths)
