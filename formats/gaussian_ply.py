@@ -33,7 +33,7 @@ def write_gaussian_ply(
 
     The properties are those of the original code in its order: x y z, nx ny nz (0), f_dc_0..2, f_rest_* (as many as
     `sh_degree` has, all 0), opacity (logit), scale_0..2 (log), rot_0..3 (w x y z); after them class_id (uchar) and
-    class_prob_<class> (float) where the cloud has classes, of those that are anywhere above 0: tables of 100 classes
+    class_prob_<number> (float) where the cloud has classes, of those that are anywhere above 0: tables of 100 classes
     would otherwise fill most of the file with zeros. Degree 0, the default, is what the original writes when it
     trains without view-dependent colour; 3 is for readers that insist on 45 of them. Class names go to comments.
 

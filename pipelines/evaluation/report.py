@@ -22,6 +22,7 @@ from msgs_slam.pipelines.evaluation.table import evaluation_table
 from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, trajectory_plots
 from msgs_slam.pipelines.export.readme import lengths, readme
 from msgs_slam.pipelines.export.stage import on_earth
+from msgs_slam.pipelines.export.writers import IMAGES
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_source
@@ -203,12 +204,16 @@ def _export_section(outcome: Outcome) -> str:
     if "export" not in outcome.records:
         return section("Files for other programs", "<p>Not exported yet.</p>")
     sizes = [
-        (name, f"{size / 1e6:.2f} MB")
-        for name, (size, _) in outcome.records["export"].files.items()
-        if not name.startswith("frames/")
+        (name, f"{size / 1e6:.2f} MB") for name, size in files_of_export(outcome.run) if Path(name).parts[0] != IMAGES
     ]
     notes = readme(load_world(outcome.run) or FIRST, outcome.metres, outcome.metric)
     return section("Files for other programs", f"<pre>{escape(notes)}</pre>", table(("in export/", "size"), sizes))
+
+
+def files_of_export(run: RunFolder) -> list[tuple[str, int]]:
+    """Name and bytes of what lies there: of the stage, and what `msgs-slam export --only` has added since."""
+    root = run.stage("export")
+    return [(p.relative_to(root).as_posix(), p.stat().st_size) for p in sorted(root.rglob("*")) if p.is_file()]
 
 
 def _settings_section(outcome: Outcome) -> str:

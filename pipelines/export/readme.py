@@ -2,50 +2,115 @@
 
 from __future__ import annotations
 
+import textwrap
+from dataclasses import dataclass
+
 from msgs_slam.pipelines.types import Metres
 from msgs_slam.pipelines.upright.world import World
 
-_FILES = """\
-What is in this folder
+WIDTH = 100
+"""Characters a line, so that it fits a terminal, an editor and the report."""
+_COLUMN = 27
 
-sparse/0/                 camera, poses and points as a COLMAP model, binary and text; pinhole, no distortion left. A
-                          frame of which only the rotation is known is in trajectory.txt alone.
-                          Opens in COLMAP, pycolmap, and any Gaussian splatting trainer.
-frames/                   the undistorted frames that the model names.
-masks/                    only where people or --masks leave something out: NAME.png for the frame NAME, black is left
-                          out (colmap feature_extractor --ImageReader.mask_path masks).
-transforms.json           the same cameras for nerfstudio.
-trajectory.txt            poses in TUM format: timestamp tx ty tz qx qy qz qw (camera in the world); evo reads it.
-point_cloud.ply           the map: Gaussians in the layout of the original 3D Gaussian splatting, with class_id and
-                          class_prob_<class> of the classes that occur after it. Splat viewers (SuperSplat and
-                          others) open it.
-point_cloud_semantic.ply  the same, coloured by class, without the probabilities.
-point_cloud_compact.safetensors   the same in a fraction of the space.
-point_cloud.spz           only with --set export.spz=true: the colours of the map, small, for viewers on the web.
-point_cloud.sog           only by `msgs-slam export RUN --only sog`: the same, smaller still (PlayCanvas, SuperSplat).
-point_cloud.glb           only with --set export.splat_glb=true: the map in glTF (KHR_gaussian_splatting), classes as
-                          attribute _LABEL; programs that do not know the extension show coloured points.
-map.html                  only by `msgs-slam export RUN --only html`: the map to look at in any browser, without a
-                          server or a network, on a computer or a phone.
-mesh.ply, mesh.glb        the surface with a colour and a label (PLY: property label, GLB: attribute _LABEL) at each
-                          vertex. MeshLab, Blender, trimesh.
-mesh_textured.obj, .mtl, .png, mesh_textured.glb   only with --set export.texture=true: a tenth of the mesh's vertices,
-                          and its surface as a picture made from the keyframes' photographs, exposure removed. OBJ: a
-                          group for each class.
-classes.json              number, name and colour of each class; 255 is "unknown".
-scale.json                how many metres a unit of the run is, its relative standard deviation, and who says so.
-submap_1/ and so on       only where the map was made in parts (mapping.submap): point_cloud.ply of each part, and
-                          coarse.ply, about a tenth of it for a look from afar; tiles.json says where each lies.
-piece_2/ and so on        only where nothing joins some frames to the rest: the same of them, in a world of their own.
-world.json                what the axes are, what told which way is up, and how this world lies to the run's own.
 
-"""
+@dataclass(frozen=True)
+class Entry:
+    """A file or folder: its name, what it is, and which of the `EXPORTS` writes it, "" for all of them together; asked:
+    whether it is written only where somebody asks for it."""
+
+    name: str
+    text: str
+    kind: str = ""
+    asked: str = ""
+
+    @property
+    def lines(self) -> str:
+        """Its name, and the text beside it; below it where the name is long."""
+        text = f"Only where asked for ({self.asked}): {self.text}" if self.asked else self.text
+        first = "" if len(self.name) < _COLUMN - 1 else f"{self.name}\n"
+        head = " " * _COLUMN if first else self.name.ljust(_COLUMN)
+        return first + textwrap.fill(
+            text, WIDTH, initial_indent=head, subsequent_indent=" " * _COLUMN, break_on_hyphens=False
+        )
+
+
+_SET, _ONLY = "--set export.{}=true", "msgs-slam export RUN --only {}"
+_ENTRIES = (
+    Entry(
+        "images/, sparse/0/",
+        "a COLMAP data set: the undistorted frames whose place is known, and their camera, poses and points (binary, "
+        "text, and points3D.ply). Pinhole, no distortion left. A frame of which only the rotation is known is in "
+        "trajectory.txt alone. Opens in COLMAP, pycolmap, gsplat (simple_trainer.py default --data_dir THIS_FOLDER "
+        "--data_factor 1), the original trainer (train.py -s THIS_FOLDER).",
+        "colmap",
+    ),
+    Entry(
+        "masks/",
+        "where people or --masks leave something out: NAME.png for the frame NAME, black is left out (colmap "
+        "feature_extractor --ImageReader.mask_path masks).",
+        "colmap",
+    ),
+    Entry(
+        "transforms.json",
+        "the same for nerfstudio (ns-train splatfacto --data THIS_FOLDER) and OpenSplat (opensplat THIS_FOLDER); it "
+        "names sparse/0/points3D.ply to start from.",
+        "colmap",
+    ),
+    Entry("trajectory.txt", "poses in TUM format: timestamp tx ty tz qx qy qz qw (camera in the world); evo.", "tum"),
+    Entry(
+        "point_cloud.ply",
+        "the map: Gaussians in the layout of the original 3D Gaussian splatting; after it class_id, and class_prob_N, "
+        "the probability of class number N, for each class that occurs. Splat viewers (SuperSplat and others).",
+        "ply",
+    ),
+    Entry("point_cloud_semantic.ply", "the same, coloured by class, with class_id and no probabilities.", "ply"),
+    Entry("point_cloud_compact.safetensors", "the same in a fraction of the space.", "ply"),
+    Entry(
+        "point_cloud.spz", "the colours of the map, small, for viewers on the web.", "spz",
+        f"{_SET.format('spz')}, or {_ONLY.format('spz')}",
+    ),
+    Entry(
+        "point_cloud.sog", "the same, smaller still (PlayCanvas, SuperSplat).", "sog", _ONLY.format("sog")
+    ),
+    Entry(
+        "point_cloud.glb",
+        "the map in glTF (KHR_gaussian_splatting), classes as attribute _LABEL; programs that do not know the "
+        "extension show coloured points.",
+        "glb", f"{_SET.format('splat_glb')}, or {_ONLY.format('glb')}",
+    ),
+    Entry(
+        "map.html", "the map to look at in any browser, without a server or a network, on a computer or a phone.", "html",
+        _ONLY.format("html"),
+    ),
+    Entry(
+        "mesh.ply, mesh.glb",
+        "the surface with a colour and a label (PLY: property label, GLB: attribute _LABEL) at each vertex. MeshLab, "
+        "Blender, trimesh.",
+        "mesh",
+    ),
+    Entry(
+        "mesh_textured.obj, .mtl, .png, .glb",
+        "a tenth of the mesh's vertices, and its surface as a picture made from the keyframes' photographs, exposure "
+        "removed. OBJ: a group for each class.",
+        "texture", f"{_SET.format('texture')}, or {_ONLY.format('texture')}",
+    ),
+    Entry("classes.json", 'number, name and colour of each class; 255 is "unknown".'),
+    Entry("scale.json", "how many metres a unit of the run is, its relative standard deviation, and who says so."),
+    Entry(
+        "submap_1/ and so on",
+        "where the map was made in parts (mapping.submap): point_cloud.ply of each part, and coarse.ply, about a tenth "
+        "of it for a look from afar; tiles.json says where each lies.",
+    ),
+    Entry(
+        "piece_2/ and so on", "where nothing joins some frames to the rest: the same of them in a world of their own."
+    ),
+    Entry("world.json", "what the axes are, what told which way is up, and how this world lies to the run's own.", "*"),
+)  # fmt: skip
 
 _UPRIGHT = """\
 Axes: z is up, told by the {told_by}; {height}.
-{heading}. The formats that lay down which way is up follow their own
-rule: in all GLB files and in point_cloud.spz y is up. A viewer that takes y for up shows the PLY files on their
-back: turn them by -90 degrees about x.
+{heading}. The formats that lay down which way is up follow their own rule: in all GLB files and in point_cloud.spz y is
+up. A viewer that takes y for up shows the PLY files on their back: turn them by -90 degrees about x.
 """
 
 _OWN_HEADING = """\
@@ -70,12 +135,16 @@ def lengths(metres: Metres | None, metric: bool) -> str:
     )
 
 
-def readme(world: World, metres: Metres | None, metric: bool) -> str:
-    """The text of README.txt for files in that world."""
+def readme(world: World, metres: Metres | None, metric: bool, only: str | None = None) -> str:
+    """The text of README.txt for files in that world: of all files, or of one of the `EXPORTS` alone."""
     if world.axes == "up":
         height = "the floor is at z = 0" if world.has_floor else "no floor was found, so z counts from that path too"
         heading = "x is east and y north (GPS, see world.json)" if world.earth else _OWN_HEADING
         axes = _UPRIGHT.format(told_by=world.told_by, height=height, heading=heading)
     else:
         axes = _FIRST.format(why=", since nothing told which way is up or nobody asked (export.axes)")
-    return _FILES + axes + lengths(metres, metric) + "\n"
+    entries = [e.lines for e in _ENTRIES if only is None or e.kind in (only, "*")]
+    about = [
+        textwrap.fill(line, WIDTH, break_on_hyphens=False) for line in (axes + lengths(metres, metric)).splitlines()
+    ]
+    return "\n".join(["What is in this folder", "", *entries, "", *about]) + "\n"

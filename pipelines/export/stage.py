@@ -26,6 +26,7 @@ from msgs_slam.pipelines.export.writers import (
     write_glb_file,
     write_notes,
     write_ply,
+    write_readme,
     write_sog_file,
     write_spz_file,
     write_trajectory,
@@ -261,7 +262,10 @@ def export_run(
         "tum": lambda: write_trajectory(outcome, folder),
     }
     if only:
-        return [*writers[only](), write_world(outcome, world, folder)]
+        paths = [*writers[only](), write_world(outcome, world, folder)]
+        # The run's own folder has a README that tells of every kind.
+        own = folder.resolve() == run.stage("export").resolve()
+        return paths if own else [*paths, write_readme(outcome, world, folder, only)]
     return write_all_but_mesh(outcome, world, settings, folder) + mesh(*mesh_kinds(settings))
 
 

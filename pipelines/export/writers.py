@@ -17,6 +17,7 @@ from msgs_slam.formats.gaussian_glb import write_gaussian_glb
 from msgs_slam.formats.gaussian_ply import write_gaussian_ply
 from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
 from msgs_slam.formats.nerfstudio import write_transforms
+from msgs_slam.formats.point_ply import write_point_ply
 from msgs_slam.formats.sog import write_sog
 from msgs_slam.formats.spz import write_spz
 from msgs_slam.formats.trajectory import write_tum
@@ -30,13 +31,17 @@ from msgs_slam.pipelines.system.wording import stretches
 from msgs_slam.pipelines.types import SparseModel
 from msgs_slam.pipelines.upright.world import World, save_world
 
+IMAGES, SPARSE = "images", "sparse/0"
+"""Folders of a COLMAP data set by the names that trainers expect."""
+START = f"{SPARSE}/points3D.ply"
 _AT_ONCE, _PART = 1 << 16, 1 << 17
 """Gaussians whose probabilities are copied at a time, and those of a part that is written at a time."""
 
 
 def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
-    """`sparse/0` (binary and text) and transforms.json, with the frames whose place is known beside them in `frames/`,
-    and their masks in `masks/` where they have any."""
+    """A data set as COLMAP, nerfstudio and the trainers of Gaussian splatting open it: `images/` with the frames whose
+    place is known, `sparse/0` (binary and text, and the points as a PLY to start from), transforms.json, and `masks/`
+    where frames have any."""
     trajectory, k = outcome.trajectory, outcome.calibration.intrinsics
     posed = np.flatnonzero(trajectory.is_placed)
     frame_of = {f.id: f for f in outcome.frames}
@@ -44,14 +49,26 @@ def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
     names = tuple(f.name for f in frames)
     camera = (k.width, k.height, k.fx, k.fy, k.cx, k.cy)
     for frame in frames:
-        copy_file(outcome.run.image_file(frame), folder / "frames" / frame.name)
+        copy_file(outcome.run.image_file(frame), folder / IMAGES / frame.name)
         if (left_out := outcome.run.left_out(frame)) is not None:
             save_left_out(folder / "masks", frame, left_out)
     points = seen_points(outcome.load_sparse(), trajectory.frame_ids[posed])
-    write_colmap_model(folder / "sparse" / "0", *camera, names, trajectory.cam_from_world[posed], *points)
-    paths = [f"frames/{name}" for name in names]
-    write_transforms(folder / "transforms.json", *camera, paths, trajectory.world_from_cam[posed])
-    return [folder / "sparse" / "0", folder / "frames", folder / "transforms.json"]
+    write_colmap_model(folder / SPARSE, *camera, names, trajectory.cam_from_world[posed], *points)
+    start = write_start(folder, points[0], points[1])
+    paths = [f"{IMAGES}/{name}" for name in names]
+    write_transforms(folder / "transforms.json", *camera, paths, trajectory.world_from_cam[posed], start)
+    return [folder / SPARSE, folder / IMAGES, folder / "transforms.json"]
+
+
+def write_start(folder: Path, points: NDArray[np.float64], colors: NDArray[np.uint8]) -> str | None:
+    """The points (P, 3) that a splat begins with, as a PLY; its name in `folder`, None where there are none.
+
+    It lies where the original trainer looks for it and else writes it; others are told of it by transforms.json.
+    """
+    if len(points) == 0:
+        return None
+    write_point_ply(folder / START, points, colors)
+    return START
 
 
 def seen_points(
@@ -90,7 +107,7 @@ def map_cloud(outcome: Outcome, rows: Tensor | slice | None = None) -> GaussianC
 
 def write_ply(outcome: Outcome, sh_rest: bool, folder: Path) -> list[Path]:
     """The map as splat PLYs, in its own colours and in those of the classes, and as a compact file; part by part, for a
-    cloud takes more memory than the map it is of."""
+    cloud takes more memory than the map it is of. The probabilities are in the first only."""
     clouds, names = _in_parts(outcome), outcome.classes.names
     paths = [folder / n for n in ("point_cloud.ply", "point_cloud_semantic.ply", "point_cloud_compact.safetensors")]
     write_gaussian_ply(paths[0], clouds, names, sh_degree=3 * sh_rest)
@@ -143,7 +160,7 @@ def _by_class(cloud: GaussianCloud, outcome: Outcome) -> GaussianCloud:
     if cloud.class_ids is None:
         return cloud
     table = (np.array(outcome.classes.colors) / 255).astype(np.float32)
-    return replace(cloud, colors=table[cloud.class_ids].astype(np.float32))
+    return replace(cloud, colors=table[cloud.class_ids].astype(np.float32), class_probs=None)
 
 
 def write_trajectory(outcome: Outcome, folder: Path) -> list[Path]:
@@ -165,6 +182,11 @@ def write_world(outcome: Outcome, world: World, folder: Path) -> Path:
 def write_notes(outcome: Outcome, world: World, folder: Path) -> list[Path]:
     """The class table, the world, how long its unit is, and what each file is for."""
     save_classes(folder, outcome.classes)
-    write_text(folder / "README.txt", readme(world, outcome.metres, outcome.metric))
     world_file, scale_file = write_world(outcome, world, folder), save_metres(folder, outcome.metres)
-    return [folder / "classes.json", world_file, scale_file, folder / "README.txt"]
+    return [folder / "classes.json", world_file, scale_file, write_readme(outcome, world, folder)]
+
+
+def write_readme(outcome: Outcome, world: World, folder: Path, only: str | None = None) -> Path:
+    """README.txt: what each file is for, of all of them or of one of the `EXPORTS`."""
+    write_text(folder / "README.txt", readme(world, outcome.metres, outcome.metric, only))
+    return folder / "README.txt"

@@ -61,6 +61,7 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
     run.stage("export").mkdir(exist_ok=True)
     save_world(run.stage("export"), World("up", "floor", True, SAME), "metre")
     note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
+    (run.stage("export") / "point_cloud.spz").write_bytes(bytes(30_000))  # by `export --only`, later than the stage
     html = write_report(run).read_text()
     parsed = Balanced()
     parsed.feed(html)
@@ -84,6 +85,7 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
     swatches = re.findall(r'<i style="background:rgb\((\d+),(\d+),(\d+)\)"></i>([^<]*) <span>([\d.]+)%', html)
     assert sum(float(share) for *_, share in swatches) == pytest.approx(100, abs=0.5)
     assert len(swatches) > 3
+    assert "point_cloud.spz0.03 MB" in parsed.text
     lengths = found_lengths(load_outcome(run))
     assert len(lengths) == 5
     assert all(what in parsed.text and text in parsed.text for what, text in lengths)

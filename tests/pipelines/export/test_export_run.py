@@ -59,7 +59,7 @@ def test_poses_are_the_same_everywhere(run: RunFolder, folder: Path, exported: O
     assert len(names) == len(t.frame_ids)
     for frame, pose in zip(run.load_frames(), t.cam_from_world, strict=True):
         np.testing.assert_allclose(names[frame.name], pose[:3], atol=1e-9)
-        given, kept = folder / "frames" / frame.name, run.stage("frames") / frame.name
+        given, kept = folder / "images" / frame.name, run.stage("frames") / frame.name
         assert given.read_bytes() == kept.read_bytes()
         assert not given.samefile(kept)  # who edits the one leaves the other as it was
     tum = file_interface.read_tum_trajectory_file(str(folder / "trajectory.txt"))
@@ -126,7 +126,7 @@ def test_texture_shows_the_photographs(run: RunFolder, folder: Path, exported: O
 def test_texture_alone(run: RunFolder, tmp_path: Path) -> None:
     few = replace(SETTINGS, texture=False, mesh_side=160)
     names = [path.name for path in export_run(run, tmp_path, "texture", settings=few)]
-    assert names == [*(f"mesh_textured.{kind}" for kind in ("obj", "mtl", "png", "glb")), "world.json"]
+    assert names == [*(f"mesh_textured.{kind}" for kind in ("obj", "mtl", "png", "glb")), "world.json", "README.txt"]
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
 
 
@@ -143,7 +143,9 @@ def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
     for only in set(EXPORTS) - {"mesh", "texture"}:
         export_run(run, tmp_path / only, only, settings=ExportConfig(axes="first"))
         assert (tmp_path / only / expected[only]).exists()
-        assert not (tmp_path / only / "README.txt").exists()
+        notes = (tmp_path / only / "README.txt").read_text()
+        assert expected[only] in notes
+        assert "mesh.ply" not in notes
 
 
 def test_rest_coefficients_on_request(run: RunFolder, tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ def test_colmap_takes_the_model(finished: tuple[RunFolder, dict, dict]) -> None:
     assert model.num_reg_images() == 16
     assert 0 < model.compute_mean_reprojection_error() < 2
     assert model.num_points3D() > 100
-    assert all((folder / "frames" / image.name).exists() for image in model.images.values())
+    assert all((folder / "images" / image.name).exists() for image in model.images.values())
     times, poses = read_tum(folder / "trajectory.txt")
     assert len(times) == 16
     first = model.images[min(model.images)].cam_from_world().inverse().matrix()
