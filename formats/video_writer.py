@@ -18,13 +18,14 @@ CODECS = {".mp4": "mp4v", ".avi": "FFV1", ".mkv": "FFV1"}
 """By the file's ending: MPEG-4 plays everywhere, FFV1 loses nothing."""
 
 
-def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> Path:
-    """Encode RGB frames (H, W, 3) of one size, atomically: MPEG-4 for .mp4, lossless FFV1 for .avi and .mkv.
+def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, codec: str | None = None) -> Path:
+    """Encode RGB frames (H, W, 3) of one size, atomically: MPEG-4 for .mp4, lossless FFV1 for .avi and .mkv, or by a
+    codec of those four letters.
 
     An odd row or column at the end is left out: MPEG-4 has none. Returns `path`. Raises InputError for another ending,
     no frame at all, or a codec that this OpenCV does not have; ValueError for frames of different sizes.
     """
-    codec = CODECS.get(path.suffix.lower())
+    codec = codec or CODECS.get(path.suffix.lower())
     if codec is None:
         raise InputError(f"{path}: the ending of a video is one of {', '.join(CODECS)}; choose one of them")
     with atomic_path(path) as temporary:

@@ -26,7 +26,7 @@ from msgs_slam.msgs_cli.text import say
     help="A data set with true poses and, if it has them, depth and labels.",
 )  # fmt: skip
 @click.option("--truth-format", default="auto", help="Layout of the truth; auto recognises it.")
-@click.option("--out", type=FOLDER, metavar="DIR", help="Default: the source's name + .ablation, here.")
+@click.option("--out", "-o", type=FOLDER, metavar="DIR", help="Default: the source's name + .ablation, here.")
 @click.option("--seeds", default="0", show_default=True, metavar="N,N,...", help="One run of every row with each seed.")
 @click.option("--only", multiple=True, metavar="NAME", help="One row of the table only; may be repeated.")
 @click.option(

@@ -18,6 +18,7 @@ from msgs_slam.msgs_cli.options import (
     source_options,
     source_settings,
     stopping_softly,
+    tell_result,
     verbosity_options,
     worker_setup,
 )
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("folder", type=FOLDER)
-@click.option("--out", type=FOLDER, required=True, metavar="RUNS", help="Where the runs, batch.json and batch.md go.")
+@click.option("--out", "-o", type=FOLDER, required=True, metavar="RUNS", help="Of the runs, batch.json and batch.md.")
 @engine_options("local: one recording after the other; ray: as many at once as the cluster has room for.")
 @click.option("--shard", default="0/1", metavar="K/N", help="Every N-th recording only, the K-th from 0 on.")
 @settings_options
@@ -81,6 +82,7 @@ def batch(
             engine.close()  # type: ignore[union-attr]
     if not quiet:
         _print(rows)
+    tell_result(quiet, table=out / "batch.json", runs=[r.run for r in mine], failed=[r.run for r in failed])
     if failed:
         say(f"{len(failed)} of {len(mine)} recordings failed; {out}/NAME.failed.txt says why", err=True)
         sys.exit(1)

@@ -1,53 +1,168 @@
-"""What happens, as one JSON object a line on stderr, for programs that watch (`--log-format json`)."""
+"""What happens, as one JSON object a line on stderr and nothing else there, for programs that watch.
+
+`--log-format json`. Each has `event` and `time` (seconds since 1970): stage, progress, warning, log, stopping, and one
+of result, stopped, error at the end.
+"""
 
 from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
+import threading
 import time
+import traceback
 from collections.abc import Iterable, Iterator
-from typing import IO, Any, TypeVar
+from contextlib import contextmanager, suppress
+from itertools import pairwise
+from typing import Any, TypeVar
 
 import click
 
+from msgs_slam.pipelines.system.progress import BEGUN, StageEvent
+
 T = TypeVar("T")
 _SECONDS_BETWEEN = 0.2
+_STDERR = 2
+_AT_ONCE = 1 << 16
+_place: list[int] = []
+"""Where the lines go while the standard error output is watched; empty: to sys.stderr."""
+_stage: dict[str, Any] = {}
+"""The stage that runs."""
 
 
 def write_line(event: str, **values: Any) -> None:
-    """{"event": progress, log or error, "time": seconds since 1970, ...}."""
-    line = json.dumps({"event": event, "time": round(time.time(), 3), **values})
-    sys.stderr.write(line + "\n")
-    sys.stderr.flush()
+    """{"event": ..., "time": seconds since 1970, ...}, in one piece whatever else is written."""
+    line = json.dumps({"event": event, "time": round(time.time(), 3), **values}) + "\n"
+    if not _place:
+        sys.stderr.write(line)
+        sys.stderr.flush()
+        return
+    rest = line.encode("ascii")
+    while rest:
+        rest = rest[os.write(_place[-1], rest) :]
 
 
 class JsonProgress:
-    """{"event": "progress", "label", "done", "total"}, at most five a second and one at each end."""
+    """{"event": "stage", "name", "index", "of", "state", ...} and {"event": "progress", "label", "done", "total"}, of
+    these at most five a second and one at each end."""
 
     def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
         """Yield the items."""
         done, said = 0, 0.0
-        write_line("progress", label=label, done=0, total=total)
+        self._tell(label, 0, total)
         for done, item in enumerate(items, 1):
             yield item
             if time.monotonic() - said > _SECONDS_BETWEEN:
                 said = time.monotonic()
-                write_line("progress", label=label, done=done, total=total)
-        write_line("progress", label=label, done=done, total=total, ended=True)
+                self._tell(label, done, total)
+        self._tell(label, done, total, ended=True)
+
+    def _tell(self, label: str, done: int, total: int | None, **more: Any) -> None:
+        write_line("progress", **_stage, label=label, done=done, total=total, **more)
+
+    def stage(self, event: StageEvent) -> None:
+        """One line."""
+        _stage.clear()
+        if event.state == BEGUN:
+            _stage.update(stage=event.name, index=event.index, of=event.of)
+        left = event.left()
+        values: dict[str, Any] = {"name": event.name, "index": event.index, "of": event.of, "state": event.state}
+        if event.seconds:
+            values |= {"seconds": round(event.seconds, 2), "figures": event.figures}
+        write_line("stage", **values, seconds_left=None if left is None else round(left))
 
 
 class JsonHandler(logging.Handler):
-    """{"event": "log", "level", "message"}."""
+    """{"event": "warning", "message"}, or {"event": "log", "level", "message"}."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """One line."""
-        write_line("log", level=record.levelname.lower(), message=record.getMessage())
+        if record.levelno == logging.WARNING:
+            write_line("warning", **_stage, message=record.getMessage())
+        else:
+            write_line("log", level=record.levelname.lower(), message=record.getMessage())
 
 
-class JsonError(click.ClickException):
-    """{"event": "error", "message"}, exit code 1."""
+def is_asked_for(arguments: Iterable[str]) -> bool:
+    """Whether a command line asks for JSON lines; seen before it is parsed, for what is wrong with it is told so."""
+    words = list(arguments)
+    given = [b for a, b in pairwise(words) if a == "--log-format"]
+    given += [w.partition("=")[2] for w in words if w.startswith("--log-format=")]
+    return given[-1:] == ["json"]
 
-    def show(self, file: IO[Any] | None = None) -> None:
-        """One line."""
-        write_line("error", message=self.message)
+
+@contextmanager
+def only_json() -> Iterator[None]:
+    """In this block everything on stderr is a JSON line: what libraries, other threads and child processes print there
+    becomes {"event": "log", "level": "print"}, and what ends the program the last line. Ends with SystemExit always."""
+    code = 0
+    with _watched():
+        try:
+            yield
+        except click.exceptions.Exit as ended:
+            code = ended.exit_code
+        except SystemExit as ended:
+            code = ended.code if isinstance(ended.code, int) else int(bool(ended.code))
+        except (click.Abort, KeyboardInterrupt):
+            code = 130
+            write_line("stopped", signal=2, exit_code=code)
+        except click.ClickException as error:
+            code = error.exit_code
+            write_line("error", message=error.format_message(), exit_code=code)
+        except Exception as error:
+            code = 1
+            write_line("error", message=f"{type(error).__name__}: {error}", exit_code=code, traceback=_trace(error))
+    sys.exit(code)
+
+
+def _trace(error: BaseException) -> str:
+    return "".join(traceback.format_exception(error))
+
+
+@contextmanager
+def _watched() -> Iterator[None]:
+    """Turn what is printed on the process's stderr into lines; nothing where sys.stderr is something else (a test)."""
+    try:
+        real = sys.stderr.fileno() == _STDERR
+    except (AttributeError, OSError, ValueError):
+        real = False
+    if not real:
+        yield
+        return
+    sys.stderr.flush()
+    kept, (reading, writing), before = os.dup(_STDERR), os.pipe(), sys.stderr
+    os.dup2(writing, _STDERR)
+    os.close(writing)
+    # What was a file can be sought in, and a pipe cannot: the old stream would try.
+    sys.stderr = open(_STDERR, "w", buffering=1, encoding="utf-8", errors="backslashreplace", closefd=False)  # noqa: SIM115
+    _place.append(kept)
+    reader = threading.Thread(target=_tell_prints, args=(reading,), daemon=True)
+    reader.start()
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            sys.stderr.flush()
+        sys.stderr = before
+        nowhere = os.open(os.devnull, os.O_WRONLY)  # what is printed from here on would not be JSON
+        os.dup2(nowhere, _STDERR)
+        os.close(nowhere)
+        reader.join(timeout=2.0)  # a child that still runs holds the other end
+
+
+def _tell_prints(source: int) -> None:
+    """A line for each line that comes; carriage returns end lines too."""
+    rest = b""
+    while data := os.read(source, _AT_ONCE):
+        *lines, rest = (rest + data).replace(b"\r", b"\n").split(b"\n")
+        for line in filter(None, lines):
+            _tell_print(line)
+    if rest:
+        _tell_print(rest)
+
+
+def _tell_print(line: bytes) -> None:
+    with suppress(OSError):
+        write_line("log", level="print", message=line.decode("utf-8", errors="backslashreplace"))

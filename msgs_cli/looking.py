@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import Any
 
 import click
 
-from msgs_slam.msgs_cli.options import RUN_ARGUMENT, make_progress, open_run, set_up_logging, verbosity_options
+from msgs_slam.msgs_cli.options import (
+    RUN_ARGUMENT,
+    ending_quietly,
+    like_ctrl_c,
+    make_progress,
+    open_run,
+    set_up_logging,
+    tell_result,
+    verbosity_options,
+)
 from msgs_slam.msgs_cli.text import say
 
 
@@ -39,8 +50,10 @@ def evaluate(
     joins = open_class_map(class_map) if class_map else None
     run = open_run(run_path)
     sequence = open_sequence(truth, truth_format)
-    figures = write_evaluation(run, sequence, make_progress(quiet), legacy=protocol == "splatam", class_map=joins)
+    with ending_quietly():
+        figures = write_evaluation(run, sequence, make_progress(quiet), legacy=protocol == "splatam", class_map=joins)
     say(evaluation_table(figures))
+    tell_result(quiet, evaluation=run.evaluation_file.parent)
 
 
 @click.command()
@@ -54,28 +67,58 @@ def report(run_path: Path, to: Path | None, quiet: bool, verbose: bool) -> None:
     set_up_logging(quiet, verbose)
     from msgs_slam.pipelines.evaluation.report import write_report
 
-    say(write_report(open_run(run_path), to, make_progress(quiet)))
+    with ending_quietly():
+        made = write_report(open_run(run_path), to, make_progress(quiet))
+    say(made)
+    tell_result(quiet, report=made)
+
+
+class Size(click.ParamType):
+    """640x480"""
+
+    name = "size"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        """(width, height) of at least 16 and at most 8192 pixels each."""
+        found = re.fullmatch(r"(\d{2,4})[xX×](\d{2,4})", value) if isinstance(value, str) else None
+        sides = (int(found[1]), int(found[2])) if found else (0, 0)
+        if not all(16 <= side <= 8192 for side in sides):
+            self.fail(f"{value!r}: expected width and height in pixels, 16 to 8192, like 1280x720", param, ctx)
+        return sides
 
 
 @click.command()
 @RUN_ARGUMENT
 @click.argument("target", metavar="VIDEO|FOLDER", type=click.Path(path_type=Path))
 @click.option(
-    "--kind", default="side-by-side", type=click.Choice(["color", "depth", "labels", "side-by-side"]),
-    help="What is drawn.",
+    "--kind", default="color", show_default=True, type=click.Choice(["color", "depth", "labels", "side-by-side"]),
+    help="What is drawn; side-by-side: all three, three times as wide.",
 )  # fmt: skip
 @click.option(
-    "--path", "camera_path", default="smooth", type=click.Choice(["own", "smooth", "orbit"]),
+    "--path", "camera_path", default="smooth", show_default=True, type=click.Choice(["own", "smooth", "orbit"]),
     help="The run's own camera path, the same smoothed, or a circle about the scene.",
 )  # fmt: skip
 @click.option("--fps", default=30.0, type=click.FloatRange(0.1, 240), help="Frames a second.", show_default=True)
+@click.option(
+    "--size", type=Size(), metavar="WIDTHxHEIGHT", help="Pixels of the pictures. Default: those of the run's frames."
+)
 @verbosity_options
-def render(run_path: Path, target: Path, kind: str, camera_path: str, fps: float, quiet: bool, verbose: bool) -> None:
-    """Draw the map of RUN along a camera path into a video (.mp4) or a folder of pictures."""
+def render(
+    run_path: Path, target: Path, kind: str, camera_path: str, fps: float, size: tuple[int, int] | None, quiet: bool,
+    verbose: bool,
+) -> None:  # fmt: skip
+    """Draw the map of RUN along a camera path into a video or a folder of pictures.
+
+    An .mp4 is H.264 where PyAV is installed (pip install 'msgs-slam[hdr]'), else VP9: browsers play both. An .avi or
+    .mkv loses nothing (FFV1).
+    """
     set_up_logging(quiet, verbose)
     from msgs_slam.pipelines.render_run import render_run
 
-    say(render_run(open_run(run_path), target, kind, camera_path, fps, progress=make_progress(quiet)))
+    with ending_quietly():
+        made = render_run(open_run(run_path), target, kind, camera_path, fps, 0, make_progress(quiet), size)
+    say(made)
+    tell_result(quiet, video=made)
 
 
 @click.command()
@@ -89,9 +132,13 @@ def view(path: Path, port: int, host: str) -> None:
     """
     from msgs_slam.pipelines.viewer.server import open_viewer
 
-    viewer = open_viewer(path, host, port)
-    say(f"open {viewer.url} in a browser; Ctrl-C ends it", err=True)
     try:
-        viewer.wait()
+        with like_ctrl_c():
+            viewer = open_viewer(path, host, port)
+            say(f"open {viewer.url} in a browser; Ctrl-C ends it", err=True)
+            try:
+                viewer.wait()
+            finally:
+                viewer.stop()
     except KeyboardInterrupt:
-        viewer.stop()
+        return

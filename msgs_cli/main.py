@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +15,22 @@ import click
 # Spinning OpenMP threads of one library steal the cores of the next; must be set before torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.errors import InputError, SettingError
 from msgs_slam.msgs_cli import looking
 from msgs_slam.msgs_cli.ablating import ablate
 from msgs_slam.msgs_cli.batch import batch
 from msgs_slam.msgs_cli.doctor import doctor
-from msgs_slam.msgs_cli.json_lines import JsonError
+from msgs_slam.msgs_cli.json_lines import is_asked_for, only_json
 from msgs_slam.msgs_cli.models import models
 from msgs_slam.msgs_cli.options import (
     FOLDER,
-    LOG_FORMAT,
     RUN_ARGUMENT,
     UNTIL,
     cluster_workers,
+    device_option,
+    ending_quietly,
     engine_options,
+    is_said,
     make_progress,
     open_run,
     set_up_logging,
@@ -34,6 +38,7 @@ from msgs_slam.msgs_cli.options import (
     source_options,
     source_settings,
     stopping_softly,
+    tell_result,
     verbosity_options,
 )
 from msgs_slam.msgs_cli.text import flush_output, prepare_streams, printable, say
@@ -42,7 +47,16 @@ from msgs_slam.pipelines.run.names import EXPORTS
 
 
 class FriendlyGroup(click.Group):
-    """Prints an InputError as one message with exit code 1; a bug keeps its traceback."""
+    """Prints an InputError as one message with exit code 1, or 2 where an option or setting cannot be; a bug keeps its
+    traceback. Where `--log-format json` is asked for, all that is JSON lines."""
+
+    def main(self, args: Sequence[str] | None = None, *rest: Any, **more: Any) -> Any:
+        """As click's."""
+        words = sys.argv[1:] if args is None else list(args)
+        if not is_asked_for(words):
+            return super().main(args, *rest, **more)
+        with only_json():
+            sys.exit(super().main(args, *rest, **more | {"standalone_mode": False}))
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command inside the one error boundary."""
@@ -51,7 +65,7 @@ class FriendlyGroup(click.Group):
             flush_output()
             return result
         except InputError as error:
-            raise _refused(ctx, str(error)) from error
+            raise _refused(error) from error
         except OSError as error:
             if error.errno not in _SYSTEM_REFUSES:
                 raise
@@ -61,10 +75,19 @@ class FriendlyGroup(click.Group):
             ) from error
 
 
-def _refused(ctx: click.Context, text: str) -> click.ClickException:
-    return JsonError(text) if ctx.meta.get(LOG_FORMAT) == "json" else click.ClickException(printable(text))
+def _refused(error: InputError) -> click.ClickException:
+    kind = SettingRefused if isinstance(error, SettingError) else click.ClickException
+    return kind(printable(str(error)))
 
 
+class SettingRefused(click.ClickException):
+    """Ends as a wrong option does."""
+
+    exit_code = click.UsageError.exit_code
+
+
+_COMES_WITH = {"nerfstudio": "colmap"}
+"""Of `export --only`: written together with another kind."""
 _SYSTEM_REFUSES = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENAMETOOLONG}
 """What the user can do something about: rights, room, names."""
 
@@ -75,10 +98,11 @@ def main() -> None:
     """Turn a plain video into camera poses, a semantic Gaussian map and a labelled mesh.
 
     \b
-    msgs-slam demo                      try it on a small synthetic room (under 3 minutes)
+    msgs-slam demo                      try it on a small synthetic room (about 4 minutes on two cores)
     msgs-slam reconstruct video.mp4     the whole job; writes video.msgs/
     msgs-slam resume video.msgs         go on after a stop
     msgs-slam batch FOLDER --out RUNS   many recordings, on one machine or many
+    msgs-slam work RUN --shard K/N      one of many processes at one long run
     msgs-slam status video.msgs         what is done, what was found
     msgs-slam export video.msgs         write the export files again, or elsewhere
     msgs-slam report video.msgs         one HTML page: what was found, how good, what to film better
@@ -89,13 +113,16 @@ def main() -> None:
     msgs-slam models list               learned models for metric depth and named classes
     msgs-slam doctor                    what this machine has for the program, and what to mend
     msgs-slam config                    every setting with its default and meaning
+    msgs-slam completion bash           what makes a shell complete commands and options
     """
     prepare_streams()
 
 
 @main.command()
 @click.argument("sources", metavar="SOURCE...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--out", type=FOLDER, metavar="RUN", help="The run folder. Default: the source's name + .msgs, here.")
+@click.option(
+    "--out", "-o", type=FOLDER, metavar="RUN", help="The run folder. Default: the source's name + .msgs, here."
+)
 @settings_options
 @source_options
 @UNTIL
@@ -146,6 +173,7 @@ def reconstruct(
 @main.command()
 @RUN_ARGUMENT
 @settings_options
+@device_option
 @UNTIL
 @engine_options("local: all in this process; ray: keyframes' depths and submaps on the nodes of a cluster.")
 @verbosity_options
@@ -158,6 +186,7 @@ def resume(
     address: str,
     quiet: bool,
     verbose: bool,
+    **about_source: str | None,
 ) -> None:
     """Go on with RUN where it stopped. Finished stages are kept unless one of their settings is changed."""
     set_up_logging(quiet, verbose)
@@ -169,7 +198,7 @@ def resume(
 
     run = RunFolder(run_path)
     require_run(run)
-    config = load_config(config_file, overrides, base=load_settings(run))
+    config = load_config(config_file, [*overrides, *source_settings(about_source)], base=load_settings(run))
     with (
         cluster_workers(engine_name, address, config, quiet, verbose) as (workers, config),
         stopping_softly(f"Go on with: msgs-slam resume {run.root}"),
@@ -206,7 +235,10 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
 
 @main.command()
 @RUN_ARGUMENT
-@click.option("--only", type=click.Choice(EXPORTS), help="Write one kind of file only. Default: all.")
+@click.option(
+    "--only", type=click.Choice([*EXPORTS, *_COMES_WITH]),
+    help="Write one kind of file only; nerfstudio's comes with colmap. Default: all.",
+)  # fmt: skip
 @click.option("--to", type=FOLDER, metavar="DIR", help="Where to write. Default: RUN/export.")
 @settings_options
 @verbosity_options
@@ -234,14 +266,19 @@ def export(
 
     run = open_run(run_path)
     settings = load_config(config_file, overrides, base=made_with(run)).export
-    for path in export_run(run, to or run.stage("export"), only, make_progress(quiet), settings):
+    kind, folder = _COMES_WITH.get(only or "", only), to or run.stage("export")
+    with ending_quietly():
+        written = export_run(run, folder, kind, make_progress(quiet), settings)
+    for path in written:
         if not quiet:
             say(path)
+    tell_result(quiet, export=folder, files=written)
 
 
 @main.command()
 @click.option(
     "--out",
+    "-o",
     type=FOLDER,
     default=Path("msgs-demo"),
     metavar="DIR",
@@ -249,8 +286,16 @@ def export(
     help="Where the clip, its truth and the run are written.",
 )
 @settings_options
+@device_option
 @verbosity_options
-def demo(out: Path, config_file: Path | None, overrides: tuple[str, ...], quiet: bool, verbose: bool) -> None:
+def demo(
+    out: Path,
+    config_file: Path | None,
+    overrides: tuple[str, ...],
+    quiet: bool,
+    verbose: bool,
+    **about_source: str | None,
+) -> None:
     """Reconstruct a short video of a made-up room, compare with its known truth, print the errors and where to look."""
     set_up_logging(quiet, verbose)
     from msgs_slam.pipelines.config import load_config
@@ -258,7 +303,7 @@ def demo(out: Path, config_file: Path | None, overrides: tuple[str, ...], quiet:
     from msgs_slam.pipelines.reconstruct import reconstruct as run_reconstruct
     from msgs_slam.pipelines.run.folder import RunFolder
 
-    config = load_config(config_file, overrides)
+    config = load_config(config_file, [*overrides, *source_settings(about_source)])
 
     def reconstruct_clip(video: Path, run: RunFolder) -> None:
         with stopping_softly(f"Go on with: msgs-slam resume {run.root}"):
@@ -272,6 +317,17 @@ def demo(out: Path, config_file: Path | None, overrides: tuple[str, ...], quiet:
         say(f"  {line}")
 
 
+@main.command()
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
+def completion(shell: str) -> None:
+    """Print what makes a shell complete commands and options: msgs-slam completion bash >> ~/.bashrc."""
+    from click.shell_completion import get_completion_class
+
+    found = get_completion_class(shell)
+    if found is not None:
+        click.echo(found(main, {}, "msgs-slam", "_MSGS_SLAM_COMPLETE").source())
+
+
 @main.command("config")
 @settings_options
 def show_config(config_file: Path | None, overrides: tuple[str, ...]) -> None:
@@ -282,16 +338,18 @@ def show_config(config_file: Path | None, overrides: tuple[str, ...]) -> None:
 
 
 def _print_summary(root: Path, records: dict[str, Any]) -> None:
+    """The table, what is not said yet, and where the results are."""
     from msgs_slam.msgs_cli.tables import scale_lines, status_table, warning_lines
     from msgs_slam.pipelines.status import DONE, StageStatus
 
     say(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
-    for line in warning_lines(records):
+    for line in warning_lines(records, is_said):
         say(line, err=True)
     for line in scale_lines(root, records):
         say(line)
     if "export" in records:
         say(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")
+    tell_result(False, run=root, **({"export": root / "export"} if "export" in records else {}))
 
 
 for command in (looking.evaluate, looking.report, looking.render, looking.view):

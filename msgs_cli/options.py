@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from msgs_slam.msgs_cli.json_lines import JsonHandler, JsonProgress
-from msgs_slam.msgs_cli.text import PrintableFormatter, say
+from msgs_slam.msgs_cli.json_lines import JsonHandler, JsonProgress, write_line
+from msgs_slam.msgs_cli.text import TextHandler, say
 from msgs_slam.pipelines.run.names import STAGES
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from msgs_slam.pipelines.system.progress import Progress
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
-RUN_ARGUMENT = click.argument("run_path", metavar="RUN", type=FOLDER)
+RUN_ARGUMENT = click.argument("run_path", metavar="RUN", type=click.Path(path_type=Path))
 
 
 UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], help="Stop after this stage.")
@@ -116,11 +116,13 @@ _SOURCE_OPTIONS = {
     "device": ("run.device", "auto|cpu|cuda", "Where dense work runs. Default: auto."),
     "depth": (
         "proxy.depth", "PROVIDER",
-        "Proxy depth: auto, multiview (needs no weights), files[:FOLDER] or onnx:CARD. Default: auto.",
+        "Proxy depth: auto, multiview (needs no weights), files[:FOLDER], onnx:CARD, or a network by its name in "
+        "`models list`. Default: auto.",
     ),
     "semantics": (
         "proxy.semantics", "PROVIDER",
-        "Semantics: auto, segments (needs no weights), files[:FOLDER] or onnx:CARD. Default: auto.",
+        "Semantics: auto, segments (needs no weights), files[:FOLDER], onnx:CARD, or a network by its name. "
+        "Default: auto.",
     ),
     "classes": (
         "proxy.classes", "WORDS",
@@ -166,10 +168,31 @@ def source_options(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
+def device_option(command: Callable[..., None]) -> Callable[..., None]:
+    """--device of `source_options` alone; see `source_settings`."""
+    setting, metavar, help = _SOURCE_OPTIONS["device"]
+    return click.option("--device", setting.replace(".", "__"), metavar=metavar, help=help)(command)
+
+
 def source_settings(given: dict[str, str | None]) -> list[str]:
-    """The options of `source_options` as `section.key="value"` texts."""
-    texts = {key.replace("__", "."): value for key, value in given.items() if value is not None}
-    return [f"{key}={_toml_string(value)}" for key, value in texts.items()]
+    """The options of `source_options` as `section.key="value"` texts.
+
+    Raises SettingError, in the words that were typed, for a value that one cannot have.
+    """
+    from msgs_slam.formats.errors import SettingError
+    from msgs_slam.pipelines.config import load_config
+
+    texts = []
+    for option, (key, *_) in _SOURCE_OPTIONS.items():
+        if (value := given.get(key.replace(".", "__"))) is None:
+            continue
+        text = f"{key}={_toml_string(value)}"
+        try:
+            load_config(None, [text])
+        except SettingError as error:
+            raise SettingError(str(error).replace(f"--set {text}: {key}", f"--{option}")) from error
+        texts.append(text)
+    return texts
 
 
 def _toml_string(text: str) -> str:
@@ -183,21 +206,54 @@ def set_up_logging(quiet: bool, verbose: bool, as_json: bool | None = None) -> N
         raise click.UsageError("-q and -v exclude each other")
     level = logging.ERROR if quiet else logging.INFO if verbose else logging.WARNING
     as_json = _as_json() if as_json is None else as_json
-    handler: logging.Handler = JsonHandler() if as_json else logging.StreamHandler(sys.stderr)
-    if not as_json:
-        handler.setFormatter(PrintableFormatter("%(levelname)s: %(message)s"))
+    handler: logging.Handler = JsonHandler() if as_json else TextHandler()
+    handler.addFilter(SaidOnce())
     logging.basicConfig(level=level, handlers=[handler], force=True)
 
 
+_said: set[str] = set()
+"""The warnings that have been told since logging was set up."""
+
+
+class SaidOnce(logging.Filter):
+    """A warning is told once, however often it comes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        _said.clear()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether it is news."""
+        text = record.getMessage()
+        is_news = record.levelno != logging.WARNING or text not in _said
+        if record.levelno == logging.WARNING:
+            _said.add(text)
+        return is_news
+
+
+def is_said(warning: str) -> bool:
+    """Whether it has been told already."""
+    return warning in _said
+
+
 def make_progress(quiet: bool, as_json: bool | None = None) -> Progress:
-    """Bars on stderr, or JSON lines, or nothing."""
+    """Bars on a terminal, a line a stage in a file or pipe, JSON lines, or nothing."""
     from msgs_slam.msgs_cli.progress import BarProgress
-    from msgs_slam.pipelines.system.progress import SilentProgress
+    from msgs_slam.pipelines.system.progress import LineProgress, SilentProgress
 
     if quiet:
         return SilentProgress()
     as_json = _as_json() if as_json is None else as_json
-    return JsonProgress() if as_json else BarProgress()
+    if as_json:
+        return JsonProgress()
+    return BarProgress() if sys.stderr.isatty() else LineProgress()
+
+
+def tell_result(quiet: bool, **paths: Path | list[Path] | bool) -> None:
+    """The last event of a command that went well, for programs: where its results are."""
+    if _as_json() and not quiet:
+        texts = {k: [str(p) for p in v] if isinstance(v, list) else str(v) for k, v in paths.items()}
+        write_line("result", **texts, exit_code=0)
 
 
 def worker_setup(quiet: bool, verbose: bool, remote: bool) -> Callable[[str], Progress]:
@@ -227,18 +283,57 @@ def open_run(path: Path) -> RunFolder:
 
 
 @contextmanager
+def like_ctrl_c() -> Iterator[None]:
+    """In this block SIGTERM (docker stop, systemd) raises KeyboardInterrupt."""
+    from msgs_slam.pipelines.system.stopping import let_libraries_take_signals
+
+    let_libraries_take_signals()
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def ending_quietly() -> Iterator[None]:
+    """In this block SIGTERM ends the process at once and without a stack trace of a library."""
+    from msgs_slam.pipelines.system.stopping import let_libraries_take_signals
+
+    let_libraries_take_signals()
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+_STOPPING = (
+    "Stopping at the next snapshot. Press Ctrl-C again to stop now (what was done since the last snapshot is lost)."
+)
+
+
+@contextmanager
 def stopping_softly(how_to_go_on: str) -> Iterator[None]:
     """The first SIGINT, SIGTERM or SIGHUP ends the work in this block at its next snapshot, the second at once; then
     the process ends with 128 plus the signal's number, as shells expect."""
     from msgs_slam.pipelines.system.stopping import soft_stop
 
+    as_json = _as_json()
+
     def tell(number: int) -> None:
-        # Not through click: a signal may come while it prints.
-        os.write(2, b"\nStopping at the next snapshot. Once more: at once, which loses what was done since the last.\n")
+        if as_json:
+            write_line("stopping", signal=number, message=_STOPPING)
+        else:  # not through click: a signal may come while it prints
+            os.write(2, f"\n{_STOPPING}\n".encode())
 
     try:
         with soft_stop(tell):
             yield
     except KeyboardInterrupt as error:
-        say(f"\nStopped. {how_to_go_on}", err=True)
-        sys.exit(128 + getattr(error, "number", signal.SIGINT))
+        number = getattr(error, "number", signal.SIGINT)
+        if as_json:
+            write_line("stopped", signal=int(number), message=how_to_go_on, exit_code=128 + number)
+        else:
+            say(f"\nStopped. {how_to_go_on}", err=True)
+        sys.exit(128 + number)

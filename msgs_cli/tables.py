@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 
 KEY_FIGURES = {
-    "frames": ("frames", "keyframes_placed", "calibration", "focal_px", "focal_sd_px"),
-    "proxy": ("depth", "semantics", "metric", "classes"),
+    "frames": ("frames", "keyframes_placed", "calibration", "focal_px", "focal_sd_px", "gps"),
+    "proxy": ("depth", "semantics", "metric", "metres_per_unit", "classes"),
     "tracking": ("posed", "keyframes", "lost", "scale"),
     "mapping": ("gaussians", "keyframe_psnr"),
     "global_ba": ("loops",),
@@ -73,6 +73,6 @@ def scale_lines(root: Path, records: dict[str, StageRecord]) -> list[str]:
     return [] if metres is None else [f"\nScale: {metres.text}"]
 
 
-def warning_lines(records: dict[str, StageRecord]) -> list[str]:
-    """Every degraded result, by stage."""
-    return [f"warning ({name}): {text}" for name, record in records.items() for text in record.warnings]
+def warning_lines(records: dict[str, StageRecord], is_said: Callable[[str], bool] = lambda text: False) -> list[str]:
+    """Every degraded result, by stage, that is not said yet."""
+    return [f"warning ({n}): {text}" for n, record in records.items() for text in record.warnings if not is_said(text)]

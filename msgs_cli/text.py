@@ -20,12 +20,18 @@ def say(text: Any = "", err: bool = False) -> None:
     click.echo(printable(str(text)), err=err)
 
 
-class PrintableFormatter(logging.Formatter):
-    """Logs without what a terminal would obey."""
+class TextHandler(logging.Handler):
+    """Logs on stderr, above a bar where one is shown, without what a terminal would obey."""
 
-    def format(self, record: logging.LogRecord) -> str:
-        """One line."""
-        return printable(super().format(record))
+    def emit(self, record: logging.LogRecord) -> None:
+        """One line, and the traceback where there is one."""
+        text = printable(logging.Formatter("%(levelname)s: %(message)s").format(record))
+        if sys.stderr.isatty():
+            from tqdm import tqdm
+
+            tqdm.write(text, file=sys.stderr)
+        else:
+            print(text, file=sys.stderr, flush=True)
 
 
 def prepare_streams() -> None:

@@ -5,7 +5,6 @@ Defaults < a TOML file < `section.key=value` overrides. Unknown keys and wrong t
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 import tomllib
@@ -14,9 +13,9 @@ from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
-from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.errors import InputError, SettingError
 from msgs_slam.formats.jsonfile import read_toml
-from msgs_slam.pipelines.retired_settings import explain_retired
+from msgs_slam.pipelines.retired_settings import explain_retired, nearest
 
 
 def setting(
@@ -39,7 +38,10 @@ class RunConfig:
 
     seed: int = setting(0, "seed of every random choice", within=(0, 2**31 - 1))
     threads: int = setting(0, "CPU threads, 0 = all cores; the same count gives the same bytes", within=(0, 1024))
-    format: str = setting("auto", "layout of the source: a data set's; images = a video or plain images; auto looks")
+    format: str = setting(
+        "auto", "layout of the source: a data set's; images = a video or plain images; auto looks",
+        ("auto", "images", "7scenes", "replica", "tum", "euroc", "scannet", "sens", "nerfstudio", "colmap", "folder"),
+    )  # fmt: skip
     device: str = setting("auto", "where dense work runs; auto takes a GPU if there is one", ("auto", "cpu", "cuda"))
     memory_mb: int = setting(
         0, "plan with this much memory: given, long recordings are made in parts that fit. 0 = half of the machine's",
@@ -96,8 +98,10 @@ class FramesConfig:
 class ProxyConfig:
     """Proxy depth and semantics of every keyframe."""
 
-    depth: str = setting("auto", "depth provider: auto, multiview, files:FOLDER, files, onnx:CARD or onnx:MODEL")
-    semantics: str = setting("auto", "semantics provider: auto, segments, files:FOLDER, files, onnx:CARD or onnx:MODEL")
+    depth: str = setting("auto", "depth provider: auto, multiview, files[:FOLDER], onnx:CARD or a network's name")
+    semantics: str = setting(
+        "auto", "semantics provider: auto, segments, files[:FOLDER], onnx:CARD or a network's name"
+    )
     classes: str = setting("", "words to look for, comma-separated, for a network that compares pictures with words")
     frames: str = setting("keyframes", "which frames get maps; all needs depth without poses", ("keyframes", "all"))
     max_side: int = setting(640, "the maps are at most this many pixels on the long side", within=(64, 8192))
@@ -285,7 +289,7 @@ def load_config(file: Path | None = None, overrides: Iterable[str] = (), base: C
         key, separator, value = text.partition("=")
         section, dot, name = key.strip().partition(".")
         if not separator or not dot:
-            raise InputError(f"--set {text}: expected section.key=value, for example --set frames.rate=5")
+            raise SettingError(f"--set {text}: expected section.key=value, for example --set frames.rate=5")
         config = merge_settings(config, {section: {name: _parse_value(value.strip())}}, where=f"--set {text}")
     return config
 
@@ -295,9 +299,9 @@ def merge_settings(config: Config, changes: Mapping[str, Any], where: str) -> Co
     sections = {f.name: getattr(config, f.name) for f in fields(config)}
     for section, values in changes.items():
         if section not in sections:
-            raise InputError(f"{where}: there is no section {section!r}{_nearest(section, sections)}")
+            raise SettingError(f"{where}: there is no section {section!r}{nearest(section, sections)}")
         if not isinstance(values, Mapping):
-            raise InputError(f"{where}: {section} is a section of settings, got {values!r:.80}")
+            raise SettingError(f"{where}: {section} is a section of settings, got {values!r:.80}")
         sections[section] = _merge_section(sections[section], section, values, where)
     return Config(**sections)
 
@@ -318,11 +322,11 @@ def _merge_section(section: Any, name: str, values: Mapping[str, Any], where: st
     types = get_type_hints(type(section))
     known = {f.name: f for f in fields(section)}
     if retired := explain_retired(f"{name}.{key}" for key in values if key not in known):
-        raise InputError(f"{where}: settings of an earlier version: {retired}")
+        raise SettingError(f"{where}: settings of an earlier version: {retired}")
     checked = {}
     for key, value in values.items():
         if key not in known:
-            raise InputError(f"{where}: there is no setting {name}.{key}{_nearest(key, known, name + '.')}")
+            raise SettingError(f"{where}: there is no setting {name}.{key}{nearest(key, known, name + '.')}")
         checked[key] = _checked(value, types[key], known[key].metadata["choices"], f"{where}: {name}.{key}")
         _require_within(checked[key], known[key], f"{where}: {name}.{key}")
     return replace(section, **checked)
@@ -332,7 +336,7 @@ def _require_within(value: Any, known: Field[Any], where: str) -> None:
     if (within := known.metadata["within"]) is None or (known.metadata["or_zero"] and value == 0):
         return
     if not within[0] <= value <= within[1]:  # not so of NaN either
-        raise InputError(f"{where} is {_range_text(known)}; got {value!r:.40}")
+        raise SettingError(f"{where} is {_range_text(known)}; got {value!r:.40}")
 
 
 def allowed_values(known: Field[Any]) -> str:
@@ -349,16 +353,16 @@ def _checked(value: Any, wanted: Any, choices: tuple[str, ...], where: str) -> A
     if get_origin(wanted) is tuple:
         element = get_args(wanted)[0]
         if not isinstance(value, list | tuple):
-            raise InputError(f"{where} expects a list, got {value!r}")
+            raise SettingError(f"{where} expects a list, got {value!r}")
         return tuple(_checked(v, element, (), where) for v in value)
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value) if abs(value) < 2**53 else math.inf
     if wanted is str and not choices and isinstance(value, int | float) and not isinstance(value, bool):
         value = str(value)  # strings need no quotes, and a file's name may be a number
     if not isinstance(value, wanted) or (wanted is int and isinstance(value, bool)):
-        raise InputError(f"{where} expects {wanted.__name__}, got {value!r:.80}")
+        raise SettingError(f"{where} expects {wanted.__name__}, got {value!r:.80}")
     if choices and value not in choices:
-        raise InputError(f"{where} is one of {', '.join(choices)}; got {value!r}{_nearest(value, choices)}")
+        raise SettingError(f"{where} is one of {', '.join(choices)}; got {value!r}{nearest(value, choices)}")
     return value
 
 
@@ -368,11 +372,6 @@ def _parse_value(text: str) -> Any:
         return tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         return text
-
-
-def _nearest(word: str, known: Iterable[str], prefix: str = "") -> str:
-    matches = difflib.get_close_matches(word, list(known), n=1, cutoff=0.4)
-    return f"; did you mean {prefix}{matches[0]}?" if matches else f"; known: {', '.join(known)}"
 
 
 def config_to_dict(config: Any) -> dict[str, Any]:

@@ -126,10 +126,19 @@ def resume(
 
 def require_run(run: RunFolder) -> None:
     """Raise InputError unless the folder holds a run."""
-    if not run.manifest_file.exists():
-        raise InputError(
-            f"{run.root} is not a run folder (it has no manifest.json). Runs are made by `msgs-slam reconstruct VIDEO`"
-        )
+    if run.manifest_file.exists():
+        return
+    what = "does not exist" if not run.root.exists() else "is not a run folder (it has no manifest.json)"
+    near = [f"did you mean {' or '.join(map(str, found))}?"] if (found := runs_near(run.root)) else []
+    raise InputError(" ".join([f"{run.root} {what}.", *near, "Runs are made by `msgs-slam reconstruct VIDEO`"]))
+
+
+def runs_near(path: Path, most: int = 3) -> list[Path]:
+    """Run folders that may be meant where `path` is none: in it, around it, of the video that it is, of a like name."""
+    inside = sorted(path.iterdir()) if path.is_dir() else []
+    beside = [path.with_suffix(".msgs"), Path(f"{path.stem}.msgs"), *path.parents[:2]]
+    found = dict.fromkeys(p for p in [*inside, *beside] if RunFolder(p).manifest_file.is_file())
+    return list(found)[:most]
 
 
 def _run(

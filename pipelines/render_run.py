@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs_slam.formats.browser_video import PLAYED, write_browser_video
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.video_writer import CODECS, write_video
@@ -16,7 +18,8 @@ from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.evaluation.pictures import Picture, depth_picture, depth_range, label_picture
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.system.progress import Progress, SilentProgress
+from msgs_slam.pipelines.system.progress import Progress, SilentProgress, log
+from msgs_slam.pipelines.types import Intrinsics
 from msgs_slam.pipelines.upright.world import up_in_run
 
 KINDS = ("color", "depth", "labels", "side-by-side")
@@ -27,16 +30,18 @@ _SMOOTHING_SECONDS = 0.5
 def render_run(
     run: RunFolder,
     target: Path,
-    kind: str = "side-by-side",
+    kind: str = "color",
     path: str = "smooth",
     fps: float = 30.0,
     frames: int = 0,
     progress: Progress | None = None,
+    size: tuple[int, int] | None = None,
 ) -> Path:
     """Draw the map along a path into a video (.mp4, .avi, .mkv) or, for any other name, a folder of PNG files.
 
     kind: one of `KINDS`; path: one of `PATHS`; frames: how many pictures, 0 = as long as the walk took (an orbit: ten
-    seconds). Returns `target`. Raises InputError for an unknown kind or path, or a run without a map.
+    seconds); size: (width, height) of a picture, by default the run's. Returns `target`; where browsers will not play
+    the video, a warning says so. Raises InputError for an unknown kind or path, or a run without a map.
     """
     _require_choice("kind", kind, KINDS)
     _require_choice("path", path, PATHS)
@@ -46,13 +51,38 @@ def render_run(
         raise InputError(f"{target} is a file. Name a folder for pictures, or a video ending in {', '.join(CODECS)}")
     outcome = load_outcome(run)
     outcome.require_map()
+    outcome = outcome if size is None else _of_size(outcome, size)
     near, far = _depth_range(outcome)
     world_from_cam = _path(outcome, path, fps, frames, (near * far) ** 0.5)
     steps = (progress or SilentProgress()).track(range(len(world_from_cam)), "rendering", len(world_from_cam))
     pictures = (_draw(outcome, world_from_cam[i], kind, near, far) for i in steps)
-    if target.suffix.lower() in CODECS:
+    return _write(target, pictures, fps)
+
+
+def _write(target: Path, pictures: Iterator[Picture], fps: float) -> Path:
+    kind = target.suffix.lower()
+    if kind not in CODECS:
+        return _write_pictures(target, pictures)
+    if kind != ".mp4":
         return write_video(target, pictures, fps)
-    return _write_pictures(target, pictures)
+    if (codec := write_browser_video(target, pictures, fps)) not in PLAYED:
+        log.warning(
+            "%s is %s, which browsers do not play: nothing here writes H.264 or VP9. pip install 'msgs-slam[hdr]'",
+            target, codec,
+        )  # fmt: skip
+    return target
+
+
+def _of_size(outcome: Outcome, size: tuple[int, int]) -> Outcome:
+    """The same seen by a camera with so many pixels: of another shape it sees more or less at the sides, and the same
+    from top to bottom."""
+    k = outcome.calibration.intrinsics
+    width, height = size
+    scale = height / k.height
+    fx, fy, cx, cy = k.fx * scale, k.fy * scale, k.cx * scale + (width - k.width * scale) / 2, k.cy * scale
+    return replace(
+        outcome, calibration=replace(outcome.calibration, intrinsics=Intrinsics(width, height, fx, fy, cx, cy))
+    )
 
 
 def _require_choice(name: str, value: str, choices: tuple[str, ...]) -> None:

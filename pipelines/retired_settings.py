@@ -1,7 +1,8 @@
-"""Settings that are no more, and what became of each."""
+"""Names that are no settings: what became of those that were, and what may be meant by others."""
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable
 
 MOVED = {
@@ -49,3 +50,16 @@ def explain_retired(keys: Iterable[str]) -> str:
     if fixed:
         moved.append(f"{', '.join(fixed)}: fixed at what was the default")
     return "; ".join(moved)
+
+
+_SAME_AS = {"gpu": "cuda", "nvidia": "cuda", "cuda:0": "cuda", "video": "images", "mp4": "images"}
+"""What people type for a choice that has another name."""
+
+
+def nearest(word: str, known: Iterable[str], prefix: str = "") -> str:
+    """; did you mean ...?, or what is known where nothing is near."""
+    known = list(known)
+    if (meant := _SAME_AS.get(str(word).lower())) in known:
+        return f"; did you mean {meant}?"
+    matches = difflib.get_close_matches(str(word), known, n=1, cutoff=0.4)
+    return f"; did you mean {prefix}{matches[0]}?" if matches else f"; known: {', '.join(known)}"

@@ -92,7 +92,7 @@ def open_sequence(path: Path, format: str = "auto") -> Sequence:
     if format not in FORMATS:
         nearest = get_close_matches(format, FORMATS, 1)
         hint = f", did you mean {nearest[0]!r}?" if nearest else ""
-        raise InputError(f"no data set format {format!r}{hint} Known: {', '.join(FORMATS)}")
+        raise InputError(f"no data set format {format!r}{hint or '.'} Known: {', '.join(FORMATS)}")
     with reaching(path):
         if not path.exists():
             raise InputError(f"no such file or folder: {path}: check the spelling, and that the disk is mounted")

@@ -2,7 +2,7 @@
 
     import msgs_slam
 
-    run = msgs_slam.reconstruct("video.mp4", settings=["mapping.passes=6"])
+    run = msgs_slam.reconstruct("video.mp4", settings={"mapping.passes": 6}, progress=True)
     run.world_from_cam            # (N, 4, 4) poses of the posed frames, in the world of the exported files
     view = run.draw(run.world_from_cam[0])
     view.color, view.depth, view.labels
@@ -12,11 +12,14 @@ Everything else of the program lies beside it under this name: `msgs_slam.format
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from msgs_slam.formats.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,9 +27,11 @@ if TYPE_CHECKING:
 
     from msgs_slam.pipelines.evaluation.views import MapView
     from msgs_slam.pipelines.outcome import Outcome
+    from msgs_slam.pipelines.system.progress import Progress
     from msgs_slam.pipelines.types import Intrinsics
 
-__all__ = ["Run", "main", "open_run", "reconstruct"]
+__all__ = ["InputError", "Run", "__version__", "main", "open_run", "reconstruct"]
+__version__ = version("msgs-slam")
 
 
 @dataclass(frozen=True)
@@ -87,28 +92,58 @@ class Run:
 
 def open_run(path: Path | str) -> Run:
     """A finished run folder. Raises InputError where it is none, or its map is not done."""
+    from msgs_slam.pipelines.reconstruct import require_run
+    from msgs_slam.pipelines.run.folder import RunFolder
+
     run = Run(Path(path))
+    require_run(RunFolder(run.path))
     _ = run.outcome
     return run
 
 
-def reconstruct(source: Path | str, out: Path | str | None = None, settings: Iterable[str] = ()) -> Run:
-    """Reconstruct a video, a folder of images or a data set, or go on where an interrupted run was; silent.
+def reconstruct(
+    source: Path | str,
+    out: Path | str | None = None,
+    settings: Mapping[str, Any] | Iterable[str] = (),
+    progress: Progress | bool = False,
+) -> Run:
+    """Reconstruct a video, a folder of images or a data set, or go on where an interrupted run was.
 
-    out: the run folder, by default the source's name with .msgs in the working folder; settings: as after `--set` on
-    the command line, e.g. "mapping.passes=6". Raises InputError for a source or setting that cannot be used.
+    out: the run folder, by default the source's name with .msgs in the working folder; settings: a dict like
+    {"mapping.passes": 6} or {"mapping": {"passes": 6}}, or texts as after `--set` on the command line; progress: True
+    for bars on a terminal and a line a stage elsewhere, or an object with `track` and `stage`
+    (`msgs_slam.pipelines.system.progress.Progress`). Raises InputError for a source or setting that cannot be used.
     """
-    from msgs_slam.pipelines.config import load_config
+    from msgs_slam.pipelines.config import load_config, merge_settings
     from msgs_slam.pipelines.reconstruct import default_run_folder, existing_config
     from msgs_slam.pipelines.reconstruct import reconstruct as run_reconstruct
     from msgs_slam.pipelines.run.folder import RunFolder
-    from msgs_slam.pipelines.system.progress import SilentProgress
 
     source = Path(source)
     run = RunFolder(Path(out)) if out is not None else default_run_folder(source)
-    config = load_config(None, settings, base=existing_config(run))
-    run_reconstruct(source, run, config, SilentProgress())
+    if isinstance(settings, Mapping):
+        config = merge_settings(existing_config(run) or load_config(), _nested(settings), "settings")
+    else:
+        config = load_config(None, settings, base=existing_config(run))
+    run_reconstruct(source, run, config, _progress(progress))
     return Run(run.root)
+
+
+def _nested(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """{"mapping.passes": 6} → {"mapping": {"passes": 6}}; what is nested already stays so."""
+    sections: dict[str, Any] = {}
+    for key, value in changes.items():
+        section, dot, name = key.partition(".")
+        if not dot and not isinstance(value, Mapping):
+            raise InputError(f"settings: {key!r}: expected section.key, for example frames.rate")
+        sections.setdefault(section, {}).update({name: value} if dot else value)
+    return sections
+
+
+def _progress(wanted: Progress | bool) -> Progress:
+    from msgs_slam.msgs_cli.options import make_progress
+
+    return make_progress(quiet=not wanted, as_json=False) if isinstance(wanted, bool) else wanted
 
 
 def main() -> None:

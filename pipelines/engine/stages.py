@@ -8,8 +8,8 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 from msgs_slam.formats.atomic import is_disk_full, watched_by, write_text
 from msgs_slam.formats.errors import DiskFullError, InputError, RecoverableError
 from msgs_slam.pipelines.config import Config, settings_of_stage
+from msgs_slam.pipelines.engine.time_left import TimeLeft
 from msgs_slam.pipelines.engine.workers import TaskWorkers
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.journal import Journal, empty
@@ -36,7 +37,7 @@ from msgs_slam.pipelines.run.settings_file import save_settings
 from msgs_slam.pipelines.system.device import settle_device
 from msgs_slam.pipelines.system.identity import stage_identity
 from msgs_slam.pipelines.system.memory import give_back, memory_room
-from msgs_slam.pipelines.system.progress import Progress, log
+from msgs_slam.pipelines.system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log
 from msgs_slam.pipelines.system.stopping import stop_if_asked
 
 T = TypeVar("T")
@@ -162,6 +163,7 @@ def run_stages(
     if run.manifest() is None:
         write_manifest(run.manifest_file, Manifest(origin, records))
     save_settings(run, config)
+    watch = Watch(progress, wanted, records)
     for stage in wanted:
         fingerprint = stage_fingerprint(stage, config, upstream, inputs[stage.name])
         record = records.get(stage.name)
@@ -171,16 +173,48 @@ def run_stages(
             folder = run.partial(stage.name)
             settled = replace(config, run=replace(config.run, threads=config.run.threads or threads))
             context = StageContext(run, source, settled, folder, progress, [], stages, same_source, workers)
-            record = _run_one(stage, context, fingerprint, inputs[stage.name])
-            record = replace(record, settings=settings_of(config, stage.name))
+            with watch.running(stage.name) as ended:
+                record = _run_one(stage, context, fingerprint, inputs[stage.name])
+                ended(record := replace(record, settings=settings_of(config, stage.name)))
             records[stage.name] = record
             write_manifest(run.manifest_file, Manifest(origin, records))
             for later in STAGES[STAGES.index(stage.name) + 1 :]:  # made from what is no longer there
                 shutil.rmtree(run.stage(later), ignore_errors=True)
         else:
-            log.info("%s: up to date", stage.name)
+            watch.tell(stage.name, UP_TO_DATE)
         upstream = next_upstream(upstream, record)
     return records
+
+
+class Watch:
+    """Tells of the stages as they begin and end, and how long the rest will take."""
+
+    def __init__(self, progress: Progress, wanted: Sequence[Stage], records: Mapping[str, StageRecord]) -> None:
+        self._progress, self._names = progress, [stage.name for stage in wanted]
+        done = {name: records[name].seconds for name in self._names if name in records}
+        self._left = TimeLeft(self._names, done)
+
+    def tell(self, name: str, state: str, record: StageRecord | None = None) -> None:
+        """One event."""
+        index, figures = self._names.index(name) + 1, record.figures if record else {}
+        seconds = record.seconds if record else 0.0
+        self._progress.stage(StageEvent(name, index, len(self._names), state, seconds, figures, self._left.left))
+
+    @contextmanager
+    def running(self, name: str) -> Iterator[Callable[[StageRecord], None]]:
+        """The stage runs in this block, which hands its record over at its end."""
+        self._left.begin(name)
+        self.tell(name, BEGUN)
+
+        def ended(record: StageRecord) -> None:
+            self._left.end(name, record.seconds)
+            self.tell(name, ENDED, record)
+
+        try:
+            yield ended
+        except BaseException as error:
+            self.tell(name, STOPPED if isinstance(error, KeyboardInterrupt) else REFUSED)
+            raise
 
 
 def _drop(records: dict[str, StageRecord], name: str) -> bool:

@@ -27,6 +27,7 @@ from msgs_slam.pipelines.run.folder import (
     save_matching,
 )
 from msgs_slam.pipelines.run.records import load_records
+from msgs_slam.pipelines.system.progress import WithinStage
 
 
 def make_pieces(context: StageContext) -> list[RunFolder]:
@@ -43,7 +44,8 @@ def make_pieces(context: StageContext) -> list[RunFolder]:
         origin = sha256(f"{name} {records['frames'].content} {records['tracking'].content}".encode()).hexdigest()
         stages = [Stage("frames", take_frames, "the frames of the piece"), *context.stages[1:]]
         try:
-            run_stages(stages, piece, context.source, origin, _settings(context.config), context.progress)
+            inside = WithinStage(context.progress, name)
+            run_stages(stages, piece, context.source, origin, _settings(context.config), inside)
         except RecoverableError:
             raise
         except InputError as error:

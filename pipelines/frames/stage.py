@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.atomic import copy_file
 from msgs_slam.formats.errors import InputError, RecoverableError
+from msgs_slam.formats.gps import photo_places
 from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.formats.jsonfile import read_json, write_json
 from msgs_slam.formats.video import VideoFrame
@@ -42,7 +43,7 @@ from msgs_slam.pipelines.run.folder import (
     save_sparse,
 )
 from msgs_slam.pipelines.source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
-from msgs_slam.pipelines.source.opening import FolderSource, open_source
+from msgs_slam.pipelines.source.opening import FolderSource, Source, open_source
 from msgs_slam.pipelines.source.pick import sharpest_of_windows
 from msgs_slam.pipelines.source.sharpness import reduce_image
 from msgs_slam.pipelines.structure.backbone import to_sparse_model
@@ -84,7 +85,16 @@ def run(context: StageContext) -> dict[str, Any]:
     save_calibration(context.folder, calibration)
     save_frames(context.folder, frames)
     panoramas = {"panoramas": rig.stations} if len(rig) > 1 else {}
-    return _figures(frames, structure, calibration) | panoramas | masked
+    return _figures(frames, structure, calibration) | panoramas | masked | _places(source, frames)
+
+
+def _places(source: Source, frames: list[Frame]) -> dict[str, str]:
+    """How many pictures say by GPS where they were taken, where any does."""
+    if not isinstance(source, FolderSource):
+        return {}
+    places = photo_places([source.file(frame.source_index) for frame in frames])
+    count = int(np.isfinite(places[:, :2]).all(axis=1).sum())
+    return {"gps": f"of {count} of {len(frames)} pictures"} if count else {}
 
 
 def check(source: Path, config: Config) -> None:

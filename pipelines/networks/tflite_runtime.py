@@ -5,7 +5,10 @@ It runs on the CPU whatever the device: the networks it is for take a fraction o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +24,7 @@ from msgs_slam.pipelines.networks.port import Port
 
 _MAGIC = b"TFL3"
 _MAX_BYTES = 1 << 30
+_STDERR = 2
 
 
 class TfliteRuntime:
@@ -33,7 +37,7 @@ class TfliteRuntime:
         Raises InputError for a file that is no such network, and for a tensor that it does not have.
         """
         content = _read(path)
-        with parsing(path, "TFLite network that LiteRT can load", "download it again"):
+        with parsing(path, "TFLite network that LiteRT can load", "download it again"), without_litert_log():
             self._interpreter = Interpreter(model_content=_ending_at(path, content, outputs), num_threads=threads)
             self._interpreter.allocate_tensors()
             self._in = {d["name"]: d for d in self._interpreter.get_input_details()}
@@ -60,6 +64,26 @@ class TfliteRuntime:
             values = _real(self._interpreter.get_tensor(self._out[name]["index"]), self._out[name])
             found.append(np.ascontiguousarray(values.transpose(0, 3, 1, 2)) if values.ndim == 4 else values)
         return found
+
+
+@contextmanager
+def without_litert_log() -> Iterator[None]:
+    """LiteRT says on stderr which delegate it makes, whenever it opens a file, and has no switch for that. What goes
+    wrong it raises."""
+    try:
+        kept = os.dup(_STDERR)
+    except OSError:  # there is none
+        yield
+        return
+    sys.stderr.flush()
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, _STDERR)
+    try:
+        yield
+    finally:
+        os.dup2(kept, _STDERR)
+        os.close(nowhere)
+        os.close(kept)
 
 
 def _read(path: Path) -> bytes:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
 from statistics import median
 
 from msgs_slam.formats.datasets import Sequence as Recording
-from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.errors import InputError, SettingError
 from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.networks.card import Card, read_card
 from msgs_slam.pipelines.networks.registry import ModelStore, default_cache
@@ -53,12 +54,25 @@ class Surroundings:
 
 
 def split_choice(text: str, setting: str, kinds: tuple[str, ...]) -> tuple[str, str]:
-    """`files:FOLDER` → ("files", "FOLDER"). Raises InputError for a kind that does not exist or lacks its part."""
+    """`files:FOLDER` → ("files", "FOLDER"), and the name of a model NAME → ("onnx", "NAME").
+
+    Raises SettingError for a kind that does not exist or lacks its part.
+    """
     kind, _, rest = text.strip().partition(":")
     if kind not in kinds:
-        raise InputError(f"{setting}: there is no provider {text!r}; choose one of {', '.join(kinds)}")
+        models = [m.name for m in ModelStore.open().models]
+        if text.strip() in models:
+            return "onnx", text.strip()
+        near = get_close_matches(kind, [*kinds, *models], n=1, cutoff=0.5)
+        guess = f"; did you mean {near[0]}?" if near else ""
+        raise SettingError(
+            f"{setting}: there is no provider or model {text!r}{guess or '.'} It is one of {', '.join(kinds)}, or a "
+            "network by its name in `msgs-slam models list`"
+        )
     if kind == "onnx" and not rest:
-        raise InputError(f"{setting}: onnx needs the card of a network: onnx:CARD.toml")
+        raise SettingError(
+            f"{setting}: onnx needs the card of a network, onnx:CARD.toml, or its name in `msgs-slam models list`"
+        )
     return kind, rest
 
 

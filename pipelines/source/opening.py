@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -200,8 +201,14 @@ def open_source(path: Path, format: str = "auto") -> VideoSource | FolderSource 
     return FolderSource(path) if path.is_dir() else VideoSource(path)
 
 
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
+"""Begins an address; a path has lost one of its slashes."""
+
+
 def require_source(path: Path) -> None:
     """Raise InputError unless the path is a folder or a file with something in it, and may be read."""
+    if _URL.match(str(path)) and not path.exists():
+        raise InputError(f"{path} is an address on the net: download it first, then give the file (nothing is fetched)")
     with reaching(path):
         if path.is_dir():
             next(path.iterdir(), None)

@@ -345,7 +345,7 @@ class StructureFromMotion:
         doubtful."""
         best: _Tried | None = None
         wanted = [name for name in mappers if self.config.mapper in ("auto", name)]
-        for name in self.progress.track(wanted, "mapping", len(wanted)):
+        for name in self.progress.track(wanted, "camera model", len(wanted)):
             if best is not None and (best[2].is_sound or best[1].startswith(NEIGHBOURS)):
                 break
             found = self._tried(name, views, pairs, pairs)

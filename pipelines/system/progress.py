@@ -5,40 +5,90 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Iterable, Iterator
-from typing import Protocol, TypeVar
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol, TypeVar
 
 T = TypeVar("T")
-_SECONDS_BETWEEN_LINES = 30.0
+_SECONDS_BETWEEN_LINES = 600.0
 log = logging.getLogger("msgs_slam")
+BEGUN, ENDED, UP_TO_DATE, STOPPED, REFUSED = "begun", "done", "up to date", "stopped", "failed"
+
+
+def _unknown() -> None:
+    """Nobody knows how long it will take."""
+
+
+@dataclass(frozen=True)
+class StageEvent:
+    """Stage number `index` of `of` has come into a state: begun, done, up to date (nothing to do), stopped by a signal,
+    failed. seconds and figures of one that is done; left: seconds to the end of all of them at the moment of asking,
+    None where nothing is known."""
+
+    name: str
+    index: int
+    of: int
+    state: str
+    seconds: float = 0.0
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    left: Callable[[], float | None] = _unknown
+
+    @property
+    def title(self) -> str:
+        """[2/6 proxy]"""
+        return f"[{self.index}/{self.of} {self.name}]"
+
+    @property
+    def left_text(self) -> str:
+        """; about 4 min left, or nothing."""
+        seconds = self.left()
+        return f"; {about(seconds)} left" if seconds else ""
+
+
+def about(seconds: float) -> str:
+    """about 40 s, about 4 min, about 3 h: no finer than an estimate is good for."""
+    if seconds < 55:
+        return f"about {max(10 * round(seconds / 10), 10)} s"
+    return f"about {round(seconds / 60)} min" if seconds < 90 * 60 else f"about {round(seconds / 3600)} h"
 
 
 class Progress(Protocol):
-    """Shows one bar a piece of work."""
+    """Shows one bar a piece of work, and which stage it is part of."""
 
     def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
         """Yield the items and show how many are done."""
         ...
 
+    def stage(self, event: StageEvent) -> None:
+        """What is tracked from now on is part of this stage; or the stage has ended."""
+        ...
+
 
 class LineProgress:
-    """A line on stderr at the end of each piece of work, and every half minute of it: for who watches from afar."""
+    """A line on stderr a stage, and every ten minutes of a longer one: for files, pipes, and who watches from afar."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    def __init__(self, name: str = "") -> None:
+        self._before, self._stage = f"{name}: " if name else "", ""
+        self._said = time.monotonic()
 
     def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
         """Yield the items."""
-        done, said = 0, time.monotonic()
         for done, item in enumerate(items, 1):
             yield item
-            if time.monotonic() - said > _SECONDS_BETWEEN_LINES:
-                said = time.monotonic()
-                self._say(label, done, total)
-        self._say(label, done, total)
+            if time.monotonic() - self._said > _SECONDS_BETWEEN_LINES:
+                self._say(f"{self._stage}{label} {done}" + (f" of {total}" if total else ""))
 
-    def _say(self, label: str, done: int, total: int | None) -> None:
-        print(f"{self.name}: {label} {done}" + (f" of {total}" if total else ""), file=sys.stderr, flush=True)
+    def stage(self, event: StageEvent) -> None:
+        """Say that it has ended."""
+        self._stage, self._said = f"{event.title} ", time.monotonic()
+        if event.state == UP_TO_DATE:
+            self._say(f"{event.title} {event.state}")
+        elif event.state == ENDED:
+            self._say(f"{event.title} {event.state} in {event.seconds:.0f} s{event.left_text}")
+
+    def _say(self, text: str) -> None:
+        self._said = time.monotonic()
+        print(self._before + text, file=sys.stderr, flush=True)
 
 
 class SilentProgress:
@@ -47,3 +97,21 @@ class SilentProgress:
     def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
         """Yield the items."""
         yield from items
+
+    def stage(self, event: StageEvent) -> None:
+        """Nothing."""
+
+
+@dataclass(frozen=True)
+class WithinStage:
+    """The progress of a run that is made inside a stage of another: its stages are pieces of work called `name`."""
+
+    progress: Progress
+    name: str
+
+    def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+        """Yield the items."""
+        yield from self.progress.track(items, f"{self.name}: {label}", total)
+
+    def stage(self, event: StageEvent) -> None:
+        """Nothing: the stage around it is the one to tell of."""

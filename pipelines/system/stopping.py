@@ -39,6 +39,7 @@ def soft_stop(tell: Callable[[int], None]) -> Iterator[None]:
         _asked.append(number)
         tell(number)
 
+    let_libraries_take_signals()
     before: dict[Any, Any] = {}
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
@@ -49,6 +50,12 @@ def soft_stop(tell: Callable[[int], None]) -> Iterator[None]:
         _asked.clear()
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def let_libraries_take_signals() -> None:
+    """COLMAP's logging takes SIGTERM, to print a stack trace and die, at the moment in which it is imported: after this
+    it has been, and what is set keeps."""
+    import pycolmap  # noqa: F401
 
 
 def is_asked() -> bool:

@@ -33,7 +33,7 @@ def test_every_command_and_option_has_help(name: str) -> None:
 def test_config_prints_settings_and_refuses_unknown_ones() -> None:
     assert "[mapping]" in invoke("config").stdout
     wrong = invoke("config", "--set", "frames.rat=3")
-    assert wrong.exit_code == 1
+    assert wrong.exit_code == 2, "as an option that does not exist"
     assert "did you mean frames.rate?" in wrong.stderr
 
 

@@ -81,7 +81,7 @@ def test_progress_and_errors_as_json_lines(copied_run: Callable[[str], Path]) ->
     (run / "export" / "mesh.glb").unlink()
     done = invoke("resume", run, "--log-format", "json", "-v")
     lines = [json.loads(line) for line in done.stderr.splitlines()]
-    assert {line["event"] for line in lines} == {"progress", "log"}
+    assert {line["event"] for line in lines} >= {"stage", "progress", "log", "result"}
     ended = [line for line in lines if line.get("ended")]
     assert {line["label"] for line in ended} >= {"drawing"}
     assert all(line["done"] == line["total"] for line in ended)

@@ -1,8 +1,10 @@
 """What a notebook imports, and that an installation brings one name only."""
 
+import importlib.metadata
 import os
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,10 +13,15 @@ import pytest
 
 import msgs_slam
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.trajectory import read_tum
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.records import load_records
+from msgs_slam.pipelines.run.settings_file import load_settings
 from msgs_slam.pipelines.system.identity import source_digest
+from msgs_slam.pipelines.system.progress import SilentProgress, StageEvent
+from tests.pipelines.frames.conftest import QUICK, render, sideways
 
 ROOT = Path(__file__).resolve().parents[2]
 OracleRun = Callable[..., RunFolder]
@@ -45,12 +52,49 @@ def test_its_world_is_that_of_the_files(oracle_run: OracleRun) -> None:
 
 
 def test_errors_say_what_to_do(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no\.msgs"):
+    assert msgs_slam.InputError is InputError
+    with pytest.raises(InputError, match=r"no\.msgs does not exist\. Runs are made by `msgs-slam reconstruct VIDEO`"):
         msgs_slam.open_run(tmp_path / "no.msgs")
     with pytest.raises(InputError, match="no such file"):
         msgs_slam.reconstruct(tmp_path / "none.mp4", tmp_path / "out.msgs")
     with pytest.raises(InputError, match=r"did you mean mapping\.passes"):
         msgs_slam.reconstruct(tmp_path / "none.mp4", tmp_path / "out.msgs", ["mapping.pases=3"])
+    for wrong in ({"mapping.pases": 3}, {"mapping": {"pases": 3}}):
+        with pytest.raises(InputError, match=r"did you mean mapping\.passes"):
+            msgs_slam.reconstruct(tmp_path / "none.mp4", tmp_path / "out.msgs", wrong)
+    with pytest.raises(InputError, match=r"expected section\.key"):
+        msgs_slam.reconstruct(tmp_path / "none.mp4", tmp_path / "out.msgs", {"passes": 3})
+
+
+def test_the_version_is_the_installed_one() -> None:
+    assert msgs_slam.__version__ == importlib.metadata.version("msgs-slam")
+
+
+def test_settings_are_a_dict_and_progress_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for i, pose in enumerate(sideways(12)):
+        write_rgb(tmp_path / "walk" / f"{i:02d}.jpg", render(*pose))
+    changes = dict(text.split("=") for text in QUICK)
+    nested = {"frames": {"max_features": 300}, "run.threads": 1}
+    with pytest.raises(InputError, match="mapping"):  # a stop, long before the map
+        msgs_slam.reconstruct(tmp_path / "walk", tmp_path / "a.msgs", {**numbers(changes), **nested}, StopAfterFrames())
+    settings = load_settings(RunFolder(tmp_path / "a.msgs"))
+    assert (settings.frames.max_features, settings.run.threads) == (300, 1)
+    assert "frames" in load_records(RunFolder(tmp_path / "a.msgs"))
+    with pytest.raises(InputError, match="proxy"):
+        msgs_slam.reconstruct(tmp_path / "walk", tmp_path / "a.msgs", {"proxy.depth": "files:nowhere"}, progress=True)
+    assert "\r" not in capsys.readouterr().err
+
+
+def numbers(texts: dict[str, str]) -> dict[str, object]:
+    return {key: tomllib.loads(f"v = {value}")["v"] if value[0].isdigit() else value for key, value in texts.items()}
+
+
+class StopAfterFrames(SilentProgress):
+    """Hears of the stages, and has enough of them after the first."""
+
+    def stage(self, event: StageEvent) -> None:
+        if event.name != "frames":
+            raise InputError("enough, no mapping")
 
 
 def test_an_installation_brings_one_name_only(tmp_path: Path) -> None:

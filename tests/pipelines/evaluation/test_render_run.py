@@ -34,7 +34,7 @@ def test_own_path_in_colour_shows_the_frames(oracle_run: OracleRun, truth: Seque
 
 
 def test_side_by_side_video_of_an_orbit(oracle_run: OracleRun, tmp_path: Path) -> None:
-    video = render_run(oracle_run(), tmp_path / "orbit.mp4", path="orbit", frames=4)
+    video = render_run(oracle_run(), tmp_path / "orbit.mp4", "side-by-side", "orbit", frames=4)
     frames = [f.rgb for f in iter_video(video)]
     assert len(frames) == 4
     assert frames[0].shape == (180, 3 * 240, 3)

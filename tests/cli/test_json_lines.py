@@ -1,0 +1,136 @@
+"""`--log-format json`: every line on stderr is one JSON object, whatever becomes of the command."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cli_runs import FinishedRun
+
+COMMAND = [sys.executable, "-m", "msgs_slam"]
+JSON = ("--log-format", "json")
+
+
+def lines_of(stderr: str) -> list[dict[str, Any]]:
+    """What `jq -c . < stderr` would take, each with what every line has."""
+    found = [json.loads(line) for line in stderr.splitlines()]
+    assert all(line["event"] and line["time"] > 1.7e9 for line in found)
+    return found
+
+
+def run(*words: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*COMMAND, *map(str, words)], capture_output=True, text=True, timeout=300)
+
+
+def test_a_run_that_is_fine(copied_run: Callable[[str], Path]) -> None:
+    folder = copied_run("run.msgs")
+    done = run("resume", folder, *JSON, "--set", "mapping.min_iterations=25")
+    assert done.returncode == 0, done.stderr[-3000:]
+    lines = lines_of(done.stderr)
+    stages = [(x["name"], x["index"], x["of"], x["state"]) for x in lines if x["event"] == "stage"]
+    assert stages[:3] == [(n, i, 6, "up to date") for i, n in enumerate(("frames", "proxy", "tracking"), 1)]
+    later = [(n, i, 6, s) for i, n in enumerate(("mapping", "global_ba", "export"), 4) for s in ("begun", "done")]
+    assert stages[3:] == later
+    ended = [x for x in lines if x["event"] == "stage" and x["state"] == "done"]
+    assert ended[0]["figures"]["gaussians"] > 100
+    assert all(x["seconds"] > 0 for x in ended)
+    assert [x["seconds_left"] is not None for x in ended] == [True] * 3
+    assert ended[-1]["seconds_left"] == 0
+    progress = [x for x in lines if x["event"] == "progress"]
+    assert {(x["stage"], x["index"], x["of"]) for x in progress} <= {(n, i, 6) for n, i, *_ in later}
+    assert {x["label"] for x in progress if x.get("ended")} >= {"mapping", "drawing"}
+    assert lines[-1]["event"] == "result"
+    assert Path(lines[-1]["export"], "README.txt").exists()
+    warned = [x["message"] for x in lines if x["event"] == "warning"]
+    assert len(warned) == len(set(warned))
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["reconstruct", "none.mp4"], 1, "no such file"),
+        (["reconstruct", "none.mp4", "--nonsense"], 2, "--nonsense"),
+        (["reconstruct"], 2, "SOURCE"),
+        (["resume", "none.msgs", "--set", "frames.rat=3"], 1, "does not exist"),
+        (["reconstruct", "none.mp4", "--set", "frames.rat=3"], 2, "did you mean frames.rate?"),
+        (["status", "none.msgs"], 2, "--log-format"),
+    ],
+)
+def test_what_is_refused(words: list[str], code: int, said: str) -> None:
+    done = run(*words, *JSON)
+    assert done.returncode == code
+    *_, last = lines_of(done.stderr)
+    assert (last["event"], last["exit_code"]) == ("error", code)
+    assert said in last["message"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_a_signal_ends(number: signal.Signals, copied_run: Callable[[str], Path]) -> None:
+    folder = copied_run("run.msgs")
+    words = [*COMMAND, "resume", str(folder), *JSON, "--set", "mapping.min_iterations=60"]
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
+    while process.poll() is None and not (folder / "mapping.partial").exists():
+        time.sleep(0.005)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 128 + number, errors
+    lines = lines_of(errors)
+    assert [x["signal"] for x in lines if x["event"] == "stopping"] == [number]
+    assert [x["name"] for x in lines if x["event"] == "stage" and x["state"] == "stopped"] == ["mapping"]
+    assert (lines[-1]["event"], lines[-1]["signal"], lines[-1]["exit_code"]) == ("stopped", number, 128 + number)
+    assert f"msgs-slam resume {folder}" in lines[-1]["message"]
+
+
+@pytest.mark.parametrize("to_file", [True, False], ids=["file", "pipe"])
+def test_what_libraries_children_and_faults_print(to_file: bool, tmp_path: Path) -> None:
+    code = """
+import os, subprocess, sys
+from msgs_slam.msgs_cli.json_lines import only_json, write_line
+with only_json():
+    os.write(2, b"INFO: of a library\\nhalf a ")
+    os.write(2, b"line\\r 50%\\rbar\\n")
+    subprocess.run([sys.executable, "-c", "import sys; print('of a child', file=sys.stderr)"])
+    print("of Python \\u03bb", file=sys.stderr)
+    write_line("log", message="own")
+    os.write(2, b"without an end")
+    1 / 0
+"""
+    said = tmp_path / "said"
+    with said.open("w") as file:
+        stderr = file if to_file else subprocess.PIPE
+        done = subprocess.run([sys.executable, "-c", code], stderr=stderr, text=True)
+    lines = lines_of(said.read_text() if to_file else done.stderr)
+    assert done.returncode == 1
+    printed = [x["message"] for x in lines if x.get("level") == "print"]
+    assert printed == [
+        "INFO: of a library", "half a line", " 50%", "bar", "of a child", "of Python λ", "without an end"
+    ]  # fmt: skip
+    fault = next(x for x in lines if x["event"] == "error")
+    assert "ZeroDivisionError" in fault["message"]
+    assert "1 / 0" in fault["traceback"] or "line 11" in fault["traceback"]
+
+
+def test_the_other_commands_end_with_their_result(finished_run: FinishedRun, tmp_path: Path) -> None:
+    done = run("export", finished_run.folder, "--only", "nerfstudio", "--to", tmp_path / "given", *JSON)
+    last = lines_of(done.stderr)[-1]
+    assert (done.returncode, last["event"]) == (0, "result")
+    assert str(tmp_path / "given" / "transforms.json") in last["files"]
+
+
+def test_without_it_a_file_gets_a_line_a_stage(copied_run: Callable[[str], Path]) -> None:
+    """No bar is drawn and drawn again where nobody looks."""
+    folder = copied_run("run.msgs")
+    done = run("resume", folder, "--set", "export.voxel=0.06")
+    assert done.returncode == 0
+    lines = [line for line in done.stderr.splitlines() if line.startswith("[")]
+    assert [line.split("]")[0] for line in lines] == [
+        f"[{i}/6 {name}" for i, name in enumerate(("frames", "proxy", "tracking", "mapping", "global_ba", "export"), 1)
+    ]
+    assert lines[-1].startswith("[6/6 export] done in ")
+    assert "\r" not in done.stderr
+    assert "%|" not in done.stderr
