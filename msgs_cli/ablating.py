@@ -14,6 +14,7 @@ from msgs_slam.msgs_cli.options import (
     source_options,
     source_settings,
     stopping_softly,
+    tell_result,
     verbosity_options,
 )
 from msgs_slam.msgs_cli.text import say
@@ -72,6 +73,7 @@ def ablate(
         )  # fmt: skip
     say(ablation_table(result))
     say(f"also in {folder / 'ablation.md'} and {folder / 'ablation.json'}", err=True)
+    tell_result(quiet, table=folder / "ablation.json")
 
 
 def _seeds(text: str) -> tuple[int, ...]:

@@ -16,6 +16,7 @@ import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import pairwise
+from signal import SIGINT
 from typing import Any, TypeVar
 
 import click
@@ -34,7 +35,11 @@ _stage: dict[str, Any] = {}
 
 def write_line(event: str, **values: Any) -> None:
     """{"event": ..., "time": seconds since 1970, ...}, in one piece whatever else is written."""
-    line = json.dumps({"event": event, "time": round(time.time(), 3), **values}) + "\n"
+    _write(json.dumps({"event": event, "time": round(time.time(), 3), **values}))
+
+
+def _write(line: str) -> None:
+    line += "\n"
     if not _place:
         sys.stderr.write(line)
         sys.stderr.flush()
@@ -42,6 +47,12 @@ def write_line(event: str, **values: Any) -> None:
     rest = line.encode("ascii")
     while rest:
         rest = rest[os.write(_place[-1], rest) :]
+
+
+class Interrupted(click.ClickException):
+    """A command that keeps nothing of what it was at was stopped."""
+
+    exit_code = 128 + SIGINT
 
 
 class JsonProgress:
@@ -105,9 +116,9 @@ def only_json() -> Iterator[None]:
             code = ended.exit_code
         except SystemExit as ended:
             code = ended.code if isinstance(ended.code, int) else int(bool(ended.code))
-        except (click.Abort, KeyboardInterrupt):
-            code = 130
-            write_line("stopped", signal=2, exit_code=code)
+        except (click.Abort, KeyboardInterrupt, Interrupted) as error:
+            code = Interrupted.exit_code
+            write_line("stopped", signal=int(SIGINT), message=str(error), exit_code=code)
         except click.ClickException as error:
             code = error.exit_code
             write_line("error", message=error.format_message(), exit_code=code)
@@ -164,5 +175,17 @@ def _tell_prints(source: int) -> None:
 
 
 def _tell_print(line: bytes) -> None:
+    text = line.decode("utf-8", errors="backslashreplace")
     with suppress(OSError):
-        write_line("log", level="print", message=line.decode("utf-8", errors="backslashreplace"))
+        if _is_event(text):
+            _write(text)
+        else:
+            write_line("log", level="print", message=text)
+
+
+def _is_event(text: str) -> bool:
+    """Whether it is a line of `write_line` already, as a process of this program has written it that works for it."""
+    try:
+        return text.isascii() and {"event", "time"} <= json.loads(text).keys()
+    except (ValueError, AttributeError):
+        return False

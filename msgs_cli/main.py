@@ -20,7 +20,7 @@ from msgs_slam.msgs_cli import looking
 from msgs_slam.msgs_cli.ablating import ablate
 from msgs_slam.msgs_cli.batch import batch
 from msgs_slam.msgs_cli.doctor import doctor
-from msgs_slam.msgs_cli.json_lines import is_asked_for, only_json
+from msgs_slam.msgs_cli.json_lines import Interrupted, is_asked_for, only_json
 from msgs_slam.msgs_cli.models import models
 from msgs_slam.msgs_cli.options import (
     FOLDER,
@@ -66,6 +66,8 @@ class FriendlyGroup(click.Group):
             return result
         except InputError as error:
             raise _refused(error) from error
+        except KeyboardInterrupt as error:
+            raise Interrupted("stopped by Ctrl-C") from error
         except OSError as error:
             if error.errno not in _SYSTEM_REFUSES:
                 raise
@@ -168,6 +170,7 @@ def reconstruct(
         records = run_reconstruct(one_source(sources, run), run, config, make_progress(quiet), until, workers)
     if not quiet:
         _print_summary(run.root, records)
+    tell_result(quiet, **_results(run.root, records))
 
 
 @main.command()
@@ -206,6 +209,7 @@ def resume(
         records = run_resume(run, make_progress(quiet), config, until, workers)
     if not quiet:
         _print_summary(run.root, records)
+    tell_result(quiet, **_results(run.root, records))
 
 
 @main.command()
@@ -315,6 +319,8 @@ def demo(
     say("\nAgainst the known truth:")
     for line in demo_summary(result):
         say(f"  {line}")
+    root = result.run.root
+    tell_result(quiet, run=root, export=root / "export", evaluation=root / "evaluation")
 
 
 @main.command()
@@ -349,7 +355,11 @@ def _print_summary(root: Path, records: dict[str, Any]) -> None:
         say(line)
     if "export" in records:
         say(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")
-    tell_result(False, run=root, **({"export": root / "export"} if "export" in records else {}))
+
+
+def _results(root: Path, records: dict[str, Any]) -> dict[str, Path]:
+    """Where they are."""
+    return {"run": root} | ({"export": root / "export"} if "export" in records else {})
 
 
 for command in (looking.evaluate, looking.report, looking.render, looking.view):

@@ -12,6 +12,7 @@ from msgs_slam.msgs_cli.options import (
     open_run,
     set_up_logging,
     stopping_softly,
+    tell_result,
     verbosity_options,
     worker_setup,
 )
@@ -38,3 +39,4 @@ def work(run_path: Path, shard: str, until: str, quiet: bool, verbose: bool) -> 
     chosen, run = Shard.parse(shard), open_run(run_path)
     with stopping_softly(f"The same command goes on, or without others: msgs-slam resume {run.root}"):
         work_on_run(run, chosen, load_settings(run), worker_setup(quiet, verbose, True), until)
+    tell_result(quiet, run=run.root)

@@ -98,10 +98,8 @@ class FramesConfig:
 class ProxyConfig:
     """Proxy depth and semantics of every keyframe."""
 
-    depth: str = setting("auto", "depth provider: auto, multiview, files[:FOLDER], onnx:CARD or a network's name")
-    semantics: str = setting(
-        "auto", "semantics provider: auto, segments, files[:FOLDER], onnx:CARD or a network's name"
-    )
+    depth: str = setting("auto", "depth provider: auto, multiview, files[:FOLDER], onnx:CARD, a network's name")
+    semantics: str = setting("auto", "semantics provider: auto, segments, files[:FOLDER], onnx:CARD, a network's name")
     classes: str = setting("", "words to look for, comma-separated, for a network that compares pictures with words")
     frames: str = setting("keyframes", "which frames get maps; all needs depth without poses", ("keyframes", "all"))
     max_side: int = setting(640, "the maps are at most this many pixels on the long side", within=(64, 8192))

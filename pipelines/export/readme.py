@@ -79,8 +79,8 @@ _ENTRIES = (
         "glb", f"{_SET.format('splat_glb')}, or {_ONLY.format('glb')}",
     ),
     Entry(
-        "map.html", "the map to look at in any browser, without a server or a network, on a computer or a phone.", "html",
-        _ONLY.format("html"),
+        "map.html", "the map to look at in any browser, without a server or a network, on a computer or a phone.",
+        "html", _ONLY.format("html"),
     ),
     Entry(
         "mesh.ply, mesh.glb",

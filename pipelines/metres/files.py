@@ -10,6 +10,11 @@ from msgs_slam.pipelines.run.folder import SCALE, RunFolder
 from msgs_slam.pipelines.run.stored import dataclass_from_json, reading
 from msgs_slam.pipelines.types import Metres, MetresSource
 
+_ALONE = (
+    "what each source says without the others, as the mean of its readings: a table may be a desk or a coffee table. "
+    "Together they pick the readings that agree, which may lie outside of all of these means. Usual distances are a "
+    "weak prior that every guess begins with."
+)
 _FRAME_SCALES, _TRACKED = "frame_scales.json", "tracking.json"
 
 
@@ -43,5 +48,5 @@ def load_metres(run: RunFolder) -> Metres | None:
 def save_metres(folder: Path, metres: Metres | None) -> Path:
     """scale.json: the value, its sentence, and what each source says; null where nothing tells metres."""
     path = folder / SCALE
-    write_json(path, None if metres is None else {"text": metres.text, **asdict(metres)})
+    write_json(path, None if metres is None else {"text": metres.text, **asdict(metres), "about_alone": _ALONE})
     return path

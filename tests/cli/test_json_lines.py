@@ -95,6 +95,8 @@ with only_json():
     os.write(2, b"INFO: of a library\\nhalf a ")
     os.write(2, b"line\\r 50%\\rbar\\n")
     subprocess.run([sys.executable, "-c", "import sys; print('of a child', file=sys.stderr)"])
+    own = "from msgs_slam.msgs_cli.json_lines import write_line; write_line('warning', message='of a worker')"
+    subprocess.run([sys.executable, "-c", own])
     print("of Python \\u03bb", file=sys.stderr)
     write_line("log", message="own")
     os.write(2, b"without an end")
@@ -110,9 +112,10 @@ with only_json():
     assert printed == [
         "INFO: of a library", "half a line", " 50%", "bar", "of a child", "of Python λ", "without an end"
     ]  # fmt: skip
+    assert [x["message"] for x in lines if x["event"] == "warning"] == ["of a worker"]
     fault = next(x for x in lines if x["event"] == "error")
     assert "ZeroDivisionError" in fault["message"]
-    assert "1 / 0" in fault["traceback"] or "line 11" in fault["traceback"]
+    assert "1 / 0" in fault["traceback"] or "line 13" in fault["traceback"]
 
 
 def test_the_other_commands_end_with_their_result(finished_run: FinishedRun, tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def test_settings_are_a_dict_and_progress_is_told(tmp_path: Path, capsys: pytest
     settings = load_settings(RunFolder(tmp_path / "a.msgs"))
     assert (settings.frames.max_features, settings.run.threads) == (300, 1)
     assert "frames" in load_records(RunFolder(tmp_path / "a.msgs"))
-    with pytest.raises(InputError, match="proxy"):
+    with pytest.raises(InputError, match="nowhere"):
         msgs_slam.reconstruct(tmp_path / "walk", tmp_path / "a.msgs", {"proxy.depth": "files:nowhere"}, progress=True)
     assert "\r" not in capsys.readouterr().err
 

@@ -133,7 +133,9 @@ def test_an_export_with_a_guess_differs_in_words_only(run: RunFolder, tmp_path: 
         assert "a guess" in text
     assert "free" in (free / "trajectory.txt").read_text()
     assert read_json(free / "scale.json") is None
-    assert read_json(guessed / "scale.json")["is_guess"]
+    told = read_json(guessed / "scale.json")
+    assert told["is_guess"]
+    assert "mean of its readings" in told["about_alone"]
 
 
 # scenes of voxels ------------------------------------------------------------------------------------------------
