@@ -26,18 +26,18 @@ from msgs_slam.pipelines.source.opening import FolderSource, VideoSource, open_s
 from msgs_slam.pipelines.source.recording import RecordingSource
 from msgs_slam.pipelines.source.sharpness import reduced_size
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
-from msgs_slam.pipelines.structure.lens import to_pycolmap, unknown_camera
+from msgs_slam.pipelines.structure.lens import FOCAL_GUESS, to_pycolmap, unknown_camera
 from msgs_slam.pipelines.structure.sfm import Ahead, StructureFromMotion, nothing_ahead
 from msgs_slam.pipelines.structure.window_size import window_size
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Features, Frame
 
 AnySource = VideoSource | FolderSource | RecordingSource
-_FOCAL_GUESS = 1.2
 
 
 def known_camera(context: StageContext, source: AnySource, faces: Faces | None) -> tuple[pycolmap.Camera, str]:
-    """The camera of the reduced frames as far as it is known before, and where from."""
+    """The camera of the reduced frames as far as it is known before, and where from: given by the user, stated by the
+    data set, exif, or nowhere."""
     config = context.config.frames
     if faces is not None:
         pinhole = Camera(**asdict(faces.pinhole))
@@ -48,13 +48,13 @@ def known_camera(context: StageContext, source: AnySource, faces: Faces | None) 
         return to_pycolmap(given.resized(width, height)), "given"
     known = source.known_camera() if isinstance(source, RecordingSource) else None
     if known is not None and not known.is_nominal and not known.fisheye:
-        return to_pycolmap(known.resized(width, height)), "given"
+        return to_pycolmap(known.resized(width, height)), "stated"
     if known is not None:
         return unknown_camera(width, height, known.fx * width / source.width, is_prior=True), "self-calibrated"
     exif = source.exif_focal()
     if exif is not None:
         return unknown_camera(width, height, exif * width / source.width, is_prior=True), "exif"
-    return unknown_camera(width, height, _FOCAL_GUESS * max(width, height), is_prior=False), "self-calibrated"
+    return unknown_camera(width, height, FOCAL_GUESS * max(width, height), is_prior=False), "self-calibrated"
 
 
 def picked(context: StageContext, name: str) -> Path:
@@ -77,13 +77,13 @@ def masks_of(context: StageContext, source: AnySource, faces: Faces | None, rig:
 def structure_from_motion(
     context: StageContext,
     camera: pycolmap.Camera,
-    is_fixed: bool,
+    origin: str,
     frames: list[Frame],
     masks: FrameMasks,
     rig: Rig,
     ahead: Ahead = nothing_ahead,
 ) -> StructureFromMotion:
-    """Of these frames."""
+    """Of these frames; `origin` as of `known_camera`."""
     settings, size = context.config.frames, (camera.width, camera.height)
     learned = open_learned(settings)
 
@@ -94,7 +94,8 @@ def structure_from_motion(
     return StructureFromMotion(
         config=settings,
         camera=camera,
-        is_fixed=is_fixed,
+        is_fixed=origin in ("given", "stated"),
+        is_stated=origin == "stated",
         extract=extract,
         picture=lambda frame_id: grey_of(context, masks, frames[frame_id]),
         time=lambda frame_id: frames[frame_id].timestamp,
@@ -122,7 +123,7 @@ def _begun(task: Portion, progress: Progress) -> tuple[StructureFromMotion, dict
     masks = masks_of(context, source, faces, rig)
     if "pairs" in known:
         known = known | {"pairs": [(i, j) for i, j in known["pairs"].tolist()]}
-    return structure_from_motion(context, camera, origin == "given", frames, masks, rig), known
+    return structure_from_motion(context, camera, origin, frames, masks, rig), known
 
 
 def extract_features(task: Portion, progress: Progress) -> None:

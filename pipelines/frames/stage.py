@@ -75,8 +75,9 @@ def run(context: StageContext) -> dict[str, Any]:
     masks = masks_of(context, source, faces, rig)
     keyframes = _keyframes(context, frames, masks, rig)
     masks.find_people(frames, keyframes, context.progress)
-    structure = _structure(context, camera, origin == "given", frames, keyframes, masks, rig)
+    structure = _structure(context, camera, origin, frames, keyframes, masks, rig)
     lens = make_lens(structure.model.cameras[1])
+    origin = _settled_origin(context, origin, camera, structure)
     calibration = replace(_calibration(context, lens, origin, structure.focal_sd, faces), readout=structure.readout)
     _write_backbone(context, structure, keyframes, lens, frames)
     _write_correspondences(context, structure, keyframes, lens)
@@ -222,7 +223,7 @@ def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks, rig: 
 def _structure(
     context: StageContext,
     camera: pycolmap.Camera,
-    is_fixed: bool,
+    origin: str,
     frames: list[Frame],
     keyframes: list[int],
     masks: FrameMasks,
@@ -233,7 +234,7 @@ def _structure(
     def ahead(name: str, count: int, more: dict[str, NDArray]) -> None:
         in_portions(context, AHEAD[name], count, **known, **more)
 
-    structure = structure_from_motion(context, camera, is_fixed, frames, masks, rig, ahead).run(keyframes)
+    structure = structure_from_motion(context, camera, origin, frames, masks, rig, ahead).run(keyframes)
     warn_of_structure(context, structure, [frames[k].id for k in keyframes])
     return structure
 
@@ -276,6 +277,21 @@ def warn_of_structure(context: StageContext, structure: Structure, ids: list[int
             f"pictures taken far apart contradict the camera's path: {agreeing}. Either things that repeat were taken "
             "for each other, which does no harm, or a loop is not closed"
         )
+
+
+def _settled_origin(context: StageContext, origin: str, camera: pycolmap.Camera, structure: Structure) -> str:
+    """Where the camera comes from in the end: one that the data set states is given unless the pictures refuted it."""
+    if origin != "stated":
+        return origin
+    found = structure.model.cameras[1]
+    if list(found.params) == list(camera.params):
+        return "given"
+    context.warn(
+        f"the camera that the data set states (focal length {camera.mean_focal_length():.0f} px) explains the pictures "
+        f"much worse than one found from them ({found.mean_focal_length():.0f} px), which is used instead. To hold a "
+        "camera in any case give it with --intrinsics"
+    )
+    return "self-calibrated"
 
 
 def _calibration(context: StageContext, lens: Lens, origin: str, focal_sd: float, faces: Faces | None) -> Calibration:

@@ -63,11 +63,17 @@ def _calibrate(model: pycolmap.Reconstruction, images: Sequence[int]) -> float:
 
 
 def solve(
-    model: pycolmap.Reconstruction, images: Sequence[int], refine_camera: bool, width: float = _CAUCHY_PX
+    model: pycolmap.Reconstruction,
+    images: Sequence[int],
+    refine_camera: bool,
+    width: float = _CAUCHY_PX,
+    bend_lens: bool = True,
 ) -> pycolmap.CeresBundleAdjuster:
-    """Robust adjustment of these images, in place, under Cauchy's loss of so many pixels; deterministic."""
+    """Robust adjustment of these images, in place, under Cauchy's loss of so many pixels; deterministic. A camera that
+    is refined keeps its distortion unless `bend_lens`."""
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = options.refine_extra_params = refine_camera
+    options.refine_focal_length = refine_camera
+    options.refine_extra_params = refine_camera and bend_lens
     options.refine_sensor_from_rig = options.print_summary = False
     options.min_track_length = 2
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY

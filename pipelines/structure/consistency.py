@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -111,21 +111,28 @@ def check_pairs(
     model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], xy: Sequence[NDArray[np.float64]], total: int
 ) -> list[PairCheck]:
     """How far the matches of each pair of placed keyframes agree with their poses; by place, see `judge`."""
+    checks = []
+    for pair, error in matched_errors(model, pairs, xy):
+        first, second = sorted((pair.first % total, pair.second % total))
+        checks.append(PairCheck(first, second, len(error), int((error < _AGREE_PX).sum())))
+    return checks
+
+
+def matched_errors(
+    model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair], xy: Sequence[NDArray[np.float64]]
+) -> Iterator[tuple[VerifiedPair, NDArray[np.float64]]]:
+    """The pairs of placed keyframes, with the distances (M,) of their matches to the epipolar lines in pixels."""
     camera = model.cameras[1]
     rays = {i - 1: np.asarray(camera.cam_from_img(xy[i - 1])) for i in model.reg_image_ids()}
     poses = {i: model.images[i + 1].cam_from_world().matrix() for i in rays}
     focal = camera.mean_focal_length()
-    checks = []
     for pair in pairs:
-        if pair.first not in rays or pair.second not in rays:
-            continue
-        error = epipolar_error(
-            poses[pair.first], poses[pair.second],
-            rays[pair.first][pair.matches[:, 0]], rays[pair.second][pair.matches[:, 1]],
-        )  # fmt: skip
-        first, second = sorted((pair.first % total, pair.second % total))
-        checks.append(PairCheck(first, second, len(error), int((error * focal < _AGREE_PX).sum())))
-    return checks
+        if pair.first in rays and pair.second in rays:
+            error = epipolar_error(
+                poses[pair.first], poses[pair.second],
+                rays[pair.first][pair.matches[:, 0]], rays[pair.second][pair.matches[:, 1]],
+            )  # fmt: skip
+            yield pair, error * focal
 
 
 def epipolar_error(

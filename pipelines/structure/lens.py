@@ -13,6 +13,8 @@ from msgs_slam.formats.datasets.camera import Camera
 from msgs_slam.pipelines.types import Intrinsics
 
 _BORDER_POINTS = 65
+FOCAL_GUESS = 1.2
+"""Longer sides of a picture that a focal length is where nothing tells it."""
 
 
 def to_pycolmap(camera: Camera) -> pycolmap.Camera:

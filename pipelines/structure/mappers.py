@@ -8,6 +8,9 @@ from pathlib import Path
 
 import pycolmap
 
+_ANY_DISTORTION = 1e9
+"""COLMAP takes a camera with a coefficient above 1 for one that ran away, and places no view of it. One that is held
+cannot run away, and real ones have such: the third radial one of a Kinect is 1.16."""
 # pycolmap tells of each step on stderr, through the progress bars; what fails is told by whoever called it.
 pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
 # Its import makes a process that is asked to end print a stack trace first: back to what there was before.
@@ -39,6 +42,8 @@ def map_globally(
     mapper.bundle_adjustment.refine_extra_params = refine_camera and bend_lens
     mapper.refine_sensor_from_rig = mapper.bundle_adjustment.refine_sensor_from_rig = False
     mapper.track_required_tracks_per_view, mapper.ba_num_iterations = 300, 2
+    if not refine_camera:
+        mapper.retriangulation.max_extra_param = _ANY_DISTORTION
     return _largest(pycolmap.global_mapping(database, work, work, options))
 
 
@@ -53,6 +58,10 @@ def map_incrementally(database: Path, work: Path, refine_camera: bool, seed: int
     options.ba_refine_sensor_from_rig = False
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = refine_camera
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = refine_camera
+    if not refine_camera:
+        options.max_extra_param = options.mapper.max_extra_param = options.triangulation.max_extra_param = (
+            _ANY_DISTORTION
+        )
     return _largest(pycolmap.incremental_mapping(database, work, work, options))
 
 

@@ -193,6 +193,16 @@ class RollingModel:
                 points[k].xy = next(ordered)
 
 
+def straight_copy(
+    model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout
+) -> pycolmap.Reconstruction:
+    """The model with its observations where they would be in frames taken at once; the one given stays as it is."""
+    rolling = RollingModel(pycolmap.Reconstruction(model), xy, times)
+    if any(readout):
+        rolling.straighten(*rolling.bundle(), readout)
+    return rolling.model
+
+
 def adjust_rolling(
     model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout | None, refine_camera: bool,
     narrowly: bool = False,

@@ -31,11 +31,18 @@ from msgs_slam.pipelines.correspondence.snapshots import Snapshots
 from msgs_slam.pipelines.geometry.rig import ONE_CAMERA
 from msgs_slam.pipelines.structure.adjust import adjust
 from msgs_slam.pipelines.structure.consistency import ModelReport, check_pairs, judge, without_misplaced
-from msgs_slam.pipelines.structure.lens import set_lens
+from msgs_slam.pipelines.structure.freeing import LEAST_BETTER, LEAST_GAIN_OF_FREEING, gain_of_freeing, unexplained
+from msgs_slam.pipelines.structure.lens import FOCAL_GUESS, set_lens, unknown_camera
 from msgs_slam.pipelines.structure.mappers import calibrate_focal, map_globally, map_incrementally
 from msgs_slam.pipelines.structure.mend import mended
 from msgs_slam.pipelines.structure.parallax import HOW_TO_FILM, require_parallax
-from msgs_slam.pipelines.structure.rolling import NO_READOUT, Readout, adjust_rolling, read_readout
+from msgs_slam.pipelines.structure.rolling import (
+    NO_READOUT,
+    Readout,
+    adjust_rolling,
+    read_readout,
+    straight_copy,
+)
 from msgs_slam.pipelines.structure.seams import cut, take_out
 from msgs_slam.pipelines.structure.window_size import SIZE, windows_of
 from msgs_slam.pipelines.structure.windows import Joined, adjust_joined
@@ -114,7 +121,8 @@ class _Adjusted:
 @dataclass(frozen=True)
 class StructureFromMotion:
     """`extract(frame_id)` gives a frame's features, `picture` what they are of, `match` the pairs of two frames' that
-    are alike; `camera` is what is known of the camera before, and `is_fixed` says that it is known exactly.
+    are alike; `camera` is what is known of the camera before, and `is_fixed` says that it is held; `is_stated` that it
+    is only as long as the pictures do not contradict it.
     cam_from_rig (C, 3, 3): the keyframes come direction by direction, as `Rig` counts frames. time(frame_id): seconds
     at which a frame was taken. ahead("features" | "pairs" | "windows", count, known) may have others leave those in the
     snapshots beforehand."""
@@ -133,6 +141,7 @@ class StructureFromMotion:
     memory: float = math.inf
     window: int = SIZE
     ahead: Ahead = nothing_ahead
+    is_stated: bool = False
     cam_from_rig: NDArray[np.float64] = field(default_factory=lambda: ONE_CAMERA.cam_from_rig)
 
     def run(self, keyframe_ids: Sequence[int]) -> Structure:
@@ -162,6 +171,34 @@ class StructureFromMotion:
         )
 
     def _calibrated(self, views: _Views, pairs: Sequence[VerifiedPair]) -> _Adjusted | None:
+        """The best model; of a stated camera the model of one that is found anew, where that explains the pictures
+        much better, or where the stated one gives none."""
+        held = self._self_calibrated(views, pairs)
+        if not self.is_stated:
+            return held
+        if held is not None:
+            straight = straight_copy(held.model, views.xy, views.times, held.readout)
+            if gain_of_freeing(straight) < LEAST_GAIN_OF_FREEING:
+                return held
+        free = next(filter(None, (self._freed(name, views, pairs) for name in ("stated", "unknown"))), None)
+        if held is None or free is None:
+            return free or held
+        contradicted = unexplained(held.model, pairs, views.xy)
+        is_better = unexplained(free.model, pairs, views.xy) < (1 - LEAST_BETTER) * contradicted
+        return free if is_better and free.score >= _AS_GOOD * held.score else held
+
+    def _freed(self, start: str, views: _Views, pairs: Sequence[VerifiedPair]) -> _Adjusted | None:
+        """The model of a camera that is found anew, from the stated focal length or from nothing."""
+        is_prior, (width, height) = start == "stated", (self.camera.width, self.camera.height)
+        focal = self.camera.mean_focal_length() if is_prior else FOCAL_GUESS * max(width, height)
+        snapshots = Snapshots(self.snapshots.folder / f"freed_from_{start}")
+        snapshots.folder.mkdir(exist_ok=True)
+        camera = unknown_camera(width, height, focal, is_prior)
+        return replace(self, camera=camera, is_fixed=False, is_stated=False, snapshots=snapshots)._self_calibrated(
+            views, pairs
+        )
+
+    def _self_calibrated(self, views: _Views, pairs: Sequence[VerifiedPair]) -> _Adjusted | None:
         """The best model; of two where the first is not sure of its camera."""
         found = self._adjusted(views, pairs, ("global", "incremental"))
         if found is not None and found.focal_sd > _UNSURE_FOCAL * found.model.cameras[1].mean_focal_length():
@@ -201,7 +238,7 @@ class StructureFromMotion:
                   for p in pairs if p.first in window and p.second in window]  # fmt: skip
         snapshots = Snapshots(self.snapshots.folder / f"window_{window.start:06d}_{window.stop:06d}")
         snapshots.folder.mkdir(exist_ok=True)
-        return replace(self, snapshots=snapshots)._calibrated(views, inside)
+        return replace(self, is_stated=False, snapshots=snapshots)._calibrated(views, inside)
 
     def map_window(self, number: int, keyframe_ids: Sequence[int], proposed: Sequence[tuple[int, int]]) -> None:
         """Leave the models of a window in the snapshots; all features and pairs are there."""

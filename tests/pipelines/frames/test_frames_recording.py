@@ -66,7 +66,7 @@ def test_a_camera_of_a_file_is_fixed_and_one_of_the_kind_is_a_start(short: Seque
     path = seven_scenes(short, tmp_path / "set")
     context = StageContext(RunFolder(tmp_path), path, Config(), tmp_path, SilentProgress())
     camera, origin = known_camera(context, open_source(path), None)
-    assert (origin, camera.params.tolist()) == ("given", pytest.approx([208, 208, 120, 90], abs=20))
+    assert (origin, camera.params.tolist()) == ("stated", pytest.approx([208, 208, 120, 90], abs=20))
     (path / "camera-intrinsics-color.txt").unlink()
     camera, origin = known_camera(context, open_source(path), None)
     assert (origin, camera.model.name, camera.has_prior_focal_length) == ("self-calibrated", "SIMPLE_RADIAL", True)
