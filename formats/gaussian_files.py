@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.compact_gaussians import read_compact
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gaussian_glb import read_gaussian_glb
 from msgs_slam.formats.gaussian_ply import read_gaussian_ply
@@ -20,7 +19,7 @@ _SMALLEST_SCALE = 1e-9
 
 
 def read_gaussians(path: Path) -> GaussianCloud:
-    """The Gaussians of a .ply, .spz, .splat, .glb or compact .safetensors file, by its suffix.
+    """The Gaussians of a .ply, .spz, .splat or .glb file, by its suffix.
 
     Raises InputError for another suffix, a missing or damaged file, and values that are not finite.
     """
@@ -34,9 +33,7 @@ def read_gaussians(path: Path) -> GaussianCloud:
         return read_splat(path)
     if kind == ".glb":
         return read_gaussian_glb(path)
-    if kind == ".safetensors":
-        return read_compact(path)[0]
-    raise InputError(f"{path} is no splat file by its name: expected .ply, .spz, .splat, .glb or .safetensors")
+    raise InputError(f"{path} is no splat file by its name: expected .ply, .spz, .splat or .glb")
 
 
 def read_splat(path: Path) -> GaussianCloud:

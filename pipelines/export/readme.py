@@ -64,7 +64,6 @@ _ENTRIES = (
         "ply",
     ),
     Entry("point_cloud_semantic.ply", "the same, coloured by class, with class_id and no probabilities.", "ply"),
-    Entry("point_cloud_compact.safetensors", "the same in a fraction of the space.", "ply"),
     Entry(
         "point_cloud.spz", "the colours of the map, small, for viewers on the web.", "spz",
         f"{_SET.format('spz')}, or {_ONLY.format('spz')}",

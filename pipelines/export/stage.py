@@ -78,7 +78,6 @@ def run(context: StageContext) -> dict[str, Any]:
     return {
         "images": int(outcome.trajectory.is_placed.sum()),
         "gaussians": gaussians,
-        "compact_map_mb": round((context.folder / "point_cloud_compact.safetensors").stat().st_size / 1e6, 2),
         **mesh_figures(mesh),
         **world_figures(world),
         **metres_figures(metres),

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from msgs_slam.formats.atomic import copy_file, write_text
 from msgs_slam.formats.colmap import write_colmap_model
-from msgs_slam.formats.compact_gaussians import write_compact
 from msgs_slam.formats.gaussian_glb import write_gaussian_glb
 from msgs_slam.formats.gaussian_ply import write_gaussian_ply
 from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
@@ -106,14 +105,13 @@ def map_cloud(outcome: Outcome, rows: Tensor | slice | None = None) -> GaussianC
 
 
 def write_ply(outcome: Outcome, sh_rest: bool, folder: Path) -> list[Path]:
-    """The map as splat PLYs, in its own colours and in those of the classes, and as a compact file; part by part, for a
-    cloud takes more memory than the map it is of. The probabilities are in the first only."""
+    """The map as splat PLYs, in its own colours and in those of the classes; part by part, for a cloud takes more
+    memory than the map it is of. The probabilities are in the first only."""
     clouds, names = _in_parts(outcome), outcome.classes.names
-    paths = [folder / n for n in ("point_cloud.ply", "point_cloud_semantic.ply", "point_cloud_compact.safetensors")]
+    paths = [folder / n for n in ("point_cloud.ply", "point_cloud_semantic.ply")]
     write_gaussian_ply(paths[0], clouds, names, sh_degree=3 * sh_rest)
     by_class = clouds.changed(lambda _, cloud: _by_class(cloud, outcome))
     write_gaussian_ply(paths[1], by_class, names, sh_degree=3 * sh_rest)
-    write_compact(paths[2], clouds, names)
     return paths
 
 

@@ -164,7 +164,7 @@ def _from_file(path: Path) -> ViewerScene:
 def _up_of_file(path: Path) -> NDArray[np.float64]:
     """z in a PLY of this program's export, as world.json beside it says; else y points down, as in most splat files."""
     world = path.with_name(WORLD)
-    stands = path.suffix in (".ply", ".safetensors") and world.is_file() and read_world(world).axes == "up"
+    stands = path.suffix == ".ply" and world.is_file() and read_world(world).axes == "up"
     return np.array([0.0, 0, 1] if stands else [0.0, -1, 0])
 
 

@@ -56,7 +56,6 @@ def run_job(name: str, job: Job, work: Path) -> dict[str, Any]:
         "keyframe_psnr_db": stages["mapping"]["figures"]["keyframe_psnr"],
         "seconds": round(sum(s["seconds"] for s in stages.values())),
         "peak_mb": round(max(s["peak_memory_mb"] for s in stages.values())),
-        "map_mb": stages["export"]["figures"].get("compact_map_mb"),
     }
     if job.truth:
         msgs_slam("evaluate", run, "--truth", DATA / job.truth, "-q")

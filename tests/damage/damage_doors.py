@@ -30,7 +30,6 @@ from tokenizers import Tokenizer, normalizers, pre_tokenizers, trainers
 from tokenizers import models as tokenizer_models
 
 from msgs_slam.formats.colmap import read_colmap_model, write_colmap_model
-from msgs_slam.formats.compact_gaussians import write_compact
 from msgs_slam.formats.datasets import Camera, Sequence, open_sequence, recognise_source
 from msgs_slam.formats.datasets.classes_json import read_classes_json
 from msgs_slam.formats.datasets.intrinsics_json import read_intrinsics_json
@@ -479,7 +478,6 @@ DOORS: dict[str, Door] = {
     "SPZ": Door(lambda f: write_spz(f / "a.spz", _cloud()), gaussians, "a.spz"),
     "SPZ, version 3": Door(lambda f: write_spz(f / "a.spz", _cloud(), version=3), gaussians, "a.spz"),
     ".splat": Door(make_splat, gaussians, "a.splat"),
-    "compact map": Door(lambda f: write_compact(f / "a.safetensors", _cloud()), gaussians, "a.safetensors", JSON_HEAD),
     "Gaussian GLB": Door(
         lambda f: write_gaussian_glb(f / "a.glb", _cloud()), gaussians, "a.glb", with_json_head(12)
     ),

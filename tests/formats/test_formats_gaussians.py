@@ -1,4 +1,4 @@
-"""Gaussian splat files: the reference layout to the byte, foreign files, and the compact file's error bounds."""
+"""Gaussian splat files: the reference layout to the byte, and foreign files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 import plyfile
 import pytest
 
-from msgs_slam.formats.compact_gaussians import read_compact, write_compact
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gaussian_ply import SH_C0, read_gaussian_ply, write_gaussian_ply
 from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
@@ -125,10 +124,9 @@ def test_a_cloud_in_parts_is_the_same_file(tmp_path: Path) -> None:
     assert cloud.class_probs is not None
     cloud.class_probs[:200, 2] = 0  # a class that occurs in the last part only
     parts = [cloud.only(rows) for rows in np.array_split(np.arange(300), [1, 200, 200])]
-    for write in (write_gaussian_ply, write_compact):
-        write(tmp_path / "whole", cloud, names)
-        write(tmp_path / "parts", parts, names)
-        assert (tmp_path / "parts").read_bytes() == (tmp_path / "whole").read_bytes()
+    write_gaussian_ply(tmp_path / "whole", cloud, names)
+    write_gaussian_ply(tmp_path / "parts", parts, names)
+    assert (tmp_path / "parts").read_bytes() == (tmp_path / "whole").read_bytes()
 
 
 def test_values_that_are_not_finite_are_not_written(tmp_path: Path) -> None:
@@ -146,50 +144,3 @@ def test_half_a_million_are_fast(tmp_path: Path) -> None:
     back = read_gaussian_ply(tmp_path / "g.ply")
     assert time.process_time() - start < 15
     assert (back.means == cloud.means).all()
-
-
-@pytest.mark.parametrize("classes", [2, 4, 7, 101])
-def test_compact_file_keeps_its_error_bounds(tmp_path: Path, classes: int) -> None:
-    cloud = _cloud(2000, classes)
-    names = tuple(f"class {i}" for i in range(classes))
-    write_compact(tmp_path / "c.safetensors", cloud, names)
-    back, names_back = read_compact(tmp_path / "c.safetensors")
-    assert names_back == names
-    side = np.ptp(cloud.means, axis=0)
-    error = np.abs(back.means - cloud.means).max(axis=0)
-    assert (error <= side / 131070 * 1.01 + 1e-6).all()
-    assert (error > side / 131070 * 0.5).all()
-    assert 0 < np.abs(back.colors - cloud.colors).max() <= 0.5 / 255 + 1e-6
-    np.testing.assert_allclose(back.log_scales, cloud.log_scales, rtol=1e-3)
-    np.testing.assert_allclose(back.opacity_logits, cloud.opacity_logits, rtol=1e-3, atol=1e-4)
-    assert cloud.class_probs is not None
-    assert back.class_probs is not None
-    assert (back.class_ids == cloud.class_ids).all()
-    np.testing.assert_allclose(back.class_probs.sum(axis=1), 1, atol=1e-5)
-    largest = np.take_along_axis(back.class_probs, cloud.class_probs.argmax(axis=1)[:, None], axis=1)[:, 0]
-    np.testing.assert_allclose(largest, cloud.class_probs.max(axis=1), atol=0.012)
-    # what is not kept: at most the fifth largest probability, which is under a fifth
-    assert np.abs(back.class_probs - cloud.class_probs).max() < 0.2
-
-
-def test_compact_file_is_small_and_the_same_every_time(tmp_path: Path) -> None:
-    cloud = _cloud(300_000, 20)
-    write_compact(tmp_path / "a.safetensors", cloud)
-    write_compact(tmp_path / "b.safetensors", cloud)
-    size = (tmp_path / "a.safetensors").stat().st_size
-    assert 5e6 < size < 15e6
-    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
-
-
-def test_compact_file_of_turned_ellipsoids_and_of_nothing(tmp_path: Path, shared_data: Path) -> None:
-    cloud = read_gaussian_ply(shared_data / "format_cases" / "ply_other_writers" / "test-splat.3-points-from-train.ply")
-    write_compact(tmp_path / "c.safetensors", cloud)
-    back, names = read_compact(tmp_path / "c.safetensors")
-    assert names == ()
-    np.testing.assert_allclose(back.quat_wxyz, cloud.quat_wxyz, atol=1e-3)
-    np.testing.assert_allclose(back.log_scales, cloud.log_scales, rtol=1e-3)
-    assert back.class_probs is None
-    empty = _cloud(0)
-    write_compact(tmp_path / "e.safetensors", empty)
-    write_gaussian_ply(tmp_path / "e.ply", empty)
-    assert len(read_compact(tmp_path / "e.safetensors")[0]) == len(read_gaussian_ply(tmp_path / "e.ply")) == 0
