@@ -16,12 +16,13 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.metres.files import load_metres
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import StageRecord, load_records, load_source, recorded_config
 from msgs_slam.pipelines.run.settings_file import load_settings
 from msgs_slam.pipelines.system.device import settle_device
-from msgs_slam.pipelines.types import VOID, Calibration, ClassTable, Frame, Metres, SparseModel, Trajectory
+from msgs_slam.pipelines.types import VOID, Calibration, ClassTable, Frame, Metres, Trajectory
 
 T = TypeVar("T")
 _MAP_STAGES = ("global_ba", "mapping")

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.depth.fields import FINE, Basis, DepthFields
 from msgs_slam.pipelines.depth.posed import PosedDepth, neighbours
 from msgs_slam.pipelines.depth.solve import Equations, Prior, solve_fields
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.system.memory import ALIGNED_TOGETHER
 from msgs_slam.pipelines.system.streamed import Streamed
-from msgs_slam.pipelines.types import Intrinsics, ProxyMaps, SparseModel
+from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 
 Array = NDArray[np.float64]
 

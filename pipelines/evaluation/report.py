@@ -23,12 +23,13 @@ from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, trajectory_plo
 from msgs_slam.pipelines.export.readme import lengths, readme
 from msgs_slam.pipelines.export.stage import on_earth
 from msgs_slam.pipelines.export.writers import IMAGES
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_source
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress
 from msgs_slam.pipelines.system.wording import figure_text
-from msgs_slam.pipelines.types import LoopEdge, SparseModel
+from msgs_slam.pipelines.types import LoopEdge
 from msgs_slam.pipelines.upright.world import FIRST, load_world
 
 

@@ -22,12 +22,12 @@ from msgs_slam.formats.spz import write_spz
 from msgs_slam.formats.trajectory import write_tum
 from msgs_slam.pipelines.export.readme import lengths, readme
 from msgs_slam.pipelines.geometry.rig import rig_of
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.metres.files import save_metres
 from msgs_slam.pipelines.outcome import Outcome
 from msgs_slam.pipelines.run.folder import save_classes, save_left_out
 from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.system.wording import stretches
-from msgs_slam.pipelines.types import SparseModel
 from msgs_slam.pipelines.upright.world import World, save_world
 
 IMAGES, SPARSE = "images", "sparse/0"

@@ -10,8 +10,8 @@ from scipy.sparse import csr_matrix
 
 from msgs_slam.pipelines.config import GlobalBaConfig
 from msgs_slam.pipelines.correspondence.retrieval import Looks, far_apart, loop_pairs
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.semantics import LabelSummary, richness, similarity
-from msgs_slam.pipelines.types import SparseModel
 
 SHARED_POINTS = 15
 """Keyframes with this many points in common need no loop."""

@@ -15,6 +15,7 @@ from msgs_slam.pipelines.depth.scales import sample_proxy
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.candidates import loop_candidates
 from msgs_slam.pipelines.global_ba.close import Closed, close_loops
 from msgs_slam.pipelines.global_ba.joint import Refined, refine_together
@@ -43,7 +44,7 @@ from msgs_slam.pipelines.tracking.adjust import align_depths, without_dependent_
 from msgs_slam.pipelines.tracking.pictures import Pictures, load_shutter
 from msgs_slam.pipelines.tracking.result import to_sparse_model
 from msgs_slam.pipelines.tracking.state import FEATURE_SD, TrackState
-from msgs_slam.pipelines.types import VOID, Intrinsics, SparseModel, Trajectory
+from msgs_slam.pipelines.types import VOID, Intrinsics, Trajectory
 
 Array = NDArray[np.float64]
 

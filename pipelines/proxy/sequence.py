@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics, SparseModel
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
+from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics
 
 
 @dataclass(frozen=True)

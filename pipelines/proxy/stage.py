@@ -39,15 +39,13 @@ from msgs_slam.pipelines.proxy.tasks import (
     surroundings,
 )
 from msgs_slam.pipelines.run.folder import (
-    load_proxy_maps,
-    proxy_path,
     save_classes,
     save_descriptors,
     save_figures,
     save_frame_scales,
     save_left_out,
-    save_mirror_pairs,
 )
+from msgs_slam.pipelines.run.proxy_files import load_proxy_maps, proxy_path, save_mirror_pairs
 from msgs_slam.pipelines.system.progress import log
 from msgs_slam.pipelines.types import VOID, Features, Frame
 

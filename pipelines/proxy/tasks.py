@@ -28,7 +28,8 @@ from msgs_slam.pipelines.proxy.scale import DepthScale
 from msgs_slam.pipelines.proxy.scratch import load_scratch, save_scratch
 from msgs_slam.pipelines.proxy.selection import Surroundings, open_depth, open_semantics
 from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
-from msgs_slam.pipelines.run.folder import load_left_out, proxy_path, save_proxy_maps
+from msgs_slam.pipelines.run.folder import load_left_out
+from msgs_slam.pipelines.run.proxy_files import proxy_path, save_proxy_maps
 from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Frame, Intrinsics, ProxyMaps, any_of

@@ -25,8 +25,10 @@ from msgs_slam.formats.images import read_grey_png, read_rgb, write_grey_png
 from msgs_slam.formats.jsonfile import read_json, read_json_object, write_json
 from msgs_slam.formats.tensors import load_tensors, save_arrays, save_tensors
 from msgs_slam.pipelines.depth.fields import FINE, DepthFields
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run import stored
 from msgs_slam.pipelines.run.finished_files import FinishedFiles
+from msgs_slam.pipelines.run.proxy_files import SYMMETRY, load_mirror_pairs, load_proxy_maps, proxy_name
 from msgs_slam.pipelines.run.stored import dataclass_from_json, load_layout, reading
 from msgs_slam.pipelines.types import (
     VOID,
@@ -37,7 +39,6 @@ from msgs_slam.pipelines.types import (
     LoopEdge,
     MirrorPairs,
     ProxyMaps,
-    SparseModel,
     Trajectory,
     Vocabulary,
     any_of,
@@ -48,7 +49,7 @@ if TYPE_CHECKING:
 
 FRAMES, CALIBRATION, BACKBONE = "frames.json", "calibration.json", "backbone/model.npz"
 VOCABULARY, TRIED = "correspondence/vocabulary.npz", "correspondence/tried.npz"
-CLASSES, SYMMETRY, DESCRIPTORS = "classes.json", "symmetry.npz", "descriptors.npz"
+CLASSES, DESCRIPTORS = "classes.json", "descriptors.npz"
 TRAJECTORY, SPARSE, DEPTH_FIELDS = "trajectory.npz", "sparse.npz", "depth_fields.npz"
 MAP, EXPOSURE, LOOPS = "map.safetensors", "exposure.npz", "loops.json"
 MESH, WORLD, SCALE = "mesh.ply", "world.json", "scale.json"
@@ -312,46 +313,6 @@ def save_classes(folder: Path, classes: ClassTable) -> None:
     write_json(folder / CLASSES, rows)
 
 
-def proxy_path(folder: Path, frame_id: int) -> Path:
-    """Where a frame's proxy maps lie."""
-    return folder / proxy_name(frame_id)
-
-
-def proxy_name(frame_id: int) -> str:
-    """The same, inside the stage's folder."""
-    return f"maps/{frame_id:06d}.npz"
-
-
-def save_proxy_maps(path: Path, maps: ProxyMaps) -> None:
-    """Half-precision inverse depth and 8-bit confidences: about 0.3 MB at 640 x 480.
-
-    Inverse depth in half precision keeps 11 significant bits (0.05 %) at any distance.
-    """
-    # 65504 is the largest half; unknown depth stays 0.
-    inverse = np.divide(1.0, maps.depth, out=np.zeros_like(maps.depth), where=maps.depth > 0)
-    save_arrays(
-        path,
-        {
-            "inverse_depth": np.clip(inverse, 0, 65504).astype(np.float16),
-            "confidence": np.round(maps.confidence * 255).astype(np.uint8),
-            "labels": maps.labels,
-            "label_confidence": np.round(maps.label_confidence * 255).astype(np.uint8),
-        },
-    )
-
-
-def load_proxy_maps(path: Path) -> ProxyMaps:
-    """Inverse of `save_proxy_maps`, up to its rounding."""
-    arrays = load_layout(path, stored.PROXY_MAPS)
-    inverse = arrays["inverse_depth"].astype(np.float32)
-    return ProxyMaps(
-        depth=np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse > 0),
-        confidence=arrays["confidence"].astype(np.float32) / np.float32(255),
-        labels=arrays["labels"],
-        label_confidence=arrays["label_confidence"].astype(np.float32) / np.float32(255),
-    )
-
-
 def save_frame_scales(folder: Path, scales: dict[int, float], spreads: dict[int, float]) -> None:
     """[{"frame_id", "scale", "spread"}]: proxy depth over the depth of the backbone's points, and how its own points
     stray from that, relatively."""
@@ -364,26 +325,6 @@ def save_descriptors(folder: Path, vectors: dict[int, NDArray[np.float32]]) -> N
     if vectors:
         ids = np.array(list(vectors), np.int64)
         save_arrays(folder / DESCRIPTORS, {"frame_ids": ids, "vectors": np.stack(list(vectors.values()))})
-
-
-def save_mirror_pairs(folder: Path, pairs_of: dict[int, MirrorPairs]) -> None:
-    """One npz of all frames that have any; nothing where none has."""
-    kept = {i: p for i, p in pairs_of.items() if len(p)}
-    if not kept:
-        return
-    arrays = {n: np.concatenate([getattr(p, n) for p in kept.values()]) for n in _PAIR_ARRAYS}
-    of_frame = np.repeat(np.array(list(kept), np.int64), [len(p) for p in kept.values()])
-    save_arrays(folder / SYMMETRY, {"of_frame": of_frame, **arrays})
-
-
-def load_mirror_pairs(path: Path) -> dict[int, MirrorPairs]:
-    """Inverse of `save_mirror_pairs`."""
-    arrays = load_layout(path, stored.MIRROR_PAIRS)
-    of_frame = arrays["of_frame"]
-    return {int(i): MirrorPairs(*(arrays[n][of_frame == i] for n in _PAIR_ARRAYS)) for i in np.unique(of_frame)}
-
-
-_PAIR_ARRAYS = ("pairs", "confidence", "gain", "offset")
 
 
 def save_trajectory(folder: Path, trajectory: Trajectory) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.structure.lens import Lens
-from msgs_slam.pipelines.types import SparseModel
 
 
 def to_sparse_model(

@@ -14,11 +14,12 @@ from msgs_slam.pipelines.depth import scales
 from msgs_slam.pipelines.depth.align import align_keyframes
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.depth.scales import COARSE, WorldScale
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.structure.bundle import Bundle, adjust_bundle, adjust_pose
 from msgs_slam.pipelines.structure.rolling import straight_pixels, straightened, velocities
 from msgs_slam.pipelines.tracking.places import settle_places
 from msgs_slam.pipelines.tracking.state import TrackState
-from msgs_slam.pipelines.types import Intrinsics, ProxyMaps, SparseModel, rows_by
+from msgs_slam.pipelines.types import Intrinsics, ProxyMaps, rows_by
 
 Array = NDArray[np.float64]
 

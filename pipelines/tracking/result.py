@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.tracking.state import TrackState
-from msgs_slam.pipelines.types import Frame, SparseModel, Trajectory
+from msgs_slam.pipelines.types import Frame, Trajectory
 
 
 def split_worlds(state: TrackState, least: int) -> list[TrackState]:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.tensors import load_arrays, save_arrays
 from msgs_slam.pipelines.geometry.rig import ONE_CAMERA, Rig
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.structure.rolling import Shutter, velocities
-from msgs_slam.pipelines.types import SparseModel
 
 Array = NDArray[np.float64]
 

@@ -34,13 +34,14 @@ from msgs_slam.pipelines.depth.posed import PosedDepth, neighbours
 from msgs_slam.pipelines.depth.see_through import contradicted
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import pixel_centers, project
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.candidates import loop_candidates
 from msgs_slam.pipelines.global_ba.semantics import summarise_labels
 from msgs_slam.pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
 from msgs_slam.pipelines.structure.bundle import adjust_bundle
 from msgs_slam.pipelines.tracking.adjust import make_bundle
 from msgs_slam.pipelines.tracking.state import TrackState
-from msgs_slam.pipelines.types import Intrinsics, SparseModel
+from msgs_slam.pipelines.types import Intrinsics
 from tests.world.building import HEIGHT, LENGTH, ROOM_WIDTH, Walk, module_at
 
 CAMERA = Intrinsics(320, 240, 272.0, 272.0, 160.0, 120.0)

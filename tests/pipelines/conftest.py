@@ -17,15 +17,14 @@ from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.run.folder import (
     RunFolder,
-    proxy_path,
     save_calibration,
     save_classes,
     save_frames,
     save_map,
-    save_proxy_maps,
     save_trajectory,
     write_json,
 )
+from msgs_slam.pipelines.run.proxy_files import proxy_path, save_proxy_maps
 from msgs_slam.pipelines.types import VOID, Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, Trajectory
 
 KEYFRAME_EVERY = 4

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.geometry.camera import project
-from msgs_slam.pipelines.types import Intrinsics, SparseModel
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
+from msgs_slam.pipelines.types import Intrinsics
 
 _MAX_POINTS = 400
 _UNSEEN_WEIGHT = 0.3

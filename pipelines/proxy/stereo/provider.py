@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.scratch import load_scratch, save_scratch
 from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
@@ -29,7 +30,7 @@ from msgs_slam.pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
 from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost, warps_to
 from msgs_slam.pipelines.proxy.stereo.upsample import upsample_depth
 from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.types import Frame, Intrinsics, SparseModel
+from msgs_slam.pipelines.types import Frame, Intrinsics
 
 _CACHED_FRAMES = 48
 _VIEWS, _BEST, _FUSE_VIEWS = 6, 3, 8

@@ -13,9 +13,10 @@ from msgs_slam.pipelines.depth.align import align_keyframes, fit_fields
 from msgs_slam.pipelines.depth.fields import FINE, DepthFields, field_scales
 from msgs_slam.pipelines.depth.posed import CANDIDATES, PosedDepth, overlaps
 from msgs_slam.pipelines.depth.see_through import contradicted
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.mapping.load import MappingInput
 from msgs_slam.pipelines.run.folder import RunFolder, save_depth_fields
-from msgs_slam.pipelines.types import Intrinsics, ProxyMaps, SparseModel
+from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 
 Maps = dict[int, ProxyMaps]
 

@@ -17,9 +17,10 @@ from msgs_slam.pipelines.evaluation.lengths import found_lengths
 from msgs_slam.pipelines.evaluation.plots import Line, plot, ticks
 from msgs_slam.pipelines.evaluation.report import write_report
 from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, write_evaluation
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder, save_trajectory
-from msgs_slam.pipelines.types import LoopEdge, SparseModel
+from msgs_slam.pipelines.types import LoopEdge
 from msgs_slam.pipelines.upright.world import SAME, World, save_world
 
 OracleRun = Callable[..., RunFolder]

@@ -20,9 +20,9 @@ from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.readme import WIDTH
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder, save_sparse
-from msgs_slam.pipelines.types import SparseModel
 
 OracleRun = Callable[..., RunFolder]
 

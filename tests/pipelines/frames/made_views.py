@@ -16,9 +16,9 @@ from msgs_slam.pipelines.correspondence.matching import VerifiedPair, verify_mat
 from msgs_slam.pipelines.correspondence.snapshots import Snapshots
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
-from msgs_slam.pipelines.progress import SilentProgress
-from msgs_slam.pipelines.streamed import Streamed
 from msgs_slam.pipelines.structure.sfm import StructureFromMotion, _Views
+from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import Features
 
 Array = NDArray[np.float64]

@@ -18,6 +18,7 @@ from msgs_slam.pipelines.evaluation.depth_error import DepthErrorSum
 from msgs_slam.pipelines.evaluation.views import view_map
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.stage import STAGE
 from msgs_slam.pipelines.mapping.views import occurring_classes
 from msgs_slam.pipelines.run.folder import (
@@ -29,7 +30,7 @@ from msgs_slam.pipelines.run.folder import (
     save_trajectory,
     write_json,
 )
-from msgs_slam.pipelines.types import SparseModel, Trajectory
+from msgs_slam.pipelines.types import Trajectory
 from tests.pipelines.global_ba.test_global_ba_stage import FIRST_AGAIN, seeded_map
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames
 from tests.world.clip import WorldFrame

@@ -15,6 +15,7 @@ from msgs_slam.pipelines.correspondence.retrieval import Looks, describe, learn_
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba import loops
 from msgs_slam.pipelines.global_ba.candidates import loop_candidates, shared_points
 from msgs_slam.pipelines.global_ba.close import close_loops, reprojection_error
@@ -22,7 +23,7 @@ from msgs_slam.pipelines.global_ba.loops import FoundLoops, find_loops, load_fou
 from msgs_slam.pipelines.global_ba.semantics import summarise_labels
 from msgs_slam.pipelines.global_ba.verify import KeyframeView, make_view, verify_loop
 from msgs_slam.pipelines.tracking.state import TrackState
-from msgs_slam.pipelines.types import Features, Intrinsics, SparseModel
+from msgs_slam.pipelines.types import Features, Intrinsics
 
 Array = NDArray[np.float64]
 CAMERA = Intrinsics(640, 480, 400, 400, 320, 240)

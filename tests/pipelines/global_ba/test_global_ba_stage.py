@@ -19,6 +19,7 @@ from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.camera import unproject
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.stage import STAGE
 from msgs_slam.pipelines.mapping.views import occurring_classes
 from msgs_slam.pipelines.run.folder import (
@@ -30,7 +31,7 @@ from msgs_slam.pipelines.run.folder import (
     save_trajectory,
     write_json,
 )
-from msgs_slam.pipelines.types import SparseModel, Trajectory
+from msgs_slam.pipelines.types import Trajectory
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames, small_motion
 from tests.world.clip import WorldFrame
 

@@ -10,28 +10,19 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.depth.fields import DepthFields
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.folder import (
     RunFolder,
-    proxy_path,
     save_calibration,
     save_classes,
     save_depth_fields,
     save_frames,
-    save_proxy_maps,
     save_sparse_model,
     save_trajectory,
     write_json,
 )
-from msgs_slam.pipelines.types import (
-    VOID,
-    Calibration,
-    ClassTable,
-    Frame,
-    Intrinsics,
-    ProxyMaps,
-    SparseModel,
-    Trajectory,
-)
+from msgs_slam.pipelines.run.proxy_files import proxy_path, save_proxy_maps
+from msgs_slam.pipelines.types import VOID, Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, Trajectory
 
 SIZE = (80, 60)
 

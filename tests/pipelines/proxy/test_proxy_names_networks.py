@@ -14,6 +14,7 @@ from msgs_slam.formats.images import read_depth_png, read_rgb
 from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.evaluation.class_map import match_classes
 from msgs_slam.pipelines.evaluation.label_score import count_labels, score
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.networks.card import Card
 from msgs_slam.pipelines.networks.labels import network_labels
 from msgs_slam.pipelines.networks.registry import ModelStore
@@ -23,7 +24,7 @@ from msgs_slam.pipelines.proxy.learned.network_pass import ResultCache, Workplac
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.system.progress import SilentProgress
-from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics, SparseModel
+from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics
 from tests.world.room import CLASSES
 
 KINDS = ("wall", "floor", "furniture")

@@ -15,7 +15,8 @@ from msgs_slam.pipelines.proxy.files.depth import FilesDepth
 from msgs_slam.pipelines.proxy.files.labels import FilesLabels
 from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
 from msgs_slam.pipelines.proxy.stage import run
-from msgs_slam.pipelines.run.folder import load_proxy_maps, proxy_path, read_json, save_calibration
+from msgs_slam.pipelines.run.folder import read_json, save_calibration
+from msgs_slam.pipelines.run.proxy_files import load_proxy_maps, proxy_path
 from msgs_slam.pipelines.types import VOID, Frame
 
 Make = Callable[..., StageContext]

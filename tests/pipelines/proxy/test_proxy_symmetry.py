@@ -12,15 +12,17 @@ from proxy_room import Room, perfect_backbone
 from msgs_slam.pipelines.correspondence.features import extract_features, to_grey
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry.camera import project, unproject, unproject_depth
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.proxy import symmetry
 from msgs_slam.pipelines.proxy.mirror_features import mirror_descriptors, mirrored_matches
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.proxy.stage import run
 from msgs_slam.pipelines.proxy.symmetry import MirrorPlane, find_mirror_planes, mirror_pairs
-from msgs_slam.pipelines.run.folder import RunFolder, save_mirror_pairs
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.proxy_files import save_mirror_pairs
 from msgs_slam.pipelines.system.progress import SilentProgress
-from msgs_slam.pipelines.types import Calibration, Features, Frame, Intrinsics, MirrorPairs, SparseModel
+from msgs_slam.pipelines.types import Calibration, Features, Frame, Intrinsics, MirrorPairs
 from tests.world import WorldFrame
 
 CAMERA = Intrinsics(320, 240, 260, 260, 160, 120)

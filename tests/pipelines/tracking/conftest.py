@@ -17,6 +17,7 @@ from msgs_slam.pipelines.correspondence.features import to_grey
 from msgs_slam.pipelines.correspondence.flow import corners
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry.camera import project, unproject
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.folder import (
     RunFolder,
     proxy_path,
@@ -29,7 +30,7 @@ from msgs_slam.pipelines.run.folder import (
 )  # fmt: skip
 from msgs_slam.pipelines.structure.bundle import Bundle
 from msgs_slam.pipelines.system.progress import SilentProgress
-from msgs_slam.pipelines.types import Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, SparseModel
+from msgs_slam.pipelines.types import Calibration, ClassTable, Frame, Intrinsics, ProxyMaps
 from tests.pipelines.kept import keep_correspondences
 from tests.world.clip import ClipOptions, WorldFrame, make_world, render_frame
 
