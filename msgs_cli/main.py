@@ -219,10 +219,11 @@ def resume(
 def status(run_path: Path, verbose: bool, as_json: bool) -> None:
     """Say which stages of RUN are done, what they found, what was degraded, and which files are damaged."""
     from msgs_slam.msgs_cli.tables import scale_lines, status_table, warning_lines
+    from msgs_slam.pipelines.reconstruct import all_stages
     from msgs_slam.pipelines.status import run_status
 
     run = open_run(run_path)
-    found = run_status(run)
+    found = run_status(run, all_stages())
     if as_json:
         click.echo(json.dumps(found.to_json(), indent=1))
         return
@@ -233,7 +234,7 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
     whole = {s.name: s.record for s in found.stages if s.record and not s.damaged}
     for line in scale_lines(run.root, whole):
         say(line)
-    for line in [*(f"warning: {w}" for w in found.warnings), *warning_lines(records)]:
+    for line in [*(f"warning: {w}" for w in found.warnings), *warning_lines(records), *found.notes]:
         say(line)
 
 

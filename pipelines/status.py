@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.engine.stages import Stage
+from msgs_slam.pipelines.engine.standing import newly_chosen, next_upstream, why_again
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.run.records import StageRecord, differing_settings, load_records, load_source
@@ -25,7 +29,8 @@ class StageStatus:
     ended); outdated (its files are there, but were made with other settings or from other inputs than the stages before
     it have by now); not yet. record: of a stage that is done; changed: settings of run.toml, as `section.key=value`,
     with which `resume` would make it again; damaged: names of those files; expected_mb: the peak of memory that other
-    recordings of that size have had, None before the keyframes are known."""
+    recordings of that size have had, None before the keyframes are known; again: why `resume` would make it again,
+    where nothing above says so; newer: what `auto` would choose otherwise by now, and `resume` leaves as it is."""
 
     name: str
     state: str
@@ -33,6 +38,8 @@ class StageStatus:
     changed: tuple[str, ...] = ()
     damaged: tuple[str, ...] = ()
     expected_mb: float | None = None
+    again: str = ""
+    newer: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,18 @@ class RunStatus:
         ]
         file = self.run.settings_file
         gone = [] if file.exists() else [f"{file} is gone: stages that are not done get default settings"]
-        return gone + changed + damaged
+        other = [f"{s.name} was made otherwise ({s.again}): {again}" for s in self.stages if s.again]
+        return gone + changed + damaged + other
+
+    @property
+    def notes(self) -> list[str]:
+        """What is no fault, and good to know."""
+        return [
+            f"{s.name} keeps what auto chose when it was made ({', '.join(s.newer)}); other networks are there by now: "
+            f"to have it chosen anew, delete {self.run.stage(s.name)} and type `msgs-slam resume {self.run.root}`"
+            for s in self.stages
+            if s.newer
+        ]
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; the records without their lists of files."""
@@ -79,7 +97,7 @@ class RunStatus:
             record = {k: v for k, v in asdict(s.record).items() if k != "files"} if s.record else None
             stages.append(
                 {"name": s.name, "state": s.state, "changed": s.changed, "damaged": s.damaged, "record": record,
-                 "expected_mb": s.expected_mb}
+                 "expected_mb": s.expected_mb, "again": s.again, "newer": s.newer}
             )  # fmt: skip
         return {
             "run": str(self.run.root),
@@ -87,23 +105,48 @@ class RunStatus:
             "planned_mb": round(self.planned_mb),
             "stages": stages,
             "warnings": self.warnings,
+            "notes": self.notes,
         }
 
 
-def run_status(run: RunFolder) -> RunStatus:
-    """Reads every file of the run once, to tell which are damaged.
+def run_status(run: RunFolder, program: Sequence[Stage] = ()) -> RunStatus:
+    """Reads every file of the run once, to tell which are damaged; with the stages of the `program`, tells too what it
+    would make again, and why.
 
-    Raises InputError where the manifest or the settings are.
+    Raises InputError where the manifest or the settings are damaged.
     """
     records, config = load_records(run), load_settings(run)
+    again, newer = _compared(run, program, records, config)
     stages = []
     for name in STAGES:
         record = records.get(name)
         changed = tuple(differing_settings(record, config)) if record else ()
         damaged = tuple(run.damaged(name))
         expected = expected_mb(name, run, config) if "frames" in records else None
-        stages.append(StageStatus(name, _state(run, name, record, damaged), record, changed, damaged, expected))
+        state, why = _state(run, name, record, damaged), "" if changed or damaged else again.get(name, "")
+        stages.append(StageStatus(name, state, record, changed, damaged, expected, why, newer.get(name, ())))
     return RunStatus(run, load_source(run).path, tuple(stages), memory_room(config.run.memory_mb) / 1e6)
+
+
+def _compared(
+    run: RunFolder, program: Sequence[Stage], records: dict[str, StageRecord], config: Config
+) -> tuple[dict[str, str], dict[str, tuple[str, ...]]]:
+    """By stage: why it would be made again, the first such one only; and what `auto` would choose otherwise."""
+    origin = load_source(run)
+    upstream, again, newer = origin.digest, {}, {}
+    for stage in program:
+        if (record := records.get(stage.name)) is None:
+            break
+        try:
+            inputs = stage.inputs(Path(origin.path), config) if stage.inputs else None
+        except InputError:  # gone: it keeps what it was made from
+            inputs = record.inputs
+        if why := why_again(stage, run, record, config, upstream, inputs):
+            again[stage.name] = why
+            break
+        newer[stage.name] = tuple(newly_chosen(stage, config, record, inputs))
+        upstream = next_upstream(upstream, record)
+    return again, newer
 
 
 def expected_mb(stage: str, run: RunFolder, config: Config) -> float | None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import shutil
 import sys
@@ -16,7 +14,8 @@ from typing import Any, TypeVar
 
 from msgs_slam.formats.atomic import is_disk_full, watched_by, write_text
 from msgs_slam.formats.errors import DiskFullError, InputError, RecoverableError
-from msgs_slam.pipelines.config import Config, settings_of_stage
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.engine.standing import kept_inputs, next_upstream, stage_fingerprint, why_again
 from msgs_slam.pipelines.engine.time_left import TimeLeft
 from msgs_slam.pipelines.engine.workers import TaskWorkers
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -35,7 +34,6 @@ from msgs_slam.pipelines.run.records import (
 )
 from msgs_slam.pipelines.run.settings_file import save_settings
 from msgs_slam.pipelines.system.device import settle_device
-from msgs_slam.pipelines.system.identity import stage_identity
 from msgs_slam.pipelines.system.memory import give_back, memory_room
 from msgs_slam.pipelines.system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log
 from msgs_slam.pipelines.system.stopping import stop_if_asked
@@ -119,7 +117,10 @@ class Stage:
 
     A stage that reads more than the stages before it says so by `inputs`: plain values that change with what it reads
     (files, models). `check` refuses what it could not use. Both see (source, config) before the first stage runs, so
-    that a mistake is told of before anything slow.
+    that a mistake is told of before anything slow. `auto` names the inputs that the settings leave to what is there
+    (networks in the cache): a finished stage keeps what was chosen when it was made. `division`: into which parts the
+    work of a finished stage is divided with these settings, where the memory that is given decides that and the result
+    with it.
     """
 
     name: str
@@ -127,6 +128,8 @@ class Stage:
     summary: str
     inputs: Callable[[Path, Config], Any] | None = None
     check: Callable[[Path, Config], None] | None = None
+    auto: Callable[[Config], tuple[str, ...]] = lambda config: ()
+    division: Callable[[RunFolder, Config], Any] | None = None
 
     @property
     def file(self) -> Path:
@@ -165,9 +168,12 @@ def run_stages(
     save_settings(run, config)
     watch = Watch(progress, wanted, records)
     for stage in wanted:
-        fingerprint = stage_fingerprint(stage, config, upstream, inputs[stage.name])
         record = records.get(stage.name)
-        if record is None or record.fingerprint != fingerprint or run.damaged(stage.name):
+        why = "" if record is None else why_again(stage, run, record, config, upstream, inputs[stage.name])
+        if record is None or why:
+            fingerprint = stage_fingerprint(stage, config, upstream, inputs[stage.name])
+            if why:
+                log.warning("%s and what follows are made again (%s)", stage.name, why)
             if _drop(records, stage.name):
                 write_manifest(run.manifest_file, Manifest(origin, records))
             folder = run.partial(stage.name)
@@ -234,29 +240,22 @@ def _check_inputs(
     settled = True
     for stage in stages:
         record = records.get(stage.name)
-        if record is None or record.fingerprint != stage_fingerprint(stage, config, upstream, record.inputs):
-            settled = False
-        settled = settled and not run.damaged(stage.name)
-        kept = record.inputs if record is not None and settled else None
-        upstream = next_upstream(upstream, record) if record else upstream
+        settled = settled and record is not None and not why_again(stage, run, record, config, upstream, record.inputs)
         try:
             inputs[stage.name] = stage.inputs(source, config) if stage.inputs else None
         except InputError as error:
-            if not settled:
+            if record is None or not settled:
                 raise
             log.warning("%s: keeps what it was made from (%s)", stage.name, error)
-            inputs[stage.name] = kept
-        settled &= inputs[stage.name] == kept
+            inputs[stage.name] = record.inputs
+        if settled and record is not None:
+            settled = kept_inputs(stage, config, record, inputs[stage.name]) == record.inputs
+        upstream = next_upstream(upstream, record) if record else upstream
         if stage is stages[0] and not settled:
             same_source()
         if stage.check and not settled:
             stage.check(source, config)
     return inputs
-
-
-def next_upstream(upstream: str, record: StageRecord) -> str:
-    """What the stages after `record` are made from, as one digest."""
-    return hashlib.sha256((upstream + record.content).encode()).hexdigest()
 
 
 def _run_one(stage: Stage, context: StageContext, fingerprint: str, inputs: Any) -> StageRecord:
@@ -317,16 +316,6 @@ def _flush_folder(folder: Path) -> None:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         os.fsync(descriptor)
         os.close(descriptor)
-
-
-def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) -> str:
-    """Digest of what a stage's result depends on: its code, its settings, the seed, its inputs, what is before."""
-    own = settings_of_stage(config, stage.name)
-    beside = [] if inputs is None else [inputs]
-    text = json.dumps(
-        [stage.name, stage_identity(stage.name, stage.file), own, config.run.seed, upstream, *beside], sort_keys=True
-    )
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def forget_peak() -> None:

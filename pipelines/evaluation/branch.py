@@ -9,7 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.stages import Stage, next_upstream, stage_fingerprint
+from msgs_slam.pipelines.engine.stages import Stage
+from msgs_slam.pipelines.engine.standing import next_upstream, stage_fingerprint
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import Manifest, StageRecord, load_records, load_source, write_manifest
 from msgs_slam.pipelines.run.settings_file import load_settings, save_settings

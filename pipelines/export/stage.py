@@ -175,11 +175,12 @@ def on_earth(outcome: Outcome, world: World) -> Outcome:
     return outcome if world.earth is None else replace(outcome, metric=True, metres=None)
 
 
-def export_inputs(source: Path, config: Config) -> list[str]:
+def export_inputs(source: Path, config: Config) -> dict[str, str] | None:
     """The network that the guess is made with, and the track: other fixes under the same name make other files."""
     card = metric_card() if config.export.scale == "auto" else None
-    track = [] if config.export.gps in (AUTO, OFF) else [file_sha256(Path(config.export.gps))]
-    return track if card is None else [card_identity(card), *track]
+    metres = {} if card is None else {"metres": card_identity(card)}
+    track = {} if config.export.gps in (AUTO, OFF) else {"track": file_sha256(Path(config.export.gps))}
+    return metres | track or None
 
 
 def write_pieces(context: StageContext) -> None:
@@ -275,5 +276,10 @@ def _kept_world(outcome: Outcome, settings: ExportConfig) -> World | None:
 
 
 STAGE = Stage(
-    "export", run, "COLMAP model, Gaussian PLY, labelled mesh, trajectory, metres", inputs=export_inputs, check=_check
+    "export",
+    run,
+    "COLMAP model, Gaussian PLY, labelled mesh, trajectory, metres",
+    inputs=export_inputs,
+    check=_check,
+    auto=lambda config: ("metres",) if config.export.scale == "auto" else (),
 )

@@ -393,5 +393,5 @@ def _inputs(source: Path, config: Config) -> dict[str, str] | None:
 
 STAGE = Stage(
     "frames", run, "pick frames, calibrate the camera, structure from motion over keyframes",
-    inputs=_inputs, check=check,
+    inputs=_inputs, check=check, auto=lambda config: ("people",) if config.frames.people == "auto" else (),
 )  # fmt: skip

@@ -45,6 +45,12 @@ def proxy_inputs(source: Path, config: Config) -> dict[str, Any]:
     return identities
 
 
+def left_to_auto(config: Config) -> tuple[str, ...]:
+    """Which of them the networks in the cache decide."""
+    asked = {"depth": config.proxy.depth, "labels": config.proxy.semantics}
+    return tuple(name for name, text in asked.items() if text.partition(":")[0].strip() == "auto")
+
+
 def check_proxy(source: Path, config: Config) -> None:
     """InputError for a network that is not what its card says, a map of another shape than the pictures, and a scale
     reference that makes no sense."""

@@ -13,7 +13,7 @@ from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.correspondence.features import extract_features, to_grey
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.masks.moving import find_moving
-from msgs_slam.pipelines.proxy.inputs import check_proxy, proxy_inputs
+from msgs_slam.pipelines.proxy.inputs import check_proxy, left_to_auto, proxy_inputs
 from msgs_slam.pipelines.proxy.metres import reference_scale, scale_figures
 from msgs_slam.pipelines.proxy.providers import (
     DepthProvider,
@@ -221,4 +221,11 @@ def _report(
     }
 
 
-STAGE = Stage("proxy", run, "depth, reliability and classes of the keyframes", inputs=proxy_inputs, check=check_proxy)
+STAGE = Stage(
+    "proxy",
+    run,
+    "depth, reliability and classes of the keyframes",
+    inputs=proxy_inputs,
+    check=check_proxy,
+    auto=left_to_auto,
+)

@@ -21,11 +21,13 @@ _MARK = re.compile(r"# Written by msgs-slam\. Change settings with --set or --co
 
 
 def save_settings(run: RunFolder, config: Config) -> None:
-    """Atomically. The checksum in the first line is over the rest and the run's source, so that neither an emptied
-    file nor that of another run is taken for this one's. Raises InputError when the disk refuses."""
+    """Atomically, where they are others than before. The checksum in the first line is over the rest and the run's
+    source, so that neither an emptied file nor that of another run is taken for this one's. Raises InputError when the
+    disk refuses."""
     text = config_to_toml(config)
     mark = f"# Written by msgs-slam. Change settings with --set or --config. Check: {_check(run, text)}\n"
-    write_text(run.settings_file, mark + text)
+    if not run.settings_file.exists() or run.settings_file.read_bytes() != (mark + text).encode():
+        write_text(run.settings_file, mark + text)
 
 
 def load_settings(run: RunFolder) -> Config:

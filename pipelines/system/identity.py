@@ -28,6 +28,7 @@ PLUMBING = frozenset(
         "msgs_slam.pipelines.config",
         "msgs_slam.pipelines.retired_settings",
         "msgs_slam.pipelines.engine.stages",
+        "msgs_slam.pipelines.engine.standing",
         "msgs_slam.pipelines.system.progress",
         "msgs_slam.pipelines.system.stopping",
         "msgs_slam.pipelines.run.records",

@@ -1,0 +1,76 @@
+"""Whether a finished stage is what its settings, its inputs and this program would make, and if not, why."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from msgs_slam.pipelines.config import Config, settings_of_stage
+from msgs_slam.pipelines.run.records import StageRecord, differing_settings, recorded_config
+from msgs_slam.pipelines.system.identity import stage_identity
+
+if TYPE_CHECKING:
+    from msgs_slam.pipelines.engine.stages import Stage
+    from msgs_slam.pipelines.run.folder import RunFolder
+
+
+def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) -> str:
+    """Digest of what a stage's result depends on: its code, its settings, the seed, its inputs, what is before."""
+    own = settings_of_stage(config, stage.name)
+    beside = [] if inputs is None else [inputs]
+    text = json.dumps(
+        [stage.name, stage_identity(stage.name, stage.file), own, config.run.seed, upstream, *beside], sort_keys=True
+    )
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def next_upstream(upstream: str, record: StageRecord) -> str:
+    """What the stages after `record` are made from, as one digest."""
+    return hashlib.sha256((upstream + record.content).encode()).hexdigest()
+
+
+def kept_inputs(stage: Stage, config: Config, record: StageRecord | None, inputs: Any) -> Any:
+    """The inputs of now with what `auto` has chosen as it was when the stage was made: that belongs to the run, and a
+    network that has appeared since makes nothing out of date."""
+    was = record.inputs if record is not None else None
+    if not isinstance(inputs, Mapping | None) or not isinstance(was, Mapping | None) or record is None:
+        return inputs
+    chosen = stage.auto(config)
+    kept = {k: v for k, v in (inputs or {}).items() if k not in chosen}
+    return kept | {k: v for k, v in (was or {}).items() if k in chosen} or None
+
+
+def newly_chosen(stage: Stage, config: Config, record: StageRecord, inputs: Any) -> list[str]:
+    """Names of the inputs that `auto` would choose otherwise by now."""
+    if kept_inputs(stage, config, record, inputs) == inputs:
+        return []
+    return [name for name in stage.auto(config) if (record.inputs or {}).get(name) != (inputs or {}).get(name)]
+
+
+def why_again(
+    stage: Stage, run: RunFolder, record: StageRecord, config: Config, upstream: str, inputs: Any
+) -> str:  # fmt: skip
+    """Why a finished stage has to be made again, "" where it has not; `inputs` are those of now."""
+    if damaged := run.damaged(stage.name):
+        return f"{len(damaged)} of its files are damaged or gone"
+    kept = kept_inputs(stage, config, record, inputs)
+    if record.fingerprint != stage_fingerprint(stage, config, upstream, kept):
+        return _what_differs(stage, record, config, upstream, kept)
+    if stage.division is not None:
+        was = recorded_config({stage.name: record}, config)
+        if stage.division(run, config) != stage.division(run, was):
+            return f"run.memory_mb={config.run.memory_mb} divides it otherwise than {was.run.memory_mb} has"
+    return ""
+
+
+def _what_differs(stage: Stage, record: StageRecord, config: Config, upstream: str, inputs: Any) -> str:
+    differing = differing_settings(record, config)
+    if (seed := record.settings.get("run", {}).get("seed", config.run.seed)) != config.run.seed:
+        differing.append(f"run.seed={config.run.seed}, not {seed}")
+    if differing:
+        return f"other settings: {', '.join(differing)}"
+    if stage_fingerprint(stage, config, upstream, record.inputs) == record.fingerprint:
+        return "what it reads beside the stages before it has changed"
+    return "another version of the program made it, or other stages before it"
