@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.gaussian_map import GaussianMap
@@ -41,6 +43,14 @@ def adjust_views(
     """
     unit = scene_depth(views)
     return [_adjusted(v, gaussian_map, settings, steps, unit) if v.frame_id in chosen else v for v in views]
+
+
+def adjusted_poses(
+    views: Sequence[View], gaussian_map: GaussianMap, settings: MappingConfig, steps: int
+) -> dict[int, NDArray[np.float64]]:
+    """Frame id → the pose that `adjust_views` finds for it, one view in memory at a time."""
+    unit = scene_depth(views)
+    return {v.frame_id: _adjusted(v, gaussian_map, settings, steps, unit).cam_from_world.cpu().numpy() for v in views}
 
 
 def _adjusted(view: View, gaussian_map: GaussianMap, settings: MappingConfig, steps: int, unit: float) -> View:

@@ -19,12 +19,12 @@ from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.candidates import loop_candidates
 from msgs_slam.pipelines.global_ba.close import Closed, close_loops
 from msgs_slam.pipelines.global_ba.joint import Refined, refine_together
-from msgs_slam.pipelines.global_ba.local import adjust_views, loop_keyframes
+from msgs_slam.pipelines.global_ba.local import adjust_views, adjusted_poses, loop_keyframes
 from msgs_slam.pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_found
 from msgs_slam.pipelines.global_ba.move_map import follow_keyframes, move_map
 from msgs_slam.pipelines.global_ba.semantics import LabelSummary, summarise_labels
 from msgs_slam.pipelines.global_ba.verify import KeyframeView, Loop, make_view
-from msgs_slam.pipelines.mapping.divided import refine_divided
+from msgs_slam.pipelines.mapping.divided import refine_divided, rows_of
 from msgs_slam.pipelines.mapping.load import load_views, with_rigid_panoramas
 from msgs_slam.pipelines.mapping.poses import move_trajectory
 from msgs_slam.pipelines.run.folder import (
@@ -230,6 +230,7 @@ def refine(
     exposure = context.run.load_exposure()
     if context.run.load_submaps():
         exposures = exposure["log_gains"], exposure["offsets"]
+        trajectory = at_loop_ends(context, gaussian_map, trajectory, fields, found, exposure["frame_ids"])
         before, made, after = refine_divided(
             context, gaussian_map, trajectory, fields, exposures, settings.joint_passes
         )
@@ -245,6 +246,29 @@ def refine(
     offsets = {int(i): o for i, o in zip(exposure["frame_ids"], exposure["offsets"], strict=True)}
     exposures = np.array([gains[v.frame_id] for v in views]), np.array([offsets[v.frame_id] for v in views])
     return refine_together(context, gaussian_map, views, exposures, len(class_ids), mapping, settings.joint_passes)
+
+
+def at_loop_ends(
+    context: StageContext,
+    gaussian_map: GaussianMap,
+    trajectory: Trajectory,
+    fields: DepthFields,
+    found: FoundLoops,
+    keyframe_ids: NDArray[np.int64],
+) -> Trajectory:
+    """The poses at the ends of loops by labels and depth, eq. (25), in a map that was made in submaps; the other
+    keyframes where they were."""
+    steps, ends = context.config.article.loop_steps, loop_keyframes(found.loops, keyframe_ids.tolist())
+    if not steps or not ends:
+        return trajectory
+    mapping, article, memory = context.config.mapping, context.config.article, context.memory_room
+    around = rows_of(trajectory, np.array(sorted(ends)))
+    class_ids = context.run.load_class_ids()
+    views = load_views(context.run, around, mapping, article, context.device, fields, memory, class_ids).views
+    poses = poses_of(trajectory, keyframe_ids).copy()
+    for frame_id, pose in adjusted_poses(views, gaussian_map, mapping, steps).items():
+        poses[np.searchsorted(keyframe_ids, frame_id)] = pose
+    return move_trajectory(trajectory, keyframe_ids, poses)
 
 
 def save(
