@@ -35,6 +35,7 @@ from msgs_slam.pipelines.frames.learned import learned_inputs, open_learned
 from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
 from msgs_slam.pipelines.geometry.rig import Rig, rig_of
 from msgs_slam.pipelines.run.folder import (
+    RunFolder,
     save_backbone,
     save_calibration,
     save_features,
@@ -42,6 +43,7 @@ from msgs_slam.pipelines.run.folder import (
     save_matching,
     save_sparse,
 )
+from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
 from msgs_slam.pipelines.source.opening import FolderSource, Source, open_source
 from msgs_slam.pipelines.source.pick import sharpest_of_windows
@@ -52,6 +54,7 @@ from msgs_slam.pipelines.structure.lens import Lens, distortion_of, make_lens
 from msgs_slam.pipelines.structure.parallax import require_motion
 from msgs_slam.pipelines.structure.rolling import read_readout
 from msgs_slam.pipelines.structure.sfm import Structure, parallel_map
+from msgs_slam.pipelines.structure.window_size import window_size, windows_of
 from msgs_slam.pipelines.types import Calibration, Frame
 
 _SIGNIFICANT_SHIFT_PX = 0.3
@@ -391,7 +394,16 @@ def _inputs(source: Path, config: Config) -> dict[str, str] | None:
     return (mask_inputs(source, config) or {}) | learned_inputs(config.frames) or None
 
 
+def _division(run: RunFolder, config: Config) -> list[range]:
+    """The windows of structure from motion, which are smaller for less memory: other ones give other poses."""
+    calibration, figures = run.load_calibration(), load_records(run)["frames"].figures
+    pixels = calibration.intrinsics.width * calibration.intrinsics.height
+    size = window_size(config.run.memory_mb, pixels)
+    return windows_of(figures.get("keyframes", 0), size) if calibration.directions == 1 else []
+
+
 STAGE = Stage(
     "frames", run, "pick frames, calibrate the camera, structure from motion over keyframes",
     inputs=_inputs, check=check, auto=lambda config: ("people",) if config.frames.people == "auto" else (),
+    division=_division,
 )  # fmt: skip

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.mapping.divided import Mapped, map_divided
 from msgs_slam.pipelines.mapping.load import load_views, split_frames, survey, with_rigid_panoramas
@@ -16,7 +17,7 @@ from msgs_slam.pipelines.mapping.optimise import OptimisedMap, optimise_map
 from msgs_slam.pipelines.mapping.poses import interpolate_rows, move_trajectory
 from msgs_slam.pipelines.mapping.submaps import submap_count
 from msgs_slam.pipelines.mapping.views import View
-from msgs_slam.pipelines.run.folder import save_exposure, save_figures, save_map, save_trajectory
+from msgs_slam.pipelines.run.folder import RunFolder, save_exposure, save_figures, save_map, save_trajectory
 from msgs_slam.pipelines.system.memory import submap_size
 from msgs_slam.pipelines.types import Trajectory
 
@@ -109,4 +110,10 @@ def _measure_held_out(
     return [measure_view(result.gaussian_map, *args) for args in zip(held_out, poses, gains, offsets, strict=True)]
 
 
-STAGE = Stage("mapping", run, "the semantic Gaussian map from the keyframes")
+def _division(run: RunFolder, config: Config) -> int:
+    """Into how many submaps; more for less memory."""
+    kept, _ = split_frames(run.load_trajectory("tracking"), config.mapping.hold_out)
+    return submap_count(len(kept), submap_size(config, run.load_calibration().intrinsics))
+
+
+STAGE = Stage("mapping", run, "the semantic Gaussian map from the keyframes", division=_division)

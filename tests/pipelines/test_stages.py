@@ -268,3 +268,44 @@ def test_inputs_of_a_stage_are_looked_at_first_and_rerun_it_when_they_change(
     with pytest.raises(InputError, match="is not there"):
         bring(load_config(overrides=["frames.rate=1"]))
     assert recorder.ran == []
+
+
+def test_memory_that_divides_a_stage_otherwise_makes_it_again(recorder: Recorder, tmp_path: Path) -> None:
+    """And only then: where the parts are the same, the result is."""
+    stages = recorder.stages()
+    stages[0] = replace(stages[0], division=lambda run, config: config.run.memory_mb // 1000)
+
+    def bring(memory_mb: int) -> list[str]:
+        recorder.ran.clear()
+        config = load_config(overrides=[f"run.memory_mb={memory_mb}"])
+        (tmp_path / "r").mkdir(exist_ok=True)
+        run_stages(stages, RunFolder(tmp_path / "r"), Path("video.mp4"), "d", config, SilentProgress())
+        return list(recorder.ran)
+
+    assert bring(2100) == list(STAGES)
+    assert bring(2900) == []
+    assert bring(900) == list(STAGES)
+    assert bring(900) == []
+
+
+def test_a_finished_stage_keeps_what_auto_has_chosen(recorder: Recorder, tmp_path: Path) -> None:
+    there = {"depth": "files", "labels": "segments"}
+    auto = ["labels"]
+    stages = recorder.stages()
+    stages[1] = replace(stages[1], inputs=lambda source, config: dict(there), auto=lambda config: tuple(auto))
+
+    def bring() -> list[str]:
+        recorder.ran.clear()
+        (tmp_path / "r").mkdir(exist_ok=True)
+        run_stages(stages, RunFolder(tmp_path / "r"), Path("video.mp4"), "d", Config(), SilentProgress())
+        return list(recorder.ran)
+
+    assert bring() == list(STAGES)
+    there["labels"] = "a network"
+    assert bring() == []
+    there["depth"] = "other files"
+    assert bring() == list(STAGES[1:])  # and then everything is chosen anew
+    assert load_records(RunFolder(tmp_path / "r"))["proxy"].inputs == there
+    auto.clear()
+    there["labels"] = "another network"
+    assert bring() == list(STAGES[1:])

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 from numpy.typing import NDArray
 
+from msgs_slam.pipelines.config import load_config
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair
+from msgs_slam.pipelines.frames.stage import STAGE
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
 from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.run.folder import RunFolder, save_calibration
+from msgs_slam.pipelines.run.records import Manifest, Source, StageRecord, checksums, write_manifest
 from msgs_slam.pipelines.structure.adjust import adjust, reprojection_errors
 from msgs_slam.pipelines.structure.consistency import judge
 from msgs_slam.pipelines.structure.lens import unknown_camera
@@ -20,7 +25,7 @@ from msgs_slam.pipelines.structure.mend import mended, resize_behind, size_ratio
 from msgs_slam.pipelines.structure.rolling import NO_READOUT
 from msgs_slam.pipelines.structure.window_size import SHARED, SIZE, window_size, windows_of
 from msgs_slam.pipelines.structure.windows import WIDE, Joined, adjust_together, close_loops
-from msgs_slam.pipelines.types import Intrinsics
+from msgs_slam.pipelines.types import Calibration, Intrinsics
 from tests.world.paths import look_at
 
 Array = NDArray[np.float64]
@@ -218,3 +223,15 @@ def test_points_a_pixel_off_have_no_say_in_a_narrow_adjustment() -> None:
         found = np.array([tried.images[i].projection_center() for i in range(1, COUNT + 1)])
         errors.append(np.linalg.norm(align_points(found, wanted).apply(found) - wanted, axis=1).mean())
     assert errors[1] < 0.5 * errors[0]
+
+
+@pytest.mark.parametrize(("keyframes", "differs"), [(100, False), (750, True)])
+def test_memory_makes_only_frames_of_long_recordings_again(keyframes: int, differs: bool, tmp_path: Path) -> None:
+    run = RunFolder(tmp_path)
+    save_calibration(run.stage("frames"), Calibration(CAMERA, "given", 0.0, (0, 0, 0, 0)))
+    files = checksums(run.stage("frames"))
+    record = StageRecord("", files, 0, 0, {"keyframes": keyframes}, [], "")
+    write_manifest(run.manifest_file, Manifest(Source("", ""), {"frames": record}))
+    assert STAGE.division is not None
+    whole, parts = (STAGE.division(run, load_config(None, [f"run.memory_mb={mb}"])) for mb in (0, 1100))
+    assert (whole != parts) == differs
