@@ -17,7 +17,7 @@ from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.mapping.article.mirrors import Mirrors
 from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.system.memory import VIEWS_SHARE
+from msgs_slam.pipelines.system.memory import VIEWS_SHARE, room_on
 from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import Frame, Intrinsics, ProxyMaps, Trajectory
 
@@ -43,8 +43,8 @@ def load_views(
 ) -> MappingInput:
     """The keyframes of `trajectory` with images and proxies, in order.
 
-    Of `memory`, bytes, a quarter is for views; what has no room there is read again when
-    it is visited. Depths are in the unit of the world by `fields`, those of tracking unless others are given; what
+    Of `memory`, bytes, or of what a GPU has free where the views lie on one, a quarter is for views; what has no room
+    there is read again when it is visited. Depths are in the unit of the world by `fields`, those of tracking unless others are given; what
     other views see through is unknown. Without `class_ids` the channels are the classes that occur.
     """
     frames = {f.id: f for f in run.load_frames()}
@@ -65,6 +65,8 @@ def load_views(
             return view
         field = torch.from_numpy(fields.scales(frame_id, *view.depth.shape)).to(device)
         return replace(view, mirrors=Mirrors.of(symmetry[frame_id], full, intrinsics, device).scaled(field))
+
+    memory = room_on(device, memory)
 
     def streamed(ids: list[int], room: float) -> Streamed[View]:
         return Streamed(len(ids), lambda n: load(ids[n]), lambda v: v.nbytes, room)

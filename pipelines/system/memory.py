@@ -54,6 +54,15 @@ def memory_room(memory_mb: int) -> float:
     return memory_mb * 1e6 if memory_mb else machine_memory() / 2
 
 
+def room_on(device: object, host: float) -> float:
+    """Bytes to plan with for what lies on a device: on a GPU what is free there now, whatever the `host` has."""
+    if not str(device).startswith("cuda"):
+        return host
+    import torch
+
+    return float(torch.cuda.mem_get_info()[0])
+
+
 def machine_memory() -> float:
     """Bytes of memory of the machine, or of the container where that has less; 8 GB where nobody tells."""
     return min([_physical_memory(), *_container_limits()])

@@ -8,6 +8,7 @@ import numpy as np
 import plyfile
 import pycolmap
 import pytest
+import torch
 import trimesh
 from finished import note_finished
 
@@ -20,7 +21,9 @@ from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.export.volume import Grid
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.mapping import stage as mapping_stage
+from msgs_slam.pipelines.mapping.load import load_views
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.memory import room_on
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID
 from msgs_slam.pipelines.upright.world import read_world
@@ -151,3 +154,16 @@ def test_no_keyframe_left_is_refused(small_run: RunFolder, tmp_path: Path) -> No
     given = StageContext(small_run, small_run.root, config, tmp_path, SilentProgress())
     with pytest.raises(InputError, match="hold_out"):
         mapping_stage.run(given)
+
+
+def test_views_on_a_card_are_planned_by_its_own_memory(small_run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine with more memory than its card has would fill the card."""
+    monkeypatch.setattr("torch.cuda.mem_get_info", lambda: (1000, 8_000_000_000))
+    assert room_on("cuda", 64e9) == room_on(torch.device("cuda:0"), 64e9) == 1000
+    assert room_on("cpu", 64e9) == 64e9
+    monkeypatch.setattr("msgs_slam.pipelines.mapping.load.room_on", lambda device, host: room_on("cuda", host))
+    views = load_views(small_run, small_run.load_trajectory("tracking"), MappingConfig(), memory=64e9).views
+    first = views[0]
+    assert views[1] is not first
+    assert views[0] is not first  # read again: a thousand bytes hold no two of them
+    assert torch.equal(views[0].image, first.image)
