@@ -52,7 +52,7 @@ def status_table(stages: Sequence[StageStatus], everything: bool = False) -> str
     for stage in stages:
         expected = "" if stage.expected_mb is None else f"{stage.expected_mb:.0f}"
         if (record := stage.record) is None:
-            rows.append([stage.name, stage.state, "", "", expected, ""])
+            rows.append([stage.name, stage.state_text, "", "", expected, ""])
             continue
         wanted = record.figures if everything else [k for k in KEY_FIGURES[stage.name] if k in record.figures]
         figures = ", ".join(f"{key} {figure_text(record.figures[key], key)}" for key in wanted)

@@ -17,6 +17,7 @@ from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import LEADER, LOCK, locked, make_folder
 from msgs_slam.pipelines.run.names import SOURCE_LIST, STAGES
 from msgs_slam.pipelines.run.records import StageRecord, load_records, load_source, recorded_config
+from msgs_slam.pipelines.run.running import NotedProgress
 from msgs_slam.pipelines.run.settings_file import load_settings
 from msgs_slam.pipelines.source.opening import source_digest
 from msgs_slam.pipelines.system.device import settle_device
@@ -165,7 +166,8 @@ def _run(
 
     threads = config.run.threads or (workers.threads if workers else threads) or os.cpu_count() or 1
     set_threads(threads)
-    return run_stages(all_stages(), run, source, digest, config, progress, until, same_source, workers, threads)
+    with NotedProgress(progress, run) as noted:
+        return run_stages(all_stages(), run, source, digest, config, noted, until, same_source, workers, threads)
 
 
 def _require_run_or_empty(run: RunFolder) -> None:

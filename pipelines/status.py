@@ -14,23 +14,26 @@ from msgs_slam.pipelines.engine.standing import newly_chosen, next_upstream, why
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.run.records import StageRecord, differing_settings, load_records, load_source
+from msgs_slam.pipelines.run.running import Running, load_running
 from msgs_slam.pipelines.run.settings_file import load_settings
 from msgs_slam.pipelines.structure.window_size import window_size, windows_of
 from msgs_slam.pipelines.system.memory import ALIGNED_TOGETHER, GAUSSIANS, NEEDS, memory_room, submap_size
 
 _BEYOND = 0.3
 """MB for each keyframe that `frames` or tracking has not in work."""
-DONE, DAMAGED, INTERRUPTED, OUTDATED, NOT_YET = "done", "damaged", "interrupted", "outdated", "not yet"
+DONE, RUNNING, DAMAGED, INTERRUPTED = "done", "running", "damaged", "interrupted"
+OUTDATED, NOT_YET = "outdated", "not yet"
 
 
 @dataclass(frozen=True)
 class StageStatus:
-    """state: done; damaged (done, but some of its files are gone or not as it left them); interrupted (begun and not
-    ended); outdated (its files are there, but were made with other settings or from other inputs than the stages before
-    it have by now); not yet. record: of a stage that is done; changed: settings of run.toml, as `section.key=value`,
-    with which `resume` would make it again; damaged: names of those files; expected_mb: the peak of memory that other
-    recordings of that size have had, None before the keyframes are known; again: why `resume` would make it again,
-    where nothing above says so; newer: what `auto` would choose otherwise by now, and `resume` leaves as it is."""
+    """state: done; running (a process makes it now); damaged (done, but some of its files are gone or not as it left
+    them); interrupted (begun and not ended); outdated (its files are there, but were made with other settings or from
+    other inputs than the stages before it have by now); not yet. record: of a stage that is done; changed: settings of
+    run.toml, as `section.key=value`, with which `resume` would make it again; damaged: names of those files;
+    expected_mb: the peak of memory that other recordings of that size have had, None before the keyframes are known;
+    again: why `resume` would make it again, where nothing above says so; newer: what `auto` would choose otherwise by
+    now, and `resume` leaves as it is; running: how far the process is that makes it now."""
 
     name: str
     state: str
@@ -40,6 +43,12 @@ class StageStatus:
     expected_mb: float | None = None
     again: str = ""
     newer: tuple[str, ...] = ()
+    running: Running | None = None
+
+    @property
+    def state_text(self) -> str:
+        """The state, and of a stage that is being made how far it is."""
+        return self.running.text if self.running else self.state
 
 
 @dataclass(frozen=True)
@@ -97,7 +106,8 @@ class RunStatus:
             record = {k: v for k, v in asdict(s.record).items() if k != "files"} if s.record else None
             stages.append(
                 {"name": s.name, "state": s.state, "changed": s.changed, "damaged": s.damaged, "record": record,
-                 "expected_mb": s.expected_mb, "again": s.again, "newer": s.newer}
+                 "expected_mb": s.expected_mb, "again": s.again, "newer": s.newer,
+                 "progress": asdict(s.running) if s.running else None}
             )  # fmt: skip
         return {
             "run": str(self.run.root),
@@ -117,6 +127,7 @@ def run_status(run: RunFolder, program: Sequence[Stage] = ()) -> RunStatus:
     """
     records, config = load_records(run), load_settings(run)
     again, newer = _compared(run, program, records, config)
+    running = load_running(run)
     stages = []
     for name in STAGES:
         record = records.get(name)
@@ -124,7 +135,9 @@ def run_status(run: RunFolder, program: Sequence[Stage] = ()) -> RunStatus:
         damaged = tuple(run.damaged(name))
         expected = expected_mb(name, run, config) if "frames" in records else None
         state, why = _state(run, name, record, damaged), "" if changed or damaged else again.get(name, "")
-        stages.append(StageStatus(name, state, record, changed, damaged, expected, why, newer.get(name, ())))
+        now = running if running and running.stage == name and record is None else None
+        state = RUNNING if now else state
+        stages.append(StageStatus(name, state, record, changed, damaged, expected, why, newer.get(name, ()), now))
     return RunStatus(run, load_source(run).path, tuple(stages), memory_room(config.run.memory_mb) / 1e6)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,10 +12,12 @@ from typing import IO
 
 from msgs_slam.formats.errors import InputError, RecoverableError
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock_file import leading
+from msgs_slam.pipelines.run.lock_file import leading, shows_life
 from msgs_slam.pipelines.run.records import load_records
 
 LOCK, LEADER = ".lock", ".leader"
+_LOOKS, _A_MOMENT = 3, 0.05
+"""How often a lock that is held is tried again, and the seconds between."""
 
 
 class RunBusyError(InputError):
@@ -74,11 +77,26 @@ def _open(path: Path) -> IO[bytes]:
 def _alone(stream: IO[bytes], root: Path) -> Iterator[bool]:
     """Whether no other process leads."""
     taken = _take(stream)
+    for _ in range(_LOOKS):  # who only asks whether somebody leads holds it for a moment
+        if taken is not False:
+            break
+        time.sleep(_A_MOMENT)
+        taken = _take(stream)
     if taken is not None:
         yield taken
         return
     with leading(root / LEADER) as alone:
         yield alone
+
+
+def is_led(run: RunFolder) -> bool:
+    """Whether a process works on the run now, by its lock; where there are none, by the sign of life."""
+    try:
+        with (run.root / LOCK).open("rb") as stream:
+            taken = _take(stream)
+    except OSError:  # nobody ever did, or it may not be read
+        return False
+    return shows_life(run.root / LEADER) if taken is None else not taken
 
 
 def take_lock(stream: IO[bytes]) -> bool:

@@ -44,6 +44,14 @@ def leading(path: Path) -> Iterator[bool]:
             path.unlink(missing_ok=True)
 
 
+def shows_life(path: Path) -> bool:
+    """Whether the file is there and has been given a sign of life, by this machine's clock."""
+    try:
+        return time.time() - path.stat().st_mtime < SILENT
+    except FileNotFoundError:
+        return False
+
+
 def _made(path: Path) -> bool:
     about = {"host": platform.node(), "mark": machine_mark(), "process": os.getpid(), "since": time.time_ns()}
     for _ in range(2):

@@ -26,7 +26,7 @@ def require_unchanged_by_resume(run: Path) -> None:
     before, times = contents(run), files_below(run)
     resumed = invoke("resume", run, "-v")
     assert resumed.exit_code == 0
-    assert resumed.stderr.count(": up to date") == 6
+    assert resumed.stderr.count("] up to date") == 6
     assert contents(run) == before
     assert files_below(run) == times
 
@@ -67,4 +67,4 @@ def test_status_says_what_another_version_would_make_again(
     assert contents(run) == before
     resumed = invoke("resume", run, "--until", "global_ba", "-v")
     assert "global_ba and what follows are made again (another version of the program" in resumed.stderr
-    assert resumed.stderr.count(": up to date") == 4
+    assert resumed.stderr.count("] up to date") == 4

@@ -1,0 +1,94 @@
+"""How far the process that works on a run has come, for whoever asks from beside it: a small file in the run."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Iterable, Iterator, Sized
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.jsonfile import read_json
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.lock import is_led
+from msgs_slam.pipelines.run.stored import dataclass_from_json
+from msgs_slam.pipelines.system.progress import BEGUN, Progress, StageEvent, about
+
+T = TypeVar("T")
+FILE = ".progress.json"
+_BETWEEN_WRITES = 2.0
+"""Seconds."""
+
+
+@dataclass(frozen=True)
+class Running:
+    """The stage that is being made; of the piece of work that it is at how much is `done`, of how many (0: unknown);
+    left: seconds to the end of all stages, 0 where nothing is known."""
+
+    stage: str
+    label: str = ""
+    done: int = 0
+    of: int = 0
+    left: float = 0.0
+
+    @property
+    def text(self) -> str:
+        """running, features 57 %, about 4 min left"""
+        share = f", {self.label} {100 * self.done // self.of} %" if self.of else ""
+        return f"running{share}" + (f", {about(self.left)} left" if self.left else "")
+
+
+class NotedProgress:
+    """Shows what another one shows, and notes it in the run while a stage is being made, seldom enough to cost nothing.
+    The file goes with the block."""
+
+    def __init__(self, progress: Progress, run: RunFolder) -> None:
+        self._progress, self._file = progress, run.root / FILE
+        self._event: StageEvent | None = None
+        self._written = 0.0
+
+    def __enter__(self) -> NotedProgress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(OSError):
+            self._file.unlink(missing_ok=True)
+
+    def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+        """Yield the items."""
+        of = total or (len(items) if isinstance(items, Sized) else 0)
+        for done, item in enumerate(self._progress.track(items, label, total)):
+            if time.monotonic() - self._written > _BETWEEN_WRITES:
+                self._note(label, done, of)
+            yield item
+
+    def stage(self, event: StageEvent) -> None:
+        """What is tracked from now on is part of this stage."""
+        self._progress.stage(event)
+        self._event = event if event.state == BEGUN else self._event
+        if event.state == BEGUN:
+            self._note()
+
+    def _note(self, label: str = "", done: int = 0, of: int = 0) -> None:
+        if self._event is None:
+            return
+        self._written = time.monotonic()
+        now = Running(self._event.name, label, done, of, float(self._event.left() or 0.0))
+        temporary = self._file.with_suffix(".tmp")
+        with suppress(OSError):  # who works must not stop for who watches
+            temporary.write_text(json.dumps(asdict(now)), encoding="utf-8")
+            os.replace(temporary, self._file)
+
+
+def load_running(run: RunFolder) -> Running | None:
+    """What a process is making of the run now; None where none is at work, or it has not begun a stage."""
+    path = Path(run.root / FILE)
+    if not path.exists() or not is_led(run):
+        return None
+    with suppress(InputError, ValueError):
+        return dataclass_from_json(Running, read_json(path))
+    return None
