@@ -9,6 +9,7 @@ from typing import TypeVar
 from tqdm import tqdm
 
 from msgs_slam.pipelines.system.progress import BEGUN, ENDED, UP_TO_DATE, StageEvent
+from msgs_slam.pipelines.system.stopping import is_asked
 
 T = TypeVar("T")
 _FORMAT = "{desc} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
@@ -23,7 +24,8 @@ class BarProgress:
         self._event: StageEvent | None = None
 
     def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
-        """Yield the items and show how many are done; a bar that ends early is full, for nothing is left to do."""
+        """Yield the items and show how many are done. A bar that ends early is full, for nothing is left to do, but for
+        one that a signal ends."""
         title = f"{self._event.title} " if self._event else ""
         with tqdm(total=total, desc=f"{title}{label}".ljust(_WIDTH), mininterval=0.2, dynamic_ncols=True,
                   bar_format=_FORMAT) as bar:  # fmt: skip
@@ -33,7 +35,8 @@ class BarProgress:
                     self._show_left(bar)
                     bar.update()
             finally:
-                bar.total = bar.n
+                if not is_asked():
+                    bar.total = bar.n
                 bar.refresh()
 
     def _show_left(self, bar: tqdm) -> None:

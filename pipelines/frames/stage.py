@@ -89,10 +89,10 @@ def run(context: StageContext) -> dict[str, Any]:
     save_calibration(context.folder, calibration)
     save_frames(context.folder, frames)
     panoramas = {"panoramas": rig.stations} if len(rig) > 1 else {}
-    return _figures(frames, structure, calibration) | panoramas | masked | _places(source, frames)
+    return _figures(frames, structure, calibration) | panoramas | masked | places_figure(source, frames)
 
 
-def _places(source: Source, frames: list[Frame]) -> dict[str, str]:
+def places_figure(source: Source, frames: list[Frame]) -> dict[str, str]:
     """How many pictures say by GPS where they were taken, where any does."""
     if not isinstance(source, FolderSource):
         return {}
