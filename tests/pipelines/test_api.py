@@ -2,11 +2,13 @@
 
 import importlib.metadata
 import os
+import re
 import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,6 +51,21 @@ def test_its_world_is_that_of_the_files(oracle_run: OracleRun) -> None:
     run = msgs_slam.open_run(folder.root)
     _, poses = read_tum(folder.stage("export") / "trajectory.txt")
     np.testing.assert_allclose(run.world_from_cam, poses, atol=1e-6)
+
+
+def test_the_readers_on_the_page_read_an_export(
+    oracle_run: OracleRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = oracle_run(pixel_stride=6)
+    for kind in ("ply", "tum"):
+        export_run(run, tmp_path / "video.msgs" / "export", kind)
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    code = next(b for b in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "read_tum" in b)
+    found: dict[str, Any] = {}
+    exec(code, found)
+    assert len(found["cloud"]) == len(found["cloud"].class_ids) > 1000
+    assert found["world_from_cam"].shape == (len(found["seconds"]), 4, 4)
 
 
 def test_errors_say_what_to_do(tmp_path: Path) -> None:
