@@ -41,7 +41,7 @@ class BarProgress:
 
     def _show_left(self, bar: tqdm) -> None:
         if self._event is not None:
-            bar.set_postfix_str(self._event.left_text.removeprefix("; ").replace("left", "in all"), refresh=False)
+            bar.set_postfix_str(self._event.left_text.removeprefix("; ").replace("left", "to the end"), refresh=False)
 
     def stage(self, event: StageEvent) -> None:
         """Say which stage begins, and how long one that has ended took."""

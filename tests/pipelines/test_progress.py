@@ -68,7 +68,7 @@ def test_bars_name_their_stage_and_close_at_their_count(monkeypatch: pytest.Monk
     said = sys.stderr.getvalue()  # type: ignore[attr-defined]
     last = [piece for piece in said.replace("\n", "\r").split("\r") if "|" in piece]
     assert any(piece.startswith("[2/6 proxy] depth") and "100%" in piece and "2/2" in piece for piece in last)
-    assert "about 4 min in all" in said
+    assert "about 4 min to the end" in said
     assert "[2/6 proxy] camera model" in said
     assert "100%" in last[-1]
     assert "[2/6 proxy] done in 96 s; about 4 min left" in said

@@ -1,5 +1,7 @@
 """TensorFlow Lite networks behind the same card as ONNX: stand-ins of their contract, and the real files."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -69,6 +71,21 @@ def test_depth_and_people_come_back_dequantised(tmp_path: Path) -> None:
     assert likely.shape == (48, 64)
     assert likely[40, 10] == pytest.approx(1 / (1 + np.exp(-6)), abs=1e-3)
     assert likely[10, 10] == pytest.approx(1 / (1 + np.exp(6)), abs=1e-3)
+
+
+def test_litert_says_nothing_and_others_still_can(tmp_path: Path) -> None:
+    """LiteRT tells on the process's stderr which delegate it makes, the first time that it does."""
+    file = write_tflite(tmp_path / "net.tflite", COLOURS, [0, 0, 0.5], "argmax")
+    by_itself = (
+        f"from ai_edge_litert.interpreter import Interpreter\nInterpreter(model_path={str(file)!r}).allocate_tensors()"
+    )
+    here = (
+        "import os, pathlib\nfrom msgs_slam.pipelines.networks.tflite_runtime import TfliteRuntime\n"
+        f"TfliteRuntime(pathlib.Path({str(file)!r}), ['scores'], 1)\nos.write(2, b'heard')"
+    )
+    said = [subprocess.run([sys.executable, "-c", c], capture_output=True, text=True).stderr for c in (by_itself, here)]
+    assert "XNNPACK" in said[0], "there is nothing to be silenced any more"
+    assert said[1] == "heard"
 
 
 def test_the_same_bytes_whatever_the_threads(tmp_path: Path) -> None:
