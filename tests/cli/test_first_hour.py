@@ -128,15 +128,20 @@ def test_render_draws_colour_for_a_browser_in_the_size_that_is_asked_for(
     assert "1280x720" in wrong.stderr
 
 
-def test_sigterm_ends_other_commands_without_a_stack_trace(finished_run: FinishedRun, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, -signal.SIGTERM)])
+def test_signals_end_other_commands_without_a_stack_trace(
+    number: signal.Signals, code: int, finished_run: FinishedRun, tmp_path: Path
+) -> None:
     words = [*COMMAND, "render", str(finished_run.folder), str(tmp_path / "frames"), "--fps", "240"]
     process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
     while process.poll() is None and not list(tmp_path.glob("frames/*.png")):
         time.sleep(0.01)
-    process.send_signal(signal.SIGTERM)
+    process.send_signal(number)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == -signal.SIGTERM
+    assert process.returncode == code
     assert "stack trace" not in errors
+    assert "Traceback" not in errors
+    assert ("stopped by Ctrl-C" in errors) == (number == signal.SIGINT)
 
 
 def test_status_tells_how_long_the_unit_is_and_gps() -> None:
