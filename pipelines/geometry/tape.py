@@ -90,7 +90,7 @@ def tape_text(length: float, sd: float, is_metric: bool, metres: Metres | None) 
     if metres is None:
         return text
     guess = metres.per_unit * length, metres.per_unit * np.hypot(sd, unit_sd * length)
-    return f"{text}, about {_with_sd(*guess)} m"
+    return f"{text} ≈ {_with_sd(*guess)} m"
 
 
 def _with_sd(value: float, sd: float) -> str:

@@ -18,10 +18,13 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.pipelines.viewer.door import guarding
 from msgs_slam.pipelines.viewer.scene import MODES, ViewerCamera, ViewerScene, load_scenes
-from msgs_slam.pipelines.viewer.tools import Selection, Tape
+from msgs_slam.pipelines.viewer.tools import Selection, Tape, class_name, unit_text
 
 _FRUSTUM = 0.09
 _PREVIEW_WIDTH = 480
+_HELP = "Drag: turn. Right drag: move. Wheel: zoom. W A S D, Q E: fly. Two fingers: move and zoom."
+_GREY = "gray"
+"""Buttons of equal weight: none of them is what the page is for."""
 
 
 def open_viewer(path: Path, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
@@ -86,6 +89,8 @@ class Viewer:
     def show(self, mode: str, client: Any = None) -> None:
         """Colour the Gaussians by one of `MODES`; depth is seen from where `client` looks, else the first camera."""
         s = self.scene
+        if "legend" in vars(self):
+            self.legend.content, self.legend.visible = legend_html(s), mode == "classes"
         colors = s.depth_colors(*self._eye(client)) if mode == "depth" else s.colors[mode]
         with self._sending:
             rows = np.arange(len(s.cloud)) if self.selection is None else np.flatnonzero(self.selection.rows)
@@ -134,8 +139,10 @@ class Viewer:
         modes = tuple(m for m in MODES if m in self.scene.colors or m == "depth")
         self.mode = gui.add_dropdown("Gaussians", modes)
         self.mode.on_update(lambda event: self.show(self.mode.value, event.client))
-        depth_here = gui.add_button("Depth from here", hint="Colour by depth, seen from the present view")
+        self.legend = gui.add_html("", visible=False)
+        depth_here = gui.add_button("Colour by depth from this view", color=_GREY)
         depth_here.on_click(self._show_depth)
+        gui.add_button("Reset view", color=_GREY).on_click(lambda event: self._place(event.client))
         self._checkbox("Show Gaussians", True, lambda on: setattr(self._splats, "visible", on))
         if self._cameras:
             self._checkbox("Cameras", True, self._show_cameras)
@@ -143,7 +150,9 @@ class Viewer:
             self._checkbox("Mesh", False, self._show_mesh)
         if self.scene.cameras:
             blank = np.full((30, 40, 3), 235, np.uint8)
-            self.preview = gui.add_image(blank, label="frame (click a camera)", format="jpeg")
+            self.preview = gui.add_image(blank, label="Camera image", format="jpeg", visible=False)
+        hint = "Click a camera to look from it and see its image. " if self.scene.cameras else ""
+        gui.add_markdown(f"{unit_text(self.scene)}\n\n{hint}{_HELP}")
 
     def _add_tools(self) -> None:
         self._tools = self.server.gui.add_folder("Tools")
@@ -198,6 +207,7 @@ class Viewer:
             label = f"{plain(camera.frame.name)}, {camera.frame.timestamp:.2f} s"
             try:
                 self.preview.image = _reduced(self.scene.run.image(camera.frame))
+                self.preview.visible = True
             except InputError as error:  # this frame alone: what else is shown was checked
                 label = plain(str(error))
             self.preview.label = label
@@ -233,6 +243,23 @@ class Viewer:
         found = read_mesh_ply(self.scene.mesh_file)
         mesh = trimesh.Trimesh(found.vertices, found.faces, vertex_colors=found.colors, process=False)
         return self.server.scene.add_mesh_trimesh("/mesh", mesh, scale=self.scene.scale, visible=False)
+
+
+def legend_html(scene: ViewerScene) -> str:
+    """A swatch, the name and the share of each class that occurs, largest first; "" without classes."""
+    if scene.labels is None:
+        return ""
+    counts, table = np.bincount(scene.labels, minlength=256), dict(enumerate(scene.class_colors))
+    rows = []
+    for label in sorted(np.flatnonzero(counts).tolist(), key=lambda k: -counts[k]):
+        color = "rgb({},{},{})".format(*table.get(label, (128, 128, 128)))
+        swatch = (
+            f"<span style='display:inline-block;width:12px;height:12px;border-radius:3px;background:{color}'></span>"
+        )
+        rows.append(
+            f"<div>{swatch} {plain(class_name(scene, label))} {100 * counts[label] / len(scene.labels):.0f} %</div>"
+        )
+    return f"<div style='font-size:0.8em;padding:0 0.75em 0.5em'>{''.join(rows)}</div>"
 
 
 def plain(name: str) -> str:

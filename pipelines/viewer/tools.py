@@ -36,7 +36,9 @@ class Selection:
                 self._add_classes(scene.labels)
         with server.gui.add_folder("Crop", expand_by_default=False):
             self._add_box()
-        save = server.gui.add_button("Export what I see", hint="The Gaussians shown, as a splat PLY, where they are")
+        save = server.gui.add_button(
+            "Save visible Gaussians (.ply)", hint="In the coordinates of the exported files", color="gray"
+        )
         save.on_click(lambda event: self.save(event.client))
 
     @property
@@ -70,9 +72,7 @@ class Selection:
         buttons = self._server.gui.add_button_group("All", ("on", "off"))
         buttons.on_click(lambda _: self._switch_all(buttons.value == "on"))
         for label in sorted(np.flatnonzero(counts).tolist(), key=lambda k: -counts[k]):
-            names = self._scene.class_names
-            name = "unknown" if label == VOID or label >= len(names) else names[label]
-            switch = self._server.gui.add_checkbox(f"{name} ({counts[label]:,})", True)
+            switch = self._server.gui.add_checkbox(f"{class_name(self._scene, label)} ({counts[label]:,})", True)
             switch.on_update(lambda _: self._soon())
             self.classes[label] = switch
 
@@ -87,10 +87,10 @@ class Selection:
         self.crop = gui.add_checkbox("Only what is in the box", False)
         self.crop.on_update(lambda _: self._soon())
         self.box = []
+        gui.add_markdown(unit_text(self._scene))
         for axis, a, b in zip("xyz", low, high, strict=True):
-            step = max((b - a) / 200, 1e-6)
-            top = a + 200 * step
-            slider = gui.add_multi_slider(axis, a, top, step, (a, top))
+            bottom, top, step = round_range(a, b)
+            slider = gui.add_multi_slider(axis, bottom, top, step, (bottom, top))
             slider.on_update(lambda _: self._soon())
             self.box.append(slider)
 
@@ -112,6 +112,27 @@ class Selection:
         self._server.scene.add_box(
             "/crop", _RED, size, wireframe=True, position=(low + high) / 2, visible=bool(self.crop.value)
         )
+
+
+def round_range(low: float, high: float) -> tuple[float, float, float]:
+    """A range around both with a step of a power of ten, so that a slider shows few digits: 0.01 for a room."""
+    power = int(np.floor(np.log10(max(high - low, 1e-6) / 50)))
+    step, digits = 10.0**power, max(-power, 0)
+    return round(float(np.floor(low / step)) * step, digits), round(float(np.ceil(high / step)) * step, digits), step
+
+
+def class_name(scene: ViewerScene, label: int) -> str:
+    """That of a label of the scene's Gaussians."""
+    return "unknown" if label == VOID or label >= len(scene.class_names) else scene.class_names[label]
+
+
+def unit_text(scene: ViewerScene) -> str:
+    """What lengths are given in, in a line."""
+    if scene.is_metric:
+        return "Lengths are metres."
+    if scene.metres is None:
+        return "Lengths have no known unit."
+    return f"1 unit ≈ {scene.metres.per_unit:.2g} m ± {100 * scene.metres.relative_sd:.0f} %"
 
 
 class Tape:

@@ -24,6 +24,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gaussian_ply import read_gaussian_ply
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.viewer.scene import load_scenes
+from msgs_slam.pipelines.viewer.tools import round_range
 
 OracleRun = Callable[..., RunFolder]
 
@@ -73,6 +74,12 @@ def test_what_cannot_be_shown_is_refused(tmp_path: Path) -> None:
         load_scenes(tmp_path / "nowhere")
     with pytest.raises(InputError):
         load_scenes(tmp_path)
+
+
+def test_sliders_have_few_digits() -> None:
+    assert round_range(-1.039511, 1.40123) == (-1.04, 1.41, 0.01)
+    assert round_range(-53.2, 118.9) == (-54.0, 119.0, 1.0)
+    assert round_range(0.00231, 0.00872) == (0.0023, 0.0088, 0.0001)
 
 
 # in the browser -------------------------------------------------------------------------------------------------
@@ -217,13 +224,20 @@ def test_page_shows_the_map_and_every_control_changes_it(
             colour = page.wait_for(lambda p: p.std() > 20 and (p < 240).mean() > 0.3)
             viewer.mode.value = "classes"
             classes = changes(page, colour)
+            assert viewer.legend.visible
+            assert viewer.legend.content.count("background:rgb(") == len(np.unique(viewer.scene.labels))
             viewer.mode.value = "depth"
             depth = changes(page, classes)
+            assert not viewer.legend.visible
             first = viewer.scene.cameras[0]
             client = next(iter(viewer.server.get_clients().values()))
             page.click(*where_shown(first.world_from_cam[:3, 3] * viewer.scene.scale, client.camera, page.canvas()))
             elsewhere = changes(page, depth)
             assert viewer.preview.label.startswith(first.frame.name)
+            page.press("Reset view")
+            changes(page, elsewhere)
+            viewer.visit(first, client)
+            page.wait_for(lambda p: np.abs(p.astype(float) - elsewhere).mean() < 3)
             measured, true = measure(page, viewer, truth)
             assert 0 < abs(measured - true) < 0.1 * true
             viewer.tape.switch.value = False

@@ -98,7 +98,7 @@ def test_a_distance_is_told_in_the_units_there_are() -> None:
     guess = Metres(2.0, 0.09, True, ("a door",))
     assert tape_text(1.5, 0.03, True, None) == "1.500 ± 0.030 m"
     assert tape_text(1.5, 0.03, False, None) == "1.500 ± 0.030 units"
-    assert tape_text(1.5, 0.03, False, guess) == "1.500 ± 0.030 units, about 3.00 ± 0.28 m"
+    assert tape_text(1.5, 0.03, False, guess) == "1.500 ± 0.030 units ≈ 3.00 ± 0.28 m"
     assert tape_text(1.5, 0.03, True, Metres(1.0, 0.01, False, ("GPS",))) == "1.500 ± 0.034 m"
 
 
