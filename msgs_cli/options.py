@@ -138,6 +138,11 @@ _SOURCE_OPTIONS = {
         "Kind of camera: equirectangular for whole 360° panoramas, fisheye for a lens given by --intrinsics (k1 to k4 "
         "of OpenCV's fisheye). Default: auto, what the source says of itself.",
     ),
+    "poses": (
+        "frames.poses", "FILE|FOLDER",
+        "Camera poses by another program to start from: a COLMAP model, a transforms.json, ARKit's JSON, a TUM "
+        "trajectory or lines of 4x4 matrices. They need not be exact, nor all there.",
+    ),
     "masks": (
         "frames.masks", "FOLDER",
         "What is no part of the scene: NAME.png for a picture NAME, or the frame's number in the video; black is left "
@@ -145,7 +150,8 @@ _SOURCE_OPTIONS = {
     ),
     "scale-ref": (
         "proxy.scale_ref", "REF",
-        "Metres without metric depth: PICTURE:X1,Y1,X2,Y2=METRES, two pixels of one picture, or height=METRES.",
+        "Metres without metric depth: PICTURE:X1,Y1,X2,Y2=METRES, two pixels of one picture, height=METRES, "
+        "or poses: those of --poses are in metres.",
     ),
     "scale": (
         "export.scale", "auto|free",

@@ -68,6 +68,7 @@ class FramesConfig:
         "auto", "auto: what the source says of itself; a panorama becomes six pictures, a fisheye of known lens one",
         ("auto", "perspective", "equirectangular", "fisheye"),
     )  # fmt: skip
+    poses: str = setting("", "poses to start from: a COLMAP model, transforms.json, ARKit's JSON, TUM or 4x4 lines")
     rolling_shutter: str = setting(
         "auto", "seconds from a frame's first row to its last; auto finds them, where they explain something; off"
     )
@@ -107,8 +108,8 @@ class ProxyConfig:
     scale_ref: str = setting(
         "",
         "what makes metres without metric depth: PICTURE:X1,Y1,X2,Y2=METRES, two pixels of one picture of the source "
-        "(an image's name or a video frame's number; the first pixel's centre is 0.5,0.5), or height=METRES of the "
-        "camera over the floor",
+        "(an image's name or a video frame's number; the first pixel's centre is 0.5,0.5), height=METRES of the "
+        "camera over the floor, or poses: those of frames.poses are in metres",
     )
     fuse: str = setting(
         "learned",

@@ -22,10 +22,12 @@ from msgs_slam.pipelines.frames.learned import open_learned, picture_features
 from msgs_slam.pipelines.frames.masks import FrameMasks
 from msgs_slam.pipelines.geometry.rig import Rig, rig_of
 from msgs_slam.pipelines.source.faces import Faces, find_faces
+from msgs_slam.pipelines.source.known_poses import given_poses
 from msgs_slam.pipelines.source.opening import FolderSource, VideoSource, open_source
 from msgs_slam.pipelines.source.recording import RecordingSource
 from msgs_slam.pipelines.source.sharpness import reduced_size
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
+from msgs_slam.pipelines.structure.given import GivenPoses
 from msgs_slam.pipelines.structure.lens import FOCAL_GUESS, to_pycolmap, unknown_camera
 from msgs_slam.pipelines.structure.sfm import Ahead, StructureFromMotion, nothing_ahead
 from msgs_slam.pipelines.structure.window_size import window_size
@@ -81,6 +83,7 @@ def structure_from_motion(
     frames: list[Frame],
     masks: FrameMasks,
     rig: Rig,
+    given: GivenPoses | None,
     ahead: Ahead = nothing_ahead,
 ) -> StructureFromMotion:
     """Of these frames; `origin` as of `known_camera`."""
@@ -96,6 +99,7 @@ def structure_from_motion(
         camera=camera,
         is_fixed=origin in ("given", "stated"),
         is_stated=origin == "stated",
+        given=None if given is None else given.cam_from_world,
         extract=extract,
         picture=lambda frame_id: grey_of(context, masks, frames[frame_id]),
         time=lambda frame_id: frames[frame_id].timestamp,
@@ -123,7 +127,8 @@ def _begun(task: Portion, progress: Progress) -> tuple[StructureFromMotion, dict
     masks = masks_of(context, source, faces, rig)
     if "pairs" in known:
         known = known | {"pairs": [(i, j) for i, j in known["pairs"].tolist()]}
-    return structure_from_motion(context, camera, origin, frames, masks, rig), known
+    given = given_poses(context.config.frames, source, frames)
+    return structure_from_motion(context, camera, origin, frames, masks, rig, given), known
 
 
 def extract_features(task: Portion, progress: Progress) -> None:

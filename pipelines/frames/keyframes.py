@@ -77,8 +77,11 @@ class _Tracker:
     def advance(self, gray: NDArray[np.uint8]) -> tuple[float, float]:
         """Median displacement since the keyframe (fraction of the width) and the share of its tracks that live."""
         previous, self._previous = self._previous, gray
-        if previous is None or self._started == 0:
+        if previous is None:
             return 0.0, 1.0
+        if self._started == 0:  # the keyframe showed nothing: the next one is what shows something
+            sees = len(corners(gray, self._origin[:0], _MAX_CORNERS, _APART_PX, None)) >= _MIN_TRACKS
+            return 0.0, 0.0 if sees else 1.0
         if len(self._points):
             moved, found = follow(previous, gray, self._points, self._points, _LEVELS)
             self._origin, self._points = self._origin[found], moved[found]

@@ -30,6 +30,7 @@ from msgs_slam.pipelines.frames.begun import (
     picked,
     structure_from_motion,
 )
+from msgs_slam.pipelines.frames.findings import settled_origin, warn_of_given, warn_of_structure
 from msgs_slam.pipelines.frames.keyframes import KeyframeChoice, choose_keyframes
 from msgs_slam.pipelines.frames.learned import learned_inputs, open_learned
 from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
@@ -45,11 +46,13 @@ from msgs_slam.pipelines.run.folder import (
 )
 from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
+from msgs_slam.pipelines.source.known_poses import check_poses, given_poses, pose_inputs
 from msgs_slam.pipelines.source.opening import FolderSource, Source, open_source
 from msgs_slam.pipelines.source.pick import sharpest_of_windows
 from msgs_slam.pipelines.source.sharpness import reduce_image
 from msgs_slam.pipelines.structure.backbone import to_sparse_model
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
+from msgs_slam.pipelines.structure.given import GivenPoses
 from msgs_slam.pipelines.structure.lens import Lens, distortion_of, make_lens
 from msgs_slam.pipelines.structure.parallax import require_motion
 from msgs_slam.pipelines.structure.rolling import read_readout
@@ -60,7 +63,6 @@ from msgs_slam.pipelines.types import Calibration, Frame
 _SIGNIFICANT_SHIFT_PX = 0.3
 _FEW_KEYFRAMES = 12
 _UNSURE_FOCAL = 0.05
-_LEAST_PART = 3
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -78,9 +80,10 @@ def run(context: StageContext) -> dict[str, Any]:
     masks = masks_of(context, source, faces, rig)
     keyframes = _keyframes(context, frames, masks, rig)
     masks.find_people(frames, keyframes, context.progress)
-    structure = _structure(context, camera, origin, frames, keyframes, masks, rig)
+    given = given_poses(context.config.frames, source, frames)
+    structure = _structure(context, (camera, origin), frames, keyframes, masks, rig, given)
     lens = make_lens(structure.model.cameras[1])
-    origin = _settled_origin(context, origin, camera, structure)
+    origin = settled_origin(context, origin, camera, structure)
     calibration = replace(_calibration(context, lens, origin, structure.focal_sd, faces), readout=structure.readout)
     _write_backbone(context, structure, keyframes, lens, frames)
     _write_correspondences(context, structure, keyframes, lens)
@@ -88,8 +91,11 @@ def run(context: StageContext) -> dict[str, Any]:
     masked = masks.write(context.folder / "masks", frames, lens)
     save_calibration(context.folder, calibration)
     save_frames(context.folder, frames)
+    if given is not None:
+        given.save(context.folder)
+    told = {} if given is None else warn_of_given(context, structure, given, keyframes)
     panoramas = {"panoramas": rig.stations} if len(rig) > 1 else {}
-    return _figures(frames, structure, calibration) | panoramas | masked | places_figure(source, frames)
+    return _figures(frames, structure, calibration) | told | panoramas | masked | places_figure(source, frames)
 
 
 def places_figure(source: Source, frames: list[Frame]) -> dict[str, str]:
@@ -113,10 +119,13 @@ def check(source: Path, config: Config) -> None:
         read_intrinsics(config.frames.intrinsics, opened.width, opened.height)
     if faces is not None and len(faces) > 1:
         _check_panoramas(config)
+    check_poses(config.frames, opened)
 
 
 def _check_panoramas(config: Config) -> None:
     """What knows pixels of the source's own pictures does not know its panoramas."""
+    if config.frames.poses:
+        raise InputError("--poses cannot be used with panoramas: leave it away")
     files = [p for p in (config.proxy.depth, config.proxy.semantics) if p.startswith("files")]
     reference = config.proxy.scale_ref.strip()
     if files or (reference and not reference.startswith("height")):
@@ -196,7 +205,11 @@ def _keyframes(context: StageContext, frames: list[Frame], masks: FrameMasks, ri
     panoramas all sides are keyframes."""
     table = context.snapshot / "keyframes.json"
     if not table.exists():
-        write_json(table, rig.frames_of(_choose(context, frames, masks, rig).keyframes))
+        chosen = _choose(context, frames, masks, rig).keyframes
+        if context.config.frames.poses and len(chosen) < _FEW_KEYFRAMES:  # blank pictures whose poses are known
+            even = np.linspace(0, len(frames) - 1, min(_FEW_KEYFRAMES, len(frames))).round().astype(int)
+            chosen = sorted({*chosen, *even.tolist()})
+        write_json(table, rig.frames_of(chosen))
     return read_json(table, None)
 
 
@@ -217,7 +230,8 @@ def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks, rig: 
     parallax = context.config.frames.parallax
     while True:
         choice = choose_keyframes(pictures(), parallax / across)
-        require_motion(choice.largest_displacement * across)
+        if not context.config.frames.poses:
+            require_motion(choice.largest_displacement * across)
         if len(choice.keyframes) >= min(_FEW_KEYFRAMES, len(places)) or parallax < context.config.frames.parallax / 3:
             return choice
         parallax /= 2
@@ -225,76 +239,21 @@ def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks, rig: 
 
 def _structure(
     context: StageContext,
-    camera: pycolmap.Camera,
-    origin: str,
+    camera: tuple[pycolmap.Camera, str],
     frames: list[Frame],
     keyframes: list[int],
     masks: FrameMasks,
     rig: Rig,
+    given: GivenPoses | None,
 ) -> Structure:
     known = {"frames": frames, "keyframes": keyframes}
 
     def ahead(name: str, count: int, more: dict[str, NDArray]) -> None:
         in_portions(context, AHEAD[name], count, **known, **more)
 
-    structure = structure_from_motion(context, camera, origin, frames, masks, rig, ahead).run(keyframes)
+    structure = structure_from_motion(context, *camera, frames, masks, rig, given, ahead).run(keyframes)
     warn_of_structure(context, structure, [frames[k].id for k in keyframes])
     return structure
-
-
-def warn_of_structure(context: StageContext, structure: Structure, ids: list[int]) -> None:
-    """What is missing in the structure, and where it contradicts the pictures; ids[k] is the frame of keyframe k."""
-    report = structure.report
-    if report.registered < report.total:
-        context.warn(
-            f"structure from motion could not place {report.total - report.registered} of {report.total} keyframes"
-        )
-    for piece in structure.pieces:
-        inside = sorted(ids[i - 1] for i in piece.reg_image_ids())
-        context.warn(
-            f"{len(inside)} of them, frames {inside[0]}-{inside[-1]}, fit among each other: what tracking does not "
-            "find elsewhere becomes a piece of its own"
-        )
-    parts = [p for p in report.parts if len(p) >= _LEAST_PART]
-    if len(parts) > 1:
-        named = ", ".join(f"{ids[p[0]]}-{ids[p[-1]]}" for p in parts)
-        context.warn(
-            f"structure from motion fell into {len(parts)} parts that nothing holds together (frames {named}): "
-            "tracking joins what it recognises"
-        )
-    alone = sorted(ids[k] for p in report.parts if len(p) < _LEAST_PART for k in p)
-    if alone:
-        context.warn(
-            f"{len(alone)} keyframes have hardly a point in common with the others (frames "
-            f"{', '.join(map(str, alone))}): tracking looks for them again"
-        )
-    folds = ", ".join(f"{ids[s.before]}-{ids[s.after]}" for s in report.contradicted)
-    agreeing = f"{report.pairs_agreeing:.0%} of the matched pairs of views agree with it (mapper: {structure.mapper})"
-    if folds:
-        context.warn(
-            f"the camera's path may be folded between frames {folds}, where neighbouring pictures contradict it: "
-            f"{agreeing}"
-        )
-    elif report.pairs_agreeing < 0.9:
-        context.warn(
-            f"pictures taken far apart contradict the camera's path: {agreeing}. Either things that repeat were taken "
-            "for each other, which does no harm, or a loop is not closed"
-        )
-
-
-def _settled_origin(context: StageContext, origin: str, camera: pycolmap.Camera, structure: Structure) -> str:
-    """Where the camera comes from in the end: one that the data set states is given unless the pictures refuted it."""
-    if origin != "stated":
-        return origin
-    found = structure.model.cameras[1]
-    if list(found.params) == list(camera.params):
-        return "given"
-    context.warn(
-        f"the camera that the data set states (focal length {camera.mean_focal_length():.0f} px) explains the pictures "
-        f"much worse than one found from them ({found.mean_focal_length():.0f} px), which is used instead. To hold a "
-        "camera in any case give it with --intrinsics"
-    )
-    return "self-calibrated"
 
 
 def _calibration(context: StageContext, lens: Lens, origin: str, focal_sd: float, faces: Faces | None) -> Calibration:
@@ -391,7 +350,7 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
 
 
 def _inputs(source: Path, config: Config) -> dict[str, str] | None:
-    return (mask_inputs(source, config) or {}) | learned_inputs(config.frames) or None
+    return (mask_inputs(source, config) or {}) | learned_inputs(config.frames) | pose_inputs(config.frames) or None
 
 
 def _division(run: RunFolder, config: Config) -> list[range]:

@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from msgs_slam.formats.digest import files_sha256
+from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.networks.identity import card_identity
 from msgs_slam.pipelines.proxy.files.depth import FilesDepth, require_sizes
 from msgs_slam.pipelines.proxy.files.labels import FilesLabels
-from msgs_slam.pipelines.proxy.scale_reference import require_reference_in
+from msgs_slam.pipelines.proxy.scale_reference import POSES, require_reference_in
 from msgs_slam.pipelines.proxy.selection import (
     Surroundings,
     choose_depth,
@@ -54,6 +55,8 @@ def left_to_auto(config: Config) -> tuple[str, ...]:
 def check_proxy(source: Path, config: Config) -> None:
     """InputError for a network that is not what its card says, a map of another shape than the pictures, and a scale
     reference that makes no sense."""
+    if config.proxy.scale_ref.strip() == POSES and not config.frames.poses:
+        raise InputError("--scale-ref poses needs poses: give them with --poses FILE|FOLDER")
     if config.proxy.scale_ref:
         require_reference_in(open_source(source, config.run.format), config.proxy.scale_ref)
     depth, semantics = choose_depth(config.proxy), choose_semantics(config.proxy)

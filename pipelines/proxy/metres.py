@@ -12,9 +12,18 @@ from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.proxy.providers import DepthEstimate, DepthProvider
 from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
 from msgs_slam.pipelines.proxy.scale import DepthScale
-from msgs_slam.pipelines.proxy.scale_reference import ReferenceScale, distance_scale, height_scale, parse_reference
+from msgs_slam.pipelines.proxy.scale_reference import (
+    POSES,
+    ReferenceScale,
+    distance_scale,
+    height_scale,
+    parse_reference,
+)
 from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.source.known_poses import load_given
 from msgs_slam.pipelines.source.opening import open_source
+from msgs_slam.pipelines.structure.given import agreement
 from msgs_slam.pipelines.types import Frame
 
 
@@ -33,7 +42,8 @@ def reference_scale(
     config = context.config.proxy
     known = parse_reference(config.scale_ref)
     if known is None:
-        return None
+        is_said = config.scale_ref.strip() == POSES
+        return None if depths.metric else given_scale(context.run, scale, is_said)
 
     if known.picture:
         source = open_source(context.source, context.config.run.format)
@@ -53,6 +63,19 @@ def reference_scale(
         )
         return None
     return found
+
+
+def given_scale(run: RunFolder, scale: DepthScale, is_said: bool) -> ReferenceScale | None:
+    """Metres per unit of the depth by poses that the user gave in metres, by their kind or as it `is_said`; None where
+    these tell none."""
+    given, backbone = load_given(run), run.load_backbone()
+    if given is None or not (given.is_metric or is_said) or backbone is None:
+        return None
+    rows = np.flatnonzero(given.known[backbone.frame_ids])
+    agreed = agreement(backbone.cam_from_world[rows], given.cam_from_world[backbone.frame_ids[rows]])
+    if agreed is None:
+        return None
+    return ReferenceScale(agreed.move.scale / scale.value, agreed.scale_sd, len(rows))
 
 
 def scale_figures(depths: DepthProvider, scale: DepthScale, reference: ReferenceScale | None) -> dict[str, Any]:

@@ -25,7 +25,12 @@ DepthOf = Callable[[Frame], DepthEstimate]
 _NUMBER = r"\s*([0-9.]+)\s*"
 _DISTANCE = re.compile(rf"(.+):{_NUMBER},{_NUMBER},{_NUMBER},{_NUMBER}={_NUMBER}m?")
 _HEIGHT = re.compile(rf"height\s*={_NUMBER}m?")
-_HOW = "PICTURE:X1,Y1,X2,Y2=METRES (two pixels of one picture of the source) or height=METRES (camera over the floor)"
+POSES = "poses"
+"""The reference that says that given poses are in metres."""
+_HOW = (
+    "PICTURE:X1,Y1,X2,Y2=METRES (two pixels of one picture of the source), height=METRES (camera over the floor) or "
+    "poses (those given with --poses)"
+)
 _LEAST_APART = 8.0
 _KEYFRAMES = 5
 _PATCH = 2
@@ -53,8 +58,8 @@ class ReferenceScale:
 
 
 def parse_reference(text: str) -> Reference | None:
-    """The reference a setting describes, None for "". Raises InputError for a malformed one."""
-    if not text.strip():
+    """The length a setting describes, None for "" and for poses. Raises InputError for a malformed one."""
+    if text.strip() in ("", POSES):
         return None
     if found := _HEIGHT.fullmatch(text.strip()):
         return Reference(_positive(found[1], text))

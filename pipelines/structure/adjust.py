@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.structure.lens import set_lens
 
-_CAUCHY_PX = 1.0
+CAUCHY_PX = 1.0
 _MAX_REPROJECTION_PX = 4.0
 _MIN_ANGLE_DEG = 1.0
 _MIN_KEYFRAMES_TO_SPLIT = 8
@@ -41,7 +41,7 @@ def adjust(model: pycolmap.Reconstruction, refine_camera: bool, narrowly: bool =
             solve(model, images, refine_camera=False)
             remove_wild(model)
     if narrowly:
-        solve(model, images, refine_camera=False, width=min(median_error(model), _CAUCHY_PX))
+        solve(model, images, refine_camera=False, width=min(median_error(model), CAUCHY_PX))
         remove_wild(model)
     return focal_sd
 
@@ -66,7 +66,7 @@ def solve(
     model: pycolmap.Reconstruction,
     images: Sequence[int],
     refine_camera: bool,
-    width: float = _CAUCHY_PX,
+    width: float = CAUCHY_PX,
     bend_lens: bool = True,
 ) -> pycolmap.CeresBundleAdjuster:
     """Robust adjustment of these images, in place, under Cauchy's loss of so many pixels; deterministic. A camera that
@@ -110,8 +110,9 @@ def reprojection_errors(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
 
 
 def median_error(model: pycolmap.Reconstruction) -> float:
-    """Of all observations, in pixels."""
-    return float(np.median(reprojection_errors(model)))
+    """Of all observations, in pixels; 0 without any."""
+    errors = reprojection_errors(model)
+    return float(np.median(errors)) if len(errors) else 0.0
 
 
 def remove_wild(model: pycolmap.Reconstruction) -> None:

@@ -20,14 +20,15 @@ def to_sparse_model(
 ) -> SparseModel:
     """Keyframes, points and observations in undistorted pixels.
 
-    The world is the camera of the first registered keyframe, and its unit the median depth of all observations.
+    The world is the camera of the first registered keyframe, and its unit the median depth of all observations, or the
+    model's own where there are none.
     keyframe_ids[i] is the frame id of the image with id i + 1; load_rgb(frame_id) gives (H, W, 3) of the frame before
     undistortion, one at a time.
     """
     image_ids = sorted(model.reg_image_ids())
     poses = np.stack([pose_of(model.images[i]) for i in image_ids])
     point_ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
-    points = np.stack([model.points3D[int(p)].xyz for p in point_ids])
+    points = np.array([model.points3D[int(p)].xyz for p in point_ids], np.float64).reshape(-1, 3)
     row = {int(p): k for k, p in enumerate(point_ids)}
     observed = [_observations(model.images[i], row) for i in image_ids]
     frame_ids = np.array([keyframe_ids[i - 1] for i in image_ids], dtype=np.int64)
@@ -76,7 +77,7 @@ def _rebased(
     poses = cam_from_world @ world_from_first
     moved = points @ first[:3, :3].T + first[:3, 3]
     depth = (poses[obs_frame, 2, :3] * moved[obs_point]).sum(1) + poses[obs_frame, 2, 3]
-    unit = float(np.median(depth))
+    unit = float(np.median(depth)) if len(depth) else 1.0
     poses[:, :3, 3] /= unit
     poses[0] = np.eye(4)
     return poses, moved / unit

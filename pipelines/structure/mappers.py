@@ -47,8 +47,11 @@ def map_globally(
     return _largest(pycolmap.global_mapping(database, work, work, options))
 
 
-def map_incrementally(database: Path, work: Path, refine_camera: bool, seed: int) -> pycolmap.Reconstruction | None:
-    """Poses image by image (Schönberger and Frahm, Structure-from-Motion Revisited, CVPR 2016); None on failure."""
+def map_incrementally(
+    database: Path, work: Path, refine_camera: bool, seed: int, start: pycolmap.Reconstruction | None = None
+) -> pycolmap.Reconstruction | None:
+    """Poses image by image (Schönberger and Frahm, Structure-from-Motion Revisited, CVPR 2016); None on failure. A
+    model of images in the database to `start` from keeps its poses; others are added to it."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     for part in (options, options.mapper, options.triangulation):
@@ -62,7 +65,12 @@ def map_incrementally(database: Path, work: Path, refine_camera: bool, seed: int
         options.max_extra_param = options.mapper.max_extra_param = options.triangulation.max_extra_param = (
             _ANY_DISTORTION
         )
-    return _largest(pycolmap.incremental_mapping(database, work, work, options))
+    if start is None:
+        return _largest(pycolmap.incremental_mapping(database, work, work, options))
+    options.fix_existing_frames = True
+    (before := work / "start").mkdir()
+    start.write_binary(before)
+    return _largest(pycolmap.incremental_mapping(database, work, work, options, before))
 
 
 def _largest(models: dict[int, pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:

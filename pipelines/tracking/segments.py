@@ -79,7 +79,7 @@ def _join(segment: int, main: int, state: TrackState, pictures: Pictures, seed: 
         depth = state.median_depth(ours[n])
         if any(agree(found[0], other, state.poses[ours[n]], depth) for _, other, _ in answers):
             answers.append((ours[n], *found))
-            _move(segment, main, found[0], state)
+            move_segment(segment, main, found[0], state)
             for frame_id, _, seen in answers:
                 known = state.sightings[frame_id]
                 state.sightings[frame_id] = known.joined(seen.select(~np.isin(seen.point, known.point)))
@@ -134,7 +134,7 @@ def agree(first: Similarity, second: Similarity, cam_from_world: Array, depth: f
     )
 
 
-def _move(segment: int, main: int, main_from_segment: Similarity, state: TrackState) -> None:
+def move_segment(segment: int, main: int, main_from_segment: Similarity, state: TrackState) -> None:
     """Poses and points of a segment into the main one's world."""
     frames = [i for i in sorted(state.poses) if state.segment[i] == segment]
     points = np.unique(np.concatenate([state.sightings[i].point for i in frames]))

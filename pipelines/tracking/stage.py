@@ -11,11 +11,13 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.geometry.rig import Rig, rig_of
 from msgs_slam.pipelines.run.folder import save_depth_fields, save_figures, save_sparse, save_trajectory
+from msgs_slam.pipelines.source.known_poses import load_given
 from msgs_slam.pipelines.structure.rolling import Shutter
 from msgs_slam.pipelines.system.memory import give_back
 from msgs_slam.pipelines.system.stopping import is_asked
 from msgs_slam.pipelines.system.wording import stretches
 from msgs_slam.pipelines.tracking.adjust import Report, adjust_state, align_depths, without_dependent_depth
+from msgs_slam.pipelines.tracking.carry import carry_given
 from msgs_slam.pipelines.tracking.front_end import FrontEnd
 from msgs_slam.pipelines.tracking.pictures import Pictures, load_shutter
 from msgs_slam.pipelines.tracking.places import settle_places
@@ -40,7 +42,7 @@ def run(context: StageContext) -> dict[str, Any]:
     intrinsics = pictures.intrinsics
 
     state = track_frames(context, frames, pictures)
-    if len(state.poses) < 2:
+    if len(state.poses) < 2 and load_given(context.run) is None:
         raise InputError(
             f"{context.source}: no camera motion could be recovered from {len(frames)} frames. A still camera, pure "
             "rotation or pictures without texture give no parallax; film while walking, or choose another part"
@@ -48,6 +50,7 @@ def run(context: StageContext) -> dict[str, Any]:
     report = adjust_state(state, intrinsics, pictures.proxy, metric, settings)
     give_back()
     compared = compare_all(context, state, pictures) if settings.render == "all" else {}
+    carried = carry_given(context, state)
     hold_turns(state, pictures, context.config.run.seed)
     if state.turned:
         context.warn(
@@ -62,7 +65,8 @@ def run(context: StageContext) -> dict[str, Any]:
     model = to_sparse_model(state)
     save_sparse(context.folder, model)
     save_depth_fields(context.folder, align_depths(model, report, intrinsics, pictures.proxy))
-    figures = {**describe(state, frames, report, metric), **compared, "pieces": [len(p.poses) for p in pieces]}
+    figures = {**describe(state, frames, report, metric), **compared, **carried}
+    figures["pieces"] = [len(p.poses) for p in pieces]
     if "reference_relative_sd" in proxy:  # what the user's reference leaves open; depths agree far better
         figures["scale_relative_sd"] = proxy["reference_relative_sd"]
     save_figures(context.folder, "tracking", figures)

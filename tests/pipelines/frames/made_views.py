@@ -16,7 +16,8 @@ from msgs_slam.pipelines.correspondence.matching import VerifiedPair, verify_mat
 from msgs_slam.pipelines.correspondence.snapshots import Snapshots
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
-from msgs_slam.pipelines.structure.sfm import StructureFromMotion, _Views
+from msgs_slam.pipelines.structure.candidates import Views
+from msgs_slam.pipelines.structure.sfm import StructureFromMotion
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import Features
@@ -49,11 +50,11 @@ class MadeViews:
                     found.append(pair)
         return found
 
-    def views(self) -> _Views:
-        """As structure from motion has them."""
+    def views(self, given: Array | None = None) -> Views:
+        """As structure from motion has them, with poses (N, 4, 4) by another program."""
         streamed = Streamed(len(self.features), self.features.__getitem__, lambda f: f.nbytes, 1e9)
         times = np.arange(len(self.features), dtype=float)
-        return _Views(streamed, [f.xy for f in self.features], 10 * times, [])
+        return Views(streamed, [f.xy for f in self.features], 10 * times, [], given)
 
     def off(self, model: pycolmap.Reconstruction) -> float:
         """Metres by which the model's worst camera is off after a similarity."""

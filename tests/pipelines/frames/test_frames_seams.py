@@ -11,7 +11,7 @@ import pycolmap
 import pytest
 
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.frames.stage import warn_of_structure
+from msgs_slam.pipelines.frames.findings import warn_of_structure
 from msgs_slam.pipelines.structure.adjust import adjust
 from msgs_slam.pipelines.structure.consistency import ModelReport
 from msgs_slam.pipelines.structure.seams import (

@@ -12,8 +12,9 @@ from msgs_slam.pipelines.correspondence.bridges import Picture
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair, verify_matches
 from msgs_slam.pipelines.correspondence.snapshots import Snapshots
 from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.structure.candidates import Views
 from msgs_slam.pipelines.structure.lens import unknown_camera
-from msgs_slam.pipelines.structure.sfm import StructureFromMotion, _Views
+from msgs_slam.pipelines.structure.sfm import StructureFromMotion
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import Features
@@ -69,11 +70,12 @@ def test_sides_that_look_alike_do_not_fold_the_path(tmp_path: Path) -> None:
     pairs = matched(features, seen)
     assert sum(p.second - p.first > VIEWS // SIDES - 1 for p in pairs) > 50
     structure = StructureFromMotion(
-        FramesConfig(overlap=REACH), CAMERA, False, features.__getitem__, no_picture, float,
-        lambda *_: np.zeros((0, 2), np.uint32), Snapshots(tmp_path), SilentProgress(), threads=1, seed=0,
+        config=FramesConfig(overlap=REACH), camera=CAMERA, is_fixed=False, extract=features.__getitem__,
+        picture=no_picture, time=float, match=lambda *_: np.zeros((0, 2), np.uint32), snapshots=Snapshots(tmp_path),
+        progress=SilentProgress(), threads=1, seed=0,
     )  # fmt: skip
     streamed = Streamed(VIEWS, features.__getitem__, lambda f: f.nbytes, 1e9)
-    given = _Views(streamed, [f.xy for f in features], np.arange(VIEWS, dtype=float), [])
+    given = Views(streamed, [f.xy for f in features], np.arange(VIEWS, dtype=float), [])
     folded = structure._tried("global", given, pairs, pairs)
     found = structure._map(given, pairs)
     assert folded is not None

@@ -1,0 +1,139 @@
+"""Camera poses by another program: COLMAP models, transforms.json, ARKit's JSON, TUM trajectories, matrices."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_slam.formats.colmap import model_suffix, read_colmap_model
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.jsonfile import read_json
+from msgs_slam.formats.reading import reaching
+from msgs_slam.formats.textfile import read_rows
+from msgs_slam.formats.trajectory import clean_poses, read_matrices, read_tum
+
+_MODEL_FOLDERS = (".", "sparse/0", "sparse", "0")
+_TABLES = ("transforms.json", "transforms_train.json")
+_MATRIX_KEYS = (
+    "transform_matrix", "cameraPoseARFrame", "transform", "camera_transform", "camera_pose", "pose", "matrix",
+)  # fmt: skip
+_NAME_KEYS = ("file_path", "image", "file_name", "filename", "name", "frame_name")
+_TIME_KEYS = ("timestamp", "time", "t")
+_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_HOW = (
+    "give a COLMAP model's folder, a transforms.json, a JSON list of frames with a 4x4 `transform` and a name or "
+    "timestamp each (ARKit), a TUM trajectory, or a text file of 4x4 matrices"
+)
+
+
+@dataclass(frozen=True)
+class PoseFile:
+    """N poses: world_from_cam (N, 4, 4), camera axes x right, y down, z forward; names (N) of their pictures without
+    folder and suffix, () where it tells none; times (N,) in seconds, None where it tells none; `is_metric`: whether
+    files of its kind always are in metres."""
+
+    what: str
+    world_from_cam: NDArray[np.float64]
+    names: tuple[str, ...] = ()
+    times: NDArray[np.float64] | None = None
+    is_metric: bool = False
+
+    def __len__(self) -> int:
+        return len(self.world_from_cam)
+
+
+def read_poses(path: Path) -> PoseFile:
+    """The poses of a file or folder, whatever it is of those named above. Raises InputError for anything else."""
+    with reaching(path):
+        path = path.expanduser()
+        if not path.exists():
+            raise InputError(f"--poses {path}: there is no such file or folder: check the spelling")
+        if path.is_dir():
+            found = _from_folder(path)
+        else:
+            found = _from_json(path) if path.suffix.lower() == ".json" else _from_text(path)
+    known = np.isfinite(found.world_from_cam).all(axis=(1, 2))
+    if not known.any():
+        raise InputError(f"--poses {path} holds no pose: {_HOW}")
+    return found
+
+
+def stem(name: str) -> str:
+    """By which a picture is known: its file's name without folder and suffix."""
+    return PurePosixPath(name.replace("\\", "/")).stem
+
+
+def _from_folder(path: Path) -> PoseFile:
+    for folder in (path / name for name in _MODEL_FOLDERS):
+        if folder.is_dir() and model_suffix(folder):
+            return _from_colmap(folder)
+    table = next((path / name for name in _TABLES if (path / name).is_file()), None)
+    if table is None:
+        raise InputError(f"--poses {path}: neither a COLMAP model nor a transforms.json lies in it: {_HOW}")
+    return _from_json(table)
+
+
+def _from_colmap(folder: Path) -> PoseFile:
+    model = read_colmap_model(folder)
+    poses = np.asarray(np.linalg.inv(model.cam_from_world), np.float64).reshape(-1, 4, 4)
+    return PoseFile("a COLMAP model", poses, _unique(map(stem, model.names), folder))
+
+
+def _from_json(path: Path) -> PoseFile:
+    table = read_json(path)
+    listed = table.get("frames") if isinstance(table, dict) else table
+    frames = [f for f in listed if isinstance(f, dict)] if isinstance(listed, list) else []
+    keys = {key for frame in frames for key in frame}
+    known = _MATRIX_KEYS, _NAME_KEYS, _TIME_KEYS
+    matrix, name, time = (next((k for k in wanted if k in keys), "") for wanted in known)
+    frames = [f for f in frames if matrix in f]
+    if not frames or not (name or time):
+        raise InputError(f"--poses {path} lists no frames with a pose and a name or time: {_HOW}")
+    matrices = np.stack([_matrix(frame[matrix], path, k) for k, frame in enumerate(frames)])
+    # ARKit's matrices are written column by column; then what should be 0 0 0 1 is the last column.
+    if np.abs(matrices[:, 3, :3]).max() > 0 and not np.abs(matrices[:, :3, 3]).max() > 0:
+        matrices = matrices.transpose(0, 2, 1)
+    poses = clean_poses(matrices, str(path)) @ _OPENCV_FROM_OPENGL
+    times = np.array([_number(f.get(time), path) for f in frames]) if time and not name else None
+    names = _unique((stem(str(f.get(name, ""))) for f in frames), path) if name else ()
+    is_arkit = matrix != "transform_matrix" or any("depth_file_path" in f for f in frames)
+    return PoseFile("ARKit's poses" if matrix != "transform_matrix" else path.name, poses, names, times, is_arkit)
+
+
+def _from_text(path: Path) -> PoseFile:
+    rows = read_rows(path)
+    if rows and len(rows[0]) == 8:
+        times, poses = read_tum(path)
+        return PoseFile("a TUM trajectory", poses, times=times)
+    return PoseFile("a file of matrices", read_matrices(path))
+
+
+def _matrix(value: Any, path: Path, number: int) -> NDArray[np.float64]:
+    try:
+        flat = np.array(value, np.float64).ravel()
+    except (TypeError, ValueError):
+        flat = np.zeros(0)
+    if len(flat) == 12:
+        flat = np.append(flat, [0.0, 0.0, 0.0, 1.0])
+    if len(flat) != 16:
+        raise InputError(f"--poses {path}: frame {number + 1} has no 4x4 matrix: {_HOW}")
+    return flat.reshape(4, 4)
+
+
+def _number(value: Any, path: Path) -> float:
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise InputError(f"--poses {path}: {str(value)[:40]!r} is no time: give every frame its seconds as a number")
+    return float(value)
+
+
+def _unique(names: Iterable[str], path: Path) -> tuple[str, ...]:
+    found = tuple(names)
+    twice = next((n for k, n in enumerate(found) if n in found[:k]), None) if len(set(found)) < len(found) else None
+    if twice is not None:
+        raise InputError(f"--poses {path}: two poses are of pictures called {twice!r}: names must differ")
+    return found

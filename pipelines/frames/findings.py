@@ -1,0 +1,111 @@
+"""What structure from motion has to tell: what is missing, what contradicts itself, what became of what was given."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from msgs_slam.pipelines.engine.stages import StageContext
+from msgs_slam.pipelines.structure.backbone import pose_of
+from msgs_slam.pipelines.structure.candidates import GIVEN, GIVEN_ALONE
+from msgs_slam.pipelines.structure.given import GivenPoses, agreement
+from msgs_slam.pipelines.structure.sfm import Structure
+from msgs_slam.pipelines.system.wording import stretches
+
+_LEAST_PART = 3
+
+
+def settled_origin(context: StageContext, origin: str, camera: pycolmap.Camera, structure: Structure) -> str:
+    """Where the camera comes from in the end: one that the data set states is given unless the pictures refuted it."""
+    if origin != "stated":
+        return origin
+    found = structure.model.cameras[1]
+    if list(found.params) == list(camera.params):
+        return "given"
+    context.warn(
+        f"the camera that the data set states (focal length {camera.mean_focal_length():.0f} px) explains the pictures "
+        f"much worse than one found from them ({found.mean_focal_length():.0f} px), which is used instead. To hold a "
+        "camera in any case give it with --intrinsics"
+    )
+    return "self-calibrated"
+
+
+def warn_of_structure(context: StageContext, structure: Structure, ids: list[int]) -> None:
+    """What is missing in the structure, and where it contradicts the pictures; ids[k] is the frame of keyframe k."""
+    report = structure.report
+    if report.registered < report.total:
+        context.warn(
+            f"structure from motion could not place {report.total - report.registered} of {report.total} keyframes"
+        )
+    for piece in structure.pieces:
+        inside = sorted(ids[i - 1] for i in piece.reg_image_ids())
+        context.warn(
+            f"{len(inside)} of them, frames {inside[0]}-{inside[-1]}, fit among each other: what tracking does not "
+            "find elsewhere becomes a piece of its own"
+        )
+    parts = [p for p in report.parts if len(p) >= _LEAST_PART]
+    if len(parts) > 1:
+        named = ", ".join(f"{ids[p[0]]}-{ids[p[-1]]}" for p in parts)
+        context.warn(
+            f"structure from motion fell into {len(parts)} parts that nothing holds together (frames {named}): "
+            "tracking joins what it recognises"
+        )
+    alone = sorted(ids[k] for p in report.parts if len(p) < _LEAST_PART for k in p)
+    if alone:
+        context.warn(
+            f"{len(alone)} keyframes have hardly a point in common with the others (frames "
+            f"{', '.join(map(str, alone))}): tracking looks for them again"
+        )
+    folds = ", ".join(f"{ids[s.before]}-{ids[s.after]}" for s in report.contradicted)
+    agreeing = f"{report.pairs_agreeing:.0%} of the matched pairs of views agree with it (mapper: {structure.mapper})"
+    if folds:
+        context.warn(
+            f"the camera's path may be folded between frames {folds}, where neighbouring pictures contradict it: "
+            f"{agreeing}"
+        )
+    elif report.pairs_agreeing < 0.9:
+        context.warn(
+            f"pictures taken far apart contradict the camera's path: {agreeing}. Either things that repeat were taken "
+            "for each other, which does no harm, or a loop is not closed"
+        )
+
+
+def warn_of_given(
+    context: StageContext, structure: Structure, given: GivenPoses, keyframes: Sequence[int]
+) -> dict[str, Any]:
+    """Figures of how the given poses agree with those found, with a warning where they carry them or contradict."""
+    placed = [i for i in sorted(structure.model.reg_image_ids()) if structure.model.images[i].num_points3D]
+    ids = [i - 1 for i in placed if given.known[keyframes[i - 1]]]
+    figures: dict[str, Any] = {"given_poses": int(given.known.sum()), "given_metric": given.is_metric}
+    if structure.mapper == GIVEN_ALONE:
+        context.warn(
+            f"structure from motion found nothing in the pictures: {structure.report.registered} keyframes stand where "
+            f"--poses ({given.what}) says, nothing of them is checked"
+        )
+        return figures
+    if structure.mapper.startswith(GIVEN):
+        context.warn(
+            f"the poses rest on those given with --poses ({given.what}), adjusted to the pictures: without them "
+            "structure from motion found less"
+        )
+    rows = [keyframes[k] for k in ids]
+    found = np.array([pose_of(structure.model.images[k + 1]) for k in ids]).reshape(-1, 4, 4)
+    agreed = agreement(found, given.cam_from_world[rows])
+    if agreed is None:
+        context.warn("the given poses cannot be compared with those found: too few, or they hardly move")
+        return figures
+    wrong = [row for row, is_wrong in zip(rows, agreed.wrong, strict=True) if is_wrong]
+    unit = " m" if given.is_metric else ""
+    if wrong:
+        context.warn(
+            f"{len(wrong)} given poses are far from where the pictures say (frames {stretches(wrong)}), and are left "
+            f"out; the others agree to {agreed.position_sd:.3g}{unit} and {agreed.degrees_sd:.2g} degrees"
+        )
+    return figures | {
+        "given_position_sd": round(agreed.position_sd, 6),
+        "given_degrees_sd": round(agreed.degrees_sd, 4),
+        "given_wrong": wrong,
+    }

@@ -1,0 +1,110 @@
+"""Which given pose belongs to which frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_slam.formats.datasets.matching import SAME_INSTANT_SECONDS, poses_at
+from msgs_slam.formats.digest import files_sha256
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.poses import PoseFile, read_poses, stem
+from msgs_slam.pipelines.config import FramesConfig
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.source.opening import FolderSource, VideoSource
+from msgs_slam.pipelines.source.recording import RecordingSource
+from msgs_slam.pipelines.structure.given import FILE, GivenPoses
+from msgs_slam.pipelines.types import Frame
+
+AnySource = VideoSource | FolderSource | RecordingSource
+LEAST = 3
+"""Poses that belong to a picture, below which a file is taken for one of another recording."""
+
+
+def given_poses(config: FramesConfig, source: AnySource, frames: Sequence[Frame]) -> GivenPoses | None:
+    """The poses of `frames.poses` frame by frame; None where none are given.
+
+    A picture's pose is known by the picture's name; of a file of times by the nearest within 20 ms; of one that tells
+    neither, or times of pictures without, by the order, where there are as many as pictures. Raises InputError where
+    fewer than three belong to a frame.
+    """
+    if not config.poses:
+        return None
+    file = read_poses(Path(config.poses))
+    if file.names:
+        found = _by_name(file, source, frames)
+    elif file.times is not None and source.has_times:
+        found = poses_at(np.array([f.timestamp for f in frames]), file.times, file.world_from_cam, SAME_INSTANT_SECONDS)
+    else:
+        found = _by_order(file, source, frames, config.poses)
+    known = np.isfinite(found).all(axis=(1, 2))
+    if known.sum() < min(LEAST, len(frames)):
+        raise InputError(
+            f"--poses {config.poses}: of its {len(file)} poses {known.sum()} belong to frames of {source.path}"
+            f"{_examples(file, source, frames)}. Give the poses of these pictures"
+        )
+    cam_from_world = np.full_like(found, np.nan)
+    cam_from_world[known] = se3.inverse(found[known])
+    return GivenPoses(cam_from_world, file.is_metric, file.what)
+
+
+def load_given(run: RunFolder) -> GivenPoses | None:
+    """The poses that the user gave for the run's frames; None without any."""
+    return GivenPoses.load(run.file("frames", FILE)) if run.has("frames", FILE) else None
+
+
+def check_poses(config: FramesConfig, source: AnySource) -> None:
+    """Raise InputError for poses that cannot belong to the source, as far as its names and their number tell."""
+    if not config.poses:
+        return
+    file = read_poses(Path(config.poses))
+    pictures = [Frame(i, source.name(i, i), 0.0, i, 0.0) for i in range(source.expected_frames)]
+    if file.names or file.times is None or not source.has_times:
+        given_poses(config, source, pictures)
+
+
+def pose_inputs(config: FramesConfig) -> dict[str, str]:
+    """What changes with the poses' files."""
+    path = Path(config.poses).expanduser()
+    if not config.poses or not path.exists():
+        return {}
+    files = sorted(p for p in path.rglob("*") if p.suffix in (".bin", ".txt", ".json")) if path.is_dir() else [path]
+    return {"poses": files_sha256((p.name, p) for p in files)}
+
+
+def _by_name(file: PoseFile, source: AnySource, frames: Sequence[Frame]) -> NDArray[np.float64]:
+    """A video's frames are called by their numbers."""
+    if isinstance(source, VideoSource):
+        rows = {int(d): k for k, n in enumerate(file.names) if (d := "".join(c for c in n if c.isdigit()))}
+        return _rows(file, [rows.get(f.source_index) for f in frames])
+    named = {n: k for k, n in enumerate(file.names)}
+    return _rows(file, [named.get(stem(source.name(f.id, f.source_index))) for f in frames])
+
+
+def _by_order(file: PoseFile, source: AnySource, frames: Sequence[Frame], path: str) -> NDArray[np.float64]:
+    if source.expected_frames != len(file):
+        raise InputError(
+            f"--poses {path}: {len(file)} poses for {source.expected_frames} pictures, and neither names nor times "
+            "tell which belongs to which: give one for each picture, or poses with the pictures' names"
+        )
+    return _rows(file, [f.source_index for f in frames])
+
+
+def _rows(file: PoseFile, rows: Sequence[int | None]) -> NDArray[np.float64]:
+    found = np.full((len(rows), 4, 4), np.nan)
+    for k, row in enumerate(rows):
+        if row is not None:
+            found[k] = file.world_from_cam[row]
+    return found
+
+
+def _examples(file: PoseFile, source: AnySource, frames: Sequence[Frame]) -> str:
+    if file.names:
+        return f" (its first is of {file.names[0]!r}, the source's first picture is {stem(frames[0].name)!r})"
+    if file.times is None:
+        return ""
+    return f" (it begins at {file.times[0]:.2f} s, the source at {frames[0].timestamp:.2f} s)"

@@ -1,0 +1,257 @@
+"""Models of matched keyframes that could be the structure, and which of them is.
+
+A mapper's model is judged by all matches; where it is doubtful the next one is asked, and where neighbouring pictures
+contradict it, it is made again from what these share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from msgs_slam.pipelines.config import FramesConfig
+from msgs_slam.pipelines.correspondence.database import write_database
+from msgs_slam.pipelines.correspondence.matching import VerifiedPair
+from msgs_slam.pipelines.correspondence.snapshots import Snapshots
+from msgs_slam.pipelines.geometry.rig import ONE_CAMERA
+from msgs_slam.pipelines.structure.adjust import CAUCHY_PX, adjust, remove_wild, solve
+from msgs_slam.pipelines.structure.consistency import ModelReport, judge, without_misplaced
+from msgs_slam.pipelines.structure.freeing import LEAST_BETTER, LEAST_GAIN_OF_FREEING, gain_of_freeing, unexplained
+from msgs_slam.pipelines.structure.given import posed_model
+from msgs_slam.pipelines.structure.lens import FOCAL_GUESS, unknown_camera
+from msgs_slam.pipelines.structure.mappers import calibrate_focal, map_globally, map_incrementally
+from msgs_slam.pipelines.structure.mend import mended
+from msgs_slam.pipelines.structure.rolling import (
+    FEATURE_SD,
+    NO_READOUT,
+    Readout,
+    adjust_rolling,
+    read_readout,
+    straight_copy,
+)
+from msgs_slam.pipelines.structure.windows import WIDE, close_loops
+from msgs_slam.pipelines.system.progress import Progress
+from msgs_slam.pipelines.system.streamed import Streamed
+from msgs_slam.pipelines.types import Features
+
+_MIN_KEYFRAMES = 3
+_MIN_POINTS = 30
+LENS_HELD, NEIGHBOURS, GIVEN, GIVEN_ALONE = "global-lens-held", "neighbours", "given", "given-alone"
+_UNSURE_FOCAL = 0.03
+_AS_GOOD = 0.98
+"""The second attempt's share of the first one's score, from which it is as good and its surer focal length decides."""
+_Tried = tuple[pycolmap.Reconstruction, str, ModelReport]
+"""A model, the mapper that made it, and how good it is."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """What is known of the keyframes: features, their pixels (F, 2) again, which are needed when descriptors no longer
+    are, times (K,) in seconds, the numbers of those that hold the path's size badly, and the poses (K, 4, 4) that the
+    user gave, NaN where none, if any."""
+
+    features: Streamed[Features]
+    xy: list[NDArray[np.float64]]
+    times: NDArray[np.float64]
+    weak: list[int]
+    given: NDArray[np.float64] | None = None
+
+    def part(self, window: range) -> Views:
+        """Of the keyframes of a window, counted from 0."""
+        numbers = slice(window.start, window.stop)
+        weak = [k - window.start for k in self.weak if k in window]
+        given = None if self.given is None else self.given[numbers]
+        return Views(self.features.part(window), self.xy[numbers], self.times[numbers], weak, given)
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    model: pycolmap.Reconstruction
+    mapper: str
+    focal_sd: float
+    score: float
+    readout: Readout
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidates:
+    """What models of matched keyframes are made with: `camera` is what is known of the camera before, and `is_fixed`
+    says that it is held; `is_stated` that it is only as long as the pictures do not contradict it. cam_from_rig
+    (C, 3, 3): the keyframes come direction by direction, as `Rig` counts frames."""
+
+    config: FramesConfig
+    camera: pycolmap.Camera
+    is_fixed: bool
+    snapshots: Snapshots
+    progress: Progress
+    seed: int
+    is_stated: bool = False
+    cam_from_rig: NDArray[np.float64] = field(default_factory=lambda: ONE_CAMERA.cam_from_rig)
+
+    def _calibrated(self, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
+        """The best model; of a stated camera the model of one that is found anew, where that explains the pictures
+        much better, or where the stated one gives none."""
+        held = self._self_calibrated(views, pairs)
+        if not self.is_stated:
+            return held
+        if held is not None:
+            straight = straight_copy(held.model, views.xy, views.times, held.readout)
+            if gain_of_freeing(straight) < LEAST_GAIN_OF_FREEING:
+                return held
+        free = next(filter(None, (self._freed(name, views, pairs) for name in ("stated", "unknown"))), None)
+        if held is None or free is None:
+            return free or held
+        contradicted = unexplained(held.model, pairs, views.xy)
+        is_better = unexplained(free.model, pairs, views.xy) < (1 - LEAST_BETTER) * contradicted
+        return free if is_better and free.score >= _AS_GOOD * held.score else held
+
+    def _freed(self, start: str, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
+        """The model of a camera that is found anew, from the stated focal length or from nothing."""
+        is_prior, (width, height) = start == "stated", (self.camera.width, self.camera.height)
+        focal = self.camera.mean_focal_length() if is_prior else FOCAL_GUESS * max(width, height)
+        snapshots = Snapshots(self.snapshots.folder / f"freed_from_{start}")
+        snapshots.folder.mkdir(exist_ok=True)
+        camera = unknown_camera(width, height, focal, is_prior)
+        return replace(self, camera=camera, is_fixed=False, is_stated=False, snapshots=snapshots)._self_calibrated(
+            views, pairs
+        )
+
+    def _self_calibrated(self, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
+        """The best model; of two where the first is not sure of its camera."""
+        found = self._adjusted(views, pairs, ("global", "incremental", GIVEN))
+        if found is not None and found.focal_sd > _UNSURE_FOCAL * found.model.cameras[1].mean_focal_length():
+            # A lens that is bent before the poses stand can run away with the focal length.
+            again = self._adjusted(views, pairs, (LENS_HELD,))
+            if again is not None and again.focal_sd < found.focal_sd and again.score >= _AS_GOOD * found.score:
+                return again
+        return found
+
+    def _adjusted(self, views: Views, pairs: Sequence[VerifiedPair], mappers: Sequence[str]) -> Adjusted | None:
+        """The best model, its camera calibrated unless it is fixed; with the readout of a rolling shutter, where one is
+        given or the model shows it."""
+        found = self._map(views, pairs, mappers)
+        if found is None:
+            return None
+        model, mapper, report = found
+        readout = NO_READOUT if len(self.cam_from_rig) > 1 else read_readout(self.config.rolling_shutter)
+        rolling = adjust_rolling(model, views.xy, views.times, readout, not self.is_fixed, bool(views.weak))
+        if rolling is not None:
+            return Adjusted(rolling[0], mapper, rolling[2], report.score, rolling[1])
+        return Adjusted(model, mapper, adjust(model, not self.is_fixed, bool(views.weak)), report.score, NO_READOUT)
+
+    def _map(
+        self,
+        views: Views,
+        pairs: Sequence[VerifiedPair],
+        mappers: Sequence[str] = ("global", "incremental"),
+    ) -> _Tried | None:
+        """The best of the mappers' models, None where none is any; the next is only made when those before it are
+        doubtful."""
+        best: _Tried | None = None
+        wanted = [name for name in mappers if name != GIVEN and self.config.mapper in ("auto", name)]
+        wanted += [GIVEN] if GIVEN in mappers and views.given is not None else []
+        for name in self.progress.track(wanted, "camera model", len(wanted)):
+            if best is not None and (best[2].is_sound or (best[1].startswith(NEIGHBOURS) and name != GIVEN)):
+                continue
+            found = self._tried(name, views, pairs, pairs)
+            if name == GIVEN:
+                found = found and self._grown(found, views, pairs, pairs)
+            unfolded = None if found is None or not found[2].contradicted else self._unfolded(views, pairs)
+            # Of two alike the one before.
+            best = max(filter(None, (best, found, unfolded)), key=lambda f: f[2].score, default=None)
+        if best is None or best[2].registered < min(_MIN_KEYFRAMES, best[2].total) or best[2].points < _MIN_POINTS:
+            return None
+        return best
+
+    def _unfolded(self, views: Views, pairs: Sequence[VerifiedPair]) -> _Tried | None:
+        """The model of a path that things which repeat have folded: made of what neighbours share, for little repeats
+        within so few pictures, its loops closed by the other pairs that lie nearly right with that."""
+        total, reach = self._places(views.xy), self.config.overlap
+        near = [p for p in pairs if abs(p.first % total - p.second % total) <= reach]
+        straight = self._tried(NEIGHBOURS, views, near, pairs)
+        if straight is None or straight[2].contradicted:
+            return straight
+        closed = self._closed(straight, views, pairs)
+        grown = self._grown(closed, views, pairs, near)
+        return closed if grown is closed else self._closed(grown, views, pairs)
+
+    def _closed(self, found: _Tried, views: Views, pairs: Sequence[VerifiedPair]) -> _Tried:
+        """The model with those points made one that are one by matched pairs which lie nearly right, and all adjusted
+        by a wide loss and a narrow one, again and again as long as that makes it better."""
+        while True:
+            model = pycolmap.Reconstruction(found[0])
+            if not close_loops(model, pairs, (), views.xy):
+                return found
+            images = sorted(model.reg_image_ids())
+            for width in (WIDE * FEATURE_SD, CAUCHY_PX):
+                solve(model, images, refine_camera=False, width=width)
+            remove_wild(model)
+            closed = self._judged(f"{NEIGHBOURS}-closed", model, views, pairs)
+            if closed[2].score <= found[2].score:
+                return found
+            found = closed
+
+    def _grown(
+        self, found: _Tried, views: Views, every: Sequence[VerifiedPair], known: Sequence[VerifiedPair]
+    ) -> _Tried:
+        """The model with the keyframes that it leaves added one by one, each by all that it shares with those placed,
+        where that makes it better; `known` are the pairs that it was made from."""
+        left = set(range(len(views.xy))) - {i - 1 for i in found[0].reg_image_ids()}
+        more = [p for p in every if p.first in left or p.second in left]
+        if not more:
+            return found
+        pairs = sorted({(p.first, p.second): p for p in (*known, *more)}.values(), key=lambda p: (p.first, p.second))
+        grown = self._tried(f"{found[1]}-grown", views, pairs, every, found[0])
+        return found if grown is None or grown[2].score < found[2].score else grown
+
+    def _tried(
+        self,
+        name: str,
+        views: Views,
+        pairs: Sequence[VerifiedPair],
+        every: Sequence[VerifiedPair],
+        start: pycolmap.Reconstruction | None = None,
+    ) -> _Tried | None:
+        """A mapper's model of these pairs, judged by `every` one; one to `start` from is added to."""
+        model = self.snapshots.model(name, lambda work: self._run_mapper(name, work, views, pairs, start))
+        return None if model is None else self._judged(name, model, views, every)
+
+    def _judged(self, name: str, model: pycolmap.Reconstruction, views: Views, every: Sequence[VerifiedPair]) -> _Tried:
+        """The model without what its neighbours contradict, mended, and how good it is."""
+        seen = every, views.xy, self._places(views.xy), self.config.overlap
+        model = without_misplaced(model, *seen)
+        report = judge(model, *seen)
+        if views.weak:
+            model, report = mended(model, report, *seen, self.seed)
+        return model, name, report
+
+    def _run_mapper(
+        self,
+        name: str,
+        work: Path,
+        views: Views,
+        pairs: Sequence[VerifiedPair],
+        start: pycolmap.Reconstruction | None,
+    ) -> pycolmap.Reconstruction | None:
+        if name == GIVEN:
+            assert views.given is not None
+            return posed_model(self.camera, views.xy, views.given, pairs, not self.is_fixed, self.seed)
+        features, database = views.features, work / "database.db"
+        names = [f"{i:06d}" for i in range(len(features))]
+        write_database(database, self.camera, names, features, pairs, self.cam_from_rig)
+        features.forget()  # the mapper needs the memory, and no descriptor
+        if start is not None:
+            return map_incrementally(database, work, False, self.seed, start)
+        if not self.camera.has_prior_focal_length:
+            calibrate_focal(database, self.seed)
+        if name == "incremental":
+            return map_incrementally(database, work, not self.is_fixed, self.seed)
+        return map_globally(database, work, not self.is_fixed, self.seed, bend_lens=name != LENS_HELD)
+
+    def _places(self, views: Sequence[object]) -> int:
+        return len(views) // len(self.cam_from_rig)

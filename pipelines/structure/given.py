@@ -1,0 +1,154 @@
+"""Poses that the user brings: what they say beside those found here, and a model that starts from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from msgs_slam.formats.tensors import load_arrays, save_arrays
+from msgs_slam.pipelines.correspondence.matching import VerifiedPair
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.alignment import Similarity, best_rotation
+from msgs_slam.pipelines.structure.adjust import remove_wild, solve
+from msgs_slam.pipelines.structure.freeing import unexplained
+from msgs_slam.pipelines.structure.tracks import complete_tracks
+
+Array = NDArray[np.float64]
+
+FILE = "given_poses.npz"
+_TURNS = (8.0, 3.0, 1.0)
+"""Degrees by which rays of one point may miss, round after round: poses that are 3 degrees off still make points, and
+what is off by more is left out once these have been adjusted."""
+_FOCALS = np.geomspace(0.4, 3.0, 41)
+_ROUNDS = 20
+_FAR_OFF = 5.0
+"""Standard deviations from which a given pose is wrong altogether."""
+_LEAST_SD = 1e-6
+
+
+@dataclass(frozen=True)
+class GivenPoses:
+    """cam_from_world (F, 4, 4) of all frames, NaN for a frame without; whether in metres; `what` they are."""
+
+    cam_from_world: Array
+    is_metric: bool
+    what: str
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(F,) which frames have one."""
+        return np.asarray(np.isfinite(self.cam_from_world).all(axis=(1, 2)))
+
+    def save(self, folder: Path) -> None:
+        """One file in the folder of the running stage."""
+        rest = {"is_metric": np.array(self.is_metric), "what": np.array(self.what)}
+        save_arrays(folder / FILE, {"cam_from_world": self.cam_from_world, **rest})
+
+    @staticmethod
+    def load(path: Path) -> GivenPoses:
+        """Inverse of `save`."""
+        a = load_arrays(path)
+        return GivenPoses(a["cam_from_world"], bool(a["is_metric"]), str(a["what"]))
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How given poses agree with found ones: given = `move`(found); their standard deviations, in the given unit and in
+    degrees, without those that are wrong altogether (`wrong`, (N,)); `scale_sd`: relative."""
+
+    move: Similarity
+    position_sd: float
+    degrees_sd: float
+    wrong: NDArray[np.bool_]
+    scale_sd: float
+
+
+def agreement(found: Array, given: Array) -> Agreement | None:
+    """Of cameras (N, 4, 4) in two worlds, by iterated reweighting (Cauchy's weights at the median residual); None
+    where fewer than three, or cameras that hardly moved, tell no scale."""
+    if len(found) < 3:
+        return None
+    ours, theirs = se3.inverse(found), se3.inverse(given)
+    # Begun without what is far from everything: a pose in another town would turn the first fit round.
+    apart = np.linalg.norm(theirs[:, :3, 3] - np.median(theirs[:, :3, 3], axis=0), axis=1)
+    weight = 1 / (1 + (apart / max(3 * float(np.median(apart)), _LEAST_SD)) ** 2)
+    for _ in range(_ROUNDS):
+        axes = np.repeat(weight, 3)[:, None]
+        rotation = best_rotation(axes * ours[:, :3, :3].transpose(0, 2, 1).reshape(-1, 3),
+                                 theirs[:, :3, :3].transpose(0, 2, 1).reshape(-1, 3))  # fmt: skip
+        mean_a, mean_b = (np.average(c[:, :3, 3], axis=0, weights=weight) for c in (ours, theirs))
+        a, b = (ours[:, :3, 3] - mean_a) @ rotation.T, theirs[:, :3, 3] - mean_b
+        spread = float(weight @ (a**2).sum(1))
+        scale = float(weight @ (a * b).sum(1)) / max(spread, 1e-300)
+        if not (scale > 0 and np.isfinite(scale)):
+            return None
+        away = np.linalg.norm(scale * a - b, axis=1)
+        turned = np.degrees(se3.rotation_angle(_turns(ours, theirs, rotation)))
+        sds = [max(float(np.median(x)) / 1.54, _LEAST_SD) for x in (away, turned)]  # the median norm of three
+        weight = 1 / (1 + (away / sds[0] / 3) ** 2 + (turned / sds[1] / 3) ** 2)
+    wrong = (away > _FAR_OFF * sds[0] + _LEAST_SD) | (turned > _FAR_OFF * sds[1] + _LEAST_SD)
+    move = Similarity(scale, rotation, mean_b - scale * rotation @ mean_a)
+    return Agreement(move, sds[0], sds[1], wrong, sds[0] / max(scale * np.sqrt(spread), 1e-12))
+
+
+def _turns(ours: Array, theirs: Array, rotation: Array) -> Array:
+    """(N, 4, 4) rotations from where ours, turned, look to where theirs do."""
+    out = np.tile(np.eye(4), (len(ours), 1, 1))
+    out[:, :3, :3] = theirs[:, :3, :3] @ (rotation @ ours[:, :3, :3]).transpose(0, 2, 1)
+    return out
+
+
+def posed_model(
+    camera: pycolmap.Camera,
+    xy: Sequence[Array],
+    cam_from_world: Array,
+    pairs: Sequence[VerifiedPair],
+    refine_camera: bool,
+    seed: int,
+) -> pycolmap.Reconstruction | None:
+    """Points of the verified matches (of pictures with pixels xy), triangulated with given poses (K, 4, 4) and adjusted
+    together with them, in rounds that ask for more and more; None where the poses make none."""
+    model = bare_model(camera, xy, cam_from_world)
+    images = sorted(model.reg_image_ids())
+    if len(images) < 2:
+        return None
+    if refine_camera and not camera.has_prior_focal_length:
+        set_best_focal(model, pairs, xy)
+    for degrees in _TURNS:
+        limit = model.cameras[1].mean_focal_length() * np.radians(degrees)
+        complete_tracks(model, pairs, seed, limit)
+        if model.num_points3D() < 2:
+            continue
+        solve(model, images, refine_camera and degrees == _TURNS[-1], width=max(1.0, limit / 8))
+        pycolmap.ObservationManager(model).filter_all_points3D(max(4.0, limit / 2), 1.0)
+    remove_wild(model)
+    return model if model.num_points3D() else None
+
+
+def bare_model(camera: pycolmap.Camera, xy: Sequence[Array], cam_from_world: Array) -> pycolmap.Reconstruction:
+    """Pictures i + 1 with pixels xy[i] at their poses, those of NaN left out, and no points."""
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+    for i, (pixels, pose) in enumerate(zip(xy, cam_from_world, strict=True)):
+        if np.isfinite(pose).all():
+            points = pycolmap.Point2DList([pycolmap.Point2D(at) for at in pixels])
+            image = pycolmap.Image(name=f"{i:06d}", points2D=points, camera_id=camera.camera_id, image_id=i + 1)
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+    return model
+
+
+def set_best_focal(model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], xy: Sequence[Array]) -> None:
+    """Give the camera the focal length at which the poses explain most of the matches, in place."""
+    camera = model.cameras[1]
+
+    def cost(focal: float) -> float:
+        camera.params = [focal, *camera.params[1:]]
+        return unexplained(model, pairs, xy)
+
+    best = min(_FOCALS * max(camera.width, camera.height), key=cost)
+    camera.params = [best, *camera.params[1:]]

@@ -1,0 +1,101 @@
+"""Where the pictures tell no pose, the given ones carry the path: between what was found on both sides of the gap."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_slam.pipelines.engine.stages import StageContext
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.source.known_poses import load_given
+from msgs_slam.pipelines.structure.given import GivenPoses, agreement
+from msgs_slam.pipelines.system.wording import stretches
+from msgs_slam.pipelines.tracking.segments import move_segment
+from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, TrackState
+
+Array = NDArray[np.float64]
+
+_MOST_SCALE_SD = 0.1
+"""Relative: a stretch shorter than the given poses are exact tells nothing of its size among them."""
+
+
+def carry_given(context: StageContext, state: TrackState) -> dict[str, Any]:
+    """Join the state's segments by the given poses, and pose lost frames by them, in place; figures of it."""
+    given = load_given(context.run)
+    if given is None:
+        return {}
+    joined = join_by_given(state, given)
+    carried = pose_lost(state, given)
+    if joined:
+        context.warn(f"{joined} stretches that no picture ties to the rest are joined to it by the given poses")
+    if carried:
+        context.warn(
+            f"{len(carried)} frames ({stretches(carried)}) are posed by --poses alone: the pictures say nothing of them"
+        )
+    return {"given_joined": joined, "given_carried": len(carried)}
+
+
+def join_by_given(state: TrackState, given: GivenPoses) -> int:
+    """Move every segment that shares frames with the given poses to where these put it beside the largest; how many."""
+    order = [s for s, _ in sorted(Counter(state.segment.values()).items(), key=lambda item: (-item[1], item[0]))]
+    main = _to_given(state, given, order[0]) if order else None
+    joined = 0
+    for segment in order[1:] if main is not None else []:
+        own = _to_given(state, given, segment)
+        if own is not None and main is not None:
+            move_segment(segment, order[0], main.inverse() @ own, state)
+            joined += 1
+    return joined
+
+
+def _to_given(state: TrackState, given: GivenPoses, segment: int) -> Similarity | None:
+    """given_from_state by the posed frames of a segment that have a given pose; None where they tell no size."""
+    ids = [i for i in sorted(state.poses) if state.segment[i] == segment and given.known[i]]
+    found = np.array([state.poses[i] for i in ids]).reshape(-1, 4, 4)
+    agreed = agreement(found, given.cam_from_world[ids])
+    return None if agreed is None or agreed.scale_sd > _MOST_SCALE_SD else agreed.move
+
+
+def pose_lost(state: TrackState, given: GivenPoses) -> list[int]:
+    """Pose every lost frame that has a given pose, in place: the given path is bent so that it runs through the posed
+    frames on both sides. The frames that were. Where nothing is posed the world is the given one."""
+    lost = [i for i in sorted(state.lost) if given.known[i]]
+    if not lost:
+        return []
+    counts = Counter(state.segment.values())
+    segment = min(counts, key=lambda s: (-counts[s], s)) if counts else 0
+    move = _to_given(state, given, segment) if counts else Similarity(1.0, np.eye(3), np.zeros(3))
+    if move is None:
+        return []
+    known = np.flatnonzero(given.known)
+    here = dict(zip(known.tolist(), move.inverse().apply_to_poses(given.cam_from_world[known]), strict=True))
+    posed = [i for i in sorted(state.poses) if state.segment[i] == segment]
+    off = _offs(state, here, posed)
+    for i in lost:
+        state.add_frame(i, _bend(i, off) @ here[i], NO_SIGHTINGS, not counts, segment)
+    return lost
+
+
+def _offs(state: TrackState, here: dict[int, Array], posed: list[int]) -> dict[int, Array]:
+    """By frame, the motion that takes its given pose to its own; without those that are wrong altogether."""
+    both = [i for i in posed if i in here]
+    if not both:
+        return {}
+    agreed = agreement(np.array([state.poses[i] for i in both]), np.array([here[i] for i in both]))
+    wrong = np.zeros(len(both), np.bool_) if agreed is None else agreed.wrong
+    return {i: state.poses[i] @ se3.inverse(here[i]) for i, bad in zip(both, wrong, strict=True) if not bad}
+
+
+def _bend(frame_id: int, off: dict[int, Array]) -> Array:
+    """(4, 4) between the motions of the nearest frames before and behind, by how near each is."""
+    before = max((i for i in off if i < frame_id), default=None)
+    behind = min((i for i in off if i > frame_id), default=None)
+    if before is None or behind is None:
+        nearest = behind if before is None else before
+        return np.eye(4) if nearest is None else off[nearest]
+    share = (frame_id - before) / (behind - before)
+    return np.asarray(off[before] @ se3.exp(share * se3.log(se3.inverse(off[before]) @ off[behind])), np.float64)

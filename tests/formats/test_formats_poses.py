@@ -1,0 +1,121 @@
+"""Poses by other programs, in the layouts that these write."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from msgs_slam.formats.colmap import write_colmap_model
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.poses import read_poses
+from msgs_slam.formats.trajectory import write_matrices, write_tum
+
+GL = np.diag([1.0, -1.0, -1.0, 1.0])
+Poses = NDArray[np.float64]
+
+
+def made() -> Poses:
+    """(5, 4, 4) world_from_cam."""
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(np.random.default_rng(0).normal(size=(5, 3))).as_matrix()
+    poses[:, :3, 3] = np.random.default_rng(1).normal(size=(5, 3))
+    return poses
+
+
+def colmap(folder: Path, poses: Poses) -> Path:
+    names, nothing = [f"images/frame_{i:03d}.jpg" for i in range(5)], np.zeros((0, 3))
+    write_colmap_model(
+        folder / "sparse" / "0", 640, 480, 500, 500, 320, 240, names, np.linalg.inv(poses), nothing,
+        nothing.astype(np.uint8), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)),
+    )  # fmt: skip
+    return folder
+
+
+def transforms(folder: Path, poses: Poses) -> Path:
+    frames = [
+        {"file_path": f"./images/frame_{i:03d}", "transform_matrix": (p @ GL).tolist()} for i, p in enumerate(poses)
+    ]
+    (folder / "transforms.json").write_text(json.dumps({"fl_x": 500, "frames": frames}))
+    return folder
+
+
+def arkit_rows(folder: Path, poses: Poses) -> Path:
+    frames = [
+        {"image": f"frame_{i:03d}.jpg", "cameraPoseARFrame": (p @ GL).ravel().tolist()} for i, p in enumerate(poses)
+    ]
+    (folder / "arkit.json").write_text(json.dumps({"frames": frames}))
+    return folder / "arkit.json"
+
+
+def arkit_columns(folder: Path, poses: Poses) -> Path:
+    frames = [{"timestamp": 10 + i / 30, "transform": (p @ GL).T.tolist()} for i, p in enumerate(poses)]
+    (folder / "poses.json").write_text(json.dumps(frames))
+    return folder / "poses.json"
+
+
+def tum(folder: Path, poses: Poses) -> Path:
+    write_tum(folder / "trajectory.txt", 10 + np.arange(5) / 30, poses)
+    return folder / "trajectory.txt"
+
+
+def matrices(folder: Path, poses: Poses) -> Path:
+    write_matrices(folder / "traj.txt", poses)
+    return folder / "traj.txt"
+
+
+@pytest.mark.parametrize(
+    ("write", "is_named", "is_timed", "is_metric"),
+    [
+        (colmap, True, False, False),
+        (transforms, True, False, False),
+        (arkit_rows, True, False, True),
+        (arkit_columns, False, True, True),
+        (tum, False, True, False),
+        (matrices, False, False, False),
+    ],
+)
+def test_all_layouts_say_the_same(
+    write: Callable[[Path, Poses], Path], is_named: bool, is_timed: bool, is_metric: bool, tmp_path: Path
+) -> None:
+    found = read_poses(write(tmp_path, made()))
+    np.testing.assert_allclose(found.world_from_cam, made(), atol=1e-6)
+    assert found.names == (tuple(f"frame_{i:03d}" for i in range(5)) if is_named else ())
+    assert (found.times is not None, found.is_metric) == (is_timed, is_metric)
+    if found.times is not None:
+        np.testing.assert_allclose(found.times, 10 + np.arange(5) / 30)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "what"),
+    [
+        ("a.json", "[]", "lists no frames"),
+        ("a.json", '[{"transform": [1, 2, 3], "name": "a"}]', "no 4x4 matrix"),
+        ("a.json", '[{"transform": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]', "lists no frames"),
+        ("a.json", '[{"timestamp": "now", "transform": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]', "is no time"),
+        ("a.json", '[{"name": "a", "transform": [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}]', "no rigid transform"),
+        ("a.txt", "1 2 3\n", "no 4x4 matrices"),
+        ("a.txt", "nan " * 16 + "\n", "holds no pose"),
+    ],
+)
+def test_what_is_none_is_refused(name: str, text: str, what: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=what):
+        read_poses(tmp_path / name)
+
+
+def test_a_folder_without_poses_and_a_name_twice_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="neither a COLMAP model nor"):
+        read_poses(tmp_path)
+    with pytest.raises(InputError, match="no such file"):
+        read_poses(tmp_path / "nowhere")
+    frame = {"transform_matrix": np.eye(4).tolist()}
+    frames = [frame | {"file_path": f"{folder}/0.jpg"} for folder in ("left", "right")]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    with pytest.raises(InputError, match="two poses are of pictures called '0'"):
+        read_poses(tmp_path / "transforms.json")

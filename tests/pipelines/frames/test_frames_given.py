@@ -1,0 +1,85 @@
+"""Poses by another program: a start, a yardstick, and what carries a path where the pictures say nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.structure.candidates import GIVEN
+from msgs_slam.pipelines.structure.given import GivenPoses, agreement, posed_model
+from msgs_slam.pipelines.structure.lens import to_pycolmap, unknown_camera
+from tests.pipelines.frames.made_views import structure_of, walk_round
+
+CAMERA = to_pycolmap(Camera(640, 480, 520.0, 520.0, 320.0, 240.0))
+
+
+def disturbed(cam_from_world: NDArray[np.float64], metres: float = 0.05, degrees: float = 3.0) -> NDArray[np.float64]:
+    """Each pose off by its own so many metres and degrees; every tenth missing, one somewhere else altogether."""
+    rng = np.random.default_rng(1)
+    world_from_cam = se3.inverse(cam_from_world)
+    turns = rng.normal(size=(len(world_from_cam), 3))
+    turns *= np.radians(degrees) / np.linalg.norm(turns, axis=1, keepdims=True)
+    world_from_cam = world_from_cam @ se3.exp(np.column_stack([np.zeros_like(turns), turns]))
+    world_from_cam[:, :3, 3] += rng.normal(0, metres / np.sqrt(3), (len(world_from_cam), 3))
+    world_from_cam[7, :3, 3] += [40.0, -3.0, 8.0]
+    given = se3.inverse(world_from_cam)
+    given[4::10] = np.nan
+    return given
+
+
+def test_agreement_tells_scale_noise_and_what_is_absurd() -> None:
+    made = walk_round(CAMERA, views=40)
+    given = disturbed(made.cam_from_world)
+    known = np.isfinite(given).all(axis=(1, 2))
+    ours = made.cam_from_world[known].copy()
+    ours[:, :3, 3] /= 2.5
+    found = agreement(ours, given[known])
+    assert found is not None
+    assert found.move.scale == pytest.approx(2.5, rel=0.04)
+    assert found.position_sd * np.sqrt(3) == pytest.approx(0.05, rel=0.4)
+    assert np.flatnonzero(known)[found.wrong].tolist() == [7]
+    assert agreement(ours[:2], given[:2]) is None
+
+
+@pytest.mark.parametrize("is_known", [True, False], ids=["known_camera", "unknown_camera"])
+def test_poses_that_are_far_off_make_a_model_as_good_as_none(is_known: bool, tmp_path: Path) -> None:
+    made = walk_round(CAMERA)
+    camera = CAMERA if is_known else unknown_camera(640, 480, 1.2 * 640, is_prior=False)
+    pairs, given = made.pairs(camera), disturbed(made.cam_from_world)
+    model = posed_model(camera, made.views().xy, given, pairs, not is_known, 0)
+    assert model is not None
+    structure = structure_of(made, camera, tmp_path, is_fixed=is_known, given=given)
+    views = made.views(given)
+    found = structure._tried(GIVEN, views, pairs, pairs)
+    assert found is not None
+    grown = structure._grown(found, views, pairs, pairs)
+    assert grown[0].num_reg_images() == 20
+    assert made.off(grown[0]) < (0.02 if is_known else 0.03)
+
+
+def test_given_poses_cost_nothing_where_the_pictures_are_enough(tmp_path: Path) -> None:
+    made = walk_round(CAMERA)
+    pairs = made.pairs(CAMERA)
+    (tmp_path / "with").mkdir()
+    alone = structure_of(made, CAMERA, tmp_path)._calibrated(made.views(), pairs)
+    beside = structure_of(made, CAMERA, tmp_path / "with")._calibrated(
+        made.views(disturbed(made.cam_from_world)), pairs
+    )
+    assert alone is not None
+    assert beside is not None
+    assert beside.mapper == alone.mapper
+    assert made.off(beside.model) == pytest.approx(made.off(alone.model))
+
+
+def test_they_are_kept_for_the_stages_behind(tmp_path: Path) -> None:
+    given = GivenPoses(disturbed(walk_round(CAMERA).cam_from_world), True, "made up")
+    given.save(tmp_path)
+    again = GivenPoses.load(tmp_path / "given_poses.npz")
+    np.testing.assert_array_equal(again.cam_from_world, given.cam_from_world)
+    assert (again.is_metric, again.what) == (True, "made up")
+    assert given.known.sum() == 18
