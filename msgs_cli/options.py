@@ -6,7 +6,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -242,8 +242,8 @@ def is_said(warning: str) -> bool:
     return warning in _said
 
 
-def make_progress(quiet: bool, as_json: bool | None = None) -> Progress:
-    """Bars on a terminal, a line a stage in a file or pipe, JSON lines, or nothing."""
+def make_progress(quiet: bool, as_json: bool | None = None, job: str = "") -> Progress:
+    """Bars on a terminal, a line a stage in a file or pipe, JSON lines, or nothing; of a `job` among others."""
     from msgs_slam.msgs_cli.progress import BarProgress
     from msgs_slam.pipelines.system.progress import LineProgress, SilentProgress
 
@@ -251,15 +251,15 @@ def make_progress(quiet: bool, as_json: bool | None = None) -> Progress:
         return SilentProgress()
     as_json = _as_json() if as_json is None else as_json
     if as_json:
-        return JsonProgress()
-    return BarProgress() if sys.stderr.isatty() else LineProgress()
+        return JsonProgress(job)
+    return BarProgress() if sys.stderr.isatty() else LineProgress(job)
 
 
-def tell_result(quiet: bool, **paths: Path | list[Path] | bool) -> None:
-    """The last event of a command that went well, for programs: where its results are."""
+def tell_result(quiet: bool, paths: Mapping[str, Path | list[Path]], exit_code: int = 0) -> None:
+    """The last event of a command that came to its end, for programs: where its results are."""
     if _as_json() and not quiet:
         texts = {k: [str(p) for p in v] if isinstance(v, list) else str(v) for k, v in paths.items()}
-        write_line("result", **texts, exit_code=0)
+        write_line("result", **texts, exit_code=exit_code)
 
 
 def worker_setup(quiet: bool, verbose: bool, remote: bool) -> Callable[[str], Progress]:
@@ -275,7 +275,7 @@ def _worker_progress(quiet: bool, verbose: bool, as_json: bool, remote: bool, na
     if remote and not quiet and not as_json:
         return LineProgress(name)
     logging.getLogger("msgs_slam").info("%s: begins", name)
-    return make_progress(quiet, as_json)
+    return make_progress(quiet, as_json, name)
 
 
 def open_run(path: Path) -> RunFolder:
