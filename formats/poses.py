@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.colmap import model_suffix, read_colmap_model
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.jsonfile import read_json
+from msgs_slam.formats.phone_poses import OPENCV_FROM_OPENGL, phone_poses
 from msgs_slam.formats.reading import reaching
 from msgs_slam.formats.textfile import read_rows
 from msgs_slam.formats.trajectory import clean_poses, read_matrices, read_tum
@@ -24,10 +25,10 @@ _MATRIX_KEYS = (
 )  # fmt: skip
 _NAME_KEYS = ("file_path", "image", "file_name", "filename", "name", "frame_name")
 _TIME_KEYS = ("timestamp", "time", "t")
-_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _HOW = (
     "give a COLMAP model's folder, a transforms.json, a JSON list of frames with a 4x4 `transform` and a name or "
-    "timestamp each (ARKit), a TUM trajectory, or a text file of 4x4 matrices"
+    "timestamp each (ARKit), what Polycam, 3D Scanner App, Record3D or Stray Scanner wrote, a TUM trajectory, or "
+    "lines of 4x4 matrices"
 )
 
 
@@ -53,7 +54,11 @@ def read_poses(path: Path) -> PoseFile:
         path = path.expanduser()
         if not path.exists():
             raise InputError(f"--poses {path}: there is no such file or folder: check the spelling")
-        if path.is_dir():
+        phone = phone_poses(path) if path.is_dir() or path.suffix.lower() in (".csv", ".json") else None
+        if phone is not None:
+            what, names, poses = phone
+            found = PoseFile(what, poses, _unique(names, path), is_metric=True)
+        elif path.is_dir():
             found = _from_folder(path)
         else:
             found = _from_json(path) if path.suffix.lower() == ".json" else _from_text(path)
@@ -98,7 +103,7 @@ def _from_json(path: Path) -> PoseFile:
     # ARKit's matrices are written column by column; then what should be 0 0 0 1 is the last column.
     if np.abs(matrices[:, 3, :3]).max() > 0 and not np.abs(matrices[:, :3, 3]).max() > 0:
         matrices = matrices.transpose(0, 2, 1)
-    poses = clean_poses(matrices, str(path)) @ _OPENCV_FROM_OPENGL
+    poses = clean_poses(matrices, str(path)) @ OPENCV_FROM_OPENGL
     times = np.array([_number(f.get(time), path) for f in frames]) if time and not name else None
     names = _unique((stem(str(f.get(name, ""))) for f in frames), path) if name else ()
     is_arkit = matrix != "transform_matrix" or any("depth_file_path" in f for f in frames)

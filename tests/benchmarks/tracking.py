@@ -206,7 +206,7 @@ def run_stages_timed(
 @contextmanager
 def adjustment_timed() -> Iterator[list[float]]:
     """CPU seconds of every adjustment of all keyframes together while this is open."""
-    from msgs_slam.pipelines.structure import sfm
+    from msgs_slam.pipelines.structure import candidates
     from msgs_slam.pipelines.tracking import stage
 
     spent: list[float] = []
@@ -221,12 +221,12 @@ def adjustment_timed() -> Iterator[list[float]]:
 
         return call
 
-    plain = stage.adjust_state, sfm.adjust
-    stage.adjust_state, sfm.adjust = timed(plain[0]), timed(plain[1])
+    plain = stage.adjust_state, candidates.adjust
+    stage.adjust_state, candidates.adjust = timed(plain[0]), timed(plain[1])
     try:
         yield spent
     finally:
-        stage.adjust_state, sfm.adjust = plain
+        stage.adjust_state, candidates.adjust = plain
 
 
 def walk_case(name: str, work: Path) -> Case:

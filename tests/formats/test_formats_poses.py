@@ -69,6 +69,68 @@ def matrices(folder: Path, poses: Poses) -> Path:
     return folder / "traj.txt"
 
 
+def polycam(folder: Path, poses: Poses) -> Path:
+    for i, pose in enumerate(poses):
+        rows = {f"t_{a}{b}": float(v) for (a, b), v in np.ndenumerate((pose @ GL)[:3])}
+        path = folder / "keyframes" / "cameras" / f"frame_{i:03d}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps({**rows, "fx": 500, "timestamp": i}))
+    return folder
+
+
+def scanner_app(folder: Path, poses: Poses) -> Path:
+    for i, pose in enumerate(poses):
+        frame = {"cameraPoseARFrame": (pose @ GL).ravel().tolist(), "intrinsics": [1.0] * 9, "time": float(i)}
+        (folder / f"frame_{i:03d}.json").write_text(json.dumps(frame))
+    return folder
+
+
+def record3d(folder: Path, poses: Poses) -> Path:
+    turns = Rotation.from_matrix((poses @ GL)[:, :3, :3]).as_quat()
+    rows = np.column_stack([turns, poses[:, :3, 3]]).tolist()
+    (folder / "metadata.json").write_text(json.dumps({"w": 720, "h": 960, "fps": 60, "poses": rows}))
+    return folder
+
+
+def stray(folder: Path, poses: Poses) -> Path:
+    lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
+    for i, pose in enumerate(poses):
+        numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+        lines.append(f"{i / 60}, {i:06d}, " + ", ".join(f"{v:.9f}" for v in numbers))
+    (folder / "odometry.csv").write_text("\n".join(lines) + "\n")
+    return folder / "odometry.csv"
+
+
+@pytest.mark.parametrize(
+    ("write", "pattern"),
+    [(polycam, "frame_{:03d}"), (scanner_app, "frame_{:03d}"), (record3d, "{}"), (stray, "{:06d}")],
+)
+def test_what_apps_on_phones_write_is_in_metres(
+    write: Callable[[Path, Poses], Path], pattern: str, tmp_path: Path
+) -> None:
+    found = read_poses(write(tmp_path, made()))
+    np.testing.assert_allclose(found.world_from_cam, made(), atol=1e-6)
+    assert found.names == tuple(pattern.format(i) for i in range(5))
+    assert found.is_metric
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "what"),
+    [
+        ("keyframes/cameras/1.json", '{"t_00": 1}', "t_01"),
+        ("frame_00000.json", '{"cameraPoseARFrame": [1, 2]}', "sixteen numbers"),
+        ("metadata.json", '{"poses": [[0, 0, 0, 1]]}', "seven numbers"),
+        ("odometry.csv", "timestamp, frame, x\n0, 0, 1\n", "no column y"),
+        ("odometry.csv", "timestamp, frame, x, y, z, qx, qy, qz, qw\n0, 0, a, 0, 0, 0, 0, 0, 1\n", "than numbers"),
+    ],
+)
+def test_damaged_files_of_apps_are_refused(name: str, text: str, what: str, tmp_path: Path) -> None:
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=what):
+        read_poses(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("write", "is_named", "is_timed", "is_metric"),
     [

@@ -296,3 +296,12 @@ def test_pycolmap_reads_the_database(tmp_path: Path) -> None:
         np.testing.assert_array_equal(geometry.inlier_matches, matches)
         np.testing.assert_allclose(geometry.F, pair.matrices[0])
         np.testing.assert_array_equal(database.read_keypoints(2)[:, :2], features[1].keypoints[:, :2])
+
+
+def test_keyframes_go_on_behind_a_blank_stretch() -> None:
+    """A keyframe without a corner has no track to lose."""
+    blank = np.full((HEIGHT, WIDTH), 128, np.uint8)
+    walk = [render(center, rotation)[..., 1] for center, rotation in sideways(12)]
+    choice = choose_keyframes(((picture, None) for picture in [blank] * 3 + walk), 0.025)
+    assert choice.keyframes[:2] == [0, 3]
+    assert len(choice.keyframes) > 6

@@ -25,7 +25,7 @@ from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.run.folder import BACKBONE, SPARSE, RunFolder, load_sparse_model, save_sparse
 from msgs_slam.pipelines.run.stored import dataclass_from_json
 from msgs_slam.pipelines.source.opening import source_digest
-from msgs_slam.pipelines.structure import sfm
+from msgs_slam.pipelines.structure import candidates, sfm
 from msgs_slam.pipelines.structure.adjust import adjust
 from msgs_slam.pipelines.structure.window_size import windows_of
 from msgs_slam.pipelines.system.progress import SilentProgress
@@ -147,7 +147,7 @@ def test_a_stage_killed_again_and_again_ends_with_the_same_bytes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(sfm, "_PAIRS_PER_BLOCK", 16)
-    places = [("picking", 7), ("keyframes", 5), ("features", 3), ("matches", 1), ("mapping", 1), ("undistorting", 4)]
+    places = [("picking", 7), ("keyframes", 5), ("features", 3), ("matches", 1), ("camera model", 1), ("undistorting", 4)]
     for label, item in places:
         with pytest.raises(Killed):
             run(make_context(bent_walk.folder, progress=KillAt(label, item)))
@@ -298,10 +298,10 @@ def test_a_focal_length_that_ran_away_is_found_again_with_the_lens_held(
         sure.append(adjust(model, refine_camera, narrowly))
         return sure[0] + 0.1 * bent_walk.focal if len(sure) == 1 else sure[-1]
 
-    monkeypatch.setattr(sfm, "adjust", adjust_unsure)
+    monkeypatch.setattr(candidates, "adjust", adjust_unsure)
     context = make_context(bent_walk.folder)
     figures = run(context)
-    assert figures["mapper"] == sfm.LENS_HELD
+    assert figures["mapper"] == candidates.LENS_HELD
     assert len(sure) == 2
     assert figures["keyframes_placed"] == figures["keyframes"]
     focal, k1 = read_json(context.folder / "calibration.json")["intrinsics"]["fx"], bent_walk.k1
