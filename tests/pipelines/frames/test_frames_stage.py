@@ -147,7 +147,14 @@ def test_a_stage_killed_again_and_again_ends_with_the_same_bytes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(sfm, "_PAIRS_PER_BLOCK", 16)
-    places = [("picking", 7), ("keyframes", 5), ("features", 3), ("matches", 1), ("camera model", 1), ("undistorting", 4)]
+    places = [
+        ("picking", 7),
+        ("keyframes", 5),
+        ("features", 3),
+        ("matches", 1),
+        ("camera model", 1),
+        ("undistorting", 4),
+    ]
     for label, item in places:
         with pytest.raises(Killed):
             run(make_context(bent_walk.folder, progress=KillAt(label, item)))
