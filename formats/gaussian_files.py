@@ -33,7 +33,7 @@ def read_gaussians(path: Path) -> GaussianCloud:
         return read_splat(path)
     if kind == ".glb":
         return read_gaussian_glb(path)
-    raise InputError(f"{path} is no splat file by its name: expected .ply, .spz, .splat or .glb")
+    raise InputError(f"{path} has an unsupported extension; expected .ply, .spz, .splat or .glb")
 
 
 def read_splat(path: Path) -> GaussianCloud:

@@ -124,7 +124,7 @@ def read_depth_png(path: Path) -> NDArray[np.uint16]:
     """(H, W) uint16 depth in the file's own unit. Raises InputError unless the file holds one channel of 16 bits."""
     values = _read_one_channel(Path(path), "depth")
     if values.dtype == np.uint8:
-        raise InputError(f"{path} has 8 bits a pixel, depth needs 16: was it saved as a preview picture?")
+        raise InputError(f"{path} has 8 bits a pixel, depth needs 16: was it saved as a preview image?")
     return values.astype(np.uint16)
 
 
@@ -264,7 +264,7 @@ def _read_one_channel(path: Path, what: str) -> NDArray:
     with _opened(path) as image:
         image.load()
         if image.mode not in ("L", "P", "I", "1") and not image.mode.startswith("I;16"):
-            raise InputError(f"{path} is a colour picture ({image.mode}), {what} need one channel: give the raw maps")
+            raise InputError(f"{path} is a colour image ({image.mode}), {what} need one channel: give the raw maps")
         values = np.asarray(image)
     if values.dtype == bool:
         return values.astype(np.uint8)
@@ -287,7 +287,7 @@ def _quiet_open(file: IO[bytes]) -> Image.Image:
         try:
             return Image.open(file, formats=_FORMATS)
         except UnidentifiedImageError:  # whose own text shows Python's file object
-            raise ValueError("it begins like no picture that can be read here") from None
+            raise ValueError("its header is of no image format that can be read here") from None
 
 
 def _require_sane_size(image: Image.Image, name: str) -> None:

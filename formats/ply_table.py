@@ -168,7 +168,7 @@ def _require_whole(path: Path, head: bytes) -> None:
     needed = sum(count * max(size, 1) for count, size in zip(counts, row_bytes, strict=True))
     if needed > available:
         raise InputError(
-            f"{path} promises {needed / 1e6:.1f} MB of data and holds {available / 1e6:.1f}: "
+            f"{path} declares {needed / 1e6:.1f} MB of data and contains {available / 1e6:.1f}: "
             "it was not copied completely, copy or export it again"
         )
 

@@ -106,7 +106,7 @@ def _require_sane(path: Path, known: bool, count: int, degree: int, fraction_bit
     if not known or degree > _MOST_DEGREE:
         raise InputError(f"{path} is no SPZ file of version 2 to 4: export it with another program's default settings")
     if count * _LEAST_BYTES > most or fraction_bits > _MOST_FRACTION_BITS:
-        raise InputError(f"{path} promises {count} Gaussians, more than it can hold: it is damaged")
+        raise InputError(f"{path} declares {count} Gaussians, more than it can contain: it is damaged")
 
 
 def _unpacked(streams: list[NDArray[np.uint8]], degree: int, fraction_bits: int) -> GaussianCloud:

@@ -195,7 +195,7 @@ def _as_predicate(wanted: Callable[[int], bool] | Container[int] | None) -> Call
 def _require_video_bytes(path: Path) -> None:
     """Refuse what is certainly no video before FFmpeg sees it, to say so better than FFmpeg would."""
     if path.suffix.lower() in IMAGE_SUFFIXES:
-        raise InputError(f"{path} is one picture, not a video: give the folder that holds the pictures")
+        raise InputError(f"{path} is a single image, not a video: give the folder that contains the images")
     with opened(path) as file:
         head = file.read(_SNIFFED_BYTES)
     if b"\0" not in head and _is_text(head):
@@ -230,7 +230,7 @@ def _open(path: Path) -> cv2.VideoCapture:
 
 def _undecodable(path: Path) -> InputError:
     return InputError(
-        f"no picture can be decoded from {path}: it holds no video stream (audio only?), is damaged, or was not "
+        f"no image can be decoded from {path}: it contains no video stream (audio only?), is damaged, or was not "
         "copied completely: play it in a video player, and if it plays convert it with `ffmpeg -i IN -c:v libx264 "
         "OUT.mp4`"
     )

@@ -97,12 +97,12 @@ _SYSTEM_REFUSES = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.E
 @click.group(cls=FriendlyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(package_name="msgs-slam")
 def main() -> None:
-    """Turn a plain video into camera poses, a semantic Gaussian map and a labelled mesh.
+    """Turn an ordinary video into camera poses, a semantic 3D Gaussian map and a labelled mesh.
 
     \b
     msgs-slam demo                      try it on a small synthetic room (about 4 minutes on two cores)
     msgs-slam reconstruct video.mp4     the whole job; writes video.msgs/
-    msgs-slam resume video.msgs         go on after a stop
+    msgs-slam resume video.msgs         resume an interrupted run
     msgs-slam batch FOLDER --out RUNS   many recordings, on one machine or many
     msgs-slam work RUN --shard K/N      one of many processes at one long run
     msgs-slam status video.msgs         what is done, what was found
@@ -111,11 +111,11 @@ def main() -> None:
     msgs-slam render video.msgs out.mp4 the map along its camera path
     msgs-slam view video.msgs           the map in the browser
     msgs-slam evaluate video.msgs --truth DATASET    errors against a known truth
-    msgs-slam ablate SOURCE --truth DATASET          what each term of the method earns
+    msgs-slam ablate SOURCE --truth DATASET          ablation: what each term contributes
     msgs-slam models list               learned models for metric depth and named classes
-    msgs-slam doctor                    what this machine has for the program, and what to mend
+    msgs-slam doctor                    check this machine and suggest fixes
     msgs-slam config                    every setting with its default and meaning
-    msgs-slam completion bash           what makes a shell complete commands and options
+    msgs-slam completion bash           shell completion of commands and options
     """
     prepare_streams()
 
@@ -165,7 +165,7 @@ def reconstruct(
     config = load_config(config_file, [*overrides, *texts], base=existing_config(run))
     with (
         cluster_workers(engine_name, address, config, quiet, verbose) as (workers, config),
-        stopping_softly(f"Go on with: msgs-slam resume {run.root}"),
+        stopping_softly(f"Resume with: msgs-slam resume {run.root}"),
     ):
         records = run_reconstruct(one_source(sources, run), run, config, make_progress(quiet), until, workers)
     if not quiet:
@@ -191,7 +191,7 @@ def resume(
     verbose: bool,
     **about_source: str | None,
 ) -> None:
-    """Go on with RUN where it stopped. Finished stages are kept unless one of their settings is changed."""
+    """Resume RUN where it stopped. Finished stages are kept unless one of their settings is changed."""
     set_up_logging(quiet, verbose)
     from msgs_slam.pipelines.config import load_config
     from msgs_slam.pipelines.reconstruct import require_run
@@ -204,7 +204,7 @@ def resume(
     config = load_config(config_file, [*overrides, *source_settings(about_source)], base=load_settings(run))
     with (
         cluster_workers(engine_name, address, config, quiet, verbose) as (workers, config),
-        stopping_softly(f"Go on with: msgs-slam resume {run.root}"),
+        stopping_softly(f"Resume with: msgs-slam resume {run.root}"),
     ):
         records = run_resume(run, make_progress(quiet), config, until, workers)
     if not quiet:
@@ -311,7 +311,7 @@ def demo(
     config = load_config(config_file, [*overrides, *source_settings(about_source)])
 
     def reconstruct_clip(video: Path, run: RunFolder) -> None:
-        with stopping_softly(f"Go on with: msgs-slam resume {run.root}"):
+        with stopping_softly(f"Resume with: msgs-slam resume {run.root}"):
             records = run_reconstruct(video, run, config, make_progress(quiet))
         if not quiet:
             _print_summary(run.root, records)

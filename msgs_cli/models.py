@@ -128,5 +128,5 @@ def path(name: str) -> None:
     store = ModelStore.open()
     model = store.get(name)
     if not store.is_here(model):
-        raise InputError(f"{name} is not in {store.cache}; type: msgs-slam models pull {name}")
+        raise InputError(f"{name} is not in {store.cache}; run: msgs-slam models pull {name}")
     click.echo(str(store.path(model)))

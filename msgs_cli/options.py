@@ -48,7 +48,7 @@ def verbosity_options(command: Callable[..., None]) -> Callable[..., None]:
         help="json: progress, logs and errors on stderr as one JSON object a line.",
     )(command)  # fmt: skip
     command = click.option("-v", "--verbose", is_flag=True, help="Log what is decided and why.")(command)
-    return click.option("-q", "--quiet", is_flag=True, help="No bars and no table; only errors.")(command)
+    return click.option("-q", "--quiet", is_flag=True, help="Print errors only.")(command)
 
 
 def settings_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -109,7 +109,7 @@ def cluster_workers(
 _SOURCE_OPTIONS = {
     "format": (
         "run.format", "NAME",
-        "What SOURCE is: auto, images (a video or plain images, whatever lies beside them), or a data set: 7scenes, "
+        "Kind of SOURCE: auto, images (a video or plain images, whatever is next to them), or a data set: 7scenes, "
         "replica, tum, euroc, scannet, sens, nerfstudio, colmap, folder. Default: auto. A data set gives its times and "
         "camera, and with --depth files --semantics files its depth and labels.",
     ),
@@ -136,7 +136,7 @@ _SOURCE_OPTIONS = {
     "camera": (
         "frames.camera", "auto|perspective|equirectangular|fisheye",
         "Kind of camera: equirectangular for whole 360° panoramas, fisheye for a lens given by --intrinsics (k1 to k4 "
-        "of OpenCV's fisheye). Default: auto, what the source says of itself.",
+        "of OpenCV's fisheye). Default: auto, from the source's metadata.",
     ),
     "poses": (
         "frames.poses", "FILE|FOLDER",
@@ -145,23 +145,22 @@ _SOURCE_OPTIONS = {
     ),
     "masks": (
         "frames.masks", "FOLDER",
-        "What is no part of the scene: NAME.png for a picture NAME, or the frame's number in the video; black is left "
-        "out.",
+        "Folder of masks: NAME.png for an image NAME, or the frame's number for a video. Black pixels are ignored.",
     ),
     "scale-ref": (
         "proxy.scale_ref", "REF",
-        "Metres without metric depth: PICTURE:X1,Y1,X2,Y2=METRES, two pixels of one picture, height=METRES, "
+        "Metres without metric depth: IMAGE:X1,Y1,X2,Y2=METRES, two pixels of one image, height=METRES, "
         "or poses: those of --poses are in metres.",
     ),
     "scale": (
         "export.scale", "auto|free",
-        "Without metric depth or --scale-ref, auto says how many metres a unit is about; free does not guess. Neither "
-        "changes any length. Default: auto.",
+        "auto: estimate metres per unit where neither metric depth nor --scale-ref gives them; free: do not. Neither "
+        "rescales coordinates. Default: auto.",
     ),
     "gps": (
         "export.gps", "FILE",
         "Where it was taken, for files with x east, y north in metres: a GPX track, or a CSV with the columns time, "
-        "lat, lon, alt (a video counts from its start). Default: auto, the pictures' EXIF; off for neither.",
+        "lat, lon, alt (a video counts from its start). Default: auto, the images' EXIF; off for neither.",
     ),
 }  # fmt: skip
 """Option → the setting it stands for, what is given, help."""

@@ -65,7 +65,7 @@ class FramesConfig:
     max_side: int = setting(960, "longer images are reduced to this many pixels on the long side", within=(64, 8192))
     intrinsics: str = setting("", "fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file; empty = find them")
     camera: str = setting(
-        "auto", "auto: what the source says of itself; a panorama becomes six pictures, a fisheye of known lens one",
+        "auto", "auto: from the source's metadata; a panorama becomes six images, a fisheye of known lens one",
         ("auto", "perspective", "equirectangular", "fisheye"),
     )  # fmt: skip
     poses: str = setting("", "poses to start from: a COLMAP model, transforms.json, ARKit's JSON, TUM or 4x4 lines")
@@ -83,7 +83,7 @@ class FramesConfig:
     loop_candidates: int = setting(
         4, "each keyframe is also matched with this many that look alike, for loops", within=(0, 1000)
     )
-    masks: str = setting("", "folder of masks, NAME.png for each picture or some: black is no part of the scene")
+    masks: str = setting("", "folder of masks, NAME.png for each image or some; black pixels are ignored")
     people: str = setting(
         "auto", "auto leaves people out where networks for them are in the cache; keep takes them for scene",
         ("auto", "keep"),
@@ -101,13 +101,13 @@ class ProxyConfig:
 
     depth: str = setting("auto", "depth provider: auto, multiview, files[:FOLDER], onnx:CARD, a network's name")
     semantics: str = setting("auto", "semantics provider: auto, segments, files[:FOLDER], onnx:CARD, a network's name")
-    classes: str = setting("", "words to look for, comma-separated, for a network that compares pictures with words")
+    classes: str = setting("", "words to look for, comma-separated, for a network that compares images with words")
     frames: str = setting("keyframes", "which frames get maps; all needs depth without poses", ("keyframes", "all"))
     max_side: int = setting(640, "the maps are at most this many pixels on the long side", within=(64, 8192))
     depth_scale: float = setting(0.001, "metres per unit of integer depth files", within=(1e-9, 1000))
     scale_ref: str = setting(
         "",
-        "what makes metres without metric depth: PICTURE:X1,Y1,X2,Y2=METRES, two pixels of one picture of the source "
+        "what makes metres without metric depth: IMAGE:X1,Y1,X2,Y2=METRES, two pixels of one image of the source "
         "(an image's name or a video frame's number; the first pixel's centre is 0.5,0.5), height=METRES of the "
         "camera over the floor, or poses: those of frames.poses are in metres",
     )
@@ -192,7 +192,7 @@ class ExportConfig:
     )
     gps: str = setting(
         "auto",
-        "x east, y north, metres: auto by GPS in the pictures' EXIF, off, or a track (GPX, or CSV of time, lat, lon)",
+        "x east, y north, metres: auto by GPS in the images' EXIF, off, or a track (GPX, or CSV of time, lat, lon)",
     )
     voxel: float = setting(0.008, "voxel of the mesh, in units of the scene's median depth", within=(0.0005, 1))
     max_blocks: int = setting(
@@ -223,7 +223,7 @@ class ArticleConfig:
         0.0, "κ of eq. (7), in units of the scene's median depth; 0 = off", stages=_MAPPING, within=(0, 1000)
     )
     edge_weight: float = setting(
-        0.0, "λ_E of eq. (18), the edge term (19), 0.02 in the article", stages=_MAPPING, within=(0, 1000)
+        0.0, "λ_E of eq. (18), the edge term (19), 0.02 in the paper", stages=_MAPPING, within=(0, 1000)
     )
     label_image: bool = setting(False, "eq. (20) for the labels instead of cross-entropy", stages=_MAPPING)
     class_growth: bool = setting(False, "grow the map where it shows another class than the label", stages=_MAPPING)

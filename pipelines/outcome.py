@@ -90,7 +90,7 @@ class Outcome:
     def require_map(self) -> GaussianMap:
         """The map. Raises InputError before mapping is done."""
         if self.gaussian_map is None:
-            raise InputError(f"{self.run.root}: there is no map yet. Type `msgs-slam resume {self.run.root}` first")
+            raise InputError(f"{self.run.root}: there is no map yet. Run `msgs-slam resume {self.run.root}` first")
         return self.gaussian_map
 
     def load_sparse(self) -> SparseModel | None:
@@ -137,7 +137,7 @@ def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:
     pose_stage = next((s for s in _POSE_STAGES if s in records), "")
     if not pose_stage:
         raise InputError(
-            f"{run.root}: no camera poses yet (tracking is not done). Type `msgs-slam resume {run.root}` first"
+            f"{run.root}: no camera poses yet (tracking is not done). Run `msgs-slam resume {run.root}` first"
         )
     trajectory = run.load_trajectory(pose_stage)
     map_stage = next((s for s in _MAP_STAGES if s in records), "")

@@ -115,7 +115,7 @@ def resume(
     """Go on with a run from its own settings, or from `config`."""
     require_run(run)
     if run.is_piece:
-        raise InputError(f"{run.root} is a piece of {run.root.parent}: type `msgs-slam resume {run.root.parent}`")
+        raise InputError(f"{run.root} is a piece of {run.root.parent}: run `msgs-slam resume {run.root.parent}`")
     origin = load_source(run)
     source = Path(origin.path)
     config = config or load_settings(run)
@@ -153,7 +153,7 @@ def _run(
     threads: int = 0,
 ) -> dict[str, StageRecord]:
     def same_source() -> None:
-        kept = f"What is done so far is kept: bring it back, then type `msgs-slam resume {run.root}`"
+        kept = f"What is done so far is kept: bring it back, then run `msgs-slam resume {run.root}`"
         try:
             same = source_digest(source, config.run.format) == digest
         except InputError as error:

@@ -66,8 +66,8 @@ class RunStatus:
         """What stages plan with here, and what the ones that are done have needed most."""
         peaks = {s.name: s.record.peak_memory_mb for s in self.stages if s.record}
         most = max(peaks, key=lambda name: peaks[name], default="")
-        needed = f"; at most {peaks[most]:.0f} MB were needed ({most})" if most else ""
-        return f"memory: planned with {self.planned_mb:.0f} MB{needed}"
+        needed = f"peak {peaks[most] / 1000:.1f} GB in {most} " if most else ""
+        return f"memory: {needed}(budget {self.planned_mb / 1000:.1f} GB)"
 
     @property
     def warnings(self) -> list[str]:
@@ -94,7 +94,7 @@ class RunStatus:
         """What is no fault, and good to know."""
         return [
             f"{s.name} keeps what auto chose when it was made ({', '.join(s.newer)}); other networks are there by now: "
-            f"to have it chosen anew, delete {self.run.stage(s.name)} and type `msgs-slam resume {self.run.root}`"
+            f"to have it chosen anew, delete {self.run.stage(s.name)} and run `msgs-slam resume {self.run.root}`"
             for s in self.stages
             if s.newer
         ]

@@ -326,10 +326,10 @@ class Metres:
 
     @property
     def text(self) -> str:
-        """1 unit = about 0.83 m ± 18 % (a guess, from floor height and 2 doors)."""
+        """1 unit = about 0.83 m ± 18 % (estimated from floor height and 2 doors)."""
         *first, last = self.sources or ("nothing in particular",)
         told = f"{', '.join(first)} and {last}" if first else last
-        about, guess = ("about ", "a guess, ") if self.is_guess else ("", "")
+        about, guess = ("about ", "estimated ") if self.is_guess else ("", "")
         percent = 100 * self.relative_sd
         spread = f"{percent:.0f}" if percent >= 2 else f"{percent:.1f}"
         return f"1 unit = {about}{self.per_unit:.{2 if self.is_guess else 3}g} m ± {spread} % ({guess}from {told})"

@@ -130,7 +130,7 @@ def _read_index(
 ) -> tuple[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64], NDArray[np.float64]]:
     """(starts, colour bytes, depth bytes) of each frame, poses (N, 4, 4) and times (N,) as stored."""
     if count < 1 or count * _FRAME_HEAD.size > size:
-        raise InputError(f"{path} promises {count} frames in {size / 1e6:.1f} MB: it is damaged, copy it again")
+        raise InputError(f"{path} declares {count} frames in {size / 1e6:.1f} MB: it is damaged, copy it again")
     rows, poses, times = [], [], []
     for i in range(count):
         *matrix, color_time, _, color_bytes, depth_bytes = _unpack(file, _FRAME_HEAD.format, path)

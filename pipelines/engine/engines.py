@@ -31,7 +31,7 @@ _ANSWERS_WITHIN, _ENDS_WITHIN = 5.0, 20.0
 """Seconds: for an address to answer, for cancelled calls to end by themselves."""
 _BETWEEN_LOOKS, _HEAD_WITHIN = 5.0, 30.0
 """Seconds from one look for Ray's head to the next, and after which it will not come back."""
-_GO_ON = "What the tasks have done is kept: type `msgs-slam resume RUN`, with --engine ray once it is back, or without"
+_GO_ON = "What the tasks have done is kept: run `msgs-slam resume RUN`, with --engine ray once it is back, or without"
 _SETTINGS = b"\x04"
 _HTTP2 = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + _SETTINGS + bytes(5)
 """How gRPC, which Ray speaks, begins a connection, and the kind of frame it begins to answer with (RFC 9113, 3.4)."""
@@ -152,7 +152,7 @@ class RayEngine:
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise InputError(
                 f"no Ray cluster could be joined at {address or 'this machine'} ({str(error)[:300]}). Start one with "
-                "`ray start --head`, with the same versions of Python and Ray on every node, or leave --address away"
+                "`ray start --head`, with the same versions of Python and Ray on every node, or omit --address"
             ) from error
 
     @property
@@ -268,5 +268,5 @@ def _require_answer(address: str) -> None:
     except (OSError, OverflowError) as error:
         raise InputError(
             f"no Ray answers at {address} ({error}, after {time.monotonic() - started:.0f} s). Start one there with "
-            "`ray start --head`, mind the firewall, or leave --address away: then this machine works alone"
+            "`ray start --head`, mind the firewall, or omit --address to use this machine alone"
         ) from error

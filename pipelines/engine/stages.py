@@ -274,7 +274,7 @@ def _run_one(stage: Stage, context: StageContext, fingerprint: str, inputs: Any)
     except OSError as error:
         if is_disk_full(error, run.root):
             raise DiskFullError(
-                f"{run.root}: the disk is full. Free some space and type `msgs-slam resume {run.root}`"
+                f"{run.root}: the disk is full. Free some space and run `msgs-slam resume {run.root}`"
             ) from error
         raise
     shutil.rmtree(folder / "snapshot", ignore_errors=True)

@@ -69,7 +69,7 @@ class Workers:
         for ended in self.engine.run(calls):
             if ended.failure:
                 raise RecoverableError(
-                    f"{ended.call.name}: {ended.failure.rstrip()}\nWhat the other tasks have done is kept: type "
+                    f"{ended.call.name}: {ended.failure.rstrip()}\nWhat the other tasks have done is kept: run "
                     f"`msgs-slam resume {folder.parent}`"
                 )
             refused, found[ended.call.name] = ended.value

@@ -39,7 +39,7 @@ _NOTES = (
     "Frames and proxies are the same in all runs, made once with the first seed; from tracking on, every seed is a run "
     "of its own, and every row from the first stage that it changes.",
     "Cells are means ± standard deviations over the seeds (of one seed: the figure).",
-    "Errors and qualities as in `msgs-slam evaluate`; pictures at keyframes, and where frames are held out at refined "
+    "Errors and qualities as in `msgs-slam evaluate`; images at keyframes, and where frames are held out at refined "
     "own poses.",
 )
 
@@ -214,7 +214,7 @@ def _value(
             return None
         at = at[key]
     if isinstance(at, dict) or at is None:
-        missing.setdefault(column, at["missing"] if at else "every picture is equal to its frame")
+        missing.setdefault(column, at["missing"] if at else "every image is equal to its frame")
         return None
     return factor * float(at)
 

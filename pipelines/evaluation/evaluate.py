@@ -31,9 +31,9 @@ PROTOCOL = (
     "ATE: distance of camera centres after one alignment (Umeyama) over the frames it is given for; Sim(3) finds the "
     "scale, SE(3) does not.",
     "RPE: motion from one frame with truth to the next, at the scale of Sim(3).",
-    "PSNR and SSIM (Gaussian window 11, sigma 1.5) of 8-bit pictures of the frames' full size, with the exposure that "
+    "PSNR and SSIM (Gaussian window 11, sigma 1.5) of 8-bit images of the frames' full size, with the exposure that "
     "the run found; mean over views; LPIPS on AlexNet where the extra is installed. Refined poses are those from which "
-    "the map looks most like the picture; true poses are carried into the run's world by the alignment.",
+    "the map looks most like the image; true poses are carried into the run's world by the alignment.",
     "Depth of the map: the surface at which half the light is lost, against the true depth at the same pixel, over "
     "all views with true depth; pixels without either are left out of L1 and shown as the valid fraction.",
     "Labels: one confusion matrix over all views; pixels without a true class are left out, pixels to which the map "

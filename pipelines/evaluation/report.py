@@ -155,7 +155,7 @@ def _piece_section(piece: Outcome, progress: Progress) -> str:
     return section(
         f"Apart from the rest: {name.replace('_', ' ')}",
         chips([*_figures(piece, views), ("seconds of the source", seconds)]),
-        "<p>Nothing tells how it lies to the rest: it has a world and a unit of its own. "
+        "<p>It is not connected to the rest: it has a coordinate system and a unit of its own. "
         f"<code>msgs-slam report {escape(str(piece.run.root))}</code> says more; view and render take it, too.</p>",
         '<div class="two">', *trajectory_plots(piece, None), "</div>", "" if views is None else views.sheet,
     )  # fmt: skip

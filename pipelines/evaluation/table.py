@@ -64,7 +64,7 @@ def _trajectory_rows(cells: dict[str, Any], stage: str) -> list[Row]:
 def _scale_rows(cells: dict[str, Any]) -> list[Row]:
     if "missing" in cells:
         return _missing("metres per unit", cells)
-    text = f"{cells['stated']:.4g} ± {cells['relative sd']:.1%}{', a guess' if cells['guess'] else ''}"
+    text = f"{cells['stated']:.4g} ± {cells['relative sd']:.1%}{', estimated' if cells['guess'] else ''}"
     return [("metres per unit", text, f"true {cells['true']:.4g}, {cells['sigmas']:.1f} sigmas off")]
 
 

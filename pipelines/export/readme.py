@@ -89,7 +89,7 @@ _ENTRIES = (
     ),
     Entry(
         "mesh_textured.obj, .mtl, .png, .glb",
-        "a tenth of the mesh's vertices, and its surface as a picture made from the keyframes' photographs, exposure "
+        "a tenth of the mesh's vertices, and its surface as an image made from the keyframes' photographs, exposure "
         "removed. OBJ: a group for each class.",
         "texture", f"{_SET.format('texture')}, or {_ONLY.format('texture')}",
     ),
@@ -101,9 +101,10 @@ _ENTRIES = (
         "of it for a look from afar; tiles.json says where each lies.",
     ),
     Entry(
-        "piece_2/ and so on", "where nothing joins some frames to the rest: the same of them in a world of their own."
+        "piece_2/ and so on",
+        "where some frames are not connected to the rest: the same for them, in a coordinate system of their own.",
     ),
-    Entry("world.json", "what the axes are, what told which way is up, and how this world lies to the run's own.", "*"),
+    Entry("world.json", "what the axes are, how up was found, and the transform from the run's own frame.", "*"),
 )  # fmt: skip
 
 _UPRIGHT = """\

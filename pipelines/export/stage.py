@@ -157,7 +157,7 @@ def metres_figures(metres: Metres | None) -> dict[str, Any]:
     return {
         "metres_per_unit": round(metres.per_unit, 4),
         "metres_relative_sd": round(metres.relative_sd, 4),
-        "metres_are": "a guess" if metres.is_guess else "given",
+        "metres_are": "estimated" if metres.is_guess else "given",
         "metres_from": ", ".join(metres.sources),
         "metres_disagreement": round(metres.disagreement, 2),
     }
@@ -201,8 +201,8 @@ def find_world(outcome: Outcome, settings: ExportConfig) -> tuple[World, list[st
     reasons = []
     if settings.axes == "up" and world.axes != "up":
         reasons.append(
-            "neither a floor nor upright lines tell which way is up: the files keep the axes of the run, about "
-            "those of the first posed camera"
+            "neither a floor nor vertical lines were found, so up is unknown: the files keep the axes of the run, "
+            "roughly those of the first posed camera"
         )
     world, reason = world_on_earth(outcome, world, settings.gps)
     return world, [*reasons, reason] if reason else reasons

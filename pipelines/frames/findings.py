@@ -26,7 +26,7 @@ def settled_origin(context: StageContext, origin: str, camera: pycolmap.Camera, 
     if list(found.params) == list(camera.params):
         return "given"
     context.warn(
-        f"the camera that the data set states (focal length {camera.mean_focal_length():.0f} px) explains the pictures "
+        f"the camera that the data set states (focal length {camera.mean_focal_length():.0f} px) explains the images "
         f"much worse than one found from them ({found.mean_focal_length():.0f} px), which is used instead. To hold a "
         "camera in any case give it with --intrinsics"
     )
@@ -43,33 +43,33 @@ def warn_of_structure(context: StageContext, structure: Structure, ids: list[int
     for piece in structure.pieces:
         inside = sorted(ids[i - 1] for i in piece.reg_image_ids())
         context.warn(
-            f"{len(inside)} of them, frames {inside[0]}-{inside[-1]}, fit among each other: what tracking does not "
-            "find elsewhere becomes a piece of its own"
+            f"{len(inside)} of them, frames {inside[0]}-{inside[-1]}, are consistent with each other: unless tracking "
+            "connects them, they become a separate piece"
         )
     parts = [p for p in report.parts if len(p) >= _LEAST_PART]
     if len(parts) > 1:
         named = ", ".join(f"{ids[p[0]]}-{ids[p[-1]]}" for p in parts)
         context.warn(
-            f"structure from motion fell into {len(parts)} parts that nothing holds together (frames {named}): "
-            "tracking joins what it recognises"
+            f"structure from motion gave {len(parts)} disconnected parts (frames {named}): "
+            "tracking joins those it recognises"
         )
     alone = sorted(ids[k] for p in report.parts if len(p) < _LEAST_PART for k in p)
     if alone:
         context.warn(
-            f"{len(alone)} keyframes have hardly a point in common with the others (frames "
-            f"{', '.join(map(str, alone))}): tracking looks for them again"
+            f"{len(alone)} keyframes share hardly any points with the others (frames "
+            f"{', '.join(map(str, alone))}): tracking searches for them again"
         )
     folds = ", ".join(f"{ids[s.before]}-{ids[s.after]}" for s in report.contradicted)
     agreeing = f"{report.pairs_agreeing:.0%} of the matched pairs of views agree with it (mapper: {structure.mapper})"
     if folds:
         context.warn(
-            f"the camera's path may be folded between frames {folds}, where neighbouring pictures contradict it: "
+            f"the camera's path may be folded between frames {folds}, where neighbouring images contradict it: "
             f"{agreeing}"
         )
     elif report.pairs_agreeing < 0.9:
         context.warn(
-            f"pictures taken far apart contradict the camera's path: {agreeing}. Either things that repeat were taken "
-            "for each other, which does no harm, or a loop is not closed"
+            f"images taken far apart contradict the camera's path: {agreeing}. Either repeated structures were "
+            "confused, which is harmless, or a loop is not closed"
         )
 
 

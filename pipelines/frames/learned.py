@@ -101,7 +101,7 @@ def _required(store: ModelStore) -> Model:
         size = (model.bytes + store.get(model.needs).bytes) / 1e6
         raise InputError(
             f"frames.features=aliked needs {EXTRACTOR} and {MATCHER} ({size:.0f} MB), which are not in {store.cache}; "
-            f"type: msgs-slam models pull {EXTRACTOR}"
+            f"run: msgs-slam models pull {EXTRACTOR}"
         )
     return model
 
@@ -109,7 +109,7 @@ def _required(store: ModelStore) -> Model:
 def _opened(store: ModelStore, model: Model) -> Runtime:
     path: Path = store.path(model)
     if file_sha256(path) != model.sha256:
-        raise InputError(f"{path}: is damaged; type: msgs-slam models pull {model.name}")
+        raise InputError(f"{path}: is damaged; run: msgs-slam models pull {model.name}")
     # One thread each: pairs and pictures already go side by side, and results must not depend on how many there are.
     runtime = open_runtime(path, [], 1, "cpu")
     if set(runtime.inputs) != _INPUTS[model.name]:

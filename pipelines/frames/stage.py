@@ -71,7 +71,7 @@ def run(context: StageContext) -> dict[str, Any]:
     faces = find_faces(source, context.config.frames)
     if faces is None and looks_like_panoramas(source, context.config.frames):
         context.warn(
-            "the pictures are twice as wide as high, as 360° panoramas are: of such, say --camera equirectangular"
+            "the images are twice as wide as high, like 360° panoramas: if they are, pass --camera equirectangular"
         )
     camera, origin = known_camera(context, source, faces)
     _require_several(source)
@@ -104,7 +104,7 @@ def places_figure(source: Source, frames: list[Frame]) -> dict[str, str]:
         return {}
     places = photo_places([source.file(frame.source_index) for frame in frames])
     count = int(np.isfinite(places[:, :2]).all(axis=1).sum())
-    return {"gps": f"of {count} of {len(frames)} pictures"} if count else {}
+    return {"gps": f"of {count} of {len(frames)} images"} if count else {}
 
 
 def check(source: Path, config: Config) -> None:
@@ -131,7 +131,7 @@ def _check_panoramas(config: Config) -> None:
     if files or (reference and not reference.startswith("height")):
         what = f"{files[0]!r}" if files else f"--scale-ref {reference}"
         raise InputError(
-            f"{what} cannot be used with panoramas: leave it away; --scale-ref height=METRES, the camera over the "
+            f"{what} cannot be used with panoramas: omit it; --scale-ref height=METRES, the camera over the "
             "floor, makes metres"
         )
 
@@ -260,8 +260,8 @@ def _calibration(context: StageContext, lens: Lens, origin: str, focal_sd: float
     focal_sd *= lens.pinhole.fx / lens.camera.focal_length_x
     if focal_sd > _UNSURE_FOCAL * lens.pinhole.fx:
         context.warn(
-            f"the focal length is unsure: {lens.pinhole.fx:.0f} ± {focal_sd:.0f} px. If you know them, "
-            "give the intrinsics with --intrinsics"
+            f"the focal length is uncertain: {lens.pinhole.fx:.0f} ± {focal_sd:.0f} px. If you know the intrinsics, "
+            "pass --intrinsics"
         )
     if faces is None:
         return Calibration(lens.pinhole, origin, focal_sd, distortion_of(lens.camera))

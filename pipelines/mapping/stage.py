@@ -78,7 +78,7 @@ def _require_views(context: StageContext, kept: Sequence[int]) -> tuple[int, ...
             "warnings of the proxy stage, or give depth with --depth files:FOLDER"
         )
     if without:
-        context.warn(f"{without} of {len(kept)} keyframes have no proxy depth; they count by their colours only")
+        context.warn(f"{without} of {len(kept)} keyframes have no proxy depth: only their colours are used")
     return class_ids
 
 

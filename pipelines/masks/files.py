@@ -57,14 +57,14 @@ def open_masks(folder: Path, source: Source) -> MaskFiles:
             else "that of the image with .png after it"
         )
         raise InputError(
-            f"--masks {folder}: {len(strangers)} of {len(files)} files belong to no picture, the first is "
+            f"--masks {folder}: {len(strangers)} of {len(files)} files belong to no image, the first is "
             f"{strangers[0].name}. The name of a mask is {rule}"
         )
     for path in paths.values():
         if (size := image_size(path)) != (source.width, source.height):
             raise InputError(
-                f"{path} is {size[0]}x{size[1]}, the pictures are {source.width}x{source.height}: make masks of the "
-                "pictures as they are"
+                f"{path} is {size[0]}x{size[1]}, the images are {source.width}x{source.height}: make masks of the "
+                "same size"
             )
     return MaskFiles(paths)
 

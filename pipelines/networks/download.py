@@ -87,7 +87,7 @@ def _fetch_one(url: str, part: Path, size: int, progress: Callable[[int, int], N
             if error.code == 416 and before:  # the part is longer than the file: it belongs to another one
                 _discard(part)
                 continue
-            return f"the server says {error.code} {error.reason}"
+            return f"the server answers {error.code} {error.reason}"
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
                 raise DiskFullError(

@@ -161,7 +161,7 @@ class ModelStore:
                 raise
             raise InputError(
                 f"{error}\nIts makers may have replaced the file since its hash was recorded. If you trust the new "
-                f"one, download it yourself and type: msgs-slam models add FILE --family {model.family}"
+                f"one, download it yourself and run: msgs-slam models add FILE --family {model.family}"
             ) from error
         if not model.sha256:
             own = self._load_own()

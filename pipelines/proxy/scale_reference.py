@@ -28,7 +28,7 @@ _HEIGHT = re.compile(rf"height\s*={_NUMBER}m?")
 POSES = "poses"
 """The reference that says that given poses are in metres."""
 _HOW = (
-    "PICTURE:X1,Y1,X2,Y2=METRES (two pixels of one picture of the source), height=METRES (camera over the floor) or "
+    "IMAGE:X1,Y1,X2,Y2=METRES (two pixels of one image of the source), height=METRES (camera over the floor) or "
     "poses (those given with --poses)"
 )
 _LEAST_APART = 8.0
@@ -79,7 +79,7 @@ def require_reference_in(source: Source, text: str) -> None:
     _picture_index(source, reference.picture)
     inside = all(0 <= x <= source.width and 0 <= y <= source.height for x, y in reference.points)
     if not inside:
-        raise InputError(f"--scale-ref {text}: a pixel lies outside the picture ({source.width}x{source.height})")
+        raise InputError(f"--scale-ref {text}: a pixel lies outside the image ({source.width}x{source.height})")
 
 
 def distance_scale(
@@ -93,7 +93,7 @@ def distance_scale(
     index = _picture_index(source, reference.picture)
     picture = next(iter(source.read({index})), None)
     if picture is None:
-        raise InputError(f"--scale-ref: the source has no picture {reference.picture}")
+        raise InputError(f"--scale-ref: the source has no image {reference.picture}")
     points = np.array(reference.points) * [
         sequence.intrinsics.width / picture.rgb.shape[1], sequence.intrinsics.height / picture.rgb.shape[0]
     ]  # fmt: skip
@@ -108,8 +108,8 @@ def distance_scale(
             relative_sds.append(_PIXEL_SD * np.sqrt(2) / float(np.linalg.norm(followed[1] - followed[0])))
     if not lengths:
         raise InputError(
-            f"--scale-ref: no keyframe near picture {reference.picture} has reliable depth at both points. Choose "
-            "corners of things, in a picture that was taken while moving"
+            f"--scale-ref: no keyframe near image {reference.picture} has reliable depth at both points. Choose "
+            "corners of objects, in an image that was taken while moving"
         )
     length = float(np.median(lengths))
     spread = 1.4826 * float(np.median(np.abs(np.array(lengths) / length - 1)))

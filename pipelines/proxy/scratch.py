@@ -23,4 +23,4 @@ def load_scratch(path: Path) -> dict[str, NDArray]:
     try:
         return load_arrays(path, own=True)
     except InputError as error:
-        raise InputError(f"{error}; delete it and type `msgs-slam resume`") from error
+        raise InputError(f"{error}; delete it and run `msgs-slam resume`") from error

@@ -96,7 +96,7 @@ def choose_semantics(config: ProxyConfig) -> Choice:
     if choice.card is None or choice.card.text is None:
         if config.classes:
             raise InputError(
-                "proxy.classes: a network that compares pictures with words finds them, --semantics onnx:CARD.toml "
+                "proxy.classes: a network that compares images with words finds them, --semantics onnx:CARD.toml "
                 f"whose card has `text`; {choice.card.name if choice.card else choice.kind} does not"
             )
         return choice
@@ -178,7 +178,7 @@ def _read(text: str) -> Card:
     if model is None:
         return read_card(Path(text))
     if not store.is_here(model):
-        raise InputError(f"{text} is not in {store.cache}; type: msgs-slam models pull {text}")
+        raise InputError(f"{text} is not in {store.cache}; run: msgs-slam models pull {text}")
     return store.card(model)
 
 
@@ -206,7 +206,8 @@ def missing_networks() -> str | None:
     if not lacks:
         return None
     size = sum(m.bytes for m in store.with_needed([])) / 1e6
-    return f"no networks for {', '.join(lacks)} are here: `msgs-slam models pull` fetches them ({size:.0f} MB, once)"
+    named = ", ".join(lacks)
+    return f"no networks for {named} are installed: `msgs-slam models pull` fetches them ({size:.0f} MB, once)"
 
 
 def _multiview(around: Surroundings) -> MultiviewDepth:

@@ -120,7 +120,7 @@ def _warn_of_distortion(
     if strongest > 0.005 and any(p.name.startswith("files:") for p in (depths, semantics)):
         context.warn(
             f"the frames were undistorted (coefficients up to {strongest:.3f}), but map files are taken as they are: "
-            "towards the borders they lie some pixels off. Give maps of undistorted pictures"
+            "towards the borders they are some pixels off. Give maps of undistorted images"
         )
 
 

@@ -79,12 +79,12 @@ class FinishedFiles:
         if manifest is None:
             return path
         if stage not in manifest.records:
-            raise InputError(f"{self.root}: {stage} is not done. Type `msgs-slam resume {self.root}` first")
+            raise InputError(f"{self.root}: {stage} is not done. Run `msgs-slam resume {self.root}` first")
         expected = manifest.records[stage].files.get(name)
         if expected is None or not self._is_intact(path, *expected):
             what = "is gone" if not path.is_file() else "is not as the program left it: damaged or changed"
             raise InputError(
-                f"{path} {what}. Type `msgs-slam resume {self.root}`: {stage} and what follows are made again"
+                f"{path} {what}. Run `msgs-slam resume {self.root}`: {stage} and what follows are made again"
             )
         return path
 

@@ -73,7 +73,7 @@ class Journal:
         if torn:
             raise RecoverableError(
                 f"{self.folder / torn[0]} is not what was written there ({len(torn)} such files): the disk may be full "
-                f"or failing. Type `msgs-slam resume {self.folder.parent}`"
+                f"or failing. Run `msgs-slam resume {self.folder.parent}`"
             )
         for path in self.files():
             path.unlink(missing_ok=True)

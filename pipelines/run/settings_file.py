@@ -40,7 +40,7 @@ def load_settings(run: RunFolder) -> Config:
         if not (records := load_records(run)):
             raise InputError(
                 f"{run.root} was stopped before its settings were written, or {run.settings_file.name} is gone, and "
-                f"nothing is finished: type `msgs-slam reconstruct {load_source(run).path} --out {run.root}` with the "
+                f"nothing is finished: run `msgs-slam reconstruct {load_source(run).path} --out {run.root}` with the "
                 "options it had"
             )
         log.warning("%s is gone: stages that are not done get default settings", run.settings_file)
@@ -51,7 +51,7 @@ def load_settings(run: RunFolder) -> Config:
     as_written = mark is not None and mark[1] == _check(run, text[mark.end() :])
     if not as_written:
         raise InputError(
-            f"{run.settings_file} is not as the program left it: damaged, or edited by hand. Delete it and type "
+            f"{run.settings_file} is not as the program left it: damaged, or edited by hand. Delete it and run "
             f"`msgs-slam resume {run.root}`: what the finished stages were made with is kept in manifest.json. "
             "(Settings are changed with --set SECTION.KEY=VALUE, or with --config FILE, which may be a copy of it)"
         )

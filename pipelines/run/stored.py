@@ -43,7 +43,7 @@ MIRROR_PAIRS = {"of_frame": "i K", "pairs": "f K 4", "confidence": "f K", "gain"
 
 def what_to_do(path: Path) -> str:
     """Advice for a file of a run that cannot be used."""
-    return f"delete {path.name} and type `msgs-slam resume` for this run: the stage that wrote it makes it again"
+    return f"delete {path.name} and run `msgs-slam resume` for this run: the stage that wrote it makes it again"
 
 
 def reading(path: Path, what: str) -> Any:

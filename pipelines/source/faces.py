@@ -80,8 +80,8 @@ def find_faces(source: VideoSource | FolderSource | RecordingSource, config: Fra
     kind = _said(source) if config.camera == "auto" else config.camera
     if kind == PART:
         raise InputError(
-            f"{source.path} says that it shows a part of a sphere, or one for each eye: export it as one whole "
-            "equirectangular picture, twice as wide as high, or take it for plain with --camera perspective"
+            f"{source.path} declares a partial or stereo panorama: export it as one full equirectangular "
+            "image, twice as wide as high, or treat it as an ordinary image with --camera perspective"
         )
     if kind == WHOLE:
         return panorama_faces(source.width, source.height, config.max_side)
@@ -123,8 +123,8 @@ def panorama_faces(width: int, height: int, max_side: int) -> Faces:
     """
     if abs(width - 2 * height) > 0.01 * width:
         raise InputError(
-            f"an equirectangular panorama is twice as wide as high, these pictures are {width}x{height}: export them "
-            "whole and for one eye, or take them for plain with --camera perspective"
+            f"an equirectangular panorama is twice as wide as high, these images are {width}x{height}: export them "
+            "full and mono, or treat them as ordinary images with --camera perspective"
         )
     # In its middle a side then has as many pixels to the degree as the panorama has.
     side = max(16, round(min(width / math.pi, max_side) / 2) * 2)

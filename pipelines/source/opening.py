@@ -248,7 +248,7 @@ def _require_one_size(folder: Path, sizes: dict[str, tuple[int, int]], what: str
 def _require_size(rgb: NDArray[np.uint8], width: int, height: int, what: str) -> None:
     if rgb.shape[:2] != (height, width):
         raise InputError(
-            f"{what} is {rgb.shape[1]}x{rgb.shape[0]}, the pictures before it are {width}x{height}: convert the source "
+            f"{what} is {rgb.shape[1]}x{rgb.shape[0]}, the images before it are {width}x{height}: convert the source "
             "to one size first"
         )
 
@@ -256,13 +256,13 @@ def _require_size(rgb: NDArray[np.uint8], width: int, height: int, what: str) ->
 def _warn_of_the_file(path: Path, reader: VideoReader, warn: Warn) -> None:
     decoded = len(reader.timestamps)
     if reader.tone_mapped:
-        warn(f"{path.name} is HDR ({reader.hdr}): its light is brought to the range of ordinary pictures")
+        warn(f"{path.name} is HDR ({reader.hdr}): tone-mapped to the range of ordinary images")
     elif reader.hdr:
-        warn(f"{path.name} is HDR ({reader.hdr}), its colours come out flat: pip install 'msgs-slam[hdr]' mends that")
+        warn(f"{path.name} is HDR ({reader.hdr}), its colours will look flat: pip install 'msgs-slam[hdr]' fixes that")
     # Containers count a frame or two too many in passing; that is no damage.
     if reader.missing_frames > max(2, reader.info.frame_count_claimed // 50):
         warn(
-            f"{path.name} is truncated: its header promises {reader.info.frame_count_claimed} frames, {decoded} "
+            f"{path.name} is truncated: its header declares {reader.info.frame_count_claimed} frames, {decoded} "
             "decode; going on with those"
         )
     if reader.unreadable_frames:

@@ -27,7 +27,7 @@ def require_motion(largest_displacement: float) -> None:
     """Raise InputError for a camera that stands still; displacement as a fraction of the image width."""
     if largest_displacement < _MOVING_FRACTION:
         raise InputError(
-            f"there is no parallax: over the whole source the picture moves by at most {largest_displacement:.2%} of "
+            f"there is no parallax: over the whole source the image moves by at most {largest_displacement:.2%} of "
             f"its width, the camera stands still, so no depth can be found. {HOW_TO_FILM}"
         )
 

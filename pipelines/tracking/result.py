@@ -20,7 +20,7 @@ def split_worlds(state: TrackState, least: int) -> list[TrackState]:
     # The smaller number wins a tie, so that the choice does not depend on the order of a dictionary.
     order = sorted(counts, key=lambda s: (-counts[s], s))
     kept = order[:1] + [s for s in order[1:] if counts[s] >= least]
-    elsewhere = {s: f"in piece_{n}, which nothing joins to the rest" for n, s in enumerate(kept[1:], 2)}
+    elsewhere = {s: f"in piece_{n}, which is not connected to the rest" for n, s in enumerate(kept[1:], 2)}
     short = "tracked, but this stretch could not be joined to the rest"
     apart = {i: elsewhere.get(s, short) for i, s in state.segment.items() if s != order[0]}
     first, *pieces = (_alone(state, segment) for segment in kept)

@@ -45,7 +45,7 @@ def run(context: StageContext) -> dict[str, Any]:
     if len(state.poses) < 2 and load_given(context.run) is None:
         raise InputError(
             f"{context.source}: no camera motion could be recovered from {len(frames)} frames. A still camera, pure "
-            "rotation or pictures without texture give no parallax; film while walking, or choose another part"
+            "rotation or images without texture give no parallax; film while walking, or choose another part"
         )
     report = adjust_state(state, intrinsics, pictures.proxy, metric, settings)
     give_back()
@@ -54,8 +54,8 @@ def run(context: StageContext) -> dict[str, Any]:
     hold_turns(state, pictures, context.config.run.seed)
     if state.turned:
         context.warn(
-            f"{len(state.turned)} frames ({stretches(state.turned)}) are posed by rotation alone: how they are turned "
-            "against the frames beside them is known, where they stand is not"
+            f"{len(state.turned)} frames ({stretches(state.turned)}) are posed by rotation alone: their orientation "
+            "relative to neighbouring frames is known, their position is not"
         )
     state, *pieces = split_worlds(state, context.config.frames.least_piece)
     save_pieces(context, pieces, frames)
@@ -137,8 +137,8 @@ def save_pieces(context: StageContext, pieces: list[TrackState], frames: list[Fr
         save_trajectory(folder, to_trajectory(piece, frames))
         save_sparse(folder, to_sparse_model(piece))
         context.warn(
-            f"{len(piece.poses)} frames ({stretches(sorted(piece.poses))}) are posed among each other, but nothing "
-            f"tells how they lie to the rest: they are exported apart, as piece_{number}"
+            f"{len(piece.poses)} frames ({stretches(sorted(piece.poses))}) form a disconnected component: they are "
+            f"exported separately, as piece_{number}"
         )
 
 

@@ -170,11 +170,11 @@ class Tape:
         cloud = self._scene.cloud.only(self._selection.rows)
         found = touch(cloud, origin / self._scene.scale, direction / np.linalg.norm(direction), pixel)
         if found is None:
-            self.told.content = "Nothing is there: click on the map."
+            self.told.content = "No surface there: click on the map."
         elif self._first is None:
             self._first = found
             self._mark("/tape/first", found)
-            self.told.content = "And the second place."
+            self.told.content = "Click the second place."
         else:
             self._mark("/tape/second", found)
             self._tell(self._first, found)

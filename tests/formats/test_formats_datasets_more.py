@@ -263,7 +263,7 @@ def test_damaged_sens_files_are_explained(tmp_path: Path, known: Known) -> None:
         open_sequence(path)
     count_at = 12 + 9 + 256 + 8 + 16 + 4
     path.write_bytes(data[:count_at] + struct.pack("<Q", 1 << 60) + data[count_at + 8 :])
-    with pytest.raises(InputError, match="promises"):
+    with pytest.raises(InputError, match="declares"):
         open_sequence(path)
 
 

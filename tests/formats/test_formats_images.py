@@ -168,7 +168,7 @@ def test_unreadable_images_are_explained(tmp_path: Path, picture: np.ndarray) ->
     (tmp_path / "text.jpg").write_text("I am no picture")
     with pytest.raises(InputError, match="is empty"):
         read_rgb(tmp_path / "empty.png")
-    with pytest.raises(InputError, match="begins like no picture"):
+    with pytest.raises(InputError, match="of no image format"):
         read_rgb(tmp_path / "text.jpg")
     with pytest.raises(InputError, match="no such file"):
         read_rgb(tmp_path / "none.jpg")
@@ -212,7 +212,7 @@ def test_labels_round_trip_and_palettes_give_indices(tmp_path: Path) -> None:
 def test_wrong_kinds_of_maps_are_refused(tmp_path: Path, picture: np.ndarray) -> None:
     write_rgb(tmp_path / "colour.png", picture)
     write_grey_png(tmp_path / "preview.png", picture[:, :, 0])
-    with pytest.raises(InputError, match="colour picture"):
+    with pytest.raises(InputError, match="colour image"):
         read_label_png(tmp_path / "colour.png")
     with pytest.raises(InputError, match="8 bits"):
         read_depth_png(tmp_path / "preview.png")

@@ -168,7 +168,7 @@ def test_playlists_that_are_no_text_show_no_other_file(tmp_path: Path, name: str
     write_video(tmp_path / "secret.mkv", [np.full((32, 32, 3), 80, np.uint8)] * 3, 10)
     assert probe_video(tmp_path / "secret.mkv").width == 32
     (tmp_path / name).write_bytes(text.replace(b"%s", bytes(tmp_path / "secret.mkv")))
-    with pytest.raises(InputError, match="no picture can be decoded"):
+    with pytest.raises(InputError, match="no image can be decoded"):
         probe_video(tmp_path / name)
 
 
@@ -176,9 +176,9 @@ def test_one_image_is_no_video(tmp_path: Path) -> None:
     for i in range(3):
         cv2.imwrite(str(tmp_path / f"img_{i:02d}.jpg"), np.full((32, 32, 3), 80 * i, np.uint8))
     (tmp_path / "img_%02d.mp4").write_bytes((tmp_path / "img_00.jpg").read_bytes())
-    with pytest.raises(InputError, match="folder that holds the pictures"):
+    with pytest.raises(InputError, match="folder that contains the images"):
         probe_video(tmp_path / "img_00.jpg")
-    with pytest.raises(InputError, match="no picture can be decoded"):
+    with pytest.raises(InputError, match="no image can be decoded"):
         probe_video(tmp_path / "img_%02d.mp4")
 
 
@@ -306,5 +306,5 @@ def test_ordinary_videos_are_not_taken_for_hdr(counted_video: Path, tmp_path: Pa
     write_hdr(tmp_path / "a.mp4", [np.zeros((64, 64, 3), np.uint16)] * 5, "PQ")
     data = (tmp_path / "a.mp4").read_bytes()
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) * 2 // 3])
-    with pytest.raises(InputError, match="no picture can be decoded"):
+    with pytest.raises(InputError, match="no image can be decoded"):
         list(iter_video(tmp_path / "cut.mp4"))

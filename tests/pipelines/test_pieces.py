@@ -58,7 +58,8 @@ def test_a_piece_has_all_that_a_run_has(whole: RunFolder) -> None:
     assert [f.name for f in piece.frames] == [f"view_{WALK_FRAMES + i:03d}.png" for i in range(APART)]
     assert len(piece.require_map()) > 500
     assert (
-        whole.load_trajectory("tracking").lost_reasons[WALK_FRAMES + 3] == "in piece_2, which nothing joins to the rest"
+        whole.load_trajectory("tracking").lost_reasons[WALK_FRAMES + 3]
+        == "in piece_2, which is not connected to the rest"
     )
     centres, truth = piece.trajectory.centers, np.array([c for c, _ in sideways(APART)]) * [-1, 1, 1]
     apart = align_points(centres, truth, with_scale=True).apply(centres) - truth

@@ -48,7 +48,7 @@ function again() {
 function lens() {
   const ratio = window.devicePixelRatio || 1, width = Math.round(innerWidth * ratio), height = Math.round(innerHeight * ratio);
   for (const c of [canvas, overlay]) if (c.width !== width || c.height !== height) Object.assign(c, { width, height });
-  // The whole of a camera's picture fits into the window; on a phone held upright a part, else it would be small.
+  // The whole of a camera's image fits into the window; on a phone held upright a part, else it would be small.
   const whole = Math.min(height / about.slope[1], width / about.slope[0]);
   const focal = wanted.has("camera") ? whole : Math.max(whole, height / 2);
   return [focal, focal, width / 2 + focal * about.shift[0], height / 2 + focal * about.shift[1]];
@@ -164,7 +164,7 @@ function click(x, y, asTarget) {
   const ray = [(x * ratio - view[2]) / view[0], (y * ratio - view[3]) / view[1], 1];
   const direction = unit([0, 1, 2].map((k) => ray[0] * eye.r[k] + ray[1] * eye.r[3 + k] + eye.r[6 + k]));
   const found = touchCloud(cloud, eye.p, direction);
-  if (!found) { told.textContent = "Nothing is there: click on the map."; return; }
+  if (!found) { told.textContent = "No surface there: click on the map."; return; }
   found.across = (AIM_PIXELS * ratio * found.depth) / view[0];
   if (asTarget) { eye.look(eye.p, found.point); again(); return; }
   state.ends = state.ends.length === 1 ? [state.ends[0], found] : [found];

@@ -197,7 +197,7 @@ def measure(page: Page, viewer: Any, truth: Sequence) -> tuple[float, float]:
         u, v = int(camera.fx * ray[0] + camera.cx), int(camera.cy)
         places.append(depth[v, u] * ray)
     page.click(0.45 * width, 0.5 * height)
-    until(lambda: viewer.tape.told.content == "And the second place.")
+    until(lambda: viewer.tape.told.content == "Click the second place.")
     page.press("Mark the middle")
     until(lambda: viewer.tape.result)
     return float(viewer.tape.result.split()[0]), float(np.linalg.norm(places[1] - places[0]))

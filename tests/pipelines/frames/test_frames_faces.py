@@ -53,7 +53,7 @@ def test_sides_have_the_panoramas_resolution_and_at_most_so_many_pixels() -> Non
     big = panorama_faces(1440, 720, 240)
     assert (big.pinhole.width, big.size) == (240, (754, 377))
     assert big.names("000001.jpg") == [f"f{c}_000001.jpg" for c in range(6)]
-    with pytest.raises(InputError, match="twice as wide as high, these pictures are 640x480"):
+    with pytest.raises(InputError, match="twice as wide as high, these images are 640x480"):
         panorama_faces(640, 480, 960)
 
 
@@ -148,7 +148,7 @@ def test_photo_spheres_are_known_by_their_xmp(tmp_path: Path, said: str, kind: s
     assert image_sphere(tmp_path / "a.jpg") == kind
     source = open_source(tmp_path)
     if kind == PART:
-        with pytest.raises(InputError, match="part of a sphere"):
+        with pytest.raises(InputError, match="partial or stereo panorama"):
             find_faces(source, FramesConfig())
     else:
         assert (find_faces(source, FramesConfig()) is not None) == (kind == WHOLE)

@@ -156,7 +156,7 @@ def test_networks_are_part_of_what_the_stage_is_made_from(store: ModelStore) -> 
     assert isinstance(open_learned(asked), LearnedFeatures)
     path = store.path(store.get(MATCHER))
     path.write_bytes(path.read_bytes()[:-1] + b"x")
-    with pytest.raises(InputError, match=f"damaged; type: msgs-slam models pull {MATCHER}"):
+    with pytest.raises(InputError, match=f"damaged; run: msgs-slam models pull {MATCHER}"):
         open_learned(asked)
 
 
@@ -164,6 +164,6 @@ def test_without_the_networks_the_stage_says_what_to_type(tmp_path: Path, monkey
     monkeypatch.setenv("MSGS_SLAM_CACHE", str(tmp_path / "empty"))
     for i in range(3):
         cv2.imwrite(str(tmp_path / f"{i}.png"), picture(i))
-    with pytest.raises(InputError, match=r"49 MB.*type: msgs-slam models pull aliked-n16rot"):
+    with pytest.raises(InputError, match=r"49 MB.*run: msgs-slam models pull aliked-n16rot"):
         check(tmp_path, load_config(overrides=["frames.features=aliked"]))
     check(tmp_path, load_config())

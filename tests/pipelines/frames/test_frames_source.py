@@ -139,7 +139,7 @@ ODD = [
     ("d_empty.mp4", "empty"),
     ("d_text.mp4", "text file"),
     ("d_one_frame.mp4", "one frame only"),
-    ("tc_audio_only.mp3", "no picture can be decoded"),
+    ("tc_audio_only.mp3", "no image can be decoded"),
     ("not_there.mp4", "no such file"),
 ]
 

@@ -334,7 +334,7 @@ def test_what_shows_another_place_is_a_piece_of_its_own(
     assert backbone.frame_ids.max() < WALK_FRAMES <= piece.frame_ids.min()
     assert len(backbone.frame_ids) >= 10
     assert len(piece.frame_ids) >= 6
-    assert any("fit among each other" in w for w in context.warnings)
+    assert any("consistent with each other" in w for w in context.warnings)
     truth = np.array([center for center, _ in sideways(8)])[piece.frame_ids - WALK_FRAMES] * [-1, 1, 1]
     found = np.linalg.inv(piece.cam_from_world)[:, :3, 3]
     moved = align_points(found, truth, with_scale=True).apply(found)

@@ -70,8 +70,8 @@ def test_masks_are_found_by_both_names_and_reduced(pictures: Path, tmp_path: Pat
 @pytest.mark.parametrize(
     ("name", "size", "said"),
     [
-        ("view7.jpg.png", (HEIGHT, WIDTH), "1 of 1 files belong to no picture, the first is view7.jpg.png"),
-        ("view1.png", (HEIGHT, WIDTH - 1), "is 127x96, the pictures are 128x96"),
+        ("view7.jpg.png", (HEIGHT, WIDTH), "1 of 1 files belong to no image, the first is view7.jpg.png"),
+        ("view1.png", (HEIGHT, WIDTH - 1), "is 127x96, the images are 128x96"),
         ("view1.jpg", (HEIGHT, WIDTH), "holds no PNG files"),
     ],
 )

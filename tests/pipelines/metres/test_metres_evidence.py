@@ -88,7 +88,7 @@ def test_what_is_stated_survives_the_disk_and_stands_in_status(tmp_path: Path) -
     assert load_metres(run) == metres
     (line,) = scale_lines(tmp_path, {"export": None})  # type: ignore[dict-item]
     assert "1 unit = about 0.8" in line
-    assert line.endswith("(a guess, from 2 doors and floor height)")
+    assert line.endswith("(estimated from 2 doors and floor height)")
     assert scale_lines(tmp_path, {}) == []
     save_metres(run.stage("export"), None)
     assert load_metres(run) is None

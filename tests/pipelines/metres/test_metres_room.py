@@ -67,7 +67,7 @@ def test_the_scale_is_found_within_its_sigmas_and_says_from_what(run: RunFolder)
     assert abs(np.log(metres.per_unit / 0.4)) < 2 * metres.relative_sd
     assert 0.05 < metres.relative_sd <= 0.3
     assert metres.text.startswith("1 unit = about 0.")
-    assert "a guess, from " in metres.text
+    assert "(estimated from " in metres.text
     assert "floor height" in metres.sources
 
 
@@ -130,7 +130,7 @@ def test_an_export_with_a_guess_differs_in_words_only(run: RunFolder, tmp_path: 
     assert rows[0] == rows[1]
     for text in ((guessed / "trajectory.txt").read_text(), (guessed / "README.txt").read_text()):
         assert "about 0." in text
-        assert "a guess" in text
+        assert "estimated from" in text
     assert "free" in (free / "trajectory.txt").read_text()
     assert read_json(free / "scale.json") is None
     told = read_json(guessed / "scale.json")

@@ -109,7 +109,7 @@ def broken_depth(kind: str, path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "said"),
-    [("wrong size", "not the shape"), ("8 bits", "8 bits"), ("colour", "colour picture"), ("cannot read", "read")],
+    [("wrong size", "not the shape"), ("8 bits", "8 bits"), ("colour", "colour image"), ("cannot read", "read")],
 )
 def test_hostile_depth_images_are_refused_at_once(source: Path, room: Room, kind: str, said: str) -> None:
     broken_depth(kind, source.parent / "depth" / room.frames[0].name)

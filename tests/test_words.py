@@ -1,0 +1,99 @@
+"""Words that readers of English, or of the field, stumble over: they may not come back into what a user reads."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+
+from msgs_slam.msgs_cli.main import main
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+BANNED = {
+    r"leaves? (it|--\w+) away": "omit, turn off",
+    r"(nothing|which nothing) joins": "disconnected component",
+    r"how (it|they) lies? to": "the transform from … to",
+    r"what .{1,20} earns|earned nothing": "contributes, made no measurable difference",
+    r"\bto mend\b|\bmends\b": "fix",
+    r"\barticle('s)?\b": "paper",
+    r"as \w+ left it": "after …",
+    r"after a stop\b": "resume an interrupted run",
+    r"\b(is|are|an?) guess(es|ed)?\b": "estimate",
+    r"says? of itself": "metadata",
+    r"\bwithout a line\b": "without internet access",
+    r"is no part of the scene": "mask, ignored",
+    r"\bstand-ins?\b": "say what was used instead",
+    r"\bpromises\b": "declares",
+    r"once more: at once": "press Ctrl-C again to stop now",
+    r"\bpictures?\b": "image",
+    r"by its name: expected": "unsupported extension",
+    r"\bplain (monocular )?video in\b": "turn an ordinary video into",
+    r"Nothing is rescaled": "coordinates are not rescaled",
+    r"of what is mapped": "map extent",
+    r"[Tt]ype:? `?msgs-slam": "run `msgs-slam`",
+    r"\bunsure\b": "uncertain",
+}
+"""Regular expression → what to write instead."""
+
+MAY_STAY = ("corners or pictures in view",)
+"""Pictures on a wall."""
+
+
+def prose(page: Path) -> str:
+    """A page without code, links' targets and names of files."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    return re.sub(r"`[^`\n]*`|\]\([^)]*\)|<!--.*?-->", "", text)
+
+
+def texts_of_code() -> Iterator[tuple[str, str]]:
+    """(where, text) of messages and labels: what is no docstring and has a space."""
+    for room in ("msgs_cli", "pipelines", "formats"):
+        for path in sorted((ROOT / room).rglob("*.py")):
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            silent = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
+            silent |= {id(v) for n in ast.walk(tree) if isinstance(n, ast.JoinedStr) for v in n.values}
+            for node in ast.walk(tree):
+                if id(node) in silent:
+                    continue
+                if isinstance(node, ast.JoinedStr):
+                    text = "".join(str(v.value) if isinstance(v, ast.Constant) else "…" for v in node.values)
+                elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    text = node.value
+                else:
+                    continue
+                if " " in text:
+                    yield f"{path.relative_to(ROOT)}:{node.lineno}", text
+
+
+def texts_of_help(command: click.Command, name: str) -> Iterator[tuple[str, str]]:
+    yield name, command.help or ""
+    for parameter in command.params:
+        if isinstance(parameter, click.Option):
+            yield f"{name} {parameter.opts[0]}", f"{parameter.metavar or ''} {parameter.help or ''}"
+    for below in command.commands.values() if isinstance(command, click.Group) else ():
+        yield from texts_of_help(below, f"{name} {below.name}")
+
+
+def texts_of_pages() -> Iterator[tuple[str, str]]:
+    for page in PAGES:
+        yield str(page.relative_to(ROOT)), prose(page)
+    for path in sorted((ROOT / "pipelines" / "export" / "page").iterdir()):
+        if path.suffix != ".css":
+            yield str(path.relative_to(ROOT)), "\n".join(re.findall(r">[^<>{}]+<|\"[^\"]* [^\"]*\"", path.read_text()))
+
+
+@pytest.mark.parametrize("banned", BANNED)
+def test_words_that_may_not_come_back(banned: str) -> None:
+    every = [*texts_of_code(), *texts_of_help(main, "msgs-slam"), *texts_of_pages()]
+    assert len(every) > 800
+    found = [
+        f"{where}: …{text[max(0, m.start() - 40) : m.end() + 30]!r}"
+        for where, text in every
+        for m in re.finditer(banned, text, re.IGNORECASE)
+        if not any(stay in text for stay in MAY_STAY)
+    ]
+    assert found == [], f"better: {BANNED[banned]}"
