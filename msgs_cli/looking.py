@@ -73,6 +73,9 @@ def report(run_path: Path, to: Path | None, quiet: bool, verbose: bool) -> None:
     tell_result(quiet, {"report": made})
 
 
+SPLAT_FILES = (".ply", ".spz", ".glb", ".splat", ".safetensors")
+
+
 class Size(click.ParamType):
     """640x480"""
 
@@ -88,7 +91,7 @@ class Size(click.ParamType):
 
 
 @click.command()
-@RUN_ARGUMENT
+@click.argument("source", metavar="RUN|FILE", type=click.Path(path_type=Path))
 @click.argument("target", metavar="VIDEO|FOLDER", type=click.Path(path_type=Path))
 @click.option(
     "--kind", default="color", show_default=True, type=click.Choice(["color", "depth", "labels", "side-by-side"]),
@@ -100,23 +103,30 @@ class Size(click.ParamType):
 )  # fmt: skip
 @click.option("--fps", default=30.0, type=click.FloatRange(0.1, 240), help="Frames a second.", show_default=True)
 @click.option(
-    "--size", type=Size(), metavar="WIDTHxHEIGHT", help="Pixels of the pictures. Default: those of the run's frames."
+    "--size", type=Size(), metavar="WIDTHxHEIGHT", help="Pixels of the images. Default: those of the run's frames."
 )
 @verbosity_options
 def render(
-    run_path: Path, target: Path, kind: str, camera_path: str, fps: float, size: tuple[int, int] | None, quiet: bool,
+    source: Path, target: Path, kind: str, camera_path: str, fps: float, size: tuple[int, int] | None, quiet: bool,
     verbose: bool,
 ) -> None:  # fmt: skip
-    """Draw the map of RUN along a camera path into a video or a folder of pictures.
+    """Draw the map of RUN along a camera path, or any splat FILE (.ply, .spz, .glb, .splat) along an orbit, into a
+    video or a folder of images.
 
     An .mp4 is H.264 where PyAV is installed (pip install 'msgs-slam[hdr]'), else VP9: browsers play both. An .avi or
     .mkv loses nothing (FFV1).
     """
     set_up_logging(quiet, verbose)
-    from msgs_slam.pipelines.render_run import render_run
+    from msgs_slam.pipelines.render_run import render_file, render_run
 
+    is_file = source.is_file() and source.suffix.lower() in SPLAT_FILES
+    if is_file and (kind != "color" or camera_path == "own"):
+        raise click.UsageError("a splat file has colours and no cameras: --kind color, --path orbit")
     with ending_quietly():
-        made = render_run(open_run(run_path), target, kind, camera_path, fps, 0, make_progress(quiet), size)
+        if is_file:
+            made = render_file(source, target, fps, 0, make_progress(quiet), size)
+        else:
+            made = render_run(open_run(source), target, kind, camera_path, fps, 0, make_progress(quiet), size)
     say(made)
     tell_result(quiet, {"video": made})
 

@@ -11,20 +11,25 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.browser_video import PLAYED, write_browser_video
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gaussian_files import read_gaussians
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.video_writer import CODECS, write_video
-from msgs_slam.pipelines.evaluation.camera_paths import orbit, resampled, smoothed
+from msgs_slam.pipelines.evaluation.camera_paths import around, orbit, resampled, smoothed
 from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.evaluation.pictures import Picture, depth_picture, depth_range, label_picture
+from msgs_slam.pipelines.evaluation.splat_views import SplatScene, draw_splats
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress, log
 from msgs_slam.pipelines.types import Intrinsics
 from msgs_slam.pipelines.upright.world import up_in_run
+from msgs_slam.pipelines.viewer.scene import up_of_file
 
 KINDS = ("color", "depth", "labels", "side-by-side")
 PATHS = ("own", "smooth", "orbit")
 _SMOOTHING_SECONDS = 0.5
+_FILE_SIZE, _FIELD_OF_VIEW = (960, 540), np.radians(50)
+"""Of pictures of a splat file, which tells nothing of cameras: the field of view is from top to bottom."""
 
 
 def render_run(
@@ -45,10 +50,7 @@ def render_run(
     """
     _require_choice("kind", kind, KINDS)
     _require_choice("path", path, PATHS)
-    if not 0.1 <= fps <= 240:
-        raise InputError(f"--fps is 0.1 to 240 frames a second; got {fps}")
-    if target.suffix.lower() not in CODECS and target.is_file():
-        raise InputError(f"{target} is a file. Name a folder for pictures, or a video ending in {', '.join(CODECS)}")
+    _require_target(target, fps)
     outcome = load_outcome(run)
     outcome.require_map()
     outcome = outcome if size is None else _of_size(outcome, size)
@@ -57,6 +59,38 @@ def render_run(
     steps = (progress or SilentProgress()).track(range(len(world_from_cam)), "rendering", len(world_from_cam))
     pictures = (_draw(outcome, world_from_cam[i], kind, near, far) for i in steps)
     return _write(target, pictures, fps)
+
+
+def render_file(
+    path: Path,
+    target: Path,
+    fps: float = 30.0,
+    frames: int = 0,
+    progress: Progress | None = None,
+    size: tuple[int, int] | None = None,
+) -> Path:
+    """Draw a splat file by any program along a circle round it, otherwise as `render_run`; by default 960x540.
+
+    Raises InputError for a file that cannot be read or is empty.
+    """
+    _require_target(target, fps)
+    cloud = read_gaussians(path)
+    if len(cloud) == 0:
+        raise InputError(f"{path}: contains no Gaussians")
+    scene, (width, height) = SplatScene.of(cloud), size or _FILE_SIZE
+    focal = height / 2 / np.tan(_FIELD_OF_VIEW / 2)
+    camera = Intrinsics(width, height, focal, focal, width / 2, height / 2)
+    middle = np.median(cloud.means, axis=0).astype(np.float64)
+    poses = around(middle, scene.size, up_of_file(path), frames or round(10 * fps))
+    steps = (progress or SilentProgress()).track(range(len(poses)), "rendering", len(poses))
+    return _write(target, (draw_splats(scene, camera, np.linalg.inv(poses[i])) for i in steps), fps)
+
+
+def _require_target(target: Path, fps: float) -> None:
+    if not 0.1 <= fps <= 240:
+        raise InputError(f"--fps is 0.1 to 240 frames a second; got {fps}")
+    if target.suffix.lower() not in CODECS and target.is_file():
+        raise InputError(f"{target} is a file. Name a folder for images, or a video ending in {', '.join(CODECS)}")
 
 
 def _write(target: Path, pictures: Iterator[Picture], fps: float) -> Path:

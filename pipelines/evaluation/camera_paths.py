@@ -9,6 +9,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 Array = NDArray[np.float64]
 
+_FROM_OUTSIDE = 1.4
+"""Sizes of a scene that one stands away from its middle: then it fills most of a picture of 50 degrees."""
+
 
 def resampled(world_from_cam: Array, count: int) -> Array:
     """(count, 4, 4) poses evenly along the path in frames: centres linear, rotations on the shortest arc."""
@@ -48,6 +51,15 @@ def orbit(world_from_cam: Array, scene_depth: float, count: int, up: Array) -> A
     angle = 2 * np.pi * np.arange(count) / count
     centers = focus + radius * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second) + height * up
     return _looking_at(centers, focus, up)
+
+
+def around(middle: Array, size: float, up: Array, count: int) -> Array:
+    """(count, 4, 4) once round a scene of which no camera is known, a little from above; `size` is its largest side."""
+    first = _any_across(up)
+    second = np.cross(up, first)
+    angle = 2 * np.pi * np.arange(count) / count
+    circle = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
+    return _looking_at(middle + _FROM_OUTSIDE * size * (circle + 0.25 * up), middle, up)
 
 
 def _focus(world_from_cam: Array, up: Array, scene_depth: float) -> tuple[Array, float, float]:

@@ -154,14 +154,14 @@ def _from_file(path: Path) -> ViewerScene:
         title=path.name,
         cloud=cloud,
         scale=_scale(cloud.means, np.zeros((0, 3))),
-        up=_up_of_file(path),
+        up=up_of_file(path),
         labels=cloud.class_ids,
         class_names=tuple(f"class {i}" for i in range(classes)),
         class_colors=class_colors(classes),
     )
 
 
-def _up_of_file(path: Path) -> NDArray[np.float64]:
+def up_of_file(path: Path) -> NDArray[np.float64]:
     """z in a PLY of this program's export, as world.json beside it says; else y points down, as in most splat files."""
     world = path.with_name(WORLD)
     stands = path.suffix == ".ply" and world.is_file() and read_world(world).axes == "up"
