@@ -80,8 +80,7 @@ def render_file(
     scene, (width, height) = SplatScene.of(cloud), size or _FILE_SIZE
     focal = height / 2 / np.tan(_FIELD_OF_VIEW / 2)
     camera = Intrinsics(width, height, focal, focal, width / 2, height / 2)
-    middle = np.median(cloud.means, axis=0).astype(np.float64)
-    poses = around(middle, scene.size, up_of_file(path), frames or round(10 * fps))
+    poses = around(scene.middle, scene.size, up_of_file(path), frames or round(10 * fps))
     steps = (progress or SilentProgress()).track(range(len(poses)), "rendering", len(poses))
     return _write(target, (draw_splats(scene, camera, np.linalg.inv(poses[i])) for i in steps), fps)
 

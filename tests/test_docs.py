@@ -148,3 +148,17 @@ def test_dockerfile_copies_what_is_here_and_asks_for_the_same_torch() -> None:
     assert [name for name in copied if not (ROOT / name).exists()] == []
     wanted = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
     assert re.findall(r'"(torch[^"]*)"', text) == [name for name in wanted if name.startswith("torch")]
+
+
+def test_metadata_agrees_with_itself() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    (everything,) = extras["all"]
+    named = re.findall(r"\w+", everything.partition("[")[2])
+    assert sorted(named) == sorted(set(extras) - {"all", "cuda-check", "docs", "dev"})
+    asked_for = set(re.findall(r"msgs-slam\[([\w,]+)\]", texts() + "\n".join(messages())))
+    assert {name for group in asked_for for name in group.split(",")} <= set(extras)
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"version: {project['version']}" in citation
+    assert project["urls"]["Method"].removeprefix("https://doi.org/") in citation
+    assert project["description"] in (ROOT / "mkdocs.yml").read_text(encoding="utf-8")

@@ -27,11 +27,13 @@ _WIDEST = 1.3
 
 @dataclass(frozen=True)
 class SplatScene:
-    """What of a cloud does not depend on the view: covariances (M, 3, 3), opacities (M,), and the size of the scene."""
+    """What of a cloud does not depend on the view: covariances (M, 3, 3), opacities (M,), and the middle (3,) and
+    largest side of the box about most of it."""
 
     cloud: GaussianCloud
     covariances: NDArray[np.float64]
     opacities: NDArray[np.float64]
+    middle: NDArray[np.float64]
     size: float
 
     @staticmethod
@@ -41,7 +43,9 @@ class SplatScene:
         axes = turn * np.exp(cloud.log_scales.astype(np.float64))[:, None, :]
         low, high = np.quantile(cloud.means, (0.05, 0.95), axis=0)
         opacities = 1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))
-        return SplatScene(cloud, axes @ axes.transpose(0, 2, 1), opacities, max(float((high - low).max()), 1e-6))
+        return SplatScene(
+            cloud, axes @ axes.transpose(0, 2, 1), opacities, (low + high) / 2, max(float((high - low).max()), 1e-6)
+        )
 
     @property
     def low_pass(self) -> float:
