@@ -121,7 +121,25 @@ def test_tests_and_benchmarks_import_what_there_is() -> None:
                 base = ROOT.joinpath(*node.module.removeprefix("msgs_slam.").split("."))
                 if not base.with_suffix(".py").is_file() and not base.is_dir():
                     missing.append(f"{path.relative_to(ROOT)}: {node.module}")
+                elif gone := {alias.name for alias in node.names} - names_of(base):
+                    missing.append(f"{path.relative_to(ROOT)}: {node.module} has no {sorted(gone)}")
     assert not missing
+
+
+def names_of(base: Path) -> set[str]:
+    """What can be imported from the module or package whose path without suffix is `base`."""
+    inside = {p.stem for p in base.iterdir()} if base.is_dir() else set()
+    file = base / "__init__.py" if base.is_dir() else base.with_suffix(".py")
+    if not file.is_file():
+        return inside
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            inside.add(node.name)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            inside.add(node.id)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            inside |= {(alias.asname or alias.name).split(".")[0] for alias in node.names}
+    return inside
 
 
 def test_nothing_is_unpickled() -> None:

@@ -31,7 +31,7 @@ from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.proxy.learned.labels import OnnxLabels
 from msgs_slam.pipelines.proxy.learned.network_pass import ResultCache, Workplace
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.sequence import Sequence, map_intrinsics
+from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Trajectory
@@ -88,7 +88,7 @@ def with_names(run: RunFolder, seen: Seen, store: ModelStore) -> Seen:
     if seen.is_named or model is None:
         return seen
     calibration, backbone = run.load_calibration(), run.load_backbone()
-    camera = map_intrinsics(calibration.intrinsics, 640)
+    camera = calibration.intrinsics.at_most(640)
     sequence = Sequence(run.load_frames(), calibration, camera, backbone, run.image)
     frames = [f for f in sequence.frames if f.id in set(seen.frame_ids)]
     depths = {}

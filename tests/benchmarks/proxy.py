@@ -41,13 +41,14 @@ from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.geometry.camera import project, unproject_depth
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame, ProxyMaps
 
 DATA = ROOT.parent / "shared" / "data"
 RELIABLE = 0.35
 
 
-class TimedProgress:
+class TimedProgress(SilentProgress):
     """Adds up the seconds that each bar takes, by the clock and of the processor; work between its items counts to it.
 
     Where other work shares the machine, those of the processor over the number of its cores are the fair figure.

@@ -20,14 +20,13 @@ from msgs_slam.pipelines.geometry.camera import project, unproject
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.folder import (
     RunFolder,
-    proxy_path,
     save_calibration,
     save_classes,
     save_frames,
-    save_proxy_maps,
     save_sparse_model,
     write_json,
 )  # fmt: skip
+from msgs_slam.pipelines.run.proxy_files import proxy_path, save_proxy_maps
 from msgs_slam.pipelines.structure.bundle import Bundle
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, ClassTable, Frame, Intrinsics, ProxyMaps
