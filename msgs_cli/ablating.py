@@ -73,7 +73,7 @@ def ablate(
         )  # fmt: skip
     say(ablation_table(result))
     say(f"also in {folder / 'ablation.md'} and {folder / 'ablation.json'}", err=True)
-    tell_result(quiet, {"table": folder / "ablation.json"})
+    tell_result(quiet, table=folder / "ablation.json")
 
 
 def _seeds(text: str) -> tuple[int, ...]:

@@ -82,11 +82,9 @@ def batch(
             engine.close()  # type: ignore[union-attr]
     if not quiet:
         _print(rows)
+    tell_result(quiet, table=out / "batch.json", runs=[r.run for r in mine], failed=[r.run for r in failed])
     if failed:
         say(f"{len(failed)} of {len(mine)} recordings failed; {out}/NAME.failed.txt says why", err=True)
-    runs, of_failed = [r.run for r in mine], [r.run for r in failed]
-    tell_result(quiet, {"table": out / "batch.json", "runs": runs, "failed": of_failed}, int(bool(failed)))
-    if failed:
         sys.exit(1)
 
 

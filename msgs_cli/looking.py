@@ -53,7 +53,7 @@ def evaluate(
     with ending_quietly():
         figures = write_evaluation(run, sequence, make_progress(quiet), legacy=protocol == "splatam", class_map=joins)
     say(evaluation_table(figures))
-    tell_result(quiet, {"evaluation": run.evaluation_file.parent})
+    tell_result(quiet, evaluation=run.evaluation_file.parent)
 
 
 @click.command()
@@ -70,7 +70,7 @@ def report(run_path: Path, to: Path | None, quiet: bool, verbose: bool) -> None:
     with ending_quietly():
         made = write_report(open_run(run_path), to, make_progress(quiet))
     say(made)
-    tell_result(quiet, {"report": made})
+    tell_result(quiet, report=made)
 
 
 SPLAT_FILES = (".ply", ".spz", ".glb", ".splat", ".safetensors")
@@ -128,7 +128,7 @@ def render(
         else:
             made = render_run(open_run(source), target, kind, camera_path, fps, 0, make_progress(quiet), size)
     say(made)
-    tell_result(quiet, {"video": made})
+    tell_result(quiet, video=made)
 
 
 @click.command()

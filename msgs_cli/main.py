@@ -170,7 +170,7 @@ def reconstruct(
         records = run_reconstruct(one_source(sources, run), run, config, make_progress(quiet), until, workers)
     if not quiet:
         _print_summary(run.root, records)
-    tell_result(quiet, _results(run.root, records))
+    tell_result(quiet, **_results(run.root, records))
 
 
 @main.command()
@@ -209,7 +209,7 @@ def resume(
         records = run_resume(run, make_progress(quiet), config, until, workers)
     if not quiet:
         _print_summary(run.root, records)
-    tell_result(quiet, _results(run.root, records))
+    tell_result(quiet, **_results(run.root, records))
 
 
 @main.command()
@@ -277,7 +277,7 @@ def export(
     for path in written:
         if not quiet:
             say(path)
-    tell_result(quiet, {"export": folder, "files": written})
+    tell_result(quiet, export=folder, files=written)
 
 
 @main.command()
@@ -321,7 +321,7 @@ def demo(
     for line in demo_summary(result):
         say(f"  {line}")
     root = result.run.root
-    tell_result(quiet, {"run": root, "export": root / "export", "evaluation": root / "evaluation"})
+    tell_result(quiet, run=root, export=root / "export", evaluation=root / "evaluation")
 
 
 @main.command()
@@ -358,9 +358,9 @@ def _print_summary(root: Path, records: dict[str, Any]) -> None:
         say(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")
 
 
-def _results(root: Path, records: dict[str, Any]) -> dict[str, Path | list[Path]]:
+def _results(root: Path, records: dict[str, Any]) -> dict[str, Path]:
     """Where they are."""
-    return {"run": root, **({"export": root / "export"} if "export" in records else {})}
+    return {"run": root} | ({"export": root / "export"} if "export" in records else {})
 
 
 for command in (looking.evaluate, looking.report, looking.render, looking.view):

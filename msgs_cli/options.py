@@ -6,7 +6,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -241,8 +241,8 @@ def is_said(warning: str) -> bool:
     return warning in _said
 
 
-def make_progress(quiet: bool, as_json: bool | None = None, job: str = "") -> Progress:
-    """Bars on a terminal, a line a stage in a file or pipe, JSON lines, or nothing; of a `job` among others."""
+def make_progress(quiet: bool, as_json: bool | None = None) -> Progress:
+    """Bars on a terminal, a line a stage in a file or pipe, JSON lines, or nothing."""
     from msgs_slam.msgs_cli.progress import BarProgress
     from msgs_slam.pipelines.system.progress import LineProgress, SilentProgress
 
@@ -250,15 +250,15 @@ def make_progress(quiet: bool, as_json: bool | None = None, job: str = "") -> Pr
         return SilentProgress()
     as_json = _as_json() if as_json is None else as_json
     if as_json:
-        return JsonProgress(job)
-    return BarProgress() if sys.stderr.isatty() else LineProgress(job)
+        return JsonProgress()
+    return BarProgress() if sys.stderr.isatty() else LineProgress()
 
 
-def tell_result(quiet: bool, paths: Mapping[str, Path | list[Path]], exit_code: int = 0) -> None:
-    """The last event of a command that came to its end, for programs: where its results are."""
+def tell_result(quiet: bool, **paths: Path | list[Path] | bool) -> None:
+    """The last event of a command that went well, for programs: where its results are."""
     if _as_json() and not quiet:
         texts = {k: [str(p) for p in v] if isinstance(v, list) else str(v) for k, v in paths.items()}
-        write_line("result", **texts, exit_code=exit_code)
+        write_line("result", **texts, exit_code=0)
 
 
 def worker_setup(quiet: bool, verbose: bool, remote: bool) -> Callable[[str], Progress]:
@@ -274,7 +274,7 @@ def _worker_progress(quiet: bool, verbose: bool, as_json: bool, remote: bool, na
     if remote and not quiet and not as_json:
         return LineProgress(name)
     logging.getLogger("msgs_slam").info("%s: begins", name)
-    return make_progress(quiet, as_json, name)
+    return make_progress(quiet, as_json)
 
 
 def open_run(path: Path) -> RunFolder:

@@ -39,4 +39,4 @@ def work(run_path: Path, shard: str, until: str, quiet: bool, verbose: bool) -> 
     chosen, run = Shard.parse(shard), open_run(run_path)
     with stopping_softly(f"The same command goes on, or without others: msgs-slam resume {run.root}"):
         work_on_run(run, chosen, load_settings(run), worker_setup(quiet, verbose, True), until)
-    tell_result(quiet, {"run": run.root})
+    tell_result(quiet, run=run.root)

@@ -63,6 +63,25 @@ def test_named_files_exist() -> None:
         assert (ROOT / name).exists(), name
 
 
+BENCHMARKS = ROOT / "tests" / "benchmarks"
+
+
+def test_every_benchmark_is_on_its_page() -> None:
+    page = (BENCHMARKS / "README.md").read_text(encoding="utf-8")
+    assert [path.name for path in BENCHMARKS.glob("*.py") if path.name not in page] == []
+
+
+def test_options_of_benchmarks_exist() -> None:
+    """What is given to a script is among its texts, without the dashes where it makes its options in a loop."""
+    commands = re.findall(r"python tests/benchmarks/(\w+\.py)((?:\\\n|[^\n`#])*)", texts())
+    assert len({name for name, _ in commands}) > 20
+    for name, rest in commands:
+        tree = ast.parse((BENCHMARKS / name).read_text(encoding="utf-8"))
+        made = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+        for option in re.findall(r"(?<=\s)--[a-z-]+", rest):
+            assert option in made or option[2:] in made, f"{name} {option}"
+
+
 def test_pictures_are_there_and_small() -> None:
     names = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", DOCS[0].read_text(encoding="utf-8"))
     assert names

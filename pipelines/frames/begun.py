@@ -112,7 +112,6 @@ def structure_from_motion(
         window=window_size(context.config.run.memory_mb, camera.width * camera.height),
         cam_from_rig=rig.cam_from_rig,
         ahead=ahead,
-        warn=context.warn,
     )
 
 

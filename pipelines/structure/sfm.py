@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -32,13 +31,15 @@ from msgs_slam.pipelines.structure.consistency import ModelReport, judge
 from msgs_slam.pipelines.structure.given import bare_model, set_best_focal
 from msgs_slam.pipelines.structure.lens import set_lens
 from msgs_slam.pipelines.structure.parallax import HOW_TO_FILM, require_parallax
-from msgs_slam.pipelines.structure.rolling import NO_READOUT, Readout, adjust_rolling, read_readout
+from msgs_slam.pipelines.structure.rolling import (
+    NO_READOUT,
+    Readout,
+    adjust_rolling,
+)
 from msgs_slam.pipelines.structure.seams import cut, take_out
-from msgs_slam.pipelines.structure.window_models import WindowModels
 from msgs_slam.pipelines.structure.window_size import SIZE, windows_of
-from msgs_slam.pipelines.structure.windows import adjust_joined
+from msgs_slam.pipelines.structure.windows import Joined, adjust_joined
 from msgs_slam.pipelines.system.memory import give_back
-from msgs_slam.pipelines.system.progress import log
 from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import Features, Vocabulary
 
@@ -91,7 +92,6 @@ class StructureFromMotion(Candidates):
     window: int = SIZE
     ahead: Ahead = nothing_ahead
     given: NDArray[np.float64] | None = None
-    warn: Callable[[str], None] = log.warning
 
     def run(self, keyframe_ids: Sequence[int]) -> Structure:
         """Raises InputError when the keyframes have no parallax or too little in common."""
@@ -107,15 +107,13 @@ class StructureFromMotion(Candidates):
         known_focal = self.camera.mean_focal_length() if self.camera.has_prior_focal_length else None
         if self.given is None:
             require_parallax(pairs, views.xy, (self.camera.width, self.camera.height), known_focal)
-        in_windows = self._windows(len(features)) > 0
-        found, apart = self._in_windows(views, pairs) if in_windows else (self._calibrated(views, pairs), [])
-        found = found or self._as_given(views, pairs)
+        found = self._in_windows(views, pairs) or self._calibrated(views, pairs) or self._as_given(views, pairs)
         if found is None:
             raise InputError(
                 f"no structure could be found: {len(pairs)} pairs of {len(features)} views match. The views have too "
                 f"little texture, blur or overlap. {HOW_TO_FILM}, slowly and in good light"
             )
-        found, pieces = self._largest_first(found, self._pieces(views, pairs, found.model, apart), views)
+        found, pieces = self._largest_first(found, self._pieces(views, pairs, found.model), views)
         report = judge(found.model, pairs, views.xy, self._places(features), self.config.overlap)
         cut(found.model, report.parts, report.total)
         return Structure(
@@ -134,35 +132,25 @@ class StructureFromMotion(Candidates):
         focal_sd = 0.0 if self.is_fixed else model.cameras[1].mean_focal_length()
         return Adjusted(model, GIVEN_ALONE, focal_sd, 0.0, NO_READOUT)
 
-    def _in_windows(
-        self, views: Views, pairs: Sequence[VerifiedPair]
-    ) -> tuple[Adjusted | None, list[pycolmap.Reconstruction]]:
-        """Of a long recording the models of its windows, joined, in the camera that all of them tell; and the parts
-        that do not hang together with the largest."""
+    def _in_windows(self, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
+        """Of a long recording the models of its windows, joined, in the camera of the window that is surest of it.
+        None of a shorter one, of panoramas, and where the windows do not hang together."""
         windows = windows_of(len(views.xy), self.window)
+        if not self._windows(len(views.xy)):
+            return None
         views.features.forget()
-        made, surest = WindowModels(), None
+        joined, surest = Joined(), None
         for window in self.progress.track(windows, "windows", len(windows)):
-            if (found := self._window(window, views.part(window), pairs)) is not None:
-                made.add(found.model, window.start, found.focal_sd, found.readout)
-                surest = found if surest is None or found.focal_sd < surest.focal_sd else surest
-        if surest is None:
-            return None, []
-        if complaint := made.complaint(len(windows)):
-            self.warn(complaint)
-        camera, given = surest.model.cameras[1], read_readout(self.config.rolling_shutter)
-        focal_sd = 0.0 if self.is_fixed else made.calibrate(camera)
-        readout = made.readout() if given is None else given
-        whole = replace(surest, model=made.largest().model(camera, views.xy), focal_sd=focal_sd)
-        camera = whole.model.cameras[1]
-        del surest, found  # not beside the model of all
+            found = self._window(window, views.part(window), pairs)
+            if found is None or not joined.add(found.model, window.start):
+                return None
+            surest = found if surest is None or found.focal_sd < surest.focal_sd else surest
+        assert surest is not None
+        whole = replace(surest, model=joined.model(surest.model.cameras[1], views.xy))
+        del joined, surest, found  # not beside the model of all
         give_back()
-        together = partial(adjust_joined, pairs=pairs, windows=windows, narrowly=bool(views.weak))
-        readout = together(whole.model, views.xy, views.times, readout, find_readout=given is None)
-        others = made.others(camera, views.xy, whole.model, self.config.least_piece)
-        for other in others:
-            together(other, views.xy, views.times, readout)
-        return replace(whole, readout=readout), others
+        adjust_joined(whole.model, views.xy, views.times, whole.readout, pairs, windows, bool(views.weak))
+        return whole
 
     def _windows(self, count: int) -> int:
         """How many there are; 0 where all is made at once."""
@@ -183,33 +171,16 @@ class StructureFromMotion(Candidates):
         self._window(window, views.part(window), pairs)
 
     def _pieces(
-        self,
-        views: Views,
-        pairs: Sequence[VerifiedPair],
-        model: pycolmap.Reconstruction,
-        apart: Sequence[pycolmap.Reconstruction],
+        self, views: Views, pairs: Sequence[VerifiedPair], model: pycolmap.Reconstruction
     ) -> list[pycolmap.Reconstruction]:
-        """Sound models of the keyframes that `model` leaves, those `apart` that are there already and others in its
-        camera, until there is none of the least size; of a long recording no more at once than a window may have."""
-        camera, pieces = model.cameras[1], [*apart]
+        """Sound models of the keyframes that `model` leaves, in its camera, until there is none of the least size."""
+        camera = model.cameras[1]
         camera.has_prior_focal_length = True
-        placed = {i - 1 for m in (model, *apart) for i in m.reg_image_ids()}
-        left, count = [k for k in range(len(views.xy)) if k not in placed], len(views.xy)
-        most, numbers = len(windows_of(count, self.window)[0]) if self._windows(count) else count, itertools.count(2)
-        for first in range(0, len(left), most):
-            pieces += self._pieces_of(set(left[first : first + most]), views, pairs, camera, numbers)
-        return pieces
-
-    def _pieces_of(
-        self,
-        left: set[int],
-        views: Views,
-        pairs: Sequence[VerifiedPair],
-        camera: pycolmap.Camera,
-        numbers: Iterator[int],
-    ) -> list[pycolmap.Reconstruction]:
+        left = set(range(len(views.xy))) - {i - 1 for i in model.reg_image_ids()}
         pieces: list[pycolmap.Reconstruction] = []
-        for number in numbers:
+        number = 1
+        while True:
+            number += 1
             rest = [p for p in pairs if p.first in left and p.second in left]
             if len({k for p in rest for k in (p.first, p.second)}) < self.config.least_piece:
                 return pieces
@@ -229,7 +200,6 @@ class StructureFromMotion(Candidates):
             if self._is_piece(report):
                 take_out(piece, [k for part in report.parts[1:] for k in part])
                 pieces.append(piece)
-        return pieces
 
     def _is_piece(self, report: ModelReport) -> bool:
         return len(report.parts[0]) >= self.config.least_piece and report.is_consistent
