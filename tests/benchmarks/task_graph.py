@@ -36,8 +36,8 @@ DIVIDED = {
 WINDOWS, WINDOW, AGAIN = 0.30, 460, 0.12
 """Share of `frames` that makes the models of windows of so many new keyframes; how much of it is done again by the one
 process that joins them, which finds the mapper's models but adjusts them itself."""
-REGIONS, REGION = 0.13, 80
-"""Share of `export` that fuses and paints regions, and keyframes a region: 400 blocks a keyframe, 32,000 at a time."""
+REGIONS, REGION = 0.13, 20
+"""Share of `export` that fuses and paints regions, and keyframes a region: 400 blocks a keyframe, 8,000 at a time."""
 ONCE = 0.37
 """Share of `export` that does not grow: up and metres are told by 24 views however many there are."""
 
