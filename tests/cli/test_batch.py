@@ -132,7 +132,7 @@ def test_recordings_of_one_name_have_runs_of_their_own(tmp_path: Path) -> None:
 
 def test_wrong_settings_are_refused_before_anything(recordings: Path, tmp_path: Path) -> None:
     refused = run_batch(recordings, tmp_path / "runs", "--set", "frames.nonsense=1")
-    assert refused.exit_code == 1
+    assert refused.exit_code == 2
     assert "there is no setting frames.nonsense" in refused.stderr
     assert not (tmp_path / "runs").exists()
     assert run_batch(recordings, tmp_path / "runs", "--address", "x:1").exit_code == 2
