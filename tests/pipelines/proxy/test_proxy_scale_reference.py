@@ -48,11 +48,11 @@ def test_references_are_read() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("0.6", "expected PICTURE:X1"),
-        ("height=-1", "expected PICTURE:X1"),
+        ("0.6", "expected IMAGE:X1"),
+        ("height=-1", "expected IMAGE:X1"),
         ("height=0", "make no sense"),
         ("height=1.2.3", "is no number"),
-        ("000003.png:1,2,3=1", "expected PICTURE:X1"),
+        ("000003.png:1,2,3=1", "expected IMAGE:X1"),
         ("000003.png:100,20,100.5,20=1", "nearly the same"),
         ("000003.png:10,20,100,20=99999", "make no sense"),
         ("nowhere.png:10,20,100,20=1", "has no image nowhere.png"),
