@@ -140,5 +140,5 @@ def _unique(names: Iterable[str], path: Path) -> tuple[str, ...]:
     found = tuple(names)
     twice = next((n for k, n in enumerate(found) if n in found[:k]), None) if len(set(found)) < len(found) else None
     if twice is not None:
-        raise InputError(f"--poses {path}: two poses are of pictures called {twice!r}: names must differ")
+        raise InputError(f"--poses {path}: two poses are of images called {twice!r}: names must differ")
     return found

@@ -82,13 +82,13 @@ def warn_of_given(
     figures: dict[str, Any] = {"given_poses": int(given.known.sum()), "given_metric": given.is_metric}
     if structure.mapper == GIVEN_ALONE:
         context.warn(
-            f"structure from motion found nothing in the pictures: {structure.report.registered} keyframes stand where "
+            f"structure from motion found nothing in the images: {structure.report.registered} keyframes stand where "
             f"--poses ({given.what}) says, nothing of them is checked"
         )
         return figures
     if structure.mapper.startswith(GIVEN):
         context.warn(
-            f"the poses rest on those given with --poses ({given.what}), adjusted to the pictures: without them "
+            f"the poses rest on those given with --poses ({given.what}), adjusted to the images: without them "
             "structure from motion found less"
         )
     rows = [keyframes[k] for k in ids]
@@ -101,7 +101,7 @@ def warn_of_given(
     unit = " m" if given.is_metric else ""
     if wrong:
         context.warn(
-            f"{len(wrong)} given poses are far from where the pictures say (frames {stretches(wrong)}), and are left "
+            f"{len(wrong)} given poses are far from where the images say (frames {stretches(wrong)}), and are left "
             f"out; the others agree to {agreed.position_sd:.3g}{unit} and {agreed.degrees_sd:.2g} degrees"
         )
     return figures | {

@@ -125,7 +125,7 @@ def check(source: Path, config: Config) -> None:
 def _check_panoramas(config: Config) -> None:
     """What knows pixels of the source's own pictures does not know its panoramas."""
     if config.frames.poses:
-        raise InputError("--poses cannot be used with panoramas: leave it away")
+        raise InputError("--poses cannot be used with panoramas: omit it")
     files = [p for p in (config.proxy.depth, config.proxy.semantics) if p.startswith("files")]
     reference = config.proxy.scale_ref.strip()
     if files or (reference and not reference.startswith("height")):

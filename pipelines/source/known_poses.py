@@ -45,7 +45,7 @@ def given_poses(config: FramesConfig, source: AnySource, frames: Sequence[Frame]
     if known.sum() < min(LEAST, len(frames)):
         raise InputError(
             f"--poses {config.poses}: of its {len(file)} poses {known.sum()} belong to frames of {source.path}"
-            f"{_examples(file, source, frames)}. Give the poses of these pictures"
+            f"{_examples(file, source, frames)}. Give the poses of these images"
         )
     cam_from_world = np.full_like(found, np.nan)
     cam_from_world[known] = se3.inverse(found[known])
@@ -88,8 +88,8 @@ def _by_name(file: PoseFile, source: AnySource, frames: Sequence[Frame]) -> NDAr
 def _by_order(file: PoseFile, source: AnySource, frames: Sequence[Frame], path: str) -> NDArray[np.float64]:
     if source.expected_frames != len(file):
         raise InputError(
-            f"--poses {path}: {len(file)} poses for {source.expected_frames} pictures, and neither names nor times "
-            "tell which belongs to which: give one for each picture, or poses with the pictures' names"
+            f"--poses {path}: {len(file)} poses for {source.expected_frames} images, and neither names nor times "
+            "tell which belongs to which: give one for each image, or poses with the images' names"
         )
     return _rows(file, [f.source_index for f in frames])
 
@@ -104,7 +104,7 @@ def _rows(file: PoseFile, rows: Sequence[int | None]) -> NDArray[np.float64]:
 
 def _examples(file: PoseFile, source: AnySource, frames: Sequence[Frame]) -> str:
     if file.names:
-        return f" (its first is of {file.names[0]!r}, the source's first picture is {stem(frames[0].name)!r})"
+        return f" (its first is of {file.names[0]!r}, the source's first image is {stem(frames[0].name)!r})"
     if file.times is None:
         return ""
     return f" (it begins at {file.times[0]:.2f} s, the source at {frames[0].timestamp:.2f} s)"

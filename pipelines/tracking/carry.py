@@ -31,10 +31,10 @@ def carry_given(context: StageContext, state: TrackState) -> dict[str, Any]:
     joined = join_by_given(state, given)
     carried = pose_lost(state, given)
     if joined:
-        context.warn(f"{joined} stretches that no picture ties to the rest are joined to it by the given poses")
+        context.warn(f"{joined} stretches that no image ties to the rest are joined to it by the given poses")
     if carried:
         context.warn(
-            f"{len(carried)} frames ({stretches(carried)}) are posed by --poses alone: the pictures say nothing of them"
+            f"{len(carried)} frames ({stretches(carried)}) are posed by --poses alone: the images say nothing of them"
         )
     return {"given_joined": joined, "given_carried": len(carried)}
 
