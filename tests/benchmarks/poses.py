@@ -117,7 +117,7 @@ def disturbed(world_from_cam: Array) -> Array:
     return np.asarray(out)
 
 
-def write_given(source: Path, case: Case, work: Path) -> Path:
+def write_given(source: Path, case: Case, path: Path) -> Path:
     """The disturbed truth of a folder's pictures as a JSON list."""
     from msgs_slam.formats.images import list_images
     from msgs_slam.formats.jsonfile import write_json
@@ -127,8 +127,8 @@ def write_given(source: Path, case: Case, work: Path) -> Path:
     poses = disturbed(np.array([np.full((4, 4), np.nan) if t is None else t for t in truth]))
     poses = poses @ np.diag([1.0, -1.0, -1.0, 1.0])
     rows = [{"name": n, "transform": p.tolist()} for n, p in zip(names, poses, strict=True) if np.isfinite(p).all()]
-    write_json(work / "given.json", rows)
-    return work / "given.json"
+    write_json(path, rows)
+    return path
 
 
 def measure(name: str, form: str, work: Path, settings: list[str], until: str) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def measure(name: str, form: str, work: Path, settings: list[str], until: str) -
 
     case = recordings(work)[name][form]
     source = prepare(name, case, work)
-    more = [f'frames.poses="{write_given(source, case, work)}"'] if form == "given" else []
+    more = [f'frames.poses="{write_given(source, case, work / f"{name}_given.json")}"'] if form == "given" else []
     run = RunFolder(work / f"{name}_{form}.msgs")
     config = load_config(overrides=[*COARSE, *case.settings, *more, *settings])
     records, seconds = run_stages_timed(source, run, config, until)
