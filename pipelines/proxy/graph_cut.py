@@ -19,21 +19,6 @@ def cut_graph(
     return np.unique(root, return_inverse=True)[1]
 
 
-def cut_image(image: NDArray[np.uint8], scale: float) -> NDArray[np.int64]:
-    """(h, w) regions of like colour of an RGB image (h, w, 3); costs are colour differences in grey levels."""
-    height, width = image.shape[:2]
-    index = np.arange(height * width).reshape(height, width)
-    color = image.astype(np.float64)
-    pairs, costs = [], []
-    for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        here = (slice(0, height - dy), slice(max(0, -dx), width - max(0, dx)))
-        there = (slice(dy, height), slice(max(0, dx), width + min(0, dx)))
-        pairs.append(np.stack([index[here].ravel(), index[there].ravel()]))
-        costs.append(np.sqrt(((color[here] - color[there]) ** 2).sum(-1)).ravel())
-    a, b = np.concatenate(pairs, axis=1)
-    return cut_graph(a, b, np.concatenate(costs), np.ones(height * width), scale).reshape(height, width)
-
-
 @kernel
 def _root(parent: NDArray[np.int64], i: int) -> int:
     while parent[i] != i:

@@ -22,8 +22,9 @@ from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.scratch import load_scratch, save_scratch
 from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
+from msgs_slam.pipelines.proxy.stereo.borrow import agreed_depth, borrow_depth, carry_depth
 from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
-from msgs_slam.pipelines.proxy.stereo.fill import fill_unsure
+from msgs_slam.pipelines.proxy.stereo.fill import fill_unsure, judge_by_company
 from msgs_slam.pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
 from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth
 from msgs_slam.pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
@@ -31,15 +32,20 @@ from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost, warps_to
 from msgs_slam.pipelines.proxy.stereo.upsample import upsample_depth
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Frame, Intrinsics
+from msgs_slam.pipelines.voxels.voxels import to_lab
 
 _CACHED_FRAMES = 48
-_VIEWS, _BEST, _FUSE_VIEWS = 6, 3, 8
-"""Keyframes that one is matched with, those of them that count at a pixel, and those whose depths are compared."""
+_VIEWS, _BEST, _FUSE_VIEWS, _LENDERS = 6, 3, 8, 16
+"""Keyframes that one is matched with, those of them that count at a pixel, those whose depths are compared, and those
+that lend theirs."""
+_CACHED_LENDERS = _LENDERS + 4
 _BEST_ANGLE = 8.0
 """Degrees between the views of a pair."""
 _SMALL_STEP, _JUMP, _EDGE = 0.05, 0.4, 0.05
 """Of the smoothing: a plane more or less, any other step, and the intensity step that makes it cheap."""
 _STIFFNESS = 0.01
+_STOP = 0.02
+"""As a part of the range of inverse depths: so near to its ends nothing is a match."""
 _TOLERANCE = 0.01
 """Relative difference between depths that agree."""
 
@@ -69,6 +75,10 @@ class MultiviewDepth:
         self._camera: Intrinsics = sequence.calibration.intrinsics.at_most(side)
         self._grey = lru_cache(_CACHED_FRAMES)(self._read_grey)
         self._raw = lru_cache(_CACHED_FRAMES)(self._load_raw)
+        self._fused = lru_cache(_CACHED_LENDERS)(self._fuse)
+        self._small = lru_cache(_CACHED_LENDERS)(self._read_small)
+        self._lab = lru_cache(_CACHED_LENDERS)(lambda index: to_lab(self._small(index)))
+        self._nearest = lru_cache(_CACHED_FRAMES)(self._choose_nearest)
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames that are no keyframes of the backbone."""
@@ -84,7 +94,7 @@ class MultiviewDepth:
                 save_scratch(path, inverse_depth=self._sweep(self._index[frame.id]))
 
     def _sweep(self, index: int) -> NDArray[np.float32]:
-        """(H, W) inverse depth of one keyframe from its neighbours alone; 0 where it has none to match with."""
+        """(H, W) inverse depth of one keyframe from its neighbours alone; 0 where nothing matches."""
         camera = self._camera
         companions = self._neighbours(index, _VIEWS)
         limits = depth_range(self._model, index, companions)
@@ -102,7 +112,8 @@ class MultiviewDepth:
         inverse = refine_inverse_depth(image, others, warps, inverse, step / 3, 2, _STIFFNESS, _BEST, self._bands)
         inverse = cv2.bilateralFilter(inverse, 7, 0.7 * step, 2.0)
         inverse = np.clip(inverse, planes[0], planes[-1]).astype(np.float32)
-        return inverse if left_out is None else np.where(left_out, np.float32(0), inverse)
+        unknown = at_stops(inverse, planes)
+        return np.where(unknown if left_out is None else unknown | left_out, np.float32(0), inverse)
 
     # second pass ------------------------------------------------------------------------------------------------
 
@@ -113,15 +124,22 @@ class MultiviewDepth:
             empty = np.zeros((target.height, target.width), np.float32)
             return DepthEstimate(empty, empty)
         index = self._index[frame.id]
-        depth, confidence = self._fuse(index)
-        image = self._sequence.image(frame)
-        size = (self._camera.width, self._camera.height)
-        depth, confidence = fill_unsure(depth, confidence, resize_area(image, *size))
-        return upsample_depth(depth, confidence, image)
+        depth, confidence = self._borrow(index)
+        depth, confidence = fill_unsure(depth, confidence, self._small(index))
+        return upsample_depth(depth, confidence, self._sequence.image(frame))
+
+    def _borrow(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Depth and confidence of one keyframe, with sure depths of others where its own is unsure."""
+        own, lab = self._fused(index), self._lab(index)
+        carried = []
+        for j in self._present(self._neighbours(index, _LENDERS)).tolist():
+            warp = self._warps(j, np.array([index]))[0]
+            carried.append(carry_depth(*self._fused(j), self._lab(j), warp, lab))
+        return borrow_depth(*own, *agreed_depth(carried)) if carried else own
 
     def _fuse(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        companions = self._neighbours(index, _FUSE_VIEWS)
-        companions = np.array([j for j in companions if self._path(int(self._model.frame_ids[j])).exists()], np.int64)
+        """Depth of one keyframe and those of its neighbours that agree, and its confidence."""
+        companions = self._present(self._neighbours(index, _FUSE_VIEWS))
         depth = self._raw(index)
         if len(companions) == 0:
             return depth, np.where(depth > 0, 0.2, 0).astype(np.float32)
@@ -130,7 +148,7 @@ class MultiviewDepth:
         fused, support, conflict = fuse_depths(
             depth, others, self._warps(index, companions), back, _TOLERANCE, self._bands
         )
-        return fused, agreement(support, conflict)
+        return fused, judge_by_company(agreement(support, conflict), self._small(index))
 
     def figures(self) -> dict[str, Any]:
         """The size that the images were matched at."""
@@ -141,9 +159,16 @@ class MultiviewDepth:
     def _path(self, frame_id: int) -> Path:
         return self._folder() / f"{frame_id:06d}.npz"
 
+    def _present(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those that have a raw depth map."""
+        return np.array([j for j in indices if self._path(int(self._model.frame_ids[j])).exists()], np.int64)
+
     def _neighbours(self, index: int, count: int) -> NDArray[np.int64]:
+        return self._nearest(index)[:count]
+
+    def _choose_nearest(self, index: int) -> NDArray[np.int64]:
         camera = self._sequence.calibration.intrinsics
-        return choose_neighbours(self._model, camera, index, count, _BEST_ANGLE)
+        return choose_neighbours(self._model, camera, index, _LENDERS, _BEST_ANGLE)
 
     def _warps(self, index: int, others: NDArray[np.int64]) -> NDArray[np.float64]:
         matrix, poses = self._camera.matrix, self._model.cam_from_world
@@ -156,6 +181,11 @@ class MultiviewDepth:
         small = resize_area(np.asarray(grey, np.uint8), *size)
         return small.astype(np.float32) / np.float32(255), self._sequence.left_out(self._frame[frame_id], *size)
 
+    def _read_small(self, index: int) -> NDArray[np.uint8]:
+        """(h, w, 3) RGB at the size that is matched."""
+        image = self._sequence.image(self._frame[int(self._model.frame_ids[index])])
+        return resize_area(image, self._camera.width, self._camera.height)
+
     def _load_raw(self, index: int) -> NDArray[np.float32]:
         inverse = load_scratch(self._path(int(self._model.frame_ids[index])))["inverse_depth"]
         return invert(inverse)
@@ -164,6 +194,13 @@ class MultiviewDepth:
 def _blanked(grey: NDArray[np.float32], left_out: NDArray[np.bool_] | None) -> NDArray[np.float32]:
     """Another view's picture with NaN where it shows no scene: no window that touches it is compared."""
     return grey if left_out is None else np.where(left_out, np.float32(np.nan), grey)
+
+
+def at_stops(inverse: NDArray[np.float32], planes: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Where the sweep ended at its first or last planes: there a surface without texture ends, for no plane is better
+    than the first, and all views agree on it."""
+    place = (inverse - planes[0]) / (planes[-1] - planes[0])
+    return np.asarray((place < _STOP) | (place > 1 - _STOP))
 
 
 def invert(values: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -5,8 +5,10 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
+from msgs_slam.pipelines.proxy.stereo.borrow import agreed_depth, borrow_depth, carry_depth
 from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
-from msgs_slam.pipelines.proxy.stereo.fill import SURE, fill_unsure
+from msgs_slam.pipelines.proxy.stereo.fill import SURE, fill_unsure, judge_by_company
+from msgs_slam.pipelines.proxy.stereo.provider import at_stops
 from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth
 from msgs_slam.pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
 from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost, warps_to
@@ -222,6 +224,72 @@ def test_a_blank_wall_is_filled_with_the_plane_of_its_border() -> None:
     np.testing.assert_array_equal(filled[~blank], seen[~blank])
     assert np.abs(filled / truth - 1)[blank].max() < 0.02
     assert 0 < trust[blank].min() <= trust[blank].max() < SURE
+
+
+def test_each_of_two_blank_surfaces_takes_its_own_plane() -> None:
+    left = np.broadcast_to(np.arange(WIDTH) < 30, (HEIGHT, WIDTH))
+    slope = 0.002 * np.arange(WIDTH)[None] + 0 * np.arange(HEIGHT)[:, None]
+    truth = np.where(left, 1 / (0.3 + slope), 1 / (0.9 - slope))
+    image = np.where(left, 60, 180).astype(np.uint8)[..., None].repeat(3, -1)
+    sure = np.ones((HEIGHT, WIDTH), bool)
+    sure[8:-8] = False
+    filled, _ = fill_unsure(truth.astype(np.float32), np.where(sure, 0.9, 0).astype(np.float32), image)
+    assert np.abs(filled / truth - 1).max() < 0.03
+
+
+def test_a_chance_match_in_a_blank_wall_is_not_sure_for_it_stands_alone() -> None:
+    image = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
+    image[:, 30:] = np.random.default_rng(3).integers(0, 40, (HEIGHT, 30, 3))
+    confidence = np.where(np.arange(WIDTH)[None] < 30, 0.02, 0.8).repeat(HEIGHT, 0).astype(np.float32)
+    confidence[20, 10] = 0.8
+    judged = judge_by_company(confidence, image)
+    assert judged[20, 10] < SURE / 2
+    assert judged[:, 36:].min() > 0.6
+    one_surface = judge_by_company(np.full((HEIGHT, WIDTH), 0.8, np.float32), image)
+    np.testing.assert_allclose(one_surface, 0.64**0.75, rtol=1e-4)
+
+
+def test_the_ends_of_the_sweep_are_no_matches() -> None:
+    planes = np.linspace(0.2, 1.2, 51)
+    found = at_stops(np.array([0.2, 0.215, 0.23, 0.7, 1.17, 1.19, 1.2], np.float32), planes)
+    np.testing.assert_array_equal(found, [True, True, False, False, False, True, True])
+
+
+def lend(truth: NDArray, color: float, confidence: float = 0.9) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The plane's depths of a camera aside, whose picture has one lightness, carried into the middle camera."""
+    warp = warps_to(MATRIX, CAMERAS[0], [MATRIX], [np.eye(4)])[0]
+    seen = view_of_plane(CAMERAS[0], 0.3)[1].astype(np.float32)
+    lab, target = np.zeros((HEIGHT, WIDTH, 3), np.float32), np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    lab[..., 1] = color
+    return carry_depth(seen, np.full(seen.shape, confidence, np.float32), lab, warp, target)
+
+
+def test_unsure_depths_are_taken_from_views_that_show_the_same_colour() -> None:
+    truth = view_of_plane(np.eye(4), 0.3)[1]
+    own, unsure = (truth * 3).astype(np.float32), np.full(truth.shape, 0.1, np.float32)
+    inner = (slice(4, -4), slice(10, -10))
+    depth, confidence = borrow_depth(own, unsure, *agreed_depth([lend(truth, 0.5), lend(truth, 0.0)]))
+    assert np.abs(depth / truth - 1)[inner].max() < 0.02
+    assert confidence[inner].min() > SURE
+    for carried in ([lend(truth, 12.0)] * 4, [lend(truth, 0.0, 0.2)] * 4, [lend(truth, 0.0)]):
+        depth, confidence = borrow_depth(own, unsure, *agreed_depth(carried))
+        np.testing.assert_array_equal(depth, own)
+        np.testing.assert_array_equal(confidence, unsure)
+    sure = np.full(truth.shape, SURE, np.float32)
+    depth, _ = borrow_depth(own, sure, *agreed_depth([lend(truth, 0.0)] * 3))
+    np.testing.assert_array_equal(depth, own)
+
+
+def test_of_two_carried_depths_the_nearer_hides_the_other() -> None:
+    depth = np.full((HEIGHT, WIDTH), 3.0, np.float32)
+    depth[:, :20] = 1.5
+    lab = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    warp = warps_to(MATRIX, shifted(-0.3), [MATRIX], [np.eye(4)])[0]
+    carried, likeness = carry_depth(depth, np.ones_like(depth), lab, warp, lab)
+    # Seen from 0.3 to the right, the near board moves right by 10 pixels and the wall by 5.
+    np.testing.assert_allclose(carried[:, 25:29], 1.5, rtol=1e-5)
+    np.testing.assert_allclose(carried[:, 31:50], 3.0, rtol=1e-5)
+    assert set(np.unique(likeness)) <= {0.0, 1.0}
 
 
 def test_enlarged_depth_has_its_edge_where_the_picture_has_it() -> None:
