@@ -72,7 +72,7 @@ def test_poses_are_the_same_everywhere(run: RunFolder, folder: Path, exported: O
 def test_all_files_have_the_same_rights(folder: Path) -> None:
     files = [p for p in folder.rglob("*") if p.is_file()]
     assert len({p.stat().st_mode for p in files}) == 1
-    assert any(p.suffix == ".safetensors" for p in files)
+    assert {".ply", ".glb", ".json", ".txt"} <= {p.suffix for p in files}
 
 
 def test_map_is_the_same_everywhere(folder: Path, exported: Outcome) -> None:

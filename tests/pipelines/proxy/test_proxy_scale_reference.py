@@ -56,7 +56,7 @@ def test_references_are_read() -> None:
         ("000003.png:100,20,100.5,20=1", "nearly the same"),
         ("000003.png:10,20,100,20=99999", "make no sense"),
         ("nowhere.png:10,20,100,20=1", "has no image nowhere.png"),
-        ("000003.png:10,20,300,20=1", r"outside the picture \(256x192\)"),
+        ("000003.png:10,20,300,20=1", r"outside the image \(256x192\)"),
     ],
 )
 def test_bad_references_are_refused_before_anything_slow(
