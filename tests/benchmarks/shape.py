@@ -163,7 +163,8 @@ def sparsification(off: NDArray, reliability: NDArray) -> float:
 
 def write_sheet(views: list[View], target: Path, count: int = 4) -> None:
     """Picture, truth, depth, error (red too far, blue too near, full by 30 %) of the keyframes with most error."""
-    scale = np.median(np.concatenate([(v.truth / v.depth)[(v.truth > 0) & (v.depth > 0)][::9] for v in views]))
+    both = gather(views)
+    scale = np.median(both.truth / both.depth)
 
     def signed(v: View) -> NDArray:
         both = (v.truth > 0) & (v.depth > 0)
