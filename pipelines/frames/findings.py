@@ -27,7 +27,7 @@ def settled_origin(context: StageContext, origin: str, camera: pycolmap.Camera, 
         return "given"
     context.warn(
         f"the camera that the data set states (focal length {camera.mean_focal_length():.0f} px) explains the images "
-        f"much worse than one found from them ({found.mean_focal_length():.0f} px), which is used instead. To hold a "
+        f"worse than one found from them ({found.mean_focal_length():.0f} px), which is used instead. To hold a "
         "camera in any case give it with --intrinsics"
     )
     return "self-calibrated"
