@@ -179,5 +179,5 @@ def test_a_folder_without_poses_and_a_name_twice_are_refused(tmp_path: Path) -> 
     frame = {"transform_matrix": np.eye(4).tolist()}
     frames = [frame | {"file_path": f"{folder}/0.jpg"} for folder in ("left", "right")]
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
-    with pytest.raises(InputError, match="two poses are of pictures called '0'"):
+    with pytest.raises(InputError, match="two poses are of images called '0'"):
         read_poses(tmp_path / "transforms.json")
