@@ -86,6 +86,6 @@ def test_poses_of_another_recording_are_refused_before_anything(tmp_path: Path) 
     true = write_recording(tmp_path / "pictures", range(0))
     write_matrices(tmp_path / "few.txt", true[:5])
     config = load_config(overrides=[*SETTINGS, f'frames.poses="{tmp_path / "few.txt"}"'])
-    with pytest.raises(InputError, match="5 poses for 18 pictures"):
+    with pytest.raises(InputError, match="5 poses for 18 images"):
         reconstruct(tmp_path / "pictures", RunFolder(tmp_path / "run"), config, SilentProgress(), "tracking")
     assert read_rgb(tmp_path / "pictures" / "view_000.png").shape == (HEIGHT, WIDTH, 3)
