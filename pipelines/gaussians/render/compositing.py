@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import functools
-import importlib.metadata
 from dataclasses import dataclass
 from types import ModuleType
 
 import torch
 from torch import Tensor
 
+import msgs_slam.pipelines.gaussians.render.cards as cards
 import msgs_slam.pipelines.gaussians.render.reference as reference
 
 
@@ -96,7 +95,7 @@ def choose_backend(backend: str | None, example: Tensor) -> ModuleType:
 
         return cpu
     if name == "cuda":
-        if not _has_triton():
+        if not cards.has_triton():
             raise ValueError("backend: 'cuda' needs triton >= 3.3, which comes with torch >= 2.7 built for CUDA")
         import msgs_slam.pipelines.gaussians.render.cuda as cuda
 
@@ -105,20 +104,6 @@ def choose_backend(backend: str | None, example: Tensor) -> ModuleType:
 
 
 def _fastest(example: Tensor) -> str:
-    if example.dtype != torch.float32:
-        return "reference"
-    if example.device.type == "cpu":
+    if example.device.type == "cpu" and example.dtype == torch.float32:
         return "cpu"
-    # Older cards have too little shared memory for the kernels.
-    modern = example.device.type == "cuda" and torch.cuda.get_device_capability(example.device) >= (8, 0)
-    return "cuda" if modern and _has_triton() else "reference"
-
-
-@functools.cache
-def _has_triton() -> bool:
-    try:
-        version = importlib.metadata.version("triton")
-    except importlib.metadata.PackageNotFoundError:
-        return False
-    # 3.2 does not refuse the kernels but ends the process while compiling them.
-    return tuple(int(part) for part in version.split(".")[:2]) >= (3, 3)
+    return "cuda" if cards.takes_kernels(example) else "reference"

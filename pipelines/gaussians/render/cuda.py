@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+import msgs_slam.pipelines.gaussians.render.cards as cards
 import msgs_slam.pipelines.gaussians.render.rules as rules
 from msgs_slam.pipelines.gaussians.render.cuda_kernels import backward_tile, forward_tile
 from msgs_slam.pipelines.gaussians.render.reference import inspect
@@ -54,7 +55,7 @@ class _Composite(torch.autograd.Function):
         inputs = (starts, members, records, features, proxy, kappa)
         settings = _settings(guided, features.shape[1])
         size = (width, height, features.shape[1])
-        forward_tile[(len(starts) - 1,)](*inputs, image, *planes, *size, **settings)
+        cards.launch(forward_tile, len(starts) - 1, *inputs, image, *planes, *size, **settings)
         ctx.save_for_backward(*inputs[:5], image, *planes)
         ctx.kappa, ctx.size, ctx.settings = kappa, size, settings
         ctx.set_materialize_grads(False)
@@ -70,9 +71,8 @@ class _Composite(torch.autograd.Function):
             for image, gradient in zip(images, gradients, strict=True)
         ]
         d_records, d_features = features.new_zeros(len(records), 5), torch.zeros_like(features)
-        backward_tile[(len(starts) - 1,)](
-            *inputs, ctx.kappa, *images, *upstream, d_records, d_features, *ctx.size, **ctx.settings
-        )
+        results = (d_records, d_features, *ctx.size)
+        cards.launch(backward_tile, len(starts) - 1, *inputs, ctx.kappa, *images, *upstream, *results, **ctx.settings)
         return (*d_records.t().contiguous().unbind(0), d_features, *[None] * 5)
 
 
