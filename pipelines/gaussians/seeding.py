@@ -80,7 +80,7 @@ def seed_gaussians(
     z = depth[rows, columns]
     x = (columns + 0.5 - intrinsics.cx) / intrinsics.fx * z
     y = (rows + 0.5 - intrinsics.cy) / intrinsics.fy * z
-    world_from_cam = torch.linalg.inv(cam_from_world)
+    world_from_cam = torch.linalg.inv(cam_from_world).to(z.device)
     in_world = torch.stack([x, y, z], 1).double() @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
     focal = math.sqrt(intrinsics.fx * intrinsics.fy)
     if isinstance(spacing, Tensor):

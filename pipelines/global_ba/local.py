@@ -13,6 +13,7 @@ from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.gaussians.adam import AdamTable, gradients_of
 from msgs_slam.pipelines.gaussians.render import render
+from msgs_slam.pipelines.gaussians.render.rendering import beside
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.global_ba.verify import Loop
 from msgs_slam.pipelines.mapping import losses
@@ -50,12 +51,12 @@ def adjusted_poses(
 ) -> dict[int, NDArray[np.float64]]:
     """Frame id → the pose that `adjust_views` finds for it, one view in memory at a time."""
     unit = scene_depth(views)
-    return {v.frame_id: _adjusted(v, gaussian_map, settings, steps, unit).cam_from_world.cpu().numpy() for v in views}
+    return {v.frame_id: _adjusted(v, gaussian_map, settings, steps, unit).cam_from_world.numpy() for v in views}
 
 
 def _adjusted(view: View, gaussian_map: GaussianMap, settings: MappingConfig, steps: int, unit: float) -> View:
     weight = losses.depth_weight(view.trust)
-    table = AdamTable({"twist": torch.zeros(6, device=view.image.device)})
+    table = AdamTable({"twist": torch.zeros(6)})
     best, pose = float("inf"), view.cam_from_world
     for _ in range(steps + 1):
         twist = table.values["twist"]
@@ -65,7 +66,8 @@ def _adjusted(view: View, gaussian_map: GaussianMap, settings: MappingConfig, st
         )  # fmt: skip
         loss = settings.depth_weight * losses.depth_loss(shown.depth, view.depth, weight, unit)
         loss = loss + settings.label_weight * losses.label_loss(shown.features, view.channels, view.label_weight)
-        loss = loss + _POSE_WEIGHT * ((twist[:3] / unit).square().sum() + twist[3:].square().sum())
+        away = (twist[:3] / unit).square().sum() + twist[3:].square().sum()
+        loss = loss + _POSE_WEIGHT * beside(away, loss)
         if (value := float(loss.detach())) < best:
             best, pose = value, se3.exp(twist.detach().double()) @ view.cam_from_world
         (gradient,) = gradients_of(loss, (table.values,))

@@ -50,7 +50,7 @@ class Shown(Sequence[PosedDepth]):
 @torch.no_grad()
 def drawn_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], camera: Intrinsics) -> DrawnView:
     """Median depth with a weight: none where the map is thin or the depth jumps, less far away."""
-    m, pose = gaussian_map, torch.as_tensor(cam_from_world, device=gaussian_map.means.device)
+    m, pose = gaussian_map, torch.as_tensor(cam_from_world)
     radii, opacities = m.radii, m.opacities
     median, seen = median_and_seen(m.means, radii, opacities, pose, camera)
     depth, features = median.cpu().numpy(), torch.cat([m.colors[seen], m.class_logits[seen]], dim=1)

@@ -61,7 +61,7 @@ def _label_agreement(rendering: Rendering, view: View) -> float:
 
 def draw_map(gaussian_map: GaussianMap, view: View, cam_from_world: NDArray[np.float64]) -> Rendering:
     """Colours ++ class logits, depth and silhouette from a camera."""
-    pose = torch.as_tensor(cam_from_world, dtype=torch.float64, device=gaussian_map.means.device)
+    pose = torch.as_tensor(cam_from_world, dtype=torch.float64)
     features = torch.cat([gaussian_map.colors, gaussian_map.class_logits], dim=1)
     m = gaussian_map
     return render(m.means, m.radii, m.opacities, features, pose, view.intrinsics)

@@ -66,6 +66,8 @@ def optimise_map(
     for iteration in (progress or SilentProgress()).track(remaining, label, len(remaining)):
         optimiser.visit(schedule.step(iteration))
         state.iteration = iteration + 1
+        if state.iteration % len(views) == 0:
+            state.parameters.require_finite_on_card()
         if snapshot is not None and (state.iteration % every == 0 or is_asked()):
             state.save(snapshot)
     if schedule.grows:

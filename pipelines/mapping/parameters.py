@@ -10,6 +10,7 @@ from torch import Tensor
 
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.gaussians.adam import AdamTable
+from msgs_slam.pipelines.gaussians.render.compositing import require_all_finite
 
 COLOR_KEYS = ("means", "log_radii", "opacity_logits", "colors")
 KEYS = (*COLOR_KEYS, "class_logits")
@@ -38,6 +39,11 @@ class MapParameters:
 
     def __len__(self) -> int:
         return len(self.anchor_frame_ids)
+
+    def require_finite_on_card(self) -> None:
+        """Raise ValueError for NaN or infinity on a card, where the renderer does not look for them as on the CPU."""
+        if self.trust.device.type != "cpu":
+            require_all_finite(self.table.values)
 
     def keep(self, rows: Tensor) -> None:
         """Keep only the given rows everywhere."""

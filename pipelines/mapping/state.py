@@ -37,7 +37,10 @@ class OptimisedMap:
 
 @dataclass
 class OptimiserState:
-    """The map's parameters, each view's twist, the exposures (N, 2, 3) of all views, and the number of steps done."""
+    """The map's parameters, each view's twist, the exposures (N, 2, 3) of all views, and the number of steps done.
+
+    Twists and poses stay on the host, wherever the map lies: six numbers at a time are no work for a card.
+    """
 
     parameters: MapParameters
     view_tables: list[AdamTable]
@@ -53,7 +56,7 @@ class OptimiserState:
         exposures = torch.zeros(len(views), 2, 3, device=device)
         if exposure is not None:
             exposures = torch.as_tensor(np.stack(exposure, axis=1), dtype=torch.float32, device=device)
-        tables = [AdamTable({"twist": torch.zeros(6, device=device)}) for _ in views]
+        tables = [AdamTable({"twist": torch.zeros(6)}) for _ in views]
         return OptimiserState(MapParameters.from_map(initial or empty_map(classes, device)), tables, exposures)
 
     @staticmethod
@@ -61,8 +64,9 @@ class OptimiserState:
         """What `save` has written, None where there is no such file."""
         if snapshot is None or not snapshot.exists():
             return None
-        tensors = {k: v.to(views[0].image.device) for k, v in load_tensors(snapshot).items()}
-        tables = [AdamTable.from_tensors(tensors, f"view{i}", VIEW_KEYS) for i in range(len(views))]
+        loaded = load_tensors(snapshot)
+        tables = [AdamTable.from_tensors(loaded, f"view{i}", VIEW_KEYS) for i in range(len(views))]
+        tensors = {k: v.to(views[0].image.device) for k, v in loaded.items() if not k.startswith("view")}
         parameters, iteration = MapParameters.from_tensors(tensors), int(tensors["iteration"])
         return OptimiserState(parameters, tables, tensors["exposures"], iteration)
 
@@ -74,12 +78,12 @@ class OptimiserState:
         save_tensors(snapshot, out)
 
     def cam_from_world(self, index: int, view: View) -> Tensor:
-        """(4, 4) float64 the view's pose as it is refined by now."""
+        """(4, 4) float64 on the host: the view's pose as it is refined by now."""
         return se3.exp(self.view_tables[index].values["twist"].detach().double()) @ view.cam_from_world
 
     def result(self, views: Sequence[View], iterations: int) -> OptimisedMap:
         """The values without the optimiser's own."""
-        poses = [self.cam_from_world(i, v).cpu() for i, v in enumerate(views)]
+        poses = [self.cam_from_world(i, v) for i, v in enumerate(views)]
         gains, offsets = self.exposures.cpu().unbind(1)
         return OptimisedMap(
             self.parameters.to_map(), torch.stack(poses).numpy(), gains.numpy(), offsets.numpy(), iterations

@@ -21,10 +21,11 @@ from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 class View:
     """A posed picture with its proxies.
 
-    cam_from_world (4, 4) float64; image (H, W, 3) uint8; depth (H, W) float32 in the world's unit, 0 = unknown;
-    reliability U (H, W) uint8 0..255; channels (H, W) uint8: the class *channel* of each pixel, VOID where unknown;
-    channel_confidence (H, W) uint8; mirrors: where a symmetry was found; scene (H, W) bool: False where the picture
-    shows what is no part of the scene, None where all of it is. Kept in bytes: a run has hundreds of views.
+    cam_from_world (4, 4) float64, on the host wherever the others lie; image (H, W, 3) uint8; depth (H, W) float32 in
+    the world's unit, 0 = unknown; reliability U (H, W) uint8 0..255; channels (H, W) uint8: the class *channel* of each
+    pixel, VOID where unknown; channel_confidence (H, W) uint8; mirrors: where a symmetry was found; scene (H, W) bool:
+    False where the picture shows what is no part of the scene, None where all of it is. Kept in bytes: a run has
+    hundreds of views.
     """
 
     frame_id: int
@@ -73,7 +74,7 @@ class View:
 
     def posed_depth(self) -> PosedDepth:
         """What other views are compared with, as arrays."""
-        pose = self.cam_from_world.cpu().numpy()
+        pose = self.cam_from_world.numpy()
         return PosedDepth(self.intrinsics, pose, self.depth.cpu().numpy(), self.trust.cpu().numpy())
 
     def without_depth_at(self, wrong: Tensor) -> View:
@@ -107,7 +108,7 @@ def make_view(
         channel_table(class_ids)[maps.labels],
         np.round(maps.label_confidence * 255).astype(np.uint8),
     )
-    pose = torch.tensor(cam_from_world, dtype=torch.float64, device=device)  # a copy: workers get arrays to read only
+    pose = torch.tensor(cam_from_world, dtype=torch.float64)  # a copy: workers get arrays to read only
     colors, depth, reliability, channels, confidence = (
         torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays
     )

@@ -67,16 +67,17 @@ class Counting(TorchDispatchMode):
         result = function(*args, **(kwargs or {}))
         given = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, torch.Tensor)]
         if any(isinstance(x, PretendTensor) for x in given):
-            self._note(function, given, result)
+            self._note(function, given, result, bool((kwargs or {}).get("output_size")))
         return result
 
-    def _note(self, function: Any, given: list[torch.Tensor], result: Any) -> None:
+    def _note(self, function: Any, given: list[torch.Tensor], result: Any, told: bool) -> None:
+        """`told`: the size of the result was given, and need not be read."""
         name = function._schema.name
         left = isinstance(result, torch.Tensor) and not isinstance(result, PretendTensor)
         masks = name.startswith("aten::index") and any(x.dtype == torch.bool for x in given[1:])
         if left:
             self.copied("bytes from it", result.nbytes)
-        elif name.startswith(_WAITING) or masks:
+        elif (name.startswith(_WAITING) and not told) or masks:
             self.counts["reads"] += 1
             self.names[f"reads: {name}"] += 1
         if name == "aten::copy_" and not isinstance(given[1], PretendTensor):
@@ -107,7 +108,8 @@ def counted(work: Callable[[], object]) -> Counting:
 
     def watched(self: Any, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         result = handle(self, function, types, args, kwargs)
-        made = isinstance(result, PretendTensor) and not pretend_device._has_pretender((args, kwargs))
+        of = args[:1] if function is torch.Tensor.to else (args, kwargs)
+        made = isinstance(result, PretendTensor) and not pretend_device._has_pretender(of)
         if made and function in (torch.Tensor.to, torch.tensor, torch.as_tensor, torch.from_numpy):
             counting.copied("bytes to the card", result.inner.nbytes)
         elif made and function not in (torch.empty,):

@@ -15,9 +15,11 @@ from msgs_slam.pipelines.config import Config, ExportConfig, GlobalBaConfig, Map
 from msgs_slam.pipelines.engine.stages import StageContext, run_stages
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
 from msgs_slam.pipelines.export.stage import export_run
+from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.global_ba.move_map import move_map
 from msgs_slam.pipelines.mapping import growth
 from msgs_slam.pipelines.mapping import stage as mapping_stage
+from msgs_slam.pipelines.mapping.parameters import MapParameters, empty_map
 from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.render_run import render_run
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -105,6 +107,21 @@ def test_gradients_there_are_those_of_the_cpu() -> None:
         loss = (leaf - 0.5).clamp(min=0).square().mean() + torch.where(leaf > 0, leaf.exp(), 0.0).sum()
         found.append(torch.autograd.grad(loss, leaf)[0].cpu())
     assert torch.equal(*found)
+
+
+def test_a_map_that_is_not_finite_there_is_found() -> None:
+    """The renderer looks for it on the CPU alone; the optimiser looks once a pass."""
+    parameters = MapParameters.from_map(empty_map(2, DEVICE))
+    colors, zeros = torch.zeros(4, 3), torch.zeros(4, device=DEVICE)
+    for value in (0.5, float("nan")):
+        parameters.require_finite_on_card()
+        colors[1, 2] = value
+        ids = torch.zeros(4, dtype=torch.int64, device=DEVICE)
+        wide = torch.zeros(4, 2, device=DEVICE)
+        seeds = GaussianMap(torch.zeros(4, 3, device=DEVICE), zeros, zeros, colors.to(DEVICE), wide, ids)
+        parameters.append(seeds, zeros)
+    with pytest.raises(ValueError, match=r"^colors: 1 of 24 values are NaN"):
+        parameters.require_finite_on_card()
 
 
 def test_a_misplaced_copy_to_the_cpu_is_found(

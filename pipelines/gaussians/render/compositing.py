@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -44,8 +45,8 @@ def composite(
 
     u, v, sigma_px (M,) pixels, pixel centres at half integers; z (M,) depth, ignored where <= near; opacity (M,) 0..1;
     features (M, C). proxy_depth (H, W), 0 = unknown, no gradient; kappa >= 0 in 1/depth². backend: "reference", "cpu",
-    "cuda" or None for the fastest that runs these tensors. Raises ValueError for wrong shapes, for NaN or infinity (by
-    the argument's name) and for an unknown backend.
+    "cuda" or None for the fastest that runs these tensors. Raises ValueError for wrong shapes, for NaN or infinity on
+    the CPU (by the argument's name) and for an unknown backend.
     """
     arguments = {"u": u, "v": v, "sigma_px": sigma_px, "z": z, "opacity": opacity, "features": features}
     check_arguments(arguments, width, height, proxy_depth, kappa)
@@ -78,11 +79,24 @@ def check_arguments(
 
 
 def require_finite(name: str, tensor: Tensor) -> None:
-    """Raise ValueError if any element is NaN or infinite."""
+    """Raise ValueError if any element is NaN or infinite, of a tensor on the CPU.
+
+    Tensors of a card pass: each look would make the host wait for all that the card has still to do. Who keeps a map
+    there looks at it once in a while by `require_all_finite`.
+    """
+    if tensor.device.type == "cpu":
+        require_all_finite({name: tensor})
+
+
+def require_all_finite(tensors: Mapping[str, Tensor]) -> None:
+    """Raise ValueError, naming the tensor, if any element of any is NaN or infinite; on a card with a single read."""
     # A sum is finite unless an element is not (or it overflows, which the second look settles): one pass, no copy.
-    if not torch.isfinite(tensor.detach().sum()) and not (finite := torch.isfinite(tensor.detach())).all():
-        bad = int((~finite).sum())
-        raise ValueError(f"{name}: {bad} of {tensor.numel()} values are NaN or infinite")
+    if torch.isfinite(sum((x.detach().sum() for x in tensors.values()), torch.zeros(()))):
+        return
+    for name, tensor in tensors.items():
+        if not (finite := torch.isfinite(tensor.detach())).all():
+            bad = int((~finite).sum())
+            raise ValueError(f"{name}: {bad} of {tensor.numel()} values are NaN or infinite")
 
 
 def choose_backend(backend: str | None, example: Tensor) -> ModuleType:

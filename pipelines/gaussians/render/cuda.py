@@ -103,19 +103,20 @@ def reach_of(
 def list_tiles(u: Tensor, v: Tensor, z: Tensor, reach: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
     """The Gaussians that may touch tile t, near to far: members[starts[t]:starts[t + 1]]."""
     across, down = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    order = torch.nonzero(reach > 0)[:, 0]
-    order = order[torch.argsort(z[order], stable=True)]
+    order = torch.argsort(z, stable=True)
     x, y, r = u[order], v[order], reach[order]
     left, right = _tile(x - r - 0.5, across), _tile(x + r - 0.5, across)
     top, bottom = _tile(y - r - 0.5, down), _tile(y + r - 0.5, down)
     wide = right - left + 1
-    counts = wide * (bottom - top + 1)
-    owner = torch.repeat_interleave(torch.arange(len(order), device=u.device), counts)
-    nth = torch.arange(len(owner), device=u.device) - (torch.cumsum(counts, 0) - counts)[owner]
+    counts = wide * (bottom - top + 1) * (r > 0)
+    ends = torch.cumsum(counts, 0)
+    # How many pairs there are is the one number that the host has to know.
+    pairs = int(ends[-1]) if len(ends) else 0
+    owner = torch.repeat_interleave(torch.arange(len(order), device=u.device), counts, output_size=pairs)
+    nth = torch.arange(pairs, device=u.device) - (ends - counts)[owner]
     tile = (top[owner] + torch.div(nth, wide[owner], rounding_mode="floor")) * across + left[owner] + nth % wide[owner]
     tile, permutation = torch.sort(tile, stable=True)
-    starts = torch.zeros(across * down + 1, dtype=torch.long, device=u.device)
-    starts[1:] = torch.cumsum(torch.bincount(tile, minlength=across * down), 0)
+    starts = torch.searchsorted(tile, torch.arange(across * down + 1, device=u.device))
     return starts, order[owner[permutation]]
 
 

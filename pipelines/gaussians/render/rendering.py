@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -39,8 +40,9 @@ def render(
     """Draw M Gaussians from the pose exp(twist) @ cam_from_world; differentiable in everything but proxy_depth.
 
     means (M, 3), radii (M,) world standard deviations, opacities (M,) 0..1, features (M, C), cam_from_world (4, 4),
-    proxy_depth (H, W) or None, twist (6,) translation first (see `pipelines.geometry.se3`). Raises ValueError for NaN,
-    infinity or wrong shapes.
+    proxy_depth (H, W) or None, twist (6,) translation first (see `pipelines.geometry.se3`). Pose and twist best stay on
+    the host where the Gaussians lie on a card: on six numbers a card is slower. Raises ValueError for wrong shapes, and
+    for NaN and infinity in what lies on the CPU.
     """
     pose = cam_from_world if twist is None else moved(cam_from_world, twist)
     if not torch.is_grad_enabled():
@@ -55,7 +57,8 @@ def render(
 
 
 def moved(cam_from_world: Tensor, twist: Tensor) -> Tensor:
-    """exp(twist) @ cam_from_world in the pose's own precision (float64 in this project); raises ValueError for NaN."""
+    """exp(twist) @ cam_from_world in the pose's own precision (float64 in this project); raises ValueError for NaN in
+    a twist on the CPU."""
     require_finite("twist", twist)
     return se3.exp(twist.to(cam_from_world.dtype)) @ cam_from_world
 
@@ -63,11 +66,29 @@ def moved(cam_from_world: Tensor, twist: Tensor) -> Tensor:
 def project_map(
     means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float = NEAR
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """u, v, sigma_px, z (M,) of the Gaussians in the camera; raises ValueError for NaN."""
+    """u, v, sigma_px, z (M,) of the Gaussians in the camera; raises ValueError for NaN in what lies on the CPU."""
     for name, tensor in (("means", means), ("radii", radii), ("cam_from_world", cam_from_world)):
         require_finite(name, tensor)
-    points_in_cam = se3.transform(cam_from_world.to(means), means)
+    points_in_cam = se3.transform(beside(cam_from_world, means), means)
     return project_gaussians(points_in_cam, radii, intrinsics, near)
+
+
+def beside(numbers: Tensor, other: Tensor) -> Tensor:
+    """`numbers` where `other` lies and in its type; the gradient comes back in one copy."""
+    if numbers.device == other.device:
+        return numbers.to(other)
+    return _Beside.apply(numbers, other)
+
+
+class _Beside(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, numbers: Tensor, other: Tensor) -> Tensor:
+        ctx.device, ctx.dtype = numbers.device, numbers.dtype
+        return numbers.detach().to(other)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        return grads[0].to(ctx.device).to(ctx.dtype), None
 
 
 def depth_ratio(depth_sum: Tensor, depth_silhouette: Tensor) -> Tensor:
