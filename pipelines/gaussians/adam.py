@@ -11,11 +11,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+import msgs_slam.pipelines.gaussians.render.cards as cards
 from msgs_slam.pipelines.gaussians.render.jit import kernel
 from msgs_slam.pipelines.gaussians.render.threads import for_each
 
 _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15
 _ROWS = 8192
+_BLOCK = 1024
+"""Numbers a program of the kernel."""
 
 
 @dataclass
@@ -110,9 +113,11 @@ def descend(
     Numbers with a gradient of 0 wait, and so do their moments: most Gaussians are seen by few of the views, and would
     drift on in between by what the last of them wanted.
 
-    float32 on a CPU takes a compiled loop, one pass over memory; everything else plain torch.
+    float32 on a CPU takes a compiled loop, one pass over memory, and on a card a kernel; everything else plain torch.
     """
-    if value.device.type == "cpu" and value.dtype == torch.float32 and value.ndim in (1, 2) and value.is_contiguous():
+    if cards.takes_kernels(value) and value.is_contiguous():
+        descend_by_kernel(value, gradient, first, second, rate, steps, shares, rows)
+    elif value.device.type == "cpu" and value.dtype == torch.float32 and value.ndim in (1, 2) and value.is_contiguous():
         _descend_fast(value, gradient, first, second, rate, steps, shares, rows)
     elif rows is None:
         plain_descend(value, gradient, first, second, rate, steps, shares)
@@ -133,6 +138,29 @@ def plain_descend(
     change = first / (second.sqrt() / math.sqrt(1 - _BETA2**steps) + _EPSILON) * (-rate / (1 - _BETA1**steps))
     change = change.masked_fill(waits, 0)
     value.add_(change if shares is None else change * shares.reshape(-1, *[1] * (value.ndim - 1)))
+
+
+def descend_by_kernel(
+    value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, steps: int, shares: Tensor | None,
+    rows: Tensor | None = None,
+) -> None:  # fmt: skip
+    """The same by a kernel of Triton, on contiguous float32 values of one card."""
+    from msgs_slam.pipelines.gaussians.adam_kernels import descend_rows  # imports triton
+
+    count, width = gradient.numel(), math.prod(value.shape[1:])
+    if count == 0:
+        return
+    if width > 1 and (gradient.ndim > 2 or gradient.stride(-1) != 1):
+        gradient = gradient.contiguous()
+    stride = width if gradient.ndim > 2 else gradient.stride(0)
+    scale, root = -rate / (1 - _BETA1**steps), 1 / math.sqrt(1 - _BETA2**steps)
+    # A kernel takes no None: what is not there is not read.
+    given = (gradient, gradient if rows is None else rows, gradient if shares is None else shares.contiguous())
+    cards.launch(
+        descend_rows, -(-count // _BLOCK), value, first, second, *given, count, width, stride, scale, root,
+        BETA1=_BETA1, BETA2=_BETA2, NEW1=1 - _BETA1, NEW2=1 - _BETA2, EPSILON=_EPSILON,
+        CHOSEN=rows is not None, SHARED=shares is not None, BLOCK=_BLOCK,
+    )  # fmt: skip
 
 
 def _descend_fast(
