@@ -5,6 +5,7 @@ Gradients are summed by atomic additions: their last bits may differ from run to
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -12,8 +13,7 @@ from torch import Tensor
 
 import msgs_slam.pipelines.gaussians.render.cards as cards
 import msgs_slam.pipelines.gaussians.render.rules as rules
-from msgs_slam.pipelines.gaussians.render.cuda_kernels import backward_tile, forward_tile
-from msgs_slam.pipelines.gaussians.render.reference import inspect
+from msgs_slam.pipelines.gaussians.render.cuda_kernels import backward_tile, forward_tile, inspect_tile
 
 __all__ = ["composite", "inspect"]
 
@@ -39,6 +39,24 @@ def composite(
     return _Composite.apply(u, v, sigma_px, z, opacity, features, width, height, proxy_depth, kappa, near)
 
 
+def inspect(
+    u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, width: int, height: int, near: float,
+    counts: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Median depth (H, W), and summed and largest blending weight of each Gaussian, (M,) each, of float32 tensors on
+    one card. In the sums a pixel counts as counts (H, W) says, as 1 where None."""
+    geometry = [x.detach() for x in (u, v, sigma_px, z, opacity)]
+    starts, members, records = _tiled(geometry, width, height, near)
+    counted = records if counts is None else counts.to(records).contiguous()
+    median, weights = records.new_empty(height, width), records.new_zeros(2, len(records))
+    settings = {key: value for key, value in _settings(False, 1).items() if key not in ("GUIDED", "PADDED")}
+    cards.launch(
+        inspect_tile, len(starts) - 1, starts, members, records, counted, median, *weights.unbind(0), width, height,
+        COUNTED=counts is not None, **settings,
+    )  # fmt: skip
+    return median, weights[0], weights[1]
+
+
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
@@ -46,10 +64,7 @@ class _Composite(torch.autograd.Function):
         width, height, proxy_depth, kappa, near = arguments[6:]
         guided = proxy_depth is not None and kappa > 0
         proxy = proxy_depth.to(features).contiguous() if guided else features.new_zeros(1)
-        u, v, sigma_px, z, opacity = geometry
-        reach = reach_of(u, v, sigma_px, z, opacity, width, height, near)
-        starts, members = list_tiles(u, v, z, reach, width, height)
-        records = torch.stack([*geometry, reach], dim=1)
+        starts, members, records = _tiled(geometry, width, height, near)
         image = features.new_empty(height, width, features.shape[1])
         planes = [features.new_empty(height, width) for _ in range(3)]
         inputs = (starts, members, records, features, proxy, kappa)
@@ -88,6 +103,13 @@ def _settings(guided: bool, channels: int) -> dict[str, Any]:
         "LIGHT_MIN": rules.TRANSMITTANCE_MIN,
         "num_warps": 8,
     }
+
+
+def _tiled(geometry: Sequence[Tensor], width: int, height: int, near: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Starts and members of `list_tiles`, and the Gaussians' records (M, 6)."""
+    u, v, sigma_px, z, opacity = geometry
+    reach = reach_of(u, v, sigma_px, z, opacity, width, height, near)
+    return *list_tiles(u, v, z, reach, width, height), torch.stack([*geometry, reach], dim=1)
 
 
 def reach_of(

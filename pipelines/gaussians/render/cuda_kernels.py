@@ -198,3 +198,36 @@ def backward_tile(
         of_features = tl.dot(tl.trans(weight), pull, input_precision="tf32x3")
         tl.atomic_add(d_features + feature_at, of_features, mask=feature_mask)
         first += STEP
+
+
+@triton.jit
+def inspect_tile(
+    starts: tl.tensor, members: tl.tensor, records: tl.tensor, counts: tl.tensor,
+    median: tl.tensor, sums: tl.tensor, most: tl.tensor, width: tl.tensor, height: tl.tensor,
+    COUNTED: tl.constexpr, STEP: tl.constexpr, TILE: tl.constexpr, ALPHA_MAX: tl.constexpr, LIGHT_MIN: tl.constexpr,
+) -> None:  # fmt: skip
+    """Stores the median depth of one tile, and adds its blending weights to those of the Gaussians."""
+    tile = tl.program_id(0)
+    across = (width + TILE - 1) // TILE
+    lane = tl.arange(0, TILE * TILE)
+    column, row = (tile % across) * TILE + lane % TILE, (tile // across) * TILE + lane // TILE
+    inside = (column < width) & (row < height)
+    pixel = row * width + column
+    x, y = column.to(tl.float32) + 0.5, row.to(tl.float32) + 0.5
+    light = tl.where(inside, 1.0, 0.0)
+    depth = tl.zeros((TILE * TILE,), tl.float32)
+    count = light
+    if COUNTED:
+        count = tl.load(counts + pixel, mask=inside, other=0.0)
+    first, end = tl.load(starts + tile), tl.load(starts + tile + 1)
+    while (first < end) & (tl.max(light, axis=0) >= LIGHT_MIN):
+        index, used, u, v, sigma, z, opacity, reach = load_step(records, members, first, end, STEP)
+        _, _, _, alpha = opacities(x, y, u, v, sigma, opacity, reach, ALPHA_MAX)
+        before, light = light_before(light, alpha, STEP)
+        weight = tl.where(before >= LIGHT_MIN, alpha * before, 0.0)
+        crossing = (before >= 0.5) & (before - weight < 0.5)
+        depth += tl.sum(tl.where(crossing, z[None, :], 0.0), axis=1)
+        tl.atomic_add(sums + index, tl.sum(weight * count[:, None], axis=0), mask=used)
+        tl.atomic_max(most + index, tl.max(weight, axis=0), mask=used)
+        first += STEP
+    tl.store(median + pixel, depth, mask=inside)

@@ -15,7 +15,7 @@ pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip
 
 from render_scenes import IMAGES, NAMES, random_gaussians, random_proxy, room  # noqa: E402
 
-from msgs_slam.pipelines.gaussians.render import composite, render  # noqa: E402
+from msgs_slam.pipelines.gaussians.render import composite, cuda, reference, render  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[4]
 DEVICE = "cuda" if ON_CARD else "cpu"
@@ -68,6 +68,24 @@ def test_more_gaussians_in_a_tile_than_fit_in_a_step():
     assert_agrees(scene, 16, 16)
 
 
+@pytest.mark.parametrize("counted", [False, True])
+@pytest.mark.parametrize("name", SCENES)
+def test_inspection_is_the_references(name, counted):
+    scene = random_gaussians(width=SIZE[0], height=SIZE[1], channels=1, seed=len(name), **SCENES[name])
+    counts = torch.rand(SIZE[1], SIZE[0], generator=torch.Generator().manual_seed(3)) if counted else None
+    found = []
+    for module, device, dtype in ((cuda, DEVICE, torch.float32), (reference, "cpu", torch.float64)):
+        inputs = [scene[key].to(device, dtype) for key in ("u", "v", "sigma_px", "z", "opacity")]
+        given = None if counts is None else counts.to(device, dtype)
+        found.append([x.cpu().double() for x in module.inspect(*inputs, *SIZE, 0.0, given)])
+    (median, sums, most), (true_median, true_sums, true_most) = found
+    assert (sums - true_sums).norm() <= 1e-3 * true_sums.norm() + 1e-12
+    torch.testing.assert_close(most, true_most, rtol=0, atol=1e-4)
+    # Where the light is halved almost exactly, rounding may choose the next Gaussian.
+    assert ((median - true_median).abs() > 1e-4).double().mean() < 2e-3
+    assert bool(true_sums.any()) == (name not in ("all behind", "none"))
+
+
 @pytest.mark.skipif(not ON_CARD, reason="needs an NVIDIA card")
 def test_full_size_room():
     scene = room(320, 240, 50_000, 8)
@@ -82,7 +100,7 @@ def test_full_size_room():
 @pytest.mark.skipif(ON_CARD, reason="the tests above compile and run the kernels")
 @pytest.mark.parametrize(
     ("name", "guided", "padded"),
-    [("forward_tile", True, 64), ("backward_tile", True, 64), ("backward_tile", False, 16)],
+    [("forward_tile", True, 64), ("backward_tile", True, 64), ("backward_tile", False, 16), ("inspect_tile", True, 16)],
 )
 def test_kernels_compile_for_cards_and_fit_their_shared_memory(name, guided, padded, tmp_path):
     """The interpreter accepts more than the compiler does; compiling needs no card."""
@@ -99,8 +117,9 @@ from triton.compiler import ASTSource
 from triton.backends.compiler import GPUTarget
 from msgs_slam.pipelines.gaussians.render import cuda_kernels
 kernel = cuda_kernels.{name}
-constants = dict(GUIDED={guided}, PADDED={padded}, STEP=16, TILE=16, ALPHA_MAX=0.99, LIGHT_MIN=1e-4)
+constants = dict(GUIDED={guided}, COUNTED={guided}, PADDED={padded}, STEP=16, TILE=16, ALPHA_MAX=0.99, LIGHT_MIN=1e-4)
 kinds = dict(width="i32", height="i32", channels="i32", kappa="fp32", starts="*i64", members="*i64")
+constants = {{n: x for n, x in constants.items() if n in kernel.arg_names}}
 signature = {{n: "constexpr" if n in constants else kinds.get(n, "*fp32") for n in kernel.arg_names}}
 source = ASTSource(kernel, signature, constexprs=constants)
 compiled = triton.compile(source, target=GPUTarget("cuda", 80, 32), options=dict(num_warps=8))
