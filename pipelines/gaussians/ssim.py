@@ -14,7 +14,7 @@ from torch.nn import functional
 C1, C2 = 0.01**2, 0.03**2
 """Constants of Wang et al. 2004 for images in 0..1."""
 TAPS = 11
-_WINDOW = cv2.getGaussianKernel(TAPS, 1.5)[:, 0]
+WINDOW = cv2.getGaussianKernel(TAPS, 1.5)[:, 0]
 """The window, along rows and along columns."""
 
 
@@ -62,7 +62,7 @@ def blur(image: Tensor) -> Tensor:
     if image.device.type == "cpu" and image.dtype in (torch.float32, torch.float64):
         # OpenCV's separable filter is about ten times torch's depthwise convolution on a CPU.
         return torch.from_numpy(blur_array(np.ascontiguousarray(image.detach().numpy())))
-    taps = torch.as_tensor(_WINDOW, dtype=image.dtype, device=image.device)
+    taps = torch.as_tensor(WINDOW, dtype=image.dtype, device=image.device)
     planes = image.permute(2, 0, 1)[:, None]
     planes = functional.conv2d(planes, taps[None, None, :, None], padding=(TAPS // 2, 0))
     planes = functional.conv2d(planes, taps[None, None, None, :], padding=(0, TAPS // 2))
@@ -71,4 +71,4 @@ def blur(image: Tensor) -> Tensor:
 
 def blur_array(image: NDArray, out: NDArray | None = None) -> NDArray:
     """The same of an array, into `out` where it is given."""
-    return cv2.sepFilter2D(image, -1, _WINDOW, _WINDOW, out, borderType=cv2.BORDER_CONSTANT).reshape(image.shape)
+    return cv2.sepFilter2D(image, -1, WINDOW, WINDOW, out, borderType=cv2.BORDER_CONSTANT).reshape(image.shape)
