@@ -216,8 +216,8 @@ _MAPPING = ("mapping",)
 
 
 @dataclass(frozen=True)
-class ArticleConfig:
-    """Terms of the article that earned nothing measurable; their modules say the figures."""
+class PaperConfig:
+    """Terms of the paper that earned nothing measurable; their modules say the figures."""
 
     kappa: float = setting(
         0.0, "κ of eq. (7), in units of the scene's median depth; 0 = off", stages=_MAPPING, within=(0, 1000)
@@ -273,7 +273,7 @@ class Config:
     mapping: MappingConfig = field(default_factory=MappingConfig)
     global_ba: GlobalBaConfig = field(default_factory=GlobalBaConfig)
     export: ExportConfig = field(default_factory=ExportConfig)
-    article: ArticleConfig = field(default_factory=ArticleConfig)
+    paper: PaperConfig = field(default_factory=PaperConfig)
 
 
 def load_config(file: Path | None = None, overrides: Iterable[str] = (), base: Config | None = None) -> Config:
@@ -384,9 +384,7 @@ def config_to_dict(config: Any) -> dict[str, Any]:
 def settings_of_stage(config: Config, stage: str) -> dict[str, Any]:
     """The settings that a stage reads: its own section, and those beside it that name it."""
     beside = {
-        f"article.{f.name}": getattr(config.article, f.name)
-        for f in fields(config.article)
-        if stage in f.metadata["stages"]
+        f"paper.{f.name}": getattr(config.paper, f.name) for f in fields(config.paper) if stage in f.metadata["stages"]
     }
     return config_to_dict(getattr(config, stage)) | beside
 

@@ -21,7 +21,7 @@ from msgs_slam.pipelines.metres.files import load_metres
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import StageRecord, load_records, load_source, recorded_config
 from msgs_slam.pipelines.run.settings_file import load_settings
-from msgs_slam.pipelines.system.device import settle_device
+from msgs_slam.pipelines.system.device import resolve_device
 from msgs_slam.pipelines.types import VOID, Calibration, ClassTable, Frame, Metres, Trajectory
 
 T = TypeVar("T")
@@ -151,7 +151,7 @@ def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:
         pose_stage=pose_stage,
         trajectory=trajectory,
         map_stage=map_stage,
-        gaussian_map=run.load_map(map_stage, settle_device(device)) if map_stage else None,
+        gaussian_map=run.load_map(map_stage, resolve_device(device)) if map_stage else None,
         classes=run.load_classes(),
         label_of_channel=np.array(run.load_class_ids() if map_stage else (), np.uint8),
         exposure=_load_exposure(run, map_stage, trajectory),

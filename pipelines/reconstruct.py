@@ -20,7 +20,7 @@ from msgs_slam.pipelines.run.records import StageRecord, load_records, load_sour
 from msgs_slam.pipelines.run.running import NotedProgress
 from msgs_slam.pipelines.run.settings_file import load_settings
 from msgs_slam.pipelines.source.opening import source_digest
-from msgs_slam.pipelines.system.device import settle_device
+from msgs_slam.pipelines.system.device import resolve_device
 from msgs_slam.pipelines.system.progress import Progress
 
 
@@ -98,7 +98,7 @@ def reconstruct(
     """
     digest = source_digest(source, config.run.format)
     _require_run_or_empty(run)
-    settle_device(config.run.device)  # refused before anything is written
+    resolve_device(config.run.device)  # refused before anything is written
     with locked(run):
         _require_same_source(run, source, digest)
         return _run(run, source.resolve(), digest, config, progress, until, workers, threads)
@@ -119,7 +119,7 @@ def resume(
     origin = load_source(run)
     source = Path(origin.path)
     config = config or load_settings(run)
-    settle_device(config.run.device)
+    resolve_device(config.run.device)
     with locked(run):
         once_locked()
         return _run(run, source, origin.digest, config, progress, until, workers)

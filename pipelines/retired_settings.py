@@ -6,15 +6,15 @@ import difflib
 from collections.abc import Iterable
 
 MOVED = {
-    "proxy.symmetry": "article.symmetry_weight",
-    "tracking.depth_weight": "article.tracking_depth_weight",
-    "tracking.label_weight": "article.tracking_label_weight",
-    "mapping.boundary_clip": "article.boundary_clip",
-    "mapping.densify_classes": "article.class_growth",
-    "mapping.edge_weight": "article.edge_weight",
-    "mapping.kappa": "article.kappa",
-    "mapping.label_loss": "article.label_image",
-    "mapping.symmetry_weight": "article.symmetry_weight",
+    "proxy.symmetry": "paper.symmetry_weight",
+    "tracking.depth_weight": "paper.tracking_depth_weight",
+    "tracking.label_weight": "paper.tracking_label_weight",
+    "mapping.boundary_clip": "paper.boundary_clip",
+    "mapping.densify_classes": "paper.class_growth",
+    "mapping.edge_weight": "paper.edge_weight",
+    "mapping.kappa": "paper.kappa",
+    "mapping.label_loss": "paper.label_image",
+    "mapping.symmetry_weight": "paper.symmetry_weight",
 }
 """Old name → the one that decides it now."""
 
@@ -52,7 +52,7 @@ def explain_retired(keys: Iterable[str]) -> str:
     return "; ".join(moved)
 
 
-_SAME_AS = {"gpu": "cuda", "nvidia": "cuda", "cuda:0": "cuda", "video": "images", "mp4": "images"}
+_SAME_AS = {"article": "paper", "gpu": "cuda", "nvidia": "cuda", "cuda:0": "cuda", "video": "images", "mp4": "images"}
 """What people type for a choice that has another name."""
 
 

@@ -177,7 +177,7 @@ def pretended(patch: pytest.MonkeyPatch) -> Iterator[str]:
     patch.setattr(compositing, "choose_backend", choose)
     patch.setattr(inspection, "choose_backend", choose)
     for user in (outcome, stages):
-        patch.setattr(user, "settle_device", lambda wanted="auto": DEVICE)
+        patch.setattr(user, "resolve_device", lambda wanted="auto": DEVICE)
     patch.setattr(torch.autograd, "_engine_run_backward", _backwards(torch.autograd._engine_run_backward))
     with _Mode():
         yield DEVICE

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.selection import Surroundings
+from msgs_slam.pipelines.proxy.selection import ProviderContext
 from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.types import Frame
 
@@ -46,6 +46,6 @@ class PointsDepth:
         return {}
 
 
-def open_points(around: Surroundings) -> PointsDepth:
+def open_points(around: ProviderContext) -> PointsDepth:
     """What goes into the table of providers."""
     return PointsDepth(around.sequence)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.correspondence.flow import corners, follow
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair
 from msgs_slam.pipelines.correspondence.snapshots import Snapshots
-from msgs_slam.pipelines.system.streamed import Streamed
+from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.types import Features
 
 LEAST = 100
@@ -33,7 +33,7 @@ Picture = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
 """(H, W) grey, and what is left out of it."""
 
 
-def weak_keyframes(pairs: Sequence[VerifiedPair], count: int, reach: int) -> list[int]:
+def weakly_connected(pairs: Sequence[VerifiedPair], count: int, reach: int) -> list[int]:
     """Keyframes that match both neighbours, and of whose features fewer than LEAST are matched with keyframes at most
     `reach` before as well as with such behind them."""
     before: list[list[NDArray[np.uint32]]] = [[] for _ in range(count)]
@@ -51,12 +51,12 @@ def weak_keyframes(pairs: Sequence[VerifiedPair], count: int, reach: int) -> lis
 
 
 def with_bridges(
-    features: Streamed[Features],
+    features: LruSequence[Features],
     pairs: Sequence[VerifiedPair],
     weak: Iterable[int],
     picture: Callable[[int], Picture],
     stored: Snapshots,
-) -> tuple[Streamed[Features], list[VerifiedPair]]:
+) -> tuple[LruSequence[Features], list[VerifiedPair]]:
     """What `bridged` finds, made once and read from where it is stored: of all keyframes it would fill the memory."""
 
     def save(k: int, found: Features) -> None:

@@ -1,7 +1,7 @@
 """Which keyframes may show the same place, by a compact descriptor of their features.
 
 VLAD (Jégou et al., PAMI 2012) with intra-normalisation (Arandjelović and Zisserman, All about VLAD, CVPR 2013) over a
-vocabulary learnt from the run itself. It stands where the article has DINOv2 features, which need weights, and beside
+vocabulary learnt from the run itself. It stands where the paper has DINOv2 features, which need weights, and beside
 them where there are any.
 """
 
@@ -29,7 +29,9 @@ def describe(features: Features, vocabulary: Vocabulary) -> NDArray[np.float32]:
     return unit(_vlad(features, vocabulary.words) - vocabulary.mean).astype(np.float32)
 
 
-def describe_all(all_features: Iterable[Features], count: int, vocabulary: Vocabulary) -> NDArray[np.float32]:
+def compute_global_descriptors(
+    all_features: Iterable[Features], count: int, vocabulary: Vocabulary
+) -> NDArray[np.float32]:
     """(count, W * 128) of as many frames, one of which at a time is in memory."""
     looks = np.empty((count, len(vocabulary.mean)), np.float32)
     for row, features in zip(looks, all_features, strict=True):
@@ -70,7 +72,7 @@ def unit(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 @dataclass(frozen=True)
-class Looks:
+class GlobalDescriptors:
     """How alike frames look: the mean over kinds of descriptors, each unit vectors (N, D), of their products.
 
     Row by row, because nobody has room for the likeness of every pair of a long recording.
@@ -101,7 +103,7 @@ def sequential_pairs(count: int, overlap: int) -> list[tuple[int, int]]:
 
 
 def loop_pairs(
-    looks: Looks, allowed: Callable[[slice], NDArray[np.bool_]], per_frame: int, least: float = 0.0
+    looks: GlobalDescriptors, allowed: Callable[[slice], NDArray[np.bool_]], per_frame: int, least: float = 0.0
 ) -> list[tuple[int, int]]:
     """For each frame the `per_frame` most alike ones of those `allowed` (rows of (N, N)) that are more alike than
     `least`, as sorted unique (i, j), i < j.

@@ -17,8 +17,8 @@ from msgs_slam.pipelines.depth.fields import FINE, Basis, DepthFields
 from msgs_slam.pipelines.depth.posed import PosedDepth, neighbours
 from msgs_slam.pipelines.depth.solve import Equations, Prior, solve_fields
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
+from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.memory import ALIGNED_TOGETHER
-from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 
 Array = NDArray[np.float64]
@@ -73,7 +73,7 @@ def align_keyframes(
             anchors[len(rows)] = _anchors(model, k, intrinsics, camera)
             rows.append(k)
     ids = [int(model.frame_ids[k]) for k in rows]
-    views = Streamed(len(rows), lambda n: view_of(rows[n]), lambda v: v.depth.nbytes + v.trust.nbytes, _ROOM)
+    views = LruSequence(len(rows), lambda n: view_of(rows[n]), lambda v: v.depth.nbytes + v.trust.nbytes, _ROOM)
     middle = float(np.median([np.median(e) for e in expected.values()])) if expected else 0.0
     start = np.array([expected.get(i, np.full(FINE.size, middle)) for i in ids]).reshape(len(ids), FINE.size)
     fields = fit_fields(views, anchors, start)
@@ -103,7 +103,7 @@ def fit_fields(views: Sequence[PosedDepth], anchors: Mapping[int, Anchors], expe
     long recording a window of views at a time, the others as they stand."""
     start = np.zeros((len(views), FINE.size)) if expected is None else expected
     fields = start.copy()
-    samples = Streamed(len(views), lambda n: _Samples.of(views[n]), lambda s: s.nbytes, _ROOM)
+    samples = LruSequence(len(views), lambda n: _Samples.of(views[n]), lambda s: s.nbytes, _ROOM)
     near = neighbours(views)
     windows = np.array_split(np.arange(len(views)), -(-len(views) // ALIGNED_TOGETHER)) if len(views) else []
     for window in windows * ROUNDS:

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 from msgs_slam.formats.errors import InputError, RecoverableError
 from msgs_slam.formats.jsonfile import read_json, write_json
-from msgs_slam.pipelines.engine.travel import TASK_MODULES, load_value, name_of, of_name, save_value
+from msgs_slam.pipelines.engine.task_files import TASK_MODULES, load_value, name_of, of_name, save_value
 from msgs_slam.pipelines.engine.workers import code_identity, work_here
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import take_lock

@@ -33,8 +33,8 @@ from msgs_slam.pipelines.run.records import (
     write_manifest,
 )
 from msgs_slam.pipelines.run.settings_file import save_settings
-from msgs_slam.pipelines.system.device import settle_device
-from msgs_slam.pipelines.system.memory import give_back, memory_room
+from msgs_slam.pipelines.system.device import resolve_device
+from msgs_slam.pipelines.system.memory import memory_room, release_free_memory
 from msgs_slam.pipelines.system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log
 from msgs_slam.pipelines.system.stopping import stop_if_asked
 
@@ -91,7 +91,7 @@ class StageContext:
     @property
     def device(self) -> str:
         """ "cpu" or "cuda"."""
-        return settle_device(self.config.run.device)
+        return resolve_device(self.config.run.device)
 
     def each(self, work: Callable[[T, Progress], R], tasks: Sequence[T]) -> list[R]:
         """What `work`, a function of a module's top level, returns of every task, in their order: done here, one after
@@ -102,7 +102,7 @@ class StageContext:
 
     def _done(self, work: Callable[[T, Progress], R], task: T) -> R:
         result = work(task, self.progress)
-        give_back()
+        release_free_memory()
         return result
 
     def warn(self, message: str) -> None:

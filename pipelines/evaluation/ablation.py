@@ -31,7 +31,7 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "without depth loss": ("mapping.depth_weight=0.0",),
     "colour only": ("mapping.use_proxy_depth=false", "mapping.label_weight=0.0"),
 }
-"""The article's ablations (MSGS-SLAM tables 7 to 10): name → what differs from the complete method."""
+"""The paper's ablations (MSGS-SLAM tables 7 to 10): name → what differs from the complete method."""
 
 _LAST = "global_ba"
 _SHARED = ("frames", "proxy")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.mesh import MeshBlocks
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.engine.travel import load_value, save_value
+from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.export.joined import Region
 from msgs_slam.pipelines.export.paint import paint
 from msgs_slam.pipelines.export.surface import chunk_surfaces, weld
@@ -19,8 +19,8 @@ from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid
 from msgs_slam.pipelines.gaussians.render import get_threads
 from msgs_slam.pipelines.mapping.depth_views import DrawnView, Shown, drawn_view
 from msgs_slam.pipelines.outcome import Outcome, maps_around
+from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import VOID
 
 TRUNCATION = 4.0
@@ -55,7 +55,7 @@ def drawn_views(
         if not files[number].exists():
             row = rows[number]
             save_value(files[number], drawn_view(near(int(t.frame_ids[row])), t.cam_from_world[row], camera))
-    return Streamed(count, lambda number: load_value(files[number]), lambda view: view.size, _KEPT_BYTES)
+    return LruSequence(count, lambda number: load_value(files[number]), lambda view: view.size, _KEPT_BYTES)
 
 
 def make_grid_of(views: Sequence[DrawnView], settings: ExportConfig) -> Grid:

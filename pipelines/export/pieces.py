@@ -76,6 +76,8 @@ def take_frames(context: StageContext) -> dict[str, Any]:
     for old, new in number.items():
         if (features := around.load_features(old)) is not None:
             save_features(context.folder, new, features)
-    tried = {(number[i], number[j]): n for (i, j), n in around.load_tried().items() if i in number and j in number}
+    tried = {
+        (number[i], number[j]): n for (i, j), n in around.load_matched_pairs().items() if i in number and j in number
+    }
     save_matching(context.folder, around.load_vocabulary(), tried)
     return {"frames": len(posed), "keyframes": len(model.frame_ids), "of_the_run": [posed[0], posed[-1]]}

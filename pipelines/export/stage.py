@@ -41,7 +41,7 @@ from msgs_slam.pipelines.proxy.selection import metric_card
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.journal import empty
 from msgs_slam.pipelines.run.records import load_records
-from msgs_slam.pipelines.system.memory import give_back
+from msgs_slam.pipelines.system.memory import release_free_memory
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress
 from msgs_slam.pipelines.types import Metres, SemanticMesh
 from msgs_slam.pipelines.upright.find import find_upright
@@ -59,7 +59,7 @@ def run(context: StageContext) -> dict[str, Any]:
     metres = gps_metres(world) or guess_metres(context, found, settings)
     outcome = on_earth(replace(found, metres=metres).moved(world.exported_from_run), world)
     del found  # one map is enough
-    give_back()
+    release_free_memory()
     write_pieces(context)
     write_all_but_mesh(outcome, world, settings, context.folder)
     if world.earth is not None:
@@ -70,7 +70,7 @@ def run(context: StageContext) -> dict[str, Any]:
     )
     views, gaussians = views_for_meshes(job, outcome), len(outcome.require_map())
     outcome = replace(outcome, gaussian_map=None)  # a mesh is made of views
-    give_back()
+    release_free_memory()
     write_meshes(job, outcome, views, world)
     mesh = mesh_blocks(context.folder / "mesh.ply")
     if mesh.face_count == 0:

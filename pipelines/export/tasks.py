@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from msgs_slam.pipelines.engine.portions import Portion, in_portions
+from msgs_slam.pipelines.engine.chunks import Chunk, in_chunks
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.export.mesh import drawn_views, fused_regions, keyframe_rows
 from msgs_slam.pipelines.export.volume import Grid
@@ -14,14 +14,14 @@ from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.system.progress import Progress
 
 
-def draw_views(task: Portion, progress: Progress) -> None:
+def draw_views(task: Chunk, progress: Progress) -> None:
     """What the map shows in some of the keyframes."""
     drawn_views(
         _outcome(task, progress), task.config.export, scratch_of(task.context(progress)), progress, task.numbers
     )
 
 
-def fuse_regions(task: Portion, progress: Progress) -> None:
+def fuse_regions(task: Chunk, progress: Progress) -> None:
     """Some regions of the grid."""
     outcome, scratch = _outcome(task, progress), scratch_of(task.context(progress))
     views = drawn_views(outcome, task.config.export, scratch, progress, range(0))
@@ -42,12 +42,12 @@ class MeshWorkers:
 
     def draw(self, outcome: Outcome) -> None:
         """All views."""
-        in_portions(self.context, draw_views, len(keyframe_rows(outcome)), move=self.move)
+        in_chunks(self.context, draw_views, len(keyframe_rows(outcome)), move=self.move)
 
     def fuse(self, grid: Grid) -> None:
         """All of the grid's regions."""
-        in_portions(self.context, fuse_regions, len(list(grid.regions())), move=self.move, grid=grid)
+        in_chunks(self.context, fuse_regions, len(list(grid.regions())), move=self.move, grid=grid)
 
 
-def _outcome(task: Portion, progress: Progress) -> Outcome:
+def _outcome(task: Chunk, progress: Progress) -> Outcome:
     return load_outcome(task.run, task.context(progress).device).moved(task.known["move"])

@@ -17,8 +17,8 @@ from msgs_slam.pipelines.export.atlas import simplified, unwrapped
 from msgs_slam.pipelines.export.mesh import keyframe_rows
 from msgs_slam.pipelines.export.texture import Shot, paint_texture, texels_wanted
 from msgs_slam.pipelines.outcome import Outcome
+from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import Frame, SemanticMesh
 
 TEXTURE_SIDE = 4096
@@ -54,7 +54,9 @@ def _shots(outcome: Outcome, views: Sequence[PosedDepth]) -> Sequence[Shot]:
     # Blank walls count as blurred in themselves: neighbours, which see about the same, tell what is sharp there.
     usual = median_filter(measured, size=7, mode="nearest")
     sharpness = np.sqrt(np.minimum(measured / np.maximum(usual, 1e-9), 1))
-    return Streamed(len(frames), lambda n: _shot(outcome, frames[n], views[n], float(sharpness[n])), lambda shot: 1, 1)
+    return LruSequence(
+        len(frames), lambda n: _shot(outcome, frames[n], views[n], float(sharpness[n])), lambda shot: 1, 1
+    )
 
 
 def _shot(outcome: Outcome, frame: Frame, view: PosedDepth, sharpness: float) -> Shot:

@@ -26,7 +26,7 @@ from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.metres.files import save_metres
 from msgs_slam.pipelines.outcome import Outcome
 from msgs_slam.pipelines.run.folder import save_classes, save_left_out
-from msgs_slam.pipelines.system.streamed import Streamed
+from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.wording import stretches
 from msgs_slam.pipelines.upright.world import World, save_world
 
@@ -115,10 +115,10 @@ def write_ply(outcome: Outcome, sh_rest: bool, folder: Path) -> list[Path]:
     return paths
 
 
-def _in_parts(outcome: Outcome) -> Streamed[GaussianCloud]:
+def _in_parts(outcome: Outcome) -> LruSequence[GaussianCloud]:
     """The map as clouds of a `_PART` each, one at a time in memory."""
     starts = range(0, max(len(outcome.require_map()), 1), _PART)
-    return Streamed(len(starts), lambda n: map_cloud(outcome, slice(starts[n], starts[n] + _PART)), len, 0)
+    return LruSequence(len(starts), lambda n: map_cloud(outcome, slice(starts[n], starts[n] + _PART)), len, 0)
 
 
 def write_spz_file(outcome: Outcome, world: World, version: int, folder: Path) -> list[Path]:

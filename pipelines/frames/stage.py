@@ -19,10 +19,14 @@ from msgs_slam.formats.jsonfile import read_json, write_json
 from msgs_slam.formats.video import VideoFrame
 from msgs_slam.pipelines.config import Config, FramesConfig
 from msgs_slam.pipelines.correspondence.bridges import Picture
-from msgs_slam.pipelines.engine.portions import in_portions
+from msgs_slam.pipelines.engine.chunks import in_chunks
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
-from msgs_slam.pipelines.frames.begun import (
-    AHEAD,
+from msgs_slam.pipelines.frames.findings import settled_origin, warn_of_given, warn_of_structure
+from msgs_slam.pipelines.frames.keyframes import KeyframeChoice, choose_keyframes
+from msgs_slam.pipelines.frames.learned import learned_inputs, open_learned
+from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
+from msgs_slam.pipelines.frames.prefetch import (
+    PREFETCH,
     AnySource,
     grey_of,
     known_camera,
@@ -30,10 +34,6 @@ from msgs_slam.pipelines.frames.begun import (
     picked,
     structure_from_motion,
 )
-from msgs_slam.pipelines.frames.findings import settled_origin, warn_of_given, warn_of_structure
-from msgs_slam.pipelines.frames.keyframes import KeyframeChoice, choose_keyframes
-from msgs_slam.pipelines.frames.learned import learned_inputs, open_learned
-from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
 from msgs_slam.pipelines.geometry.rig import Rig, rig_of
 from msgs_slam.pipelines.run.folder import (
     RunFolder,
@@ -249,7 +249,7 @@ def _structure(
     known = {"frames": frames, "keyframes": keyframes}
 
     def ahead(name: str, count: int, more: dict[str, NDArray]) -> None:
-        in_portions(context, AHEAD[name], count, **known, **more)
+        in_chunks(context, PREFETCH[name], count, **known, **more)
 
     structure = structure_from_motion(context, *camera, frames, masks, rig, given, ahead).run(keyframes)
     warn_of_structure(context, structure, [frames[k].id for k in keyframes])

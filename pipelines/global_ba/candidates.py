@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from msgs_slam.pipelines.config import GlobalBaConfig
-from msgs_slam.pipelines.correspondence.retrieval import Looks, far_apart, loop_pairs
+from msgs_slam.pipelines.correspondence.retrieval import GlobalDescriptors, far_apart, loop_pairs
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.semantics import LabelSummary, richness, similarity
 
@@ -33,7 +33,7 @@ def shared_points(model: SparseModel) -> csr_matrix:
 
 def loop_candidates(
     model: SparseModel,
-    looks: Looks,
+    looks: GlobalDescriptors,
     summaries: Sequence[LabelSummary],
     refused: Collection[tuple[int, int]],
     settings: GlobalBaConfig,
@@ -57,7 +57,7 @@ def loop_candidates(
 
 def _semantic_candidates(
     unrelated: Callable[[slice], NDArray[np.bool_]],
-    looks: Looks,
+    looks: GlobalDescriptors,
     summaries: Sequence[LabelSummary],
     settings: GlobalBaConfig,
 ) -> set[tuple[int, int]]:

@@ -48,7 +48,7 @@ def refine_together(
     result = optimise_map(
         views, classes, settings, context.config.run.seed, initial=gaussian_map, passes=passes,
         progress=context.progress, snapshot=context.snapshot / "joint.safetensors", label="refining", exposure=exposure,
-        article=context.config.article,
+        paper=context.config.paper,
     )  # fmt: skip
     after = keyframe_psnr(result.gaussian_map, views, result.cam_from_world, result.log_gains, result.offsets)
     if after < before:

@@ -21,7 +21,7 @@ from msgs_slam.pipelines.mapping.optimise import scene_depth
 from msgs_slam.pipelines.mapping.views import View
 
 _RATE = 1e-3
-"""Of Adam, rotations in radians and translations in units of the world; the article has 3e-3 for its tracking."""
+"""Of Adam, rotations in radians and translations in units of the world; the paper has 3e-3 for its tracking."""
 _POSE_WEIGHT = 100.0
 """Of the squared twist: a hundredth of the depth away costs as much as a hundredth of the depth's error."""
 _AROUND = 2

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.atomic import copy_file
-from msgs_slam.pipelines.correspondence.retrieval import Looks, describe_all, unit
+from msgs_slam.pipelines.correspondence.retrieval import GlobalDescriptors, compute_global_descriptors, unit
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.depth.scales import sample_proxy
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
@@ -39,7 +39,7 @@ from msgs_slam.pipelines.run.folder import (
     save_trajectory,
 )
 from msgs_slam.pipelines.structure.bundle import reprojection_errors
-from msgs_slam.pipelines.system.streamed import Streamed
+from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.tracking.adjust import align_depths, without_dependent_depth
 from msgs_slam.pipelines.tracking.pictures import Pictures, load_shutter
 from msgs_slam.pipelines.tracking.result import to_sparse_model
@@ -99,20 +99,20 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
     views = keyframe_views(context, model, pictures)
     ids = model.frame_ids.tolist()
     all_features = map(pictures.features, context.progress.track(ids, "features", len(ids)))
-    kinds = [describe_all(all_features, len(ids), pictures.vocabulary)]
+    kinds = [compute_global_descriptors(all_features, len(ids), pictures.vocabulary)]
     learned = run.load_descriptors()
-    if all(i in learned for i in ids):  # the article's DINOSim counts half
+    if all(i in learned for i in ids):  # the paper's DINOSim counts half
         seen = np.stack([learned[i] for i in ids])
         kinds.append(unit(seen - seen.mean(0)).astype(np.float32))
-    refused = {pair for pair, matches in run.load_tried().items() if matches == 0}
-    pairs = loop_candidates(model, Looks(tuple(kinds)), load_summaries(run, model), refused, settings)
+    refused = {pair for pair, matches in run.load_matched_pairs().items() if matches == 0}
+    pairs = loop_candidates(model, GlobalDescriptors(tuple(kinds)), load_summaries(run, model), refused, settings)
     tracked = context.progress.track(pairs, "loops", len(pairs))
     found = find_loops(tracked, views, model.cam_from_world, run.load_calibration().intrinsics, seed)
     save_found(snapshot, found)
     return found
 
 
-def keyframe_views(context: StageContext, model: SparseModel, pictures: Pictures) -> Streamed[KeyframeView]:
+def keyframe_views(context: StageContext, model: SparseModel, pictures: Pictures) -> LruSequence[KeyframeView]:
     """Features of every keyframe, with what is known of their depth; those asked for last are kept."""
     run = context.run
     intrinsics = run.load_calibration().intrinsics
@@ -128,7 +128,7 @@ def keyframe_views(context: StageContext, model: SparseModel, pictures: Pictures
         pose, seen = model.cam_from_world[k], state.sightings[frame_id]
         return make_view(frame_id, pose, features, seen, model.points_in_world, depth, intrinsics)
 
-    return Streamed(len(model.frame_ids), load, lambda view: view.features.nbytes, _VIEWS_ROOM)
+    return LruSequence(len(model.frame_ids), load, lambda view: view.features.nbytes, _VIEWS_ROOM)
 
 
 def load_summaries(run: RunFolder, model: SparseModel) -> list[LabelSummary]:
@@ -236,10 +236,10 @@ def refine(
         )
         kept = (made.gaussian_map, made.cam_from_world, made.log_gains, made.offsets)
         return Refined(*kept, before, after, after >= before)
-    article, memory = context.config.article, context.memory_room
+    paper, memory = context.config.paper, context.memory_room
     class_ids = context.run.load_class_ids()
-    views = load_views(context.run, trajectory, mapping, article, context.device, fields, memory, class_ids).views
-    if steps := context.config.article.loop_steps:
+    views = load_views(context.run, trajectory, mapping, paper, context.device, fields, memory, class_ids).views
+    if steps := context.config.paper.loop_steps:
         ends = loop_keyframes(found.loops, [v.frame_id for v in views])
         views = adjust_views(views, ends, gaussian_map, mapping, steps)
     gains = {int(i): g for i, g in zip(exposure["frame_ids"], exposure["log_gains"], strict=True)}
@@ -258,13 +258,13 @@ def at_loop_ends(
 ) -> Trajectory:
     """The poses at the ends of loops by labels and depth, eq. (25), in a map that was made in submaps; the other
     keyframes where they were."""
-    steps, ends = context.config.article.loop_steps, loop_keyframes(found.loops, keyframe_ids.tolist())
+    steps, ends = context.config.paper.loop_steps, loop_keyframes(found.loops, keyframe_ids.tolist())
     if not steps or not ends:
         return trajectory
-    mapping, article, memory = context.config.mapping, context.config.article, context.memory_room
+    mapping, paper, memory = context.config.mapping, context.config.paper, context.memory_room
     around = rows_of(trajectory, np.array(sorted(ends)))
     class_ids = context.run.load_class_ids()
-    views = load_views(context.run, around, mapping, article, context.device, fields, memory, class_ids).views
+    views = load_views(context.run, around, mapping, paper, context.device, fields, memory, class_ids).views
     poses = poses_of(trajectory, keyframe_ids).copy()
     for frame_id, pose in adjusted_poses(views, gaussian_map, mapping, steps).items():
         poses[np.searchsorted(keyframe_ids, frame_id)] = pose

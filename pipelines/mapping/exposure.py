@@ -14,7 +14,7 @@ LEAST = 100
 OUTLIER = 0.02
 """Difference of colours (0..1) from which a pixel counts the less the larger it is: light and shade on what is wrong in
 the map are not the camera's."""
-PULL = 0.003
+RIDGE = 0.003
 """Weight of no change at all beside the variance of what the view shows, in colours of the photo, and beside all pixels
 for the offset: exposures are relative, and drift together with the map's colours. What is newly seen shows a little
 less contrast than its photo, so that gains fall from keyframe to keyframe; a pull in colours of the map, whose contrast
@@ -47,8 +47,8 @@ def fit_exposure(shown: Tensor, photo: Tensor, known: Tensor, exposure: Tensor) 
     gain = (weight * (x - mean_x) * (y - mean_y)).sum(0) / variance.clamp(min=1e-12)
     gain = gain.clamp(1 / MOST_GAIN, MOST_GAIN)
     told = gain**2 * variance
-    log_gain = gain.log() * told / (told + PULL)
-    found = torch.stack([log_gain, (mean_y - log_gain.exp() * mean_x) / (1 + PULL)]).to(exposure)
+    log_gain = gain.log() * told / (told + RIDGE)
+    found = torch.stack([log_gain, (mean_y - log_gain.exp() * mean_x) / (1 + RIDGE)]).to(exposure)
     return torch.where(enough, found, exposure)
 
 

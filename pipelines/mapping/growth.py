@@ -9,14 +9,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from msgs_slam.pipelines.config import ArticleConfig, MappingConfig
+from msgs_slam.pipelines.config import MappingConfig, PaperConfig
 from msgs_slam.pipelines.gaussians.render import Rendering
 from msgs_slam.pipelines.gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
 from msgs_slam.pipelines.mapping import densify
-from msgs_slam.pipelines.mapping.article.class_growth import wrong_classes
+from msgs_slam.pipelines.mapping.paper.class_growth import wrong_classes
 from msgs_slam.pipelines.mapping.region_prior import with_region_prior
 from msgs_slam.pipelines.mapping.schedule import Seeding
-from msgs_slam.pipelines.mapping.splitting import CHILDREN, Blame, split
+from msgs_slam.pipelines.mapping.splitting import CHILDREN, DensificationError, split
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View
 
@@ -46,7 +46,7 @@ class Growth:
     views: Sequence[View]
     classes: int
     settings: MappingConfig
-    article: ArticleConfig
+    paper: PaperConfig
     state: OptimiserState
     unit: float
 
@@ -71,17 +71,17 @@ class Growth:
 
     @torch.no_grad()
     def grow(self, index: int, rendering: Rendering) -> None:
-        """Add Gaussians by the conditions of the article."""
+        """Add Gaussians by the conditions of the paper."""
         view = self.views[index]
         needed = self._needed(view, rendering)
-        if self.article.class_growth:
+        if self.paper.class_growth:
             needed |= wrong_classes(rendering.features[..., 3:], view.channels, view.label_weight)
         spacing = self._spacing(view)
         depth, trust = self._grown_depth(view, rendering)
         self._append(index, needed & (spacing > 0), depth, trust, spacing, GROWN_OPACITY)
 
     @torch.no_grad()
-    def split(self, found: Blame) -> None:
+    def split(self, found: DensificationError) -> None:
         """Split the Gaussians that answer for the most error, where they are too large: as many as the map may hold."""
         parameters, s = self.state.parameters, self.settings
         wrong = torch.where(found.footprint > SPLIT_RADIUS, found.error, 0.0)

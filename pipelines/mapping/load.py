@@ -10,15 +10,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.config import ArticleConfig, MappingConfig
+from msgs_slam.pipelines.config import MappingConfig, PaperConfig
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.depth.see_through import contradicted
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.mapping.article.mirrors import Mirrors
+from msgs_slam.pipelines.mapping.paper.mirrors import Mirrors
 from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.memory import VIEWS_SHARE, room_on
-from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import Frame, Intrinsics, ProxyMaps, Trajectory
 
 
@@ -35,7 +35,7 @@ def load_views(
     run: RunFolder,
     trajectory: Trajectory,
     settings: MappingConfig,
-    article: ArticleConfig | None = None,
+    paper: PaperConfig | None = None,
     device: torch.device | str = "cpu",
     fields: DepthFields | None = None,
     memory: float = math.inf,
@@ -52,7 +52,7 @@ def load_views(
     full = run.load_calibration().intrinsics
     intrinsics = full.at_most(settings.max_side)
     fields = fields or run.load_depth_fields("tracking")
-    symmetry = run.load_symmetry() if article and article.symmetry_weight > 0 else {}
+    symmetry = run.load_symmetry() if paper and paper.symmetry_weight > 0 else {}
     kept, measured = split_frames(trajectory, settings.hold_out)
     channels = survey(run, kept)[0] if class_ids is None else class_ids
     poses = dict(zip(trajectory.frame_ids.tolist(), trajectory.cam_from_world, strict=True))
@@ -69,8 +69,8 @@ def load_views(
 
     memory = room_on(device, memory)
 
-    def streamed(ids: list[int], room: float) -> Streamed[View]:
-        return Streamed(len(ids), lambda n: load(ids[n]), lambda v: v.nbytes, room)
+    def streamed(ids: list[int], room: float) -> LruSequence[View]:
+        return LruSequence(len(ids), lambda n: load(ids[n]), lambda v: v.nbytes, room)
 
     views = without_contradicted_depth(streamed(kept, VIEWS_SHARE * memory))
     return MappingInput(views, streamed(measured, VIEWS_SHARE * memory / 8), channels)
@@ -97,9 +97,9 @@ def survey(run: RunFolder, frame_ids: Iterable[int]) -> tuple[tuple[int, ...], i
     return occurring_classes(labels()), with_depth
 
 
-def without_contradicted_depth(views: Streamed[View]) -> Streamed[View]:
+def without_contradicted_depth(views: LruSequence[View]) -> LruSequence[View]:
     """The views, their depth unknown where others see through it."""
-    posed = Streamed(len(views), lambda i: views[i].posed_depth(), lambda p: p.depth.nbytes, 0)
+    posed = LruSequence(len(views), lambda i: views[i].posed_depth(), lambda p: p.depth.nbytes, 0)
     wrong = [np.packbits(w) for w in contradicted(posed)]
 
     def masked(index: int, view: View) -> View:

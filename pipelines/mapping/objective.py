@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from msgs_slam.pipelines.config import ArticleConfig, MappingConfig
+from msgs_slam.pipelines.config import MappingConfig, PaperConfig
 from msgs_slam.pipelines.gaussians.render import Rendering
 from msgs_slam.pipelines.mapping import losses
-from msgs_slam.pipelines.mapping.article.boundary_clip import clip_beside_boundary
-from msgs_slam.pipelines.mapping.article.edge_term import edge_loss
-from msgs_slam.pipelines.mapping.article.label_image import label_image_loss
-from msgs_slam.pipelines.mapping.article.mirrors import label_symmetry_loss, symmetry_loss
+from msgs_slam.pipelines.mapping.paper.boundary_clip import clip_beside_boundary
+from msgs_slam.pipelines.mapping.paper.edge_term import edge_loss
+from msgs_slam.pipelines.mapping.paper.label_image import label_image_loss
+from msgs_slam.pipelines.mapping.paper.mirrors import label_symmetry_loss, symmetry_loss
 from msgs_slam.pipelines.mapping.photo_loss import photo_loss
 from msgs_slam.pipelines.mapping.views import View
 
@@ -27,20 +27,20 @@ class Objective:
     """The terms with their weights; `unit`: the scene's median depth, `classes`: channels of the map."""
 
     settings: MappingConfig
-    article: ArticleConfig
+    paper: PaperConfig
     classes: int
     unit: float
 
     def uses_labels(self, iteration: int) -> bool:
         """Whether the semantic terms count at this step."""
-        wanted = max(self.settings.label_weight, self.article.edge_weight, self.article.symmetry_weight) > 0
+        wanted = max(self.settings.label_weight, self.paper.edge_weight, self.paper.symmetry_weight) > 0
         return self.classes > 0 and wanted and iteration % LABEL_EVERY == 0
 
     def of(self, view: View, exposure: Tensor, rendering: Rendering, log_radii: Tensor, with_labels: bool) -> Tensor:
         """Scalar; `exposure` (2, 3) is the view's, `log_radii` (M,) the map's."""
-        s, article = self.settings, self.article
-        if article.boundary_clip > 0:
-            clip_beside_boundary(rendering.features, view.channels, article.boundary_clip)
+        s, paper = self.settings, self.paper
+        if paper.boundary_clip > 0:
+            clip_beside_boundary(rendering.features, view.channels, paper.boundary_clip)
         # split, not slices: the gradient of each slice would be a whole image of zeros around it.
         shown, logits = rendering.features.split([3, rendering.features.shape[-1] - 3], dim=-1)
         loss = photo_loss(shown, exposure, view.image, view.scene)
@@ -49,21 +49,21 @@ class Objective:
         if s.depth_weight > 0 and s.use_proxy_depth:
             weight = losses.depth_weight(view.trust)
             loss = loss + s.depth_weight * losses.depth_loss(rendering.depth, view.depth, weight, self.unit)
-        if article.symmetry_weight > 0 and view.mirrors is not None:
-            loss = loss + article.symmetry_weight * symmetry_loss(rendering.depth, view.mirrors, self.unit)
+        if paper.symmetry_weight > 0 and view.mirrors is not None:
+            loss = loss + paper.symmetry_weight * symmetry_loss(rendering.depth, view.mirrors, self.unit)
         if with_labels:
             loss = loss + LABEL_EVERY * self._semantic(view, rendering.depth, logits)
         return loss
 
     def _semantic(self, view: View, depth: Tensor, logits: Tensor) -> Tensor:
-        """Labels, and what the article has beside them."""
-        article, weight = self.article, self.settings.label_weight
+        """Labels, and what the paper has beside them."""
+        paper, weight = self.paper, self.settings.label_weight
         loss = depth.new_zeros(())
         if weight > 0:
-            compare = label_image_loss if article.label_image else losses.label_loss
+            compare = label_image_loss if paper.label_image else losses.label_loss
             loss = loss + weight * compare(logits, view.channels, view.label_weight)
-        if article.edge_weight > 0:
-            loss = loss + article.edge_weight * edge_loss(depth, view.channels, self.unit)
-        if article.symmetry_weight > 0 and view.mirrors is not None:
-            loss = loss + article.symmetry_weight * label_symmetry_loss(logits, view.mirrors)
+        if paper.edge_weight > 0:
+            loss = loss + paper.edge_weight * edge_loss(depth, view.channels, self.unit)
+        if paper.symmetry_weight > 0 and view.mirrors is not None:
+            loss = loss + paper.symmetry_weight * label_symmetry_loss(logits, view.mirrors)
         return loss

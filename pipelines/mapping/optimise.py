@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from msgs_slam.pipelines.config import ArticleConfig, MappingConfig
+from msgs_slam.pipelines.config import MappingConfig, PaperConfig
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.gaussians.adam import AdamTable, gradients_of
 from msgs_slam.pipelines.gaussians.render import Rendering, blending_weights, in_view, render
@@ -19,12 +19,12 @@ from msgs_slam.pipelines.mapping.growth import HIGH_RELIABILITY, LOW_RELIABILITY
 from msgs_slam.pipelines.mapping.objective import Objective
 from msgs_slam.pipelines.mapping.parameters import COLOR_KEYS, KEYS
 from msgs_slam.pipelines.mapping.schedule import Schedule, Seeding, Step
-from msgs_slam.pipelines.mapping.splitting import Blame, blame
+from msgs_slam.pipelines.mapping.splitting import DensificationError, densification_error
 from msgs_slam.pipelines.mapping.state import Exposures, OptimisedMap, OptimiserState
 from msgs_slam.pipelines.mapping.views import View, halved
+from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress
 from msgs_slam.pipelines.system.stopping import is_asked
-from msgs_slam.pipelines.system.streamed import Streamed
 
 MAP_RATES = {"means": 0.1, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2, "class_logits": 6e-2}
 """Learning rates of Adam, of positions in radii of the Gaussian: what is small has to be placed finely."""
@@ -47,7 +47,7 @@ def optimise_map(
     snapshot: Path | None = None,
     label: str = "mapping",
     exposure: Exposures | None = None,
-    article: ArticleConfig | None = None,
+    paper: PaperConfig | None = None,
     first_rate: float = 1.0,
 ) -> OptimisedMap:
     """The map that explains the views (MSGS-SLAM eqs. 17-20), with their poses and exposures refined together.
@@ -57,9 +57,9 @@ def optimise_map(
     and offsets (N, 3) to start from; `first_rate`: learning rates of the first visit, as a share.
     """
     state = OptimiserState.load(snapshot, views) or OptimiserState.fresh(views, classes, initial, exposure)
-    article = article or ArticleConfig()
-    schedule = Schedule.plan(views, settings, seed, initial is None, passes, article.keyframe_miou, first_rate)
-    optimiser = MapOptimiser(views, classes, settings, article, state)
+    paper = paper or PaperConfig()
+    schedule = Schedule.plan(views, settings, seed, initial is None, passes, paper.keyframe_miou, first_rate)
+    optimiser = MapOptimiser(views, classes, settings, paper, state)
     # A map and its visits grow together: were it written every so many visits, all of it would be written ever longer.
     every = max(settings.snapshot_every, len(views))
     remaining = range(state.iteration, schedule.total)
@@ -83,14 +83,14 @@ class MapOptimiser:
         views: Sequence[View],
         classes: int,
         settings: MappingConfig,
-        article: ArticleConfig,
+        paper: PaperConfig,
         state: OptimiserState,
     ) -> None:
-        self.views, self.settings, self.article, self.state = views, settings, article, state
-        self.halves = Streamed(len(views), lambda i: halved(views[i]), lambda v: v.nbytes, HALVES_ROOM)
+        self.views, self.settings, self.paper, self.state = views, settings, paper, state
+        self.halves = LruSequence(len(views), lambda i: halved(views[i]), lambda v: v.nbytes, HALVES_ROOM)
         self.unit = scene_depth(views)
-        self.objective = Objective(settings, article, classes, self.unit)
-        self.growth = Growth(views, classes, settings, article, state, self.unit)
+        self.objective = Objective(settings, paper, classes, self.unit)
+        self.growth = Growth(views, classes, settings, paper, state, self.unit)
 
     def visit(self, step: Step) -> None:
         """Do what the schedule says: seed, compare, grow, prune."""
@@ -101,7 +101,7 @@ class MapOptimiser:
         if len(parameters) == 0:
             return
         with_labels = self.objective.uses_labels(step.iteration)
-        with_classes = with_labels or (step.grow and self.article.class_growth)
+        with_classes = with_labels or (step.grow and self.paper.class_growth)
         # What the view does not show has no gradient and would wait anyway.
         pose, radii = self.state.cam_from_world(step.view, view), torch.exp(parameters["log_radii"].detach())
         rows = in_view(parameters["means"].detach(), radii, pose, view.intrinsics)
@@ -130,14 +130,14 @@ class MapOptimiser:
         values = {k: self.state.parameters[k] for k in COLOR_KEYS}
         self.growth.seed(index, what, self.draw(view, table, values) if known else None)
 
-    def _blame(self) -> Blame:
+    def _blame(self) -> DensificationError:
         """What each Gaussian answers for in the view where that is most."""
         gaussian_map, state = self.state.parameters.to_map(), self.state
         found = (
-            blame(gaussian_map, state.cam_from_world(i, v), v.intrinsics, partial(self._color_errors, i))
+            densification_error(gaussian_map, state.cam_from_world(i, v), v.intrinsics, partial(self._color_errors, i))
             for i, v in enumerate(self.views)
         )
-        return reduce(Blame.worst_of, found)
+        return reduce(DensificationError.worst_of, found)
 
     @torch.no_grad()
     def _color_errors(self, index: int, colors: Tensor) -> Tensor:
@@ -167,7 +167,7 @@ class MapOptimiser:
 
     def draw(self, view: View, table: AdamTable, values: Mapping[str, Tensor]) -> Rendering:
         """Gaussians of raw parameters as the view's camera sees them now, with class logits where they have any."""
-        kappa, colors = self.article.kappa, values["colors"]
+        kappa, colors = self.paper.kappa, values["colors"]
         return render(
             values["means"],
             torch.exp(values["log_radii"]),
@@ -183,7 +183,7 @@ class MapOptimiser:
     def _shares(self, rows: Tensor, log_radii: Tensor) -> dict[str, Tensor]:
         """(n,) step sizes of some rows by confidence class (MSGS-SLAM 3.4), those of positions times the radius.
 
-        The article has small steps where depth is unreliable. Measured, the contrary helps: what stands in the wrong
+        The paper has small steps where depth is unreliable. Measured, the contrary helps: what stands in the wrong
         place has farther to go, and colours have to lead it there.
         """
         trust = self.state.parameters.trust[rows]

@@ -32,7 +32,7 @@ def photo_loss(shown: Tensor, exposure: Tensor, photo: Tensor, scene: Tensor | N
 
     shown (H, W, 3) 0..1, exposure (2, 3), photo (H, W, 3) uint8; differentiable in the first. Where
     scene (H, W) is False the photo is no part of the scene: there it looks as the map does, and asks for nothing.
-    The article prints ω = 0.2 before the absolute difference; the weights of 3DGS, which has the same formula, are the
+    The paper prints ω = 0.2 before the absolute difference; the weights of 3DGS, which has the same formula, are the
     other way round, and so are the ones here. float32 on a CPU takes compiled loops, on a card kernels; everything else
     plain torch.
     """

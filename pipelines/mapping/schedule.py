@@ -12,8 +12,8 @@ from scipy.sparse import csr_matrix
 
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.depth.posed import overlaps
-from msgs_slam.pipelines.mapping.article.label_choice import label_likeness
 from msgs_slam.pipelines.mapping.covisibility import keyframe_weights
+from msgs_slam.pipelines.mapping.paper.label_choice import label_likeness
 from msgs_slam.pipelines.mapping.views import View
 
 WINDOW_STEPS = 2
@@ -134,7 +134,7 @@ class Schedule:
     def _covisible(self, now: int, rng: np.random.Generator) -> int:
         row = slice(*self.overlap.indptr[now : now + 2])
         others, overlap = self.overlap.indices[row], self.overlap.data[row]
-        # η > 0.08 of the article; where nobody sees the same, anybody will do.
+        # η > 0.08 of the paper; where nobody sees the same, anybody will do.
         seeing = (others < now) & (overlap > 0.08)
         if not seeing.any():
             return int(rng.integers(now))

@@ -25,23 +25,25 @@ _NEIGHBOURS = 12
 
 
 @dataclass(frozen=True)
-class Blame:
+class DensificationError:
     """Of each Gaussian, the error it answers for in the worst of several views: `error` (M,) in pixels times colour
     error, and `footprint` (M,) its radius on that image in pixels."""
 
     error: Tensor
     footprint: Tensor
 
-    def worst_of(self, other: Blame) -> Blame:
+    def worst_of(self, other: DensificationError) -> DensificationError:
         """For each Gaussian the view of larger error."""
         worse = other.error > self.error
-        return Blame(torch.where(worse, other.error, self.error), torch.where(worse, other.footprint, self.footprint))
+        return DensificationError(
+            torch.where(worse, other.error, self.error), torch.where(worse, other.footprint, self.footprint)
+        )
 
 
 @torch.no_grad()
-def blame(
+def densification_error(
     gaussian_map: GaussianMap, cam_from_world: Tensor, intrinsics: Intrinsics, error_of: Callable[[Tensor], Tensor]
-) -> Blame:
+) -> DensificationError:
     """What each Gaussian answers for in one view: the errors of the pixels, weighed by its part in them, summed.
 
     `error_of`: (H, W, 3) colours of the map to (H, W) errors (the error of Rota Bulò, Porzi and Kontschieder, "Revising
@@ -51,7 +53,7 @@ def blame(
     shown = render(m.means, m.radii, m.opacities, m.colors, cam_from_world, intrinsics).features
     weights = blending_weights(m.means, m.radii, m.opacities, cam_from_world, intrinsics, counts=error_of(shown))
     _, _, footprint, _ = project_map(m.means, m.radii, cam_from_world, intrinsics)
-    return Blame(weights.total, footprint)
+    return DensificationError(weights.total, footprint)
 
 
 def split(gaussian_map: GaussianMap, rows: Tensor) -> GaussianMap:

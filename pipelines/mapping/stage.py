@@ -43,14 +43,14 @@ def run(context: StageContext) -> dict[str, Any]:
 
 def map_whole(context: StageContext, trajectory: Trajectory, class_ids: tuple[int, ...]) -> Mapped:
     """Views, depth that agrees between them, one map."""
-    settings, seed, article = context.config.mapping, context.config.run.seed, context.config.article
+    settings, seed, paper = context.config.mapping, context.config.run.seed, context.config.paper
     given = load_views(
-        context.run, trajectory, settings, article, context.device, memory=context.memory_room, class_ids=class_ids
+        context.run, trajectory, settings, paper, context.device, memory=context.memory_room, class_ids=class_ids
     )
     views = given.views
     result = optimise_map(
         views, len(given.class_ids), settings, seed,
-        progress=context.progress, snapshot=context.snapshot / "state.safetensors", article=article,
+        progress=context.progress, snapshot=context.snapshot / "state.safetensors", paper=paper,
     )  # fmt: skip
     ids = np.array([v.frame_id for v in views])
     moved = move_trajectory(trajectory, ids, result.cam_from_world)

@@ -31,7 +31,7 @@ from msgs_slam.pipelines.mapping.state import Exposures, OptimisedMap
 from msgs_slam.pipelines.mapping.submaps import Submap, nearest_seeing
 from msgs_slam.pipelines.mapping.views import View
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.system.device import settle_device
+from msgs_slam.pipelines.system.device import resolve_device
 from msgs_slam.pipelines.system.memory import memory_room
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Intrinsics, Trajectory
@@ -69,7 +69,7 @@ class SubmapTask:
     @property
     def device(self) -> str:
         """ "cpu" or "cuda"."""
-        return settle_device(self.config.run.device)
+        return resolve_device(self.config.run.device)
 
     def file(self, kind: str, number: int | None = None) -> Path:
         """Of a result of this submap, or of another one."""
@@ -97,7 +97,7 @@ class SubmapTask:
         settings = replace(self.config.mapping, hold_out=hold_out)
         memory = memory_room(self.config.run.memory_mb)
         return load_views(
-            self.run, trajectory, settings, self.config.article, self.device, self.fields, memory, self.class_ids
+            self.run, trajectory, settings, self.config.paper, self.device, self.fields, memory, self.class_ids
         )
 
 
@@ -247,7 +247,7 @@ def _optimise(
     return optimise_map(
         given.views, len(task.class_ids), settings, seed, initial, passes,
         progress=progress, snapshot=task.file(f"{kind}_state"), label=f"submap {task.number + 1}, {kind}",
-        exposure=exposure, article=task.config.article, first_rate=rate,
+        exposure=exposure, paper=task.config.paper, first_rate=rate,
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from msgs_slam.pipelines.depth.posed import PosedDepth
 from msgs_slam.pipelines.depth.resize import resize_depth, resize_maps
-from msgs_slam.pipelines.mapping.article.mirrors import Mirrors
+from msgs_slam.pipelines.mapping.paper.mirrors import Mirrors
 from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 
 

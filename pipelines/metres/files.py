@@ -7,7 +7,7 @@ from pathlib import Path
 
 from msgs_slam.formats.jsonfile import read_json, read_json_object, write_json
 from msgs_slam.pipelines.run.folder import SCALE, RunFolder
-from msgs_slam.pipelines.run.stored import dataclass_from_json, reading
+from msgs_slam.pipelines.run.layouts import dataclass_from_json, reading
 from msgs_slam.pipelines.types import Metres, MetresSource
 
 _ALONE = (

@@ -23,7 +23,7 @@ SMALL_SD = 0.25
 0.186 in log depth, most of it alike over a picture. On rooms of another kind it errs more; four recordings, none of
 them used to choose anything else here, gave log errors of 0.10, -0.05, -0.15 and -0.43: 0.24 root mean square."""
 LARGE_SD = 0.10
-"""Metric3D-V2 and MoGe-2: zero-shot AbsRel of 6 to 10 % on indoor sets (their articles), of which much is the scale."""
+"""Metric3D-V2 and MoGe-2: zero-shot AbsRel of 6 to 10 % on indoor sets (their papers), of which much is the scale."""
 _ZOOMS = (1.0, 1.25, 1.5)
 """FastDepth was trained on pictures enlarged by 1 to 1.5, depth divided by as much: each is as good an answer."""
 _LEAST_PIXELS = 1500

@@ -133,7 +133,7 @@ class _SafeRedirects(urllib.request.HTTPRedirectHandler):
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
-class _Impatient(http.client.HTTPConnection):
+class _TimeoutConnection(http.client.HTTPConnection):
     """Gives up on an answer whose head does not come: the timeout of a socket begins anew with every byte."""
 
     def getresponse(self) -> http.client.HTTPResponse:
@@ -150,18 +150,18 @@ class _Impatient(http.client.HTTPConnection):
             self.sock.shutdown(socket.SHUT_RDWR)
 
 
-class _ImpatientTls(_Impatient, http.client.HTTPSConnection):
+class _TimeoutTlsConnection(_TimeoutConnection, http.client.HTTPSConnection):
     """The same over TLS."""
 
 
 class _Http(urllib.request.HTTPHandler):
     def http_open(self, req: urllib.request.Request) -> http.client.HTTPResponse:
-        return self.do_open(_Impatient, req)
+        return self.do_open(_TimeoutConnection, req)
 
 
 class _Https(urllib.request.HTTPSHandler):
     def https_open(self, req: urllib.request.Request) -> http.client.HTTPResponse:
-        return self.do_open(_ImpatientTls, req)
+        return self.do_open(_TimeoutTlsConnection, req)
 
 
 def _opener() -> urllib.request.OpenerDirector:

@@ -13,7 +13,7 @@ from msgs_slam.pipelines.proxy.files.depth import FilesDepth, require_sizes
 from msgs_slam.pipelines.proxy.files.labels import FilesLabels
 from msgs_slam.pipelines.proxy.scale_reference import POSES, require_reference_in
 from msgs_slam.pipelines.proxy.selection import (
-    Surroundings,
+    ProviderContext,
     choose_depth,
     choose_semantics,
     missing_networks,
@@ -79,7 +79,7 @@ def _digest_of(files: list[Path]) -> str:
     return files_sha256((p.name, p) for p in files)
 
 
-def _before_frames(source: Path, config: Config) -> Surroundings:
+def _before_frames(source: Path, config: Config) -> ProviderContext:
     """As if every picture of the source were a frame; none of them is decoded."""
     pictures = open_source(source, config.run.format)
     width, height = pictures.width, pictures.height
@@ -93,4 +93,4 @@ def _before_frames(source: Path, config: Config) -> Surroundings:
 
     recording = pictures.sequence if isinstance(pictures, RecordingSource) else None
     sequence = Sequence(names, calibration, small, None, nothing)
-    return Surroundings(source, sequence, config.proxy, nothing, 1, "cpu", SilentProgress(), recording)
+    return ProviderContext(source, sequence, config.proxy, nothing, 1, "cpu", SilentProgress(), recording)

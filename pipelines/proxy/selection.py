@@ -37,7 +37,7 @@ _FILES_LOOKED_AT = 12
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class ProviderContext:
     """What providers are made from. `scratch(name)` is a folder that lives as long as the stage is unfinished;
     `recording` is the data set that the source is, None for a video or plain images; results of networks are kept over
     runs in `cache_mb` megabytes."""
@@ -111,7 +111,7 @@ def _choose(text: str, setting: str, own: tuple[str, ...], task: str) -> Choice:
     return Choice("files", rest) if kind == "files" else Choice(own[0] if kind == "auto" else kind)
 
 
-def open_depth(around: Surroundings) -> DepthProvider:
+def open_depth(around: ProviderContext) -> DepthProvider:
     """Raises InputError when the provider cannot work on this video."""
     choice = choose_depth(around.config)
     if choice.kind in OWN_DEPTH:
@@ -122,7 +122,7 @@ def open_depth(around: Surroundings) -> DepthProvider:
     return _fused(around, learned) if _wants_fusion(around, choice, learned) else learned
 
 
-def _wants_fusion(around: Surroundings, choice: Choice, learned: DepthProvider) -> bool:
+def _wants_fusion(around: ProviderContext, choice: Choice, learned: DepthProvider) -> bool:
     """Whether the depth gains from multi-view depth: a network's does; that of files may come from a sensor, or from a
     network that somebody ran before, and the points of structure from motion tell which."""
     if around.config.fuse != "learned" or choice.card is not None:
@@ -132,14 +132,14 @@ def _wants_fusion(around: Surroundings, choice: Choice, learned: DepthProvider) 
     return bool(strays) and median(strays.values()) > LEARNED_SPREAD
 
 
-def open_learned_depth(around: Surroundings, choice: Choice) -> FilesDepth | RecordingDepth | OnnxDepth:
+def open_learned_depth(around: ProviderContext, choice: Choice) -> FilesDepth | RecordingDepth | OnnxDepth:
     """The provider of `files` or of a network, by itself."""
     if choice.card is None:
         return open_depth_files(around, choice.folder)
     return OnnxDepth(choice.card, _workplace(around, "network_depth"))
 
 
-def open_semantics(around: Surroundings) -> SemanticsProvider:
+def open_semantics(around: ProviderContext) -> SemanticsProvider:
     """Raises InputError when the provider cannot work on this video."""
     choice = choose_semantics(around.config)
     if choice.kind in OWN_SEMANTICS:
@@ -147,7 +147,7 @@ def open_semantics(around: Surroundings) -> SemanticsProvider:
     return open_learned_semantics(around, choice)
 
 
-def open_learned_semantics(around: Surroundings, choice: Choice) -> FilesLabels | RecordingLabels | OnnxLabels:
+def open_learned_semantics(around: ProviderContext, choice: Choice) -> FilesLabels | RecordingLabels | OnnxLabels:
     """The provider of `files` or of a network, by itself."""
     if choice.card is None:
         return open_label_files(around, choice.folder)
@@ -157,14 +157,14 @@ def open_learned_semantics(around: Surroundings, choice: Choice) -> FilesLabels 
     return OnnxLabels(choice.card, place, around.config.max_classes)
 
 
-def open_depth_files(around: Surroundings, folder: str) -> FilesDepth | RecordingDepth:
+def open_depth_files(around: ProviderContext, folder: str) -> FilesDepth | RecordingDepth:
     """The depth of a folder; without one, that of the data set itself, or what lies beside the source."""
     if not folder and around.recording is not None:
         return RecordingDepth(around.recording, around.sequence)
     return FilesDepth(folder, around.source, around.sequence, around.config.depth_scale)
 
 
-def open_label_files(around: Surroundings, folder: str) -> FilesLabels | RecordingLabels:
+def open_label_files(around: ProviderContext, folder: str) -> FilesLabels | RecordingLabels:
     """The labels of a folder; without one, those of the data set itself, or what lies beside the source."""
     if not folder and around.recording is not None:
         return RecordingLabels(around.recording, around.sequence, around.progress)
@@ -210,30 +210,30 @@ def missing_networks() -> str | None:
     return f"no networks for {named} are installed: `msgs-slam models pull` fetches them ({size:.0f} MB, once)"
 
 
-def _multiview(around: Surroundings) -> MultiviewDepth:
+def _multiview(around: ProviderContext) -> MultiviewDepth:
     side, planes = around.config.stereo_side, around.config.stereo_planes
     return MultiviewDepth(
         around.sequence, side, planes, lambda: around.scratch("stereo"), around.threads, around.progress
     )
 
 
-def _segments(around: Surroundings) -> SegmentLabels:
+def _segments(around: ProviderContext) -> SegmentLabels:
     return SegmentLabels(around.sequence, around.config.max_classes, around.progress)
 
 
-OWN_DEPTH: dict[str, Callable[[Surroundings], DepthProvider]] = {"multiview": _multiview}
-OWN_SEMANTICS: dict[str, Callable[[Surroundings], SemanticsProvider]] = {"segments": _segments}
+OWN_DEPTH: dict[str, Callable[[ProviderContext], DepthProvider]] = {"multiview": _multiview}
+OWN_SEMANTICS: dict[str, Callable[[ProviderContext], SemanticsProvider]] = {"segments": _segments}
 """Providers that need neither files nor a network; a new one is a line here. `auto` falls back to the first."""
 
 
-def _fused(around: Surroundings, learned: DepthProvider) -> DepthProvider:
+def _fused(around: ProviderContext, learned: DepthProvider) -> DepthProvider:
     """With the multi-view depth where structure from motion has poses for it."""
     if around.sequence.backbone is None or len(around.sequence.backbone.frame_ids) < 2:
         return learned
     return FusedDepth(learned, _multiview(around), around.sequence)
 
 
-def _workplace(around: Surroundings, scratch: str) -> Workplace:
+def _workplace(around: ProviderContext, scratch: str) -> Workplace:
     cache = ResultCache(default_cache() / "results", around.cache_mb)
     return Workplace(
         around.sequence, lambda: around.scratch(scratch), around.threads, around.device, around.progress, cache

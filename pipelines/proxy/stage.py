@@ -80,7 +80,7 @@ def run(context: StageContext) -> dict[str, Any]:
     save_descriptors(context.folder, {i: looks for _, part in made for i, looks in part.items()})
     save_frame_scales(context.folder, scale.of_frame, scale.spread_in)
     mirrors = (
-        _symmetry_pass(context, sequence, frames, scale, metres) if context.config.article.symmetry_weight > 0 else {}
+        _symmetry_pass(context, sequence, frames, scale, metres) if context.config.paper.symmetry_weight > 0 else {}
     )
     report = {
         **_report(context, frames, depths, semantics, agreements),

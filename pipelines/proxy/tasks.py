@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.depth.resize import resample_nearest
-from msgs_slam.pipelines.engine.portions import Portion, in_portions
+from msgs_slam.pipelines.engine.chunks import Chunk, in_chunks
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.masks.moving import SIDE, MovingView, look_once
 from msgs_slam.pipelines.proxy.compact import compact
@@ -26,7 +26,7 @@ from msgs_slam.pipelines.proxy.providers import (
 from msgs_slam.pipelines.proxy.reliability import reliability, semantic_agreement, theta, warp_labels
 from msgs_slam.pipelines.proxy.scale import DepthScale
 from msgs_slam.pipelines.proxy.scratch import load_scratch, save_scratch
-from msgs_slam.pipelines.proxy.selection import Surroundings, open_depth, open_semantics
+from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth, open_semantics
 from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
 from msgs_slam.pipelines.run.folder import load_left_out
 from msgs_slam.pipelines.run.proxy_files import proxy_path, save_proxy_maps
@@ -52,33 +52,33 @@ class _Opened:
     known: dict[str, Any]
 
     @property
-    def around(self) -> Surroundings:
+    def around(self) -> ProviderContext:
         """What the providers are made from."""
         return surroundings(self.context, self.sequence)
 
 
 def by_workers(
-    context: StageContext, work: Callable[[Portion, Progress], R], frames: list[Frame], **known: Any
+    context: StageContext, work: Callable[[Chunk, Progress], R], frames: list[Frame], **known: Any
 ) -> list[R]:
-    """`in_portions` of the frames."""
+    """`in_chunks` of the frames."""
     ids = np.array([f.id for f in frames], np.int64)
-    return in_portions(context, work, len(frames), frame_ids=ids, **known)
+    return in_chunks(context, work, len(frames), frame_ids=ids, **known)
 
 
-def _opened(task: Portion, progress: Progress) -> _Opened:
+def _opened(task: Chunk, progress: Progress) -> _Opened:
     context, known = task.context(progress), task.known
     sequence, wanted = load_sequence(context), set(known["frame_ids"].tolist())
     frames = [f for f in sequence.frames if f.id in wanted]
     return _Opened(context, sequence, frames, frames[task.first : task.last], known)
 
 
-def prepare_depths(task: Portion, progress: Progress) -> None:
+def prepare_depths(task: Chunk, progress: Progress) -> None:
     """What each frame's depth needs of the others: the slow passes over the frames."""
     o = _opened(task, progress)
     open_depth(o.around).prepare(o.part)
 
 
-def make_depths(task: Portion, progress: Progress) -> None:
+def make_depths(task: Chunk, progress: Progress) -> None:
     """The depths of the frames."""
     o = _opened(task, progress)
     depths = open_depth(o.around)
@@ -86,19 +86,19 @@ def make_depths(task: Portion, progress: Progress) -> None:
     depth_pass(o.context, o.sequence, o.part, depths)
 
 
-def look_for_moving(task: Portion, progress: Progress) -> dict[int, NDArray[np.bool_]]:
+def look_for_moving(task: Chunk, progress: Progress) -> dict[int, NDArray[np.bool_]]:
     """The first round of `find_moving` over the frames."""
     o = _opened(task, progress)
     return look_once(task.numbers, *moving_views(o.context, o.sequence, o.frames, o.known["scale"]), progress)
 
 
-def look_at_pictures(task: Portion, progress: Progress) -> None:
+def look_at_pictures(task: Chunk, progress: Progress) -> None:
     """What a network says of each frame by itself."""
     o = _opened(task, progress)
     open_semantics(o.around).look(o.part)
 
 
-def make_maps(task: Portion, progress: Progress) -> MadeMaps:
+def make_maps(task: Chunk, progress: Progress) -> MadeMaps:
     """The maps of the frames."""
     o = _opened(task, progress)
     semantics = open_semantics(o.around)
@@ -107,9 +107,9 @@ def make_maps(task: Portion, progress: Progress) -> MadeMaps:
     return maps_pass(o.context, o.sequence, o.part, previous, semantics, o.known["scale"], o.known["metres"])
 
 
-def surroundings(context: StageContext, sequence: Sequence) -> Surroundings:
+def surroundings(context: StageContext, sequence: Sequence) -> ProviderContext:
     """What the providers are made from."""
-    return Surroundings(
+    return ProviderContext(
         context.source,
         sequence,
         context.config.proxy,

@@ -26,10 +26,10 @@ from msgs_slam.formats.jsonfile import read_json, read_json_object, write_json
 from msgs_slam.formats.tensors import load_tensors, save_arrays, save_tensors
 from msgs_slam.pipelines.depth.fields import FINE, DepthFields
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.run import stored
+from msgs_slam.pipelines.run import layouts
 from msgs_slam.pipelines.run.finished_files import FinishedFiles
+from msgs_slam.pipelines.run.layouts import dataclass_from_json, load_layout, reading
 from msgs_slam.pipelines.run.proxy_files import SYMMETRY, load_mirror_pairs, load_proxy_maps, proxy_name
-from msgs_slam.pipelines.run.stored import dataclass_from_json, load_layout, reading
 from msgs_slam.pipelines.types import (
     VOID,
     Calibration,
@@ -89,15 +89,17 @@ class RunFolder(FinishedFiles):
     def load_features(self, frame_id: int) -> Features | None:
         """Features of a keyframe in undistorted pixels; None for any other frame."""
         name = features_name(frame_id)
-        return Features(**load_layout(self.file("frames", name), stored.FEATURES)) if self.has("frames", name) else None
+        return (
+            Features(**load_layout(self.file("frames", name), layouts.FEATURES)) if self.has("frames", name) else None
+        )
 
     def load_vocabulary(self) -> Vocabulary:
         """By which frames are described and compared."""
-        return Vocabulary(**load_layout(self.file("frames", VOCABULARY), stored.VOCABULARY))
+        return Vocabulary(**load_layout(self.file("frames", VOCABULARY), layouts.VOCABULARY))
 
-    def load_tried(self) -> dict[tuple[int, int], int]:
+    def load_matched_pairs(self) -> dict[tuple[int, int], int]:
         """Pairs that were matched: see `save_matching`."""
-        rows = load_layout(self.file("frames", TRIED), stored.TRIED)["rows"]
+        rows = load_layout(self.file("frames", TRIED), layouts.TRIED)["rows"]
         return {(first, second): matches for first, second, matches in rows.tolist()}
 
     def image(self, frame: Frame) -> NDArray[np.uint8]:
@@ -149,7 +151,7 @@ class RunFolder(FinishedFiles):
         """Frame id → (F,) unit vector by which a network tells how the frame looks; {} where none did."""
         if not self.has("proxy", DESCRIPTORS):
             return {}
-        arrays = load_layout(self.file("proxy", DESCRIPTORS), stored.DESCRIPTORS)
+        arrays = load_layout(self.file("proxy", DESCRIPTORS), layouts.DESCRIPTORS)
         return dict(zip(arrays["frame_ids"].tolist(), arrays["vectors"], strict=True))
 
     # tracking, mapping, global_ba -------------------------------------------------------------------------------
@@ -161,10 +163,10 @@ class RunFolder(FinishedFiles):
     def load_trajectory(self, stage: str, piece: str = "") -> Trajectory:
         """The poses as `stage` ("tracking", "mapping" or "global_ba") left them."""
         path = self.file(stage, str(PurePosixPath(piece, TRAJECTORY)))
-        arrays = load_layout(path, stored.TRAJECTORY)
+        arrays = load_layout(path, layouts.TRAJECTORY)
         with reading(path, "trajectory"):
-            stored.require_increasing("frame_ids", arrays["frame_ids"])
-            stored.require_rigid("the poses", arrays["cam_from_world"])
+            layouts.require_increasing("frame_ids", arrays["frame_ids"])
+            layouts.require_rigid("the poses", arrays["cam_from_world"])
             reasons = tuple(str(r) for r in arrays.pop("lost_reasons"))
             return Trajectory(**arrays, lost_reasons=reasons)
 
@@ -179,9 +181,9 @@ class RunFolder(FinishedFiles):
     def load_depth_fields(self, stage: str) -> DepthFields:
         """What brings proxy depths into the world of `stage`, tracking or global_ba."""
         path = self.file(stage, DEPTH_FIELDS)
-        arrays = load_layout(path, stored.DEPTH_FIELDS)
+        arrays = load_layout(path, layouts.DEPTH_FIELDS)
         with reading(path, "file of depth fields"):
-            stored.require_increasing("frame_ids", arrays["frame_ids"])
+            layouts.require_increasing("frame_ids", arrays["frame_ids"])
         return DepthFields(dict(zip(arrays["frame_ids"].tolist(), arrays["log_scales"], strict=True)))
 
     def has_exposure(self, stage: str) -> bool:
@@ -190,7 +192,7 @@ class RunFolder(FinishedFiles):
 
     def load_exposure(self, stage: str = "mapping") -> dict[str, NDArray]:
         """frame_ids (N,), log_gains (N, 3), offsets (N, 3) of the mapped keyframes."""
-        return load_layout(self.file(stage, EXPOSURE), stored.EXPOSURE)
+        return load_layout(self.file(stage, EXPOSURE), layouts.EXPOSURE)
 
     def load_map(self, stage: str, device: str = "cpu") -> GaussianMap:
         """The Gaussian map as `stage` left it."""
@@ -209,7 +211,7 @@ class RunFolder(FinishedFiles):
         """The label of each class channel of the map."""
         with reading(path := self.file("mapping", "mapping.json"), "table of class channels"):
             ids = tuple(int(i) for i in read_json_object(path, None)["class_ids"])
-            stored.require_indices("class_ids", np.array(ids, np.int64), VOID)
+            layouts.require_indices("class_ids", np.array(ids, np.int64), VOID)
             return ids
 
     def load_submaps(self) -> list[dict[str, NDArray[np.int64]]]:
@@ -225,7 +227,7 @@ class RunFolder(FinishedFiles):
         with reading(path, "table of loops"):
             edges = [dataclass_from_json(LoopEdge, row) for row in rows]
             for edge in edges:
-                stored.require_rigid("a loop", edge.frame2_from_frame1)
+                layouts.require_rigid("a loop", edge.frame2_from_frame1)
             return edges
 
 
@@ -280,12 +282,12 @@ def save_sparse_model(path: Path, model: SparseModel) -> None:
 
 def load_sparse_model(path: Path) -> SparseModel:
     """Inverse of `save_sparse_model`."""
-    arrays = load_layout(path, stored.SPARSE_MODEL)
+    arrays = load_layout(path, layouts.SPARSE_MODEL)
     with reading(path, "sparse model"):
-        stored.require_increasing("frame_ids", arrays["frame_ids"])
-        stored.require_rigid("the poses", arrays["cam_from_world"])
-        stored.require_indices("obs_frame", arrays["obs_frame"], len(arrays["frame_ids"]))
-        stored.require_indices("obs_point", arrays["obs_point"], len(arrays["points_in_world"]))
+        layouts.require_increasing("frame_ids", arrays["frame_ids"])
+        layouts.require_rigid("the poses", arrays["cam_from_world"])
+        layouts.require_indices("obs_frame", arrays["obs_frame"], len(arrays["frame_ids"]))
+        layouts.require_indices("obs_point", arrays["obs_point"], len(arrays["points_in_world"]))
         return SparseModel(**arrays)
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from msgs_slam.formats.tensors import save_arrays
-from msgs_slam.pipelines.run import stored
-from msgs_slam.pipelines.run.stored import load_layout
+from msgs_slam.pipelines.run import layouts
+from msgs_slam.pipelines.run.layouts import load_layout
 from msgs_slam.pipelines.types import MirrorPairs, ProxyMaps
 
 SYMMETRY = "symmetry.npz"
@@ -44,7 +44,7 @@ def save_proxy_maps(path: Path, maps: ProxyMaps) -> None:
 
 def load_proxy_maps(path: Path) -> ProxyMaps:
     """Inverse of `save_proxy_maps`, up to its rounding."""
-    arrays = load_layout(path, stored.PROXY_MAPS)
+    arrays = load_layout(path, layouts.PROXY_MAPS)
     inverse = arrays["inverse_depth"].astype(np.float32)
     return ProxyMaps(
         depth=np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse > 0),
@@ -66,7 +66,7 @@ def save_mirror_pairs(folder: Path, pairs_of: dict[int, MirrorPairs]) -> None:
 
 def load_mirror_pairs(path: Path) -> dict[int, MirrorPairs]:
     """Inverse of `save_mirror_pairs`."""
-    arrays = load_layout(path, stored.MIRROR_PAIRS)
+    arrays = load_layout(path, layouts.MIRROR_PAIRS)
     of_frame = arrays["of_frame"]
     return {int(i): MirrorPairs(*(arrays[n][of_frame == i] for n in _PAIR_ARRAYS)) for i in np.unique(of_frame)}
 

@@ -15,8 +15,8 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.jsonfile import read_json_object, write_json
 from msgs_slam.formats.reading import parsing
 from msgs_slam.pipelines.config import Config, config_to_dict, merge_known_settings, settings_of_stage
+from msgs_slam.pipelines.run.layouts import dataclass_from_json
 from msgs_slam.pipelines.run.names import SOURCE_LIST, STAGES
-from msgs_slam.pipelines.run.stored import dataclass_from_json
 
 if TYPE_CHECKING:
     from msgs_slam.pipelines.run.folder import RunFolder

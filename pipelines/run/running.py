@@ -14,8 +14,8 @@ from typing import TypeVar
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.jsonfile import read_json
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.layouts import dataclass_from_json
 from msgs_slam.pipelines.run.lock import is_led
-from msgs_slam.pipelines.run.stored import dataclass_from_json
 from msgs_slam.pipelines.system.progress import BEGUN, Progress, StageEvent, about
 
 T = TypeVar("T")

@@ -39,25 +39,25 @@ def adjust(model: pycolmap.Reconstruction, refine_camera: bool, narrowly: bool =
         focal_sd = 0.0
         for _ in range(2):
             solve(model, images, refine_camera=False)
-            remove_wild(model)
+            filter_outliers(model)
     if narrowly:
         solve(model, images, refine_camera=False, width=min(median_error(model), CAUCHY_PX))
-        remove_wild(model)
+        filter_outliers(model)
     return focal_sd
 
 
 def _calibrate(model: pycolmap.Reconstruction, images: Sequence[int]) -> float:
     """The adjustment with the camera; the standard deviation of its focal length, see `adjust`."""
     solve(model, images, refine_camera=True)
-    remove_wild(model)
+    filter_outliers(model)
     solve(model, images, refine_camera=True)
     simple_focal = float(model.cameras[1].focal_length)
     set_lens(model.cameras[1], 2)
     solve(model, images, refine_camera=True)
-    remove_wild(model)
+    filter_outliers(model)
     # Before points are removed: the adjuster keeps pointers into the model.
     formal = _formal_sd(model, solve(model, images, refine_camera=True))
-    remove_wild(model)
+    filter_outliers(model)
     focal = float(model.cameras[1].focal_length)
     return math.hypot(formal, focal - simple_focal, _difference_of_halves(model, images) / 2)
 
@@ -115,7 +115,7 @@ def median_error(model: pycolmap.Reconstruction) -> float:
     return float(np.median(errors)) if len(errors) else 0.0
 
 
-def remove_wild(model: pycolmap.Reconstruction) -> None:
+def filter_outliers(model: pycolmap.Reconstruction) -> None:
     """Observations that the model contradicts, and points that are seen from one direction only, in place."""
     manager = pycolmap.ObservationManager(model)
     manager.filter_observations_with_negative_depth()

@@ -19,13 +19,12 @@ from msgs_slam.pipelines.correspondence.database import write_database
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair
 from msgs_slam.pipelines.correspondence.snapshots import Snapshots
 from msgs_slam.pipelines.geometry.rig import ONE_CAMERA
-from msgs_slam.pipelines.structure.adjust import CAUCHY_PX, adjust, remove_wild, solve
+from msgs_slam.pipelines.structure.adjust import CAUCHY_PX, adjust, filter_outliers, solve
 from msgs_slam.pipelines.structure.consistency import ModelReport, judge, without_misplaced
 from msgs_slam.pipelines.structure.freeing import LEAST_BETTER, LEAST_GAIN_OF_FREEING, gain_of_freeing, unexplained
 from msgs_slam.pipelines.structure.given import posed_model
 from msgs_slam.pipelines.structure.lens import FOCAL_GUESS, unknown_camera
 from msgs_slam.pipelines.structure.mappers import calibrate_focal, map_globally, map_incrementally
-from msgs_slam.pipelines.structure.mend import mended
 from msgs_slam.pipelines.structure.rolling import (
     FEATURE_SD,
     NO_READOUT,
@@ -34,9 +33,10 @@ from msgs_slam.pipelines.structure.rolling import (
     read_readout,
     straight_copy,
 )
+from msgs_slam.pipelines.structure.scale_repair import mended
 from msgs_slam.pipelines.structure.windows import WIDE, close_loops
+from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import Features
 
 _MIN_KEYFRAMES = 3
@@ -55,7 +55,7 @@ class Views:
     are, times (K,) in seconds, the numbers of those that hold the path's size badly, and the poses (K, 4, 4) that the
     user gave, NaN where none, if any."""
 
-    features: Streamed[Features]
+    features: LruSequence[Features]
     xy: list[NDArray[np.float64]]
     times: NDArray[np.float64]
     weak: list[int]
@@ -190,7 +190,7 @@ class Candidates:
             images = sorted(model.reg_image_ids())
             for width in (WIDE * FEATURE_SD, CAUCHY_PX):
                 solve(model, images, refine_camera=False, width=width)
-            remove_wild(model)
+            filter_outliers(model)
             closed = self._judged(f"{NEIGHBOURS}-closed", model, views, pairs)
             if closed[2].score <= found[2].score:
                 return found

@@ -18,7 +18,7 @@ from msgs_slam.pipelines.structure.seams import (
     find_misplaced,
     find_parts,
     find_seams,
-    take_out,
+    remove_keyframes,
     tracks_of,
     worst_contradictions,
 )
@@ -103,7 +103,7 @@ def without_misplaced(
     """The model, keyframes that their neighbours contradict taken out of it in place; arguments as of `judge`."""
     misplaced = find_misplaced(check_pairs(model, pairs, xy, total), reach)
     if 0 < len(misplaced) <= _MOST_MISPLACED * model.num_reg_frames():  # of more, who knows which are right
-        take_out(model, misplaced)
+        remove_keyframes(model, misplaced)
     return model
 
 

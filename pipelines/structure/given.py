@@ -14,7 +14,7 @@ from msgs_slam.formats.tensors import load_arrays, save_arrays
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import Similarity, best_rotation
-from msgs_slam.pipelines.structure.adjust import remove_wild, solve
+from msgs_slam.pipelines.structure.adjust import filter_outliers, solve
 from msgs_slam.pipelines.structure.freeing import unexplained
 from msgs_slam.pipelines.structure.tracks import complete_tracks
 
@@ -126,7 +126,7 @@ def posed_model(
             continue
         solve(model, images, refine_camera and degrees == _TURNS[-1], width=max(1.0, limit / 8))
         pycolmap.ObservationManager(model).filter_all_points3D(max(4.0, limit / 2), 1.0)
-    remove_wild(model)
+    filter_outliers(model)
     return model if model.num_points3D() else None
 
 

@@ -93,7 +93,7 @@ def velocities(cam_from_world: Array, times: Array, worlds: NDArray[np.int64] | 
     return out
 
 
-def straightened(bundle: Bundle, xy: Array, camera: Intrinsics, velocity: Array, readout: Readout) -> Bundle:
+def rectified_bundle(bundle: Bundle, xy: Array, camera: Intrinsics, velocity: Array, readout: Readout) -> Bundle:
     """The bundle with its observations where they would be in frames taken at once; xy (O, 2) are those in the frames,
     velocity (N, 6) those of its cameras."""
     seen = bundle.obs_cam, bundle.obs_point
@@ -102,7 +102,7 @@ def straightened(bundle: Bundle, xy: Array, camera: Intrinsics, velocity: Array,
     )
 
 
-def straight_pixels(
+def rectified_pixels(
     cam_from_world: Array, points: Array, xy: Array, camera: Intrinsics, velocity: Array, readout: Readout
 ) -> Array:
     """(Q, 2) likewise, of one camera (4, 4) of velocity (6,) that sees points (Q, 3) at xy (Q, 2)."""
@@ -120,7 +120,7 @@ def _moved(
 
 def estimate(bundle: Bundle, xy: Array, camera: Intrinsics, times: Array, direction: Readout) -> tuple[float, float]:
     """By how much the readout in this `direction` (of one second) should grow, and the share of the robust cost that a
-    second of it makes: it grows by the square. See `straightened` for the arguments.
+    second of it makes: it grows by the square. See `rectified_bundle` for the arguments.
 
     One Gauss-Newton step of it together with all poses and points, which are eliminated. Since observations far off
     weigh less, it falls short by a fixed share, and is repeated.
@@ -180,7 +180,7 @@ class RollingModel:
     def straighten(self, bundle: Bundle, xy: Array, pinhole: Intrinsics, readout: Readout) -> None:
         """Put the model's observations where they would be in frames taken at once, by `bundle`'s poses and points."""
         velocity = velocities(bundle.cam_from_world, self.times)
-        now: Array = straightened(bundle, xy, pinhole, velocity, readout).obs_xy
+        now: Array = rectified_bundle(bundle, xy, pinhole, velocity, readout).obs_xy
         rays = (now - [pinhole.cx, pinhole.cy]) / pinhole.fx
         self.put(np.asarray(self.model.cameras[1].img_from_cam(np.column_stack([rays, np.ones(len(rays))]))))
 

@@ -54,7 +54,7 @@ class Seam:
     agreement: float
 
     @property
-    def is_loose(self) -> bool:
+    def is_weak_link(self) -> bool:
         """Too few points for a pose and a scale of one side from the other."""
         return self.points < LEAST_POINTS
 
@@ -135,7 +135,7 @@ def find_misplaced(checks: Iterable[PairCheck], reach: int) -> list[int]:
         near = [c for c in near if out[-1] not in (c.first, c.second)]
 
 
-def take_out(model: pycolmap.Reconstruction, keyframes: Iterable[int]) -> None:
+def remove_keyframes(model: pycolmap.Reconstruction, keyframes: Iterable[int]) -> None:
     """Remove keyframes and their observations from the model, in place, all that was seen from their places; image
     i + 1 is keyframe i."""
     for k in keyframes:
@@ -149,7 +149,7 @@ def find_parts(
     """Placed keyframes in parts, largest first: runs between loose seams, joined where a loop, what is seen again more
     than `reach` places later, holds them together."""
     place = {k: n for n, k in enumerate(placed)}
-    loose = {s.after for s in seams if s.is_loose}
+    loose = {s.after for s in seams if s.is_weak_link}
     run = np.cumsum([k in loose for k in placed])
     number = int(run[-1])
     shared = np.zeros((number + 1, number + 1), np.int64)

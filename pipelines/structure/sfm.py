@@ -14,11 +14,11 @@ import pycolmap
 from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.correspondence.bridges import Picture, weak_keyframes, with_bridges
+from msgs_slam.pipelines.correspondence.bridges import Picture, weakly_connected, with_bridges
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair, match_pair
 from msgs_slam.pipelines.correspondence.retrieval import (
-    Looks,
-    describe_all,
+    GlobalDescriptors,
+    compute_global_descriptors,
     far_apart,
     learn_vocabulary,
     loop_pairs,
@@ -36,22 +36,22 @@ from msgs_slam.pipelines.structure.rolling import (
     Readout,
     adjust_rolling,
 )
-from msgs_slam.pipelines.structure.seams import cut, take_out
+from msgs_slam.pipelines.structure.seams import cut, remove_keyframes
 from msgs_slam.pipelines.structure.window_size import SIZE, windows_of
 from msgs_slam.pipelines.structure.windows import Joined, adjust_joined
-from msgs_slam.pipelines.system.memory import give_back
-from msgs_slam.pipelines.system.streamed import Streamed
+from msgs_slam.pipelines.system.lru_sequence import LruSequence
+from msgs_slam.pipelines.system.memory import release_free_memory
 from msgs_slam.pipelines.types import Features, Vocabulary
 
 _PAIRS_PER_BLOCK = 64
 _FEATURES_SHARE = 0.25
 """Of the memory that there is: what has no room there is read again from the snapshot."""
-Ahead = Callable[[str, int, dict[str, NDArray]], None]
+Prefetch = Callable[[str, int, dict[str, NDArray]], None]
 T = TypeVar("T")
 R = TypeVar("R")
 
 
-def nothing_ahead(name: str, count: int, known: dict[str, NDArray]) -> None:
+def no_prefetch(name: str, count: int, known: dict[str, NDArray]) -> None:
     """All is done here."""
 
 
@@ -90,7 +90,7 @@ class StructureFromMotion(Candidates):
     threads: int
     memory: float = math.inf
     window: int = SIZE
-    ahead: Ahead = nothing_ahead
+    ahead: Prefetch = no_prefetch
     given: NDArray[np.float64] | None = None
 
     def run(self, keyframe_ids: Sequence[int]) -> Structure:
@@ -148,7 +148,7 @@ class StructureFromMotion(Candidates):
         assert surest is not None
         whole = replace(surest, model=joined.model(surest.model.cameras[1], views.xy))
         del joined, surest, found  # not beside the model of all
-        give_back()
+        release_free_memory()
         adjust_joined(whole.model, views.xy, views.times, whole.readout, pairs, windows, bool(views.weak))
         return whole
 
@@ -198,7 +198,7 @@ class StructureFromMotion(Candidates):
             report = judge(piece, rest, views.xy, self._places(views.xy), self.config.overlap)
             left -= {i - 1 for i in piece.reg_image_ids()}
             if self._is_piece(report):
-                take_out(piece, [k for part in report.parts[1:] for k in part])
+                remove_keyframes(piece, [k for part in report.parts[1:] for k in part])
                 pieces.append(piece)
 
     def _is_piece(self, report: ModelReport) -> bool:
@@ -230,7 +230,7 @@ class StructureFromMotion(Candidates):
 
         return replace(found, model=rolled(largest)), [rolled(m) for m in others]
 
-    def features_of(self, keyframe_ids: Sequence[int], part: range | None = None) -> Streamed[Features]:
+    def features_of(self, keyframe_ids: Sequence[int], part: range | None = None) -> LruSequence[Features]:
         """Of all keyframes; those of a `part` of them (all) are made at once."""
 
         def stored(frame_id: int) -> Features:
@@ -239,21 +239,21 @@ class StructureFromMotion(Candidates):
         numbers = range(len(keyframe_ids)) if part is None else part
         found = parallel_map(stored, [keyframe_ids[k] for k in numbers], self.threads)
         room = _FEATURES_SHARE * self.memory
-        features = Streamed(len(keyframe_ids), lambda k: stored(keyframe_ids[k]), lambda f: f.nbytes, room)
+        features = LruSequence(len(keyframe_ids), lambda k: stored(keyframe_ids[k]), lambda f: f.nbytes, room)
         for k, value in zip(numbers, self.progress.track(found, "features", len(numbers)), strict=True):
             features.keep(k, value)
         return features
 
-    def _proposed(self, features: Streamed[Features], vocabulary: Vocabulary) -> list[tuple[int, int]]:
-        looks, places = describe_all(features, len(features), vocabulary), self._places(features)
+    def _proposed(self, features: LruSequence[Features], vocabulary: Vocabulary) -> list[tuple[int, int]]:
+        looks, places = compute_global_descriptors(features, len(features), vocabulary), self._places(features)
         allowed = far_apart(len(features), self.config.overlap + 1, places)
-        loops = loop_pairs(Looks((looks,)), allowed, self.config.loop_candidates)
+        loops = loop_pairs(GlobalDescriptors((looks,)), allowed, self.config.loop_candidates)
         following = sequential_pairs(places, self.config.overlap)
         firsts = range(0, len(features), places)
         return sorted({*((n + i, n + j) for n in firsts for i, j in following), *loops})
 
     def pairs_of(
-        self, features: Streamed[Features], proposed: Sequence[tuple[int, int]], part: range | None = None
+        self, features: LruSequence[Features], proposed: Sequence[tuple[int, int]], part: range | None = None
     ) -> list[VerifiedPair]:
         """Those of the proposed pairs that obey one geometry; of a `part` of their blocks (all)."""
         blocks = _blocks(proposed)
@@ -270,10 +270,10 @@ class StructureFromMotion(Candidates):
         return list(itertools.chain.from_iterable(found))
 
     def _bridged(
-        self, keyframe_ids: Sequence[int], features: Streamed[Features], pairs: list[VerifiedPair]
+        self, keyframe_ids: Sequence[int], features: LruSequence[Features], pairs: list[VerifiedPair]
     ) -> tuple[Views, list[VerifiedPair]]:
         """All views, with points followed through keyframes that hold the path's size badly."""
-        weak = weak_keyframes(pairs, len(features), self.config.overlap) if len(self.cam_from_rig) == 1 else []
+        weak = weakly_connected(pairs, len(features), self.config.overlap) if len(self.cam_from_rig) == 1 else []
         if weak:
             told = self.progress.track(weak, "weak keyframes", len(weak))
             stored = Snapshots(self.snapshots.folder / "bridges")

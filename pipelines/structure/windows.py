@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import Similarity, best_rotation
-from msgs_slam.pipelines.structure.adjust import median_error, remove_wild
+from msgs_slam.pipelines.structure.adjust import filter_outliers, median_error
 from msgs_slam.pipelines.structure.backbone import pose_of
 from msgs_slam.pipelines.structure.bundle import adjust_bundle
-from msgs_slam.pipelines.structure.rolling import FEATURE_SD, Readout, RollingModel, straightened, velocities
+from msgs_slam.pipelines.structure.rolling import FEATURE_SD, Readout, RollingModel, rectified_bundle, velocities
 
 Array = NDArray[np.float64]
 
@@ -140,7 +140,7 @@ def adjust_joined(
         adjust_together(model, xy, times, readout)
     if narrowly:
         adjust_together(model, xy, times, readout, median_error(model) / FEATURE_SD)
-    remove_wild(model)
+    filter_outliers(model)
 
 
 def adjust_together(
@@ -152,7 +152,7 @@ def adjust_together(
     bundle, plain, pinhole = rolling.bundle()
     if any(readout):
         velocity = velocities(bundle.cam_from_world, rolling.times)
-        bundle = straightened(bundle, plain, pinhole, velocity, readout)
+        bundle = rectified_bundle(bundle, plain, pinhole, velocity, readout)
     del rolling, plain  # pixels of all observations once more
     adjusted = adjust_bundle(bundle, pinhole, width=width).bundle
     for i, pose in zip(images, adjusted.cam_from_world, strict=True):

@@ -8,7 +8,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.system.progress import log
 
 
-def settle_device(wanted: str = "auto") -> str:
+def resolve_device(wanted: str = "auto") -> str:
     """ "cpu" or "cuda": `auto` takes a GPU if there is one. Raises InputError for a GPU that is not there."""
     import torch
 

@@ -42,7 +42,7 @@ def submap_size(config: Config, camera: Intrinsics) -> int:
     return min(most, max(LEAST_SUBMAP, int(room / (a_million_gaussians * GAUSSIANS / 1e6 * pixels))))
 
 
-def give_back() -> None:
+def release_free_memory() -> None:
     """Hand what is free back to the system, where the C library has a call for that: glibc keeps what lies between
     pieces still in use, after a window of structure from motion 40 to 190 MB."""
     if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:

@@ -16,8 +16,8 @@ from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.depth.scales import COARSE, WorldScale
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.structure.bundle import Bundle, adjust_bundle, adjust_pose
-from msgs_slam.pipelines.structure.rolling import straight_pixels, straightened, velocities
-from msgs_slam.pipelines.tracking.places import settle_places
+from msgs_slam.pipelines.structure.rolling import rectified_bundle, rectified_pixels, velocities
+from msgs_slam.pipelines.tracking.rig_poses import sync_rig_poses
 from msgs_slam.pipelines.tracking.state import TrackState
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps, rows_by
 
@@ -80,7 +80,7 @@ def adjust_state(
     ties = sample_depths(bundle, frame_ids, state, intrinsics, load_proxy, metric)
     initial, in_frame = None, bundle.obs_xy
     for round_number in range(ROUNDS):
-        bundle = seen_at_once(set_scale(bundle, ties, intrinsics), in_frame, frame_ids, state, intrinsics)
+        bundle = undo_rolling_shutter(set_scale(bundle, ties, intrinsics), in_frame, frame_ids, state, intrinsics)
         tied = with_depths(bundle, ties, intrinsics, settings)
         result = adjust_bundle(tied, intrinsics, ITERATIONS, ids=np.array(frame_ids), rig=state.rig)
         initial = result.initial_cost if initial is None else initial
@@ -94,7 +94,7 @@ def adjust_state(
     seen = np.isfinite(errors)  # not so of points that the last round has left behind a camera
     write_back(state, bundle, frame_ids)
     follow_others(state, intrinsics, set(frame_ids), ties.factor)
-    settle_places(state)
+    sync_rig_poses(state)
     figures = {
         "adjusted_frames": len(frame_ids),
         "points": len(np.unique(bundle.obs_point)),
@@ -107,7 +107,7 @@ def adjust_state(
     return Report(figures, frame_ids, ties)
 
 
-def seen_at_once(
+def undo_rolling_shutter(
     bundle: Bundle, in_frame: Array, frame_ids: list[int], state: TrackState, intrinsics: Intrinsics
 ) -> Bundle:
     """The bundle with the pixels (O, 2) at which its frames see their points, but for what a rolling shutter adds."""
@@ -116,7 +116,7 @@ def seen_at_once(
         return bundle
     worlds = np.array([state.segment[i] for i in frame_ids])
     velocity = velocities(bundle.cam_from_world, shutter.times[frame_ids], worlds)
-    return straightened(bundle, in_frame, intrinsics, velocity, shutter.readout)
+    return rectified_bundle(bundle, in_frame, intrinsics, velocity, shutter.readout)
 
 
 def align_depths(model: SparseModel, report: Report, intrinsics: Intrinsics, load_proxy: LoadProxy) -> DepthFields:
@@ -245,5 +245,5 @@ def follow_others(state: TrackState, intrinsics: Intrinsics, adjusted: set[int],
         if len(seen) >= 6:
             pose, points, xy = state.poses[frame_id], state.points[seen.point], seen.xy
             if velocity:
-                xy = straight_pixels(pose, points, xy, intrinsics, velocity[frame_id], state.shutter.readout)
+                xy = rectified_pixels(pose, points, xy, intrinsics, velocity[frame_id], state.shutter.readout)
             state.poses[frame_id] = adjust_pose(pose, points, xy, seen.sd, intrinsics)

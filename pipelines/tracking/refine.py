@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.config import ArticleConfig
+from msgs_slam.pipelines.config import PaperConfig
 from msgs_slam.pipelines.gaussians.render import render, track_gn
 from msgs_slam.pipelines.tracking.pictures import Pictures
 from msgs_slam.pipelines.tracking.state import TrackState
@@ -36,9 +36,9 @@ class RenderWeights:
     label: float = 0.0
 
     @staticmethod
-    def of(article: ArticleConfig) -> RenderWeights:
+    def of(paper: PaperConfig) -> RenderWeights:
         """As the settings say."""
-        return RenderWeights(depth=article.tracking_depth_weight, label=article.tracking_label_weight)
+        return RenderWeights(depth=paper.tracking_depth_weight, label=paper.tracking_label_weight)
 
 
 @dataclass(frozen=True)

@@ -13,19 +13,19 @@ from msgs_slam.pipelines.geometry.rig import Rig, rig_of
 from msgs_slam.pipelines.run.folder import save_depth_fields, save_figures, save_sparse, save_trajectory
 from msgs_slam.pipelines.source.known_poses import load_given
 from msgs_slam.pipelines.structure.rolling import Shutter
-from msgs_slam.pipelines.system.memory import give_back
+from msgs_slam.pipelines.system.memory import release_free_memory
 from msgs_slam.pipelines.system.stopping import is_asked
 from msgs_slam.pipelines.system.wording import stretches
 from msgs_slam.pipelines.tracking.adjust import Report, adjust_state, align_depths, without_dependent_depth
 from msgs_slam.pipelines.tracking.carry import carry_given
 from msgs_slam.pipelines.tracking.front_end import FrontEnd
 from msgs_slam.pipelines.tracking.pictures import Pictures, load_shutter
-from msgs_slam.pipelines.tracking.places import settle_places
 from msgs_slam.pipelines.tracking.refine import RenderWeights, compare_frame
 from msgs_slam.pipelines.tracking.result import split_worlds, to_sparse_model, to_trajectory
+from msgs_slam.pipelines.tracking.rig_poses import sync_rig_poses
+from msgs_slam.pipelines.tracking.rotation_only import set_rotation_only_poses
 from msgs_slam.pipelines.tracking.segments import join_segments, split_segments
 from msgs_slam.pipelines.tracking.state import FEATURE_SD, TrackState
-from msgs_slam.pipelines.tracking.turn import hold_turns
 from msgs_slam.pipelines.types import Frame
 
 SNAPSHOT_EVERY, SNAPSHOTS = 50, 20
@@ -48,10 +48,10 @@ def run(context: StageContext) -> dict[str, Any]:
             "rotation or images without texture give no parallax; film while walking, or choose another part"
         )
     report = adjust_state(state, intrinsics, pictures.proxy, metric, settings)
-    give_back()
+    release_free_memory()
     compared = compare_all(context, state, pictures) if settings.render == "all" else {}
     carried = carry_given(context, state)
-    hold_turns(state, pictures, context.config.run.seed)
+    set_rotation_only_poses(state, pictures, context.config.run.seed)
     if state.turned:
         context.warn(
             f"{len(state.turned)} frames ({stretches(state.turned)}) are posed by rotation alone: their orientation "
@@ -78,7 +78,7 @@ def run(context: StageContext) -> dict[str, Any]:
 
 def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures) -> TrackState:
     """Every frame visited once; goes on from the last snapshot."""
-    settings, weights = context.config.tracking, RenderWeights.of(context.config.article)
+    settings, weights = context.config.tracking, RenderWeights.of(context.config.paper)
     snapshot = context.snapshot / "state.npz"
     rig = rig_of(context.run.load_calibration().directions, len(frames))
     if len(rig) > 1:  # what one direction does not show, the others do
@@ -93,12 +93,12 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
         state.done += 1
         if state.done % every == 0 or is_asked():
             state.save(snapshot)
-    settle_places(state)
+    sync_rig_poses(state)
     # Frames before the first keyframe could not be followed from anywhere; now there are neighbours behind them.
     for frame_id in sorted(state.lost, reverse=True):
         front_end.track(frame_id, may_start=False)
     join_segments(state, pictures, context.config.run.seed)
-    settle_places(state)
+    sync_rig_poses(state)
     return state
 
 
@@ -116,7 +116,7 @@ def start_state(context: StageContext, rig: Rig, shutter: Shutter) -> TrackState
 
 def compare_all(context: StageContext, state: TrackState, pictures: Pictures) -> dict[str, Any]:
     """Every frame but the keyframes against Gaussians seeded around it; the new pose stays where the loss falls."""
-    weights = RenderWeights.of(context.config.article)
+    weights = RenderWeights.of(context.config.paper)
     others = [i for i in sorted(state.poses) if i not in state.keyframes]
     better = []
     for frame_id in context.progress.track(others, "comparing", len(others)):

@@ -13,7 +13,7 @@ from msgs_slam.formats.jsonfile import read_json_object, write_json
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.outcome import Outcome
 from msgs_slam.pipelines.run.folder import WORLD, RunFolder
-from msgs_slam.pipelines.run.stored import reading
+from msgs_slam.pipelines.run.layouts import reading
 from msgs_slam.pipelines.upright.find import Upright, cameras_up
 from msgs_slam.pipelines.upright.georeference import Georeference
 

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import GlobalBaConfig
-from msgs_slam.pipelines.correspondence.retrieval import Looks, far_apart, loop_pairs, unit
+from msgs_slam.pipelines.correspondence.retrieval import GlobalDescriptors, far_apart, loop_pairs, unit
 from msgs_slam.pipelines.depth.align import fit_fields
 from msgs_slam.pipelines.depth.posed import PosedDepth, neighbours
 from msgs_slam.pipelines.depth.see_through import contradicted
@@ -131,11 +131,11 @@ def _stereo(s: Synthetic) -> None:
 
 
 def _loops_by_look(s: Synthetic) -> None:
-    loop_pairs(Looks((s.looks,)), far_apart(s.count, 9), 4)
+    loop_pairs(GlobalDescriptors((s.looks,)), far_apart(s.count, 9), 4)
 
 
 def _loop_candidates(s: Synthetic) -> None:
-    loop_candidates(s.model, Looks((s.looks,)), s.summaries, (), GlobalBaConfig())
+    loop_candidates(s.model, GlobalDescriptors((s.looks,)), s.summaries, (), GlobalBaConfig())
 
 
 def _bundle(s: Synthetic) -> None:

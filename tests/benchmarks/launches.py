@@ -35,7 +35,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_flatten
 
-from msgs_slam.pipelines.config import ArticleConfig, MappingConfig
+from msgs_slam.pipelines.config import MappingConfig, PaperConfig
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.gaussians.render import cards, compositing, inspection
 from msgs_slam.pipelines.mapping.optimise import MapOptimiser
@@ -178,7 +178,7 @@ def optimiser() -> MapOptimiser:
     generator = np.random.default_rng(0)
     views = made_views(generator)
     state = OptimiserState.fresh(views, CLASSES, made_map(generator), None)
-    out = MapOptimiser(views, CLASSES, MappingConfig(), ArticleConfig(), state)
+    out = MapOptimiser(views, CLASSES, MappingConfig(), PaperConfig(), state)
     for iteration in range(2):
         out.visit(step(iteration))
     return out

@@ -65,13 +65,13 @@ CASES = {
 
 ABLATIONS = {
     **ARTICLE_ABLATIONS,
-    "semantic loss of eq. (20)": ("article.label_image=true",),
-    "with edge term": ("article.edge_weight=0.02",),
-    "kappa = 5": ("article.kappa=5.0",),
+    "semantic loss of eq. (20)": ("paper.label_image=true",),
+    "with edge term": ("paper.edge_weight=0.02",),
+    "kappa = 5": ("paper.kappa=5.0",),
     "without splitting": ("mapping.split_error=0.0",),
-    "densified by classes": ("article.class_growth=true",),
-    "gradients clipped at boundaries": ("article.boundary_clip=1.0",),
-    "with symmetry": ("article.symmetry_weight=0.05",),
+    "densified by classes": ("paper.class_growth=true",),
+    "gradients clipped at boundaries": ("paper.boundary_clip=1.0",),
+    "with symmetry": ("paper.symmetry_weight=0.05",),
     "without exposure": ("mapping.exposure=false",),
     "without pose refinement": ("mapping.refine_poses=false",),
 }

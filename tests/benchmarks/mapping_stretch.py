@@ -40,7 +40,7 @@ from msgs_slam.pipelines.evaluation.views import view_map
 from msgs_slam.pipelines.mapping.load import without_contradicted_depth
 from msgs_slam.pipelines.mapping.optimise import optimise_map
 from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes
-from msgs_slam.pipelines.system.streamed import Streamed
+from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 
 
@@ -105,7 +105,7 @@ def agreeing(views: list[View]) -> list[View]:
     fields = fit_fields([v.posed_depth() for v in views], {}).reshape(-1, FINE.rows, FINE.columns)
     scales = [field_scales(f, *v.depth.shape) for f, v in zip(fields, views, strict=True)]
     scaled = [replace(v, depth=v.depth * torch.from_numpy(s)) for v, s in zip(views, scales, strict=True)]
-    return list(without_contradicted_depth(Streamed(len(scaled), scaled.__getitem__, lambda v: v.nbytes, math.inf)))
+    return list(without_contradicted_depth(LruSequence(len(scaled), scaled.__getitem__, lambda v: v.nbytes, math.inf)))
 
 
 def measure(sequence: Sequence, shots: list[Shot], camera: Intrinsics, config: Config) -> dict[str, float]:
@@ -115,7 +115,7 @@ def measure(sequence: Sequence, shots: list[Shot], camera: Intrinsics, config: C
     classes = occurring_classes([s.maps.labels for s in used])
     started = time.process_time()
     views = agreeing([s.view(sequence, camera, classes) for s in used])
-    result = optimise_map(views, len(classes), config.mapping, 0, article=config.article)
+    result = optimise_map(views, len(classes), config.mapping, 0, paper=config.paper)
     row: dict[str, float] = {"cpu seconds": time.process_time() - started, "gaussians": len(result.gaussian_map)}
     label_of = np.array([*classes, *[VOID] * (256 - len(classes))], np.uint8)
     depth, count = DepthErrorSum(), len(sequence.classes)
@@ -168,7 +168,7 @@ def main() -> None:
     indices = range(arguments.first, min(arguments.first + arguments.frames, len(sequence)))
     shots = load_shots(sequence, camera, indices, arguments.depth, arguments.labels)
     rows = []
-    variants = {n: s for n, s in ABLATIONS.items() if all(x.startswith(("mapping.", "article.")) for x in s)}
+    variants = {n: s for n, s in ABLATIONS.items() if all(x.startswith(("mapping.", "paper.")) for x in s)}
     for name, switches in (variants if arguments.ablation else {"complete": ()}).items():
         config = load_config(None, ["mapping.min_iterations=0", *arguments.overrides, *switches])
         row = measure(sequence, shots, camera, config)

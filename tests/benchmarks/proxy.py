@@ -338,7 +338,7 @@ def run_of(name: str, work: Path, first: int, suffix: str = "") -> RunFolder:
 def measure_embedded(name: str, work: Path, first: int) -> dict[str, Any]:
     """One row: the providers that need no weights."""
     run = run_of(name, work, first)
-    progress = run_proxy(pictures_of(name, work, first), run, "article.symmetry_weight=0.05")
+    progress = run_proxy(pictures_of(name, work, first), run, "paper.symmetry_weight=0.05")
     seconds = progress.seconds
     report = run.load_proxy_report()
     row = {

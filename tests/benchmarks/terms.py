@@ -1,4 +1,4 @@
-"""What the article's choice and weights of keyframes do, eqs. (10) to (14), and its local adjustment, eq. (25), on runs
+"""What the paper's choice and weights of keyframes do, eqs. (10) to (14), and its local adjustment, eq. (25), on runs
 with a network's labels.
 
     python tests/benchmarks/terms.py RUN.msgs=DATASET RUN.msgs ... [--keyframes 14] [--json FILE]
@@ -31,7 +31,7 @@ import torch
 from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import open_sequence
-from msgs_slam.pipelines.config import ArticleConfig, MappingConfig
+from msgs_slam.pipelines.config import MappingConfig, PaperConfig
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
@@ -50,7 +50,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "(10), (11) off: any past keyframe": {"_covisible": lambda self, now, rng: int(rng.integers(now))},
     "(11) with T_geo = 0.3": {"t_geo": 0.3},
-    "(12) with T_sem = 0.65": {"article": ArticleConfig(keyframe_miou=0.65)},
+    "(12) with T_sem = 0.65": {"paper": PaperConfig(keyframe_miou=0.65)},
     "(13) off: tau = 0": {"TIME_DECAY": 0.0},
     "(14) off: delta = 0": {"RELIABILITY_DECAY": 0.0},
     "default, another seed": {"seed": 1},
@@ -69,7 +69,7 @@ def trial(given: MappingInput, change: dict[str, Any]) -> dict[str, float]:
         if limit := change.get("t_geo", 0.0):
             schedule.overlaps = lambda views: np.where((o := kept[3](views)) > limit, o, 0.0)
         result = optimise_map(
-            given.views, len(given.class_ids), settings, change.get("seed", 0), article=change.get("article")
+            given.views, len(given.class_ids), settings, change.get("seed", 0), paper=change.get("paper")
         )
     finally:
         schedule.TIME_DECAY, schedule.RELIABILITY_DECAY = kept[:2]

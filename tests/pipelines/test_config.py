@@ -66,7 +66,7 @@ def test_wrong_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_settings_of_retired_settings_are_refused_with_what_became_of_them(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"mapping\.kappa is article\.kappa now"):
+    with pytest.raises(InputError, match=r"mapping\.kappa is paper\.kappa now"):
         load_config(overrides=["mapping.kappa=5"])
     file = tmp_path / "old.toml"
     file.write_text("[mapping]\npasses = 3\nmean_rate = 0.1\nprune_weight = 0.0\n")

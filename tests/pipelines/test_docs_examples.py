@@ -40,7 +40,9 @@ def test_depth_provider(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None
     calibration = Calibration(options.intrinsics, "given", 0.0, (0.0, 0.0, 0.0, 0.0))
     room = Room(views, frames, calibration, perfect_backbone(views, options.intrinsics))
     config = load_config(None, ["proxy.depth=points"]).proxy
-    around = selection.Surroundings(tmp_path, room.sequence(80), config, lambda n: tmp_path, 1, "cpu", SilentProgress())
+    around = selection.ProviderContext(
+        tmp_path, room.sequence(80), config, lambda n: tmp_path, 1, "cpu", SilentProgress()
+    )
     with pytest.raises(InputError, match="multiview"):
         selection.open_depth(around)
     monkeypatch.setitem(selection.OWN_DEPTH, "points", open_points)

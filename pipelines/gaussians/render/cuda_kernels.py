@@ -49,7 +49,7 @@ def opacities(
 
 
 @triton.jit
-def light_before(light: tl.tensor, occlusion: tl.tensor, STEP: tl.constexpr) -> tl.tensor:
+def transmittance(light: tl.tensor, occlusion: tl.tensor, STEP: tl.constexpr) -> tl.tensor:
     """(pixels, Gaussians) light that reaches each Gaussian, and (pixels,) what is left behind all of them."""
     passed = tl.cumprod(1.0 - occlusion, axis=1)
     last = tl.arange(0, STEP) == STEP - 1
@@ -95,11 +95,11 @@ def forward_tile(
     while (first < end) & (tl.max(depth_light, axis=0) >= LIGHT_MIN):
         index, used, u, v, sigma, z, opacity, reach = load_step(records, members, first, end, STEP)
         _, _, _, alpha = opacities(x, y, u, v, sigma, opacity, reach, ALPHA_MAX)
-        before, light = light_before(light, alpha, STEP)
+        before, light = transmittance(light, alpha, STEP)
         depth_before = before
         if GUIDED:
             _, agreement = agreements(z, proxy, kappa)
-            depth_before, depth_light = light_before(depth_light, alpha * agreement, STEP)
+            depth_before, depth_light = transmittance(depth_light, alpha * agreement, STEP)
         else:
             depth_light = light
         live = depth_before >= LIGHT_MIN
@@ -158,7 +158,7 @@ def backward_tile(
     while (first < end) & (tl.max(depth_light, axis=0) >= LIGHT_MIN):
         index, used, u, v, sigma, z, opacity, reach = load_step(records, members, first, end, STEP)
         dx, dy, distance2, alpha = opacities(x, y, u, v, sigma, opacity, reach, ALPHA_MAX)
-        before, light = light_before(light, alpha, STEP)
+        before, light = transmittance(light, alpha, STEP)
         feature_mask = used[:, None] & (channel < channels)[None, :]
         feature_at = index[:, None] * channels + channel[None, :]
         values = tl.load(features + feature_at, mask=feature_mask, other=0.0)
@@ -166,7 +166,7 @@ def backward_tile(
         depth_q = pull_depth[:, None] * z[None, :] + pull_depth_seen[:, None]
         if GUIDED:
             error, agreement = agreements(z, proxy, kappa)
-            depth_before, depth_light = light_before(depth_light, alpha * agreement, STEP)
+            depth_before, depth_light = transmittance(depth_light, alpha * agreement, STEP)
             live = depth_before >= LIGHT_MIN
             depth_weight = tl.where(live, alpha * depth_before, 0.0)
             depth_left = depth_behind[:, None] - tl.cumsum(depth_weight * depth_q, axis=1)
@@ -223,7 +223,7 @@ def inspect_tile(
     while (first < end) & (tl.max(light, axis=0) >= LIGHT_MIN):
         index, used, u, v, sigma, z, opacity, reach = load_step(records, members, first, end, STEP)
         _, _, _, alpha = opacities(x, y, u, v, sigma, opacity, reach, ALPHA_MAX)
-        before, light = light_before(light, alpha, STEP)
+        before, light = transmittance(light, alpha, STEP)
         weight = tl.where(before >= LIGHT_MIN, alpha * before, 0.0)
         crossing = (before >= 0.5) & (before - weight < 0.5)
         depth += tl.sum(tl.where(crossing, z[None, :], 0.0), axis=1)

@@ -21,7 +21,7 @@ from msgs_slam.pipelines.proxy.regions.parts import cut_parts
 from msgs_slam.pipelines.proxy.regions.spread import spread_votes
 from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.system.jit import kernel
-from msgs_slam.pipelines.system.memory import give_back
+from msgs_slam.pipelines.system.memory import release_free_memory
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import VOID, ClassTable, Frame
 from msgs_slam.pipelines.voxels.layout import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
@@ -89,7 +89,7 @@ class SegmentLabels:
         """All frames' surface in voxels (V,), which way is up, and floor, ceiling, wall, surface or other (V,)."""
         posed = [f for f in frames if f.id in self._world_from_cam]
         self._size = _scene_depth([depth_of(f) for f in posed[:: max(1, len(posed) // 12)]]) / _VOXELS_PER_DEPTH
-        give_back()  # what depths and moving things have needed
+        release_free_memory()  # what depths and moving things have needed
         tracked = self._progress.track(posed, "regions", len(posed))
         voxels = merge(self._size, (self._gather(f, depth_of(f)) for f in tracked))
         voxels, self._size = select(voxels, voxels.weight > _LEAST_WEIGHT), voxels.size

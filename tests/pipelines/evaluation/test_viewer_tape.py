@@ -28,12 +28,12 @@ def wall(distance: float, thickness: float, opacity: float = 2.0) -> GaussianClo
     return isotropic_cloud(means, np.log(0.01) * ones, opacity * ones, np.full((len(x), 3), 0.5, np.float32))
 
 
-AHEAD, ORIGIN = np.array([0.0, 0, 1]), np.zeros(3)
+PREFETCH, ORIGIN = np.array([0.0, 0, 1]), np.zeros(3)
 
 
 @pytest.mark.parametrize("thickness", [0.0, 0.03])
 def test_a_wall_is_touched_where_it_is(thickness: float) -> None:
-    found = touch(wall(2.0, thickness), ORIGIN, AHEAD, pixel=0.001)
+    found = touch(wall(2.0, thickness), ORIGIN, PREFETCH, pixel=0.001)
     assert found is not None
     assert found.point[2] == pytest.approx(2.0, abs=0.004 + thickness)
     assert 0.3 * thickness <= found.along_sd <= 1.2 * thickness + 1e-9
@@ -44,7 +44,7 @@ def test_flat_discs_are_touched_on_their_plane_and_the_nearer_of_two_walls_first
     near, far = wall(1.0, 0.0), wall(2.0, 0.0)
     both = {n: np.concatenate([getattr(near, n), getattr(far, n)]) for n in vars(near) if getattr(near, n) is not None
             and n != "dropped_sh_degree"}  # fmt: skip
-    found = touch(GaussianCloud(**both), ORIGIN, AHEAD, 0.001)
+    found = touch(GaussianCloud(**both), ORIGIN, PREFETCH, 0.001)
     assert found is not None
     assert found.point[2] == pytest.approx(1.0, abs=0.01)
     # One disc, 1 m wide and 1 mm thick, turned by 45 degrees: its plane is met, not its middle's depth.
@@ -54,7 +54,7 @@ def test_flat_discs_are_touched_on_their_plane_and_the_nearer_of_two_walls_first
         np.array([[np.cos(np.pi / 8), 0, np.sin(np.pi / 8), 0]], np.float32), np.array([9.0], np.float32),
         np.ones((1, 3), np.float32),
     )  # fmt: skip
-    met = touch(disc, ORIGIN, AHEAD, 0.001)
+    met = touch(disc, ORIGIN, PREFETCH, 0.001)
     assert met is not None
     normal = np.array([half, 0, half])
     assert abs((met.point - (0.3, 0, 2)) @ normal) < 1e-3
@@ -62,8 +62,8 @@ def test_flat_discs_are_touched_on_their_plane_and_the_nearer_of_two_walls_first
 
 
 def test_nothing_is_touched_where_nothing_is() -> None:
-    assert touch(wall(2.0, 0.0), ORIGIN, -AHEAD, 0.001) is None
-    assert touch(wall(2.0, 0.0, opacity=-6.0), ORIGIN, AHEAD, 0.001) is None
+    assert touch(wall(2.0, 0.0), ORIGIN, -PREFETCH, 0.001) is None
+    assert touch(wall(2.0, 0.0, opacity=-6.0), ORIGIN, PREFETCH, 0.001) is None
 
 
 def test_distances_in_the_room_are_true_within_what_is_stated(oracle_run: OracleRun, truth: Sequence) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.mesh import read_mesh_ply, write_mesh_ply
 from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.engine.travel import load_value, save_value
+from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.export.joined import Region, joined
 from msgs_slam.pipelines.export.paint import paint
 from msgs_slam.pipelines.export.surface import Surface, chunk_surfaces, weld

@@ -18,8 +18,8 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.structure.candidates import Views
 from msgs_slam.pipelines.structure.sfm import StructureFromMotion
+from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.progress import SilentProgress
-from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import Features
 
 Array = NDArray[np.float64]
@@ -52,7 +52,7 @@ class MadeViews:
 
     def views(self, given: Array | None = None) -> Views:
         """As structure from motion has them, with poses (N, 4, 4) by another program."""
-        streamed = Streamed(len(self.features), self.features.__getitem__, lambda f: f.nbytes, 1e9)
+        streamed = LruSequence(len(self.features), self.features.__getitem__, lambda f: f.nbytes, 1e9)
         times = np.arange(len(self.features), dtype=float)
         return Views(streamed, [f.xy for f in self.features], 10 * times, [], given)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.correspondence.bridges import LEAST, Picture, bridged, weak_keyframes
+from msgs_slam.pipelines.correspondence.bridges import LEAST, Picture, bridged, weakly_connected
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair, match_features
 from msgs_slam.pipelines.correspondence.retrieval import describe, learn_vocabulary
 from msgs_slam.pipelines.types import Features
@@ -59,16 +59,16 @@ def _bridged(
 def test_a_keyframe_is_weak_where_few_features_match_before_and_behind_it() -> None:
     many, few = np.arange(2 * LEAST), np.arange(10)
     pairs = [_pair(k, k + 1, many, many if k != 3 else many[::-1] + 5000) for k in range(6)]
-    assert weak_keyframes(pairs, 7, reach=8) == [4]
+    assert weakly_connected(pairs, 7, reach=8) == [4]
     skipping = [*pairs, _pair(2, 4, many, many)]  # from further off they match
-    assert weak_keyframes(skipping, 7, reach=8) == []
-    assert weak_keyframes(skipping, 7, reach=1) == [4]
-    assert weak_keyframes([_pair(0, 1, few, few), _pair(2, 3, few, few)], 4, reach=8) == []  # nothing to follow along
+    assert weakly_connected(skipping, 7, reach=8) == []
+    assert weakly_connected(skipping, 7, reach=1) == [4]
+    assert weakly_connected([_pair(0, 1, few, few), _pair(2, 3, few, few)], 4, reach=8) == []  # nothing to follow along
 
 
 def test_corners_join_what_features_do_not(weak: tuple[list[Features], list[VerifiedPair]]) -> None:
     pairs = weak[1]
-    assert weak_keyframes(pairs, 3, reach=8) == [1]
+    assert weakly_connected(pairs, 3, reach=8) == [1]
     found, more = _bridged(weak, lambda k: (_picture(k), None))
     count = len(found[1]) - 40
     assert count > 40

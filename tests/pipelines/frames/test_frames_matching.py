@@ -15,7 +15,7 @@ from msgs_slam.pipelines.correspondence.database import write_database
 from msgs_slam.pipelines.correspondence.features import extract_features
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair, match_descriptors, verify_matches
 from msgs_slam.pipelines.correspondence.retrieval import (
-    Looks,
+    GlobalDescriptors,
     describe,
     far_apart,
     learn_vocabulary,
@@ -142,7 +142,7 @@ def test_a_revisit_is_found_by_appearance() -> None:
     vocabulary = learn_vocabulary(features, seed=0)
     descriptors = np.stack([describe(f, vocabulary) for f in features])
     np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, rtol=1e-5)
-    pairs = loop_pairs(Looks((descriptors,)), far_apart(len(views), 5), per_frame=1)
+    pairs = loop_pairs(GlobalDescriptors((descriptors,)), far_apart(len(views), 5), per_frame=1)
     assert {(1, 8), (2, 9)} <= set(pairs)
     assert all(j - i >= 5 for i, j in pairs)
     np.testing.assert_array_equal(learn_vocabulary(features, seed=0).words, vocabulary.words)
@@ -152,12 +152,12 @@ def test_likeness_row_by_row_is_likeness_at_once(monkeypatch: pytest.MonkeyPatch
     """A long recording's table of all pairs never exists; the pairs are the same."""
     vectors = np.random.default_rng(0).standard_normal((2, 40, 16)).astype(np.float32)
     kinds = tuple(v / np.linalg.norm(v, axis=1, keepdims=True) for v in vectors)
-    whole = Looks(kinds).rows(slice(0, 40))
+    whole = GlobalDescriptors(kinds).rows(slice(0, 40))
     assert whole == pytest.approx(np.mean([v @ v.T for v in kinds], 0), abs=1e-6)
-    pairs = loop_pairs(Looks(kinds), far_apart(40, 3), 2, least=0.1)
+    pairs = loop_pairs(GlobalDescriptors(kinds), far_apart(40, 3), 2, least=0.1)
     monkeypatch.setattr(retrieval, "_BLOCK", 7)
-    assert np.array_equal(Looks(kinds).rows(slice(11, 20)), whole[11:20])
-    assert loop_pairs(Looks(kinds), far_apart(40, 3), 2, least=0.1) == pairs
+    assert np.array_equal(GlobalDescriptors(kinds).rows(slice(11, 20)), whole[11:20])
+    assert loop_pairs(GlobalDescriptors(kinds), far_apart(40, 3), 2, least=0.1) == pairs
     assert pairs
     assert min(whole[i, j] for i, j in pairs) > 0.1
 
@@ -165,7 +165,7 @@ def test_likeness_row_by_row_is_likeness_at_once(monkeypatch: pytest.MonkeyPatch
 def test_retrieval_stands_frames_without_features() -> None:
     empty = Features(np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8))
     vocabulary = learn_vocabulary([empty, empty, empty], 0)
-    looks = Looks((np.stack([describe(empty, vocabulary)] * 3),))
+    looks = GlobalDescriptors((np.stack([describe(empty, vocabulary)] * 3),))
     assert loop_pairs(looks, far_apart(3, 1), 2) == []
 
 

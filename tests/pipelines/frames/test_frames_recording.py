@@ -15,10 +15,10 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import Config, load_config
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
-from msgs_slam.pipelines.frames.begun import known_camera
+from msgs_slam.pipelines.frames.prefetch import known_camera
 from msgs_slam.pipelines.proxy.files.recording import RecordingDepth, RecordingLabels
 from msgs_slam.pipelines.proxy.inputs import proxy_inputs
-from msgs_slam.pipelines.proxy.selection import Surroundings, open_depth_files, open_label_files
+from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth_files, open_label_files
 from msgs_slam.pipelines.proxy.sequence import Sequence as ProxySequence
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -109,7 +109,7 @@ def test_depth_and_labels_of_the_set_are_the_oracle(layout: str, short: Sequence
         assert (where == (VOID if value == VOID else expected.index(names[value]))).all()
 
 
-def surroundings(path: Path) -> Surroundings:
+def surroundings(path: Path) -> ProviderContext:
     source = open_source(path)
     assert isinstance(source, RecordingSource)
     camera = source.known_camera()
@@ -119,7 +119,7 @@ def surroundings(path: Path) -> Surroundings:
     calibration = Calibration(k, "given", 0.0, (0.0, 0.0, 0.0, 0.0))
     sequence = ProxySequence(frames, calibration, k.resized(120, 90), None, lambda frame: source.sequence.rgb(frame.id))
     config = Config().proxy
-    return Surroundings(
+    return ProviderContext(
         path, sequence, config, lambda name: path / name, 1, "cpu", SilentProgress(), source.sequence
     )  # fmt: skip
 

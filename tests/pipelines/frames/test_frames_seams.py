@@ -21,7 +21,7 @@ from msgs_slam.pipelines.structure.seams import (
     find_misplaced,
     find_parts,
     find_seams,
-    take_out,
+    remove_keyframes,
     tracks_of,
     worst_contradictions,
 )
@@ -90,7 +90,7 @@ def test_a_fold_misplaces_nobody() -> None:
 
 def test_what_is_taken_out_leaves_no_observation(made_model: pycolmap.Reconstruction) -> None:
     before = len(made_model.points3D)
-    take_out(made_model, [4, 7])
+    remove_keyframes(made_model, [4, 7])
     assert sorted(made_model.reg_image_ids()) == [1, 2, 3, 4, 6, 7, 9, 10]
     tracks = tracks_of(made_model, 10)
     assert 50 < len(tracks) <= before
@@ -106,7 +106,7 @@ def test_keyframes_that_were_not_placed_leave_a_gap() -> None:
     tracks = [t for row in _tracks() if len(t := [k for k in row if k in placed]) > 1]
     seams = find_seams(placed, checks, tracks, REACH)
     assert Seam(9, 13, 20, 4, 1.0) not in seams  # points of four neighbours reach 12 at most
-    assert next(s for s in seams if s.before == 9).is_loose
+    assert next(s for s in seams if s.before == 9).is_weak_link
     assert find_parts(placed, seams, tracks, REACH) == [list(range(13, COUNT)), list(range(10))]
 
 
@@ -119,7 +119,7 @@ def test_where_two_structures_share_one_keyframe_alone_nothing_holds_their_sizes
     tied = row + [[19, 20, 21]] * 12
     assert not any(s.is_loose for s in find_seams(range(COUNT), _checks(0), tied, REACH))
     skipping = row + [[19, 21]] * 50  # directions from one to the other, but no size
-    assert [s.before for s in find_seams(range(COUNT), _checks(0), skipping, REACH) if s.is_loose] == [19]
+    assert [s.before for s in find_seams(range(COUNT), _checks(0), skipping, REACH) if s.is_weak_link] == [19]
 
 
 def test_a_loop_holds_two_runs_together() -> None:

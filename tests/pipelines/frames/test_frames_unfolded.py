@@ -15,8 +15,8 @@ from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.structure.candidates import Views
 from msgs_slam.pipelines.structure.lens import unknown_camera
 from msgs_slam.pipelines.structure.sfm import StructureFromMotion
+from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.progress import SilentProgress
-from msgs_slam.pipelines.system.streamed import Streamed
 from msgs_slam.pipelines.types import Features
 
 SIDES, VIEWS, POINTS, REACH = 4, 48, 300, 8
@@ -74,7 +74,7 @@ def test_sides_that_look_alike_do_not_fold_the_path(tmp_path: Path) -> None:
         picture=no_picture, time=float, match=lambda *_: np.zeros((0, 2), np.uint32), snapshots=Snapshots(tmp_path),
         progress=SilentProgress(), threads=1, seed=0,
     )  # fmt: skip
-    streamed = Streamed(VIEWS, features.__getitem__, lambda f: f.nbytes, 1e9)
+    streamed = LruSequence(VIEWS, features.__getitem__, lambda f: f.nbytes, 1e9)
     given = Views(streamed, [f.xy for f in features], np.arange(VIEWS, dtype=float), [])
     folded = structure._tried("global", given, pairs, pairs)
     found = structure._map(given, pairs)

@@ -21,8 +21,8 @@ from msgs_slam.pipelines.run.records import Manifest, Source, StageRecord, check
 from msgs_slam.pipelines.structure.adjust import adjust, reprojection_errors
 from msgs_slam.pipelines.structure.consistency import judge
 from msgs_slam.pipelines.structure.lens import unknown_camera
-from msgs_slam.pipelines.structure.mend import mended, resize_behind, size_ratio
 from msgs_slam.pipelines.structure.rolling import NO_READOUT
+from msgs_slam.pipelines.structure.scale_repair import mended, resize_behind, size_ratio
 from msgs_slam.pipelines.structure.window_size import SHARED, SIZE, window_size, windows_of
 from msgs_slam.pipelines.structure.windows import WIDE, Joined, adjust_together, close_loops
 from msgs_slam.pipelines.types import Calibration, Intrinsics

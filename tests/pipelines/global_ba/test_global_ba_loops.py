@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import GlobalBaConfig, TrackingConfig
-from msgs_slam.pipelines.correspondence.retrieval import Looks, describe, learn_vocabulary
+from msgs_slam.pipelines.correspondence.retrieval import GlobalDescriptors, describe, learn_vocabulary
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.camera import project
@@ -47,7 +47,7 @@ class Walk:
     def pairs(self, refused: Collection[tuple[int, int]] = ()) -> list[tuple[int, int]]:
         nothing = [summarise_labels(np.full((4, 4), 255, np.uint8), 3)] * len(self.features)
         vocabulary = learn_vocabulary(self.features, 0)
-        looks = Looks((np.stack([describe(f, vocabulary) for f in self.features]),))
+        looks = GlobalDescriptors((np.stack([describe(f, vocabulary) for f in self.features]),))
         return loop_candidates(self.model, looks, nothing, refused, SETTINGS)
 
     def find(self) -> FoundLoops:

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from msgs_slam.pipelines.mapping.article.boundary_clip import beside_boundary, clip_beside_boundary
-from msgs_slam.pipelines.mapping.article.mirrors import Mirrors, at, label_symmetry_loss, symmetry_loss
+from msgs_slam.pipelines.mapping.paper.boundary_clip import beside_boundary, clip_beside_boundary
+from msgs_slam.pipelines.mapping.paper.mirrors import Mirrors, at, label_symmetry_loss, symmetry_loss
 from msgs_slam.pipelines.types import VOID, Intrinsics, MirrorPairs
 
 

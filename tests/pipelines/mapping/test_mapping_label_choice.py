@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from msgs_slam.pipelines.config import MappingConfig
-from msgs_slam.pipelines.mapping.article.label_choice import label_likeness
 from msgs_slam.pipelines.mapping.load import MappingInput
+from msgs_slam.pipelines.mapping.paper.label_choice import label_likeness
 from msgs_slam.pipelines.mapping.schedule import Schedule
 from msgs_slam.pipelines.types import VOID
 

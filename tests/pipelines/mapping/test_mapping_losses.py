@@ -8,9 +8,9 @@ from skimage.metrics import structural_similarity
 from msgs_slam.pipelines.gaussians.entropy import plain_entropy, weighted_entropy
 from msgs_slam.pipelines.gaussians.ssim import ssim_map
 from msgs_slam.pipelines.mapping import losses
-from msgs_slam.pipelines.mapping.article.edge_term import edge_loss
-from msgs_slam.pipelines.mapping.article.label_image import label_image_loss
 from msgs_slam.pipelines.mapping.exposure import expose, fit_exposure
+from msgs_slam.pipelines.mapping.paper.edge_term import edge_loss
+from msgs_slam.pipelines.mapping.paper.label_image import label_image_loss
 from msgs_slam.pipelines.mapping.photo_loss import photo_loss, plain_photo_loss
 from msgs_slam.pipelines.types import VOID
 

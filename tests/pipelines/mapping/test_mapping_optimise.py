@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from msgs_slam.pipelines.config import ArticleConfig, MappingConfig
+from msgs_slam.pipelines.config import MappingConfig, PaperConfig
 from msgs_slam.pipelines.gaussians.render import Rendering
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project_gaussians
@@ -67,7 +67,7 @@ def test_splitting_stops_at_the_largest_map(room: MappingInput) -> None:
     few = optimise_map(room.views, len(room.class_ids), replace(SETTINGS, seed_stride=4, split_error=0.0), seed=0)
     classes, most = len(room.class_ids), len(few.gaussian_map) + 31
     state = OptimiserState.fresh(room.views, classes, few.gaussian_map, None)
-    optimiser = MapOptimiser(room.views, classes, replace(SETTINGS, max_gaussians=most), ArticleConfig(), state)
+    optimiser = MapOptimiser(room.views, classes, replace(SETTINGS, max_gaussians=most), PaperConfig(), state)
     optimiser.growth.split(optimiser._blame())
     assert len(state.parameters) == len(few.gaussian_map) + 30
 
@@ -79,7 +79,7 @@ def test_what_stands_only_where_a_view_shows_no_scene_has_no_weight(room: Mappin
 
     def weights(seen: View) -> torch.Tensor:
         state = OptimiserState.fresh([seen], len(room.class_ids), m, None)
-        return MapOptimiser([seen], len(room.class_ids), SETTINGS, ArticleConfig(), state)._blending_weights()
+        return MapOptimiser([seen], len(room.class_ids), SETTINGS, PaperConfig(), state)._blending_weights()
 
     in_cam = m.means @ view.cam_from_world[:3, :3].float().T + view.cam_from_world[:3, 3].float()
     u, _, sigma, z = project_gaussians(in_cam, m.radii, view.intrinsics, 0.1)
@@ -97,7 +97,7 @@ def test_labels_count_as_often_while_the_map_grows(room: MappingInput, iteration
     plan = schedule.Schedule.plan(room.views, SETTINGS, seed=0, seeding=True, passes=None)
     growing = next(s for i in range(plan.total) if (s := plan.step(i)).grow)
     state = OptimiserState.fresh(room.views, len(room.class_ids), None, None)
-    optimiser = MapOptimiser(room.views, len(room.class_ids), SETTINGS, ArticleConfig(), state)
+    optimiser = MapOptimiser(room.views, len(room.class_ids), SETTINGS, PaperConfig(), state)
     optimiser.visit(replace(plan.step(0), view=growing.view))
     before = state.parameters["class_logits"].clone()
     optimiser.visit(replace(growing, iteration=iteration))
@@ -109,7 +109,7 @@ def test_the_edge_term_does_not_need_the_labels(room: MappingInput) -> None:
     view, losses = room.views[0], []
     drawn = Rendering(torch.zeros(*view.depth.shape, 5), view.depth + 0.3 * torch.rand(view.depth.shape), view.trust)
     for weight in (0.0, 1.0):
-        terms = objective.Objective(replace(SETTINGS, label_weight=0.0), ArticleConfig(edge_weight=weight), 2, 1.0)
+        terms = objective.Objective(replace(SETTINGS, label_weight=0.0), PaperConfig(edge_weight=weight), 2, 1.0)
         losses.append(terms.of(view, torch.zeros(2, 3), drawn, torch.zeros(1), terms.uses_labels(0)).item())
     assert losses[1] > losses[0] + 0.01
 

@@ -5,7 +5,7 @@ import torch
 
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.gaussians.render import blending_weights, render
-from msgs_slam.pipelines.mapping.splitting import CHILDREN, Blame, blame, split
+from msgs_slam.pipelines.mapping.splitting import CHILDREN, DensificationError, densification_error, split
 from msgs_slam.pipelines.types import Intrinsics
 
 CAMERA = Intrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0)
@@ -28,7 +28,7 @@ def wall(spacing: float, slope: float = 0.0, radius: float = 0.7) -> GaussianMap
 
 def test_blame_is_the_error_weighed_by_the_part_in_the_pixel() -> None:
     m = wall(0.2)
-    everywhere = blame(m, POSE, CAMERA, lambda colors: torch.ones(colors.shape[:2]))
+    everywhere = densification_error(m, POSE, CAMERA, lambda colors: torch.ones(colors.shape[:2]))
     weights = blending_weights(m.means, m.radii, m.opacities, POSE, CAMERA)
     assert torch.allclose(everywhere.error, weights.total, rtol=1e-3, atol=1e-4)
     assert weights.total.max() > 10
@@ -36,7 +36,7 @@ def test_blame_is_the_error_weighed_by_the_part_in_the_pixel() -> None:
     def in_the_left_half(colors: torch.Tensor) -> torch.Tensor:
         return (torch.arange(CAMERA.width) < CAMERA.width // 2).float().expand(colors.shape[:2])
 
-    left = blame(m, POSE, CAMERA, in_the_left_half).error
+    left = densification_error(m, POSE, CAMERA, in_the_left_half).error
     assert torch.equal(left[m.means[:, 0] > 0.6], torch.zeros_like(left)[m.means[:, 0] > 0.6])
     inside = m.means[:, 0] < -0.6
     assert torch.allclose(left[inside], everywhere.error[inside])
@@ -44,20 +44,20 @@ def test_blame_is_the_error_weighed_by_the_part_in_the_pixel() -> None:
 
 def test_blame_is_shown_the_colors_of_the_map() -> None:
     m, shown = wall(0.2), []
-    blame(m, POSE, CAMERA, lambda colors: shown.append(colors) or torch.zeros(colors.shape[:2]))
+    densification_error(m, POSE, CAMERA, lambda colors: shown.append(colors) or torch.zeros(colors.shape[:2]))
     expected = render(m.means, m.radii, m.opacities, m.colors, POSE, CAMERA).features
     assert torch.allclose(shown[0], expected, atol=1e-5)
 
 
 def test_footprints_are_radii_in_pixels() -> None:
     m = wall(0.2, radius=0.5)
-    found = blame(m, POSE, CAMERA, lambda colors: torch.zeros(colors.shape[:2]))
+    found = densification_error(m, POSE, CAMERA, lambda colors: torch.zeros(colors.shape[:2]))
     assert torch.allclose(found.footprint, torch.tensor(0.1 / 2 * 60))
 
 
 def test_the_worst_view_counts() -> None:
-    first = Blame(torch.tensor([1.0, 5.0]), torch.tensor([3.0, 4.0]))
-    second = Blame(torch.tensor([2.0, 0.5]), torch.tensor([6.0, 7.0]))
+    first = DensificationError(torch.tensor([1.0, 5.0]), torch.tensor([3.0, 4.0]))
+    second = DensificationError(torch.tensor([2.0, 0.5]), torch.tensor([6.0, 7.0]))
     worst = first.worst_of(second)
     assert worst.error.tolist() == [2.0, 5.0]
     assert worst.footprint.tolist() == [6.0, 4.0]

@@ -231,7 +231,7 @@ def test_poses_at_the_ends_of_a_loop_are_adjusted_in_parts_too(finished: RunFold
     loop = Loop(LoopEdge(int(ids[1]), int(ids[12]), np.eye(4), 1.0, 30), NO_SIGHTINGS, NO_SIGHTINGS)
     true, off = poses.cam_from_world[ids], poses.cam_from_world.copy()
     off[ids[1]] = se3.exp(np.array([0.02, -0.015, 0.02, 0.004, 0.006, -0.003])) @ off[ids[1]]
-    config = merge_settings(CONFIG, {"article": {"loop_steps": 40}, "global_ba": {"joint_passes": 0.0}}, "")
+    config = merge_settings(CONFIG, {"paper": {"loop_steps": 40}, "global_ba": {"joint_passes": 0.0}}, "")
     context = StageContext(finished, finished.root, config, tmp_path, SilentProgress())
     refined = refine(
         context, finished.load_map("mapping"), replace(poses, cam_from_world=off),

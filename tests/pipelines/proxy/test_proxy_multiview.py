@@ -15,7 +15,7 @@ from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
 from msgs_slam.pipelines.proxy.reliability import semantic_agreement, warp_labels
 from msgs_slam.pipelines.proxy.scale import measure_scale
-from msgs_slam.pipelines.proxy.selection import Surroundings, open_depth
+from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth
 from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.proxy.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.system.progress import SilentProgress
@@ -126,7 +126,7 @@ def test_files_no_better_than_a_network_are_fused_as_one(
         off = room.views[frame.id].depth * (1 + 1.4 * error * np.sin(x + frame.id) * np.cos(1.3 * y))
         write_grey_png(tmp_path / "depth" / frame.name, np.round(off * 1000).astype(np.uint16))
     config = ProxyConfig(depth=f"files:{tmp_path / 'depth'}", fuse=fuse)
-    around = Surroundings(source, room.sequence(), config, lambda name: tmp_path / name, 1, "cpu", SilentProgress())
+    around = ProviderContext(source, room.sequence(), config, lambda name: tmp_path / name, 1, "cpu", SilentProgress())
     assert isinstance(open_depth(around), FusedDepth) == expected
 
 

@@ -13,7 +13,7 @@ from msgs_slam.pipelines.networks.labels import best_classes
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.regions.belonging import one_name_each, place_likelihood
 from msgs_slam.pipelines.proxy.regions.named import NamedScene, Vocabulary
-from msgs_slam.pipelines.proxy.regions.posture import name_likelihood
+from msgs_slam.pipelines.proxy.regions.orientation import name_likelihood
 from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
 from msgs_slam.pipelines.proxy.sequence import resample_linear
 from msgs_slam.pipelines.system.progress import SilentProgress

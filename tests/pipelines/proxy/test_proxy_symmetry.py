@@ -178,7 +178,7 @@ def test_the_stage_leaves_pairs_in_the_unit_of_its_maps(
         views.append(WorldFrame(image, depth, np.ones(depth.shape, np.uint8), np.linalg.inv(pose), 0.0))
     room = Room(views, sequence.frames, sequence.calibration, perfect_backbone(views, CAMERA))
     context = make_context(
-        "proxy.depth=files", "proxy.semantics=files", "proxy.max_side=240", "article.symmetry_weight=0.05", room=room
+        "proxy.depth=files", "proxy.semantics=files", "proxy.max_side=240", "paper.symmetry_weight=0.05", room=room
     )
     report = run(context)
     found = context.run.load_symmetry()

@@ -10,7 +10,7 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.rig import CUBE, Rig, rig_of, tie_cameras
 from msgs_slam.pipelines.structure.bundle import Bundle, adjust_bundle
-from msgs_slam.pipelines.tracking.places import settle_places
+from msgs_slam.pipelines.tracking.rig_poses import sync_rig_poses
 from msgs_slam.pipelines.tracking.segments import split_segments
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics
@@ -114,7 +114,7 @@ def test_a_side_without_points_is_posed_by_the_others() -> None:
     true = _sides(_places(np.random.default_rng(3)))
     state = _state(true, [0, 5, 12, 18])
     state.lost = {1: "dark", 10: "blank", 4: "no side of its place is posed"}
-    settle_places(state)
+    sync_rig_poses(state)
     assert sorted(state.poses) == sorted(RIG.frames_of([0, 2, 3]))
     assert state.lost == {1: "dark", 4: "no side of its place is posed"}
     assert state.keyframes == [0, 12, 18]

@@ -16,7 +16,7 @@ from msgs_slam.pipelines.correspondence.bridges import Picture
 from msgs_slam.pipelines.correspondence.features import to_grey
 from msgs_slam.pipelines.correspondence.matching import match_features
 from msgs_slam.pipelines.correspondence.snapshots import Snapshots
-from msgs_slam.pipelines.engine.portions import Portion
+from msgs_slam.pipelines.engine.chunks import Chunk
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.learned import open_learned, picture_features
 from msgs_slam.pipelines.frames.masks import FrameMasks
@@ -29,7 +29,7 @@ from msgs_slam.pipelines.source.sharpness import reduced_size
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
 from msgs_slam.pipelines.structure.given import GivenPoses
 from msgs_slam.pipelines.structure.lens import FOCAL_GUESS, to_pycolmap, unknown_camera
-from msgs_slam.pipelines.structure.sfm import Ahead, StructureFromMotion, nothing_ahead
+from msgs_slam.pipelines.structure.sfm import Prefetch, StructureFromMotion, no_prefetch
 from msgs_slam.pipelines.structure.window_size import window_size
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Features, Frame
@@ -84,7 +84,7 @@ def structure_from_motion(
     masks: FrameMasks,
     rig: Rig,
     given: GivenPoses | None,
-    ahead: Ahead = nothing_ahead,
+    ahead: Prefetch = no_prefetch,
 ) -> StructureFromMotion:
     """Of these frames; `origin` as of `known_camera`."""
     settings, size = context.config.frames, (camera.width, camera.height)
@@ -118,7 +118,7 @@ def structure_from_motion(
 # by workers -----------------------------------------------------------------------------------------------------
 
 
-def _begun(task: Portion, progress: Progress) -> tuple[StructureFromMotion, dict[str, Any]]:
+def _begun(task: Chunk, progress: Progress) -> tuple[StructureFromMotion, dict[str, Any]]:
     context, known = task.context(progress), task.known
     source, frames = open_source(context.source, context.config.run.format), known["frames"]
     faces = find_faces(source, context.config.frames)
@@ -131,26 +131,26 @@ def _begun(task: Portion, progress: Progress) -> tuple[StructureFromMotion, dict
     return structure_from_motion(context, camera, origin, frames, masks, rig, given), known
 
 
-def extract_features(task: Portion, progress: Progress) -> None:
+def extract_features(task: Chunk, progress: Progress) -> None:
     """Of some keyframes."""
     structure, known = _begun(task, progress)
     structure.features_of(known["keyframes"], task.numbers)
 
 
-def match_pairs(task: Portion, progress: Progress) -> None:
+def match_pairs(task: Chunk, progress: Progress) -> None:
     """Some blocks of the pairs."""
     structure, known = _begun(task, progress)
     structure.pairs_of(structure.features_of(known["keyframes"], range(0)), known["pairs"], task.numbers)
 
 
-def map_windows(task: Portion, progress: Progress) -> None:
+def map_windows(task: Chunk, progress: Progress) -> None:
     """Some windows."""
     structure, known = _begun(task, progress)
     for number in task.numbers:
         structure.map_window(number, known["keyframes"], known["pairs"])
 
 
-AHEAD: dict[str, Callable[[Portion, Progress], None]] = {
+PREFETCH: dict[str, Callable[[Chunk, Progress], None]] = {
     "features": extract_features, "pairs": match_pairs, "windows": map_windows,
 }  # fmt: skip
 """What workers may leave in the snapshots before structure from motion asks for it."""

@@ -6,7 +6,7 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, TrackState
 
 
-def settle_places(state: TrackState) -> None:
+def sync_rig_poses(state: TrackState) -> None:
     """Pose all directions of each place, in place, by the one that sees most points; nothing for a single camera."""
     if len(state.rig) == 1:
         return

@@ -27,7 +27,7 @@ _LEAST_MATCHES, _LEAST_SHARE = 8, 0.6
 _TRIALS, _CORNERS = 200, 300
 
 
-def hold_turns(state: TrackState, pictures: Pictures, seed: int) -> None:
+def set_rotation_only_poses(state: TrackState, pictures: Pictures, seed: int) -> None:
     """Pose lost frames next to posed ones by rotation alone, in place: each stands where the nearer of the posed frames
     beside its stretch does, and has no sightings. They are noted in `state.turned`, no other frame is changed. A turn
     leads panoramas away from nothing."""

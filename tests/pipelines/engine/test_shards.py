@@ -14,7 +14,7 @@ import engine_calls
 import pytest
 
 from msgs_slam.formats.errors import InputError, RecoverableError
-from msgs_slam.pipelines.engine import shards, travel, workers
+from msgs_slam.pipelines.engine import shards, task_files, workers
 from msgs_slam.pipelines.engine.shards import Posted, Shard, SharedWorkers, posted_in
 from msgs_slam.pipelines.run.folder import RunFolder
 
@@ -24,7 +24,7 @@ HOLDS = "import fcntl, sys; f = open(sys.argv[1], 'ab'); fcntl.flock(f, fcntl.LO
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Of an unfinished stage; the tasks are those of the tests."""
-    monkeypatch.setattr(travel, "_OURS", "engine_calls")
+    monkeypatch.setattr(task_files, "_OURS", "engine_calls")
     monkeypatch.setattr(shards, "TASK_MODULES", ("engine_calls",))
     (tmp_path / "proxy.partial").mkdir()
     return tmp_path / "proxy.partial"
@@ -84,7 +84,7 @@ def test_what_a_killed_process_was_at_is_done_by_another(folder: Path) -> None:
     process.kill()
     process.wait()
     assert posted.do_one(Shard(), engine_calls.silent)
-    assert travel.load_value(posted.done(0)) == 2
+    assert task_files.load_value(posted.done(0)) == 2
 
 
 def test_a_new_lead_waits_for_who_is_at_a_task_and_begins_anew(folder: Path) -> None:

@@ -79,7 +79,7 @@ def test_a_term_of_the_article_reruns_the_stages_that_read_it(
     recorder: Recorder, tmp_path: Path, setting: str, first: str
 ) -> None:
     bring_up_to_date(recorder, tmp_path / "r")
-    config = load_config(overrides=[f"article.{setting}"])
+    config = load_config(overrides=[f"paper.{setting}"])
     assert bring_up_to_date(recorder, tmp_path / "r", config) == list(STAGES[STAGES.index(first) :])
 
 

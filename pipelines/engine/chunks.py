@@ -11,17 +11,17 @@ from typing import Any, TypeVar
 
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.engine.travel import load_value, save_value
+from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import Progress
 
 R = TypeVar("R")
-_PORTIONS = 3
+_CHUNKS_PER_WORKER = 3
 """Tasks a worker, so that all end at about the same time."""
 
 
 @dataclass(frozen=True)
-class Portion:
+class Chunk:
     """The things first to last - 1, in a stage's unfinished `folder`; `file` tells what is known of all of them."""
 
     run: RunFolder
@@ -47,14 +47,14 @@ class Portion:
         return StageContext(self.run, self.source, self.config, self.folder, progress)
 
 
-def in_portions(context: StageContext, work: Callable[[Portion, Progress], R], count: int, **known: Any) -> list[R]:
+def in_chunks(context: StageContext, work: Callable[[Chunk, Progress], R], count: int, **known: Any) -> list[R]:
     """What `work` returns of each portion of `count` things, with what is known of all; nothing where there are no
     workers: then this process does it its own way, without going over the disk."""
     if context.workers is None or count == 0:
         return []
     file = context.snapshot / f"{work.__name__}.npz"
     save_value(file, known)
-    parts = min(_PORTIONS * context.workers.at_once, count)
+    parts = min(_CHUNKS_PER_WORKER * context.workers.at_once, count)
     ends = [count * n // parts for n in range(parts + 1)]
-    task = Portion(context.run, context.source, context.config, context.folder, file, 0, 0)
+    task = Chunk(context.run, context.source, context.config, context.folder, file, 0, 0)
     return context.each(work, [replace(task, first=a, last=b) for a, b in pairwise(ends)])

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from msgs_slam.pipelines.system import memory
+from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.memory import machine_memory, memory_room
-from msgs_slam.pipelines.system.streamed import Streamed
 
 
 def test_what_was_used_last_stays_and_the_rest_is_made_again() -> None:
@@ -19,7 +19,7 @@ def test_what_was_used_last_stays_and_the_rest_is_made_again() -> None:
         made.append(i)
         return bytes([i]) * 10
 
-    values = Streamed(5, make, len, room=30)
+    values = LruSequence(5, make, len, room=30)
     assert [v[0] for v in values] == [0, 1, 2, 3, 4]
     assert [values[i][0] for i in (4, 2, 3)] == [4, 2, 3]
     assert made == [0, 1, 2, 3, 4]
@@ -39,14 +39,14 @@ def test_what_was_used_last_stays_and_the_rest_is_made_again() -> None:
 
 def test_one_value_is_kept_however_little_room_there_is() -> None:
     made: list[int] = []
-    values = Streamed(2, lambda i: made.append(i) or "x", len, room=0)
+    values = LruSequence(2, lambda i: made.append(i) or "x", len, room=0)
     assert (values[0], values[0], values[1], values[0]) == ("x",) * 4
     assert made == [0, 1, 0]
 
 
 def test_a_change_takes_over_what_is_kept() -> None:
     made: list[int] = []
-    values = Streamed(4, lambda i: made.append(i) or f"{i}", len, room=2)
+    values = LruSequence(4, lambda i: made.append(i) or f"{i}", len, room=2)
     list(values)
     changed = values.changed(lambda i, v: v + "!" * i)
     assert [changed[i] for i in (3, 2)] == ["3!!!", "2!!"]
@@ -56,7 +56,7 @@ def test_a_change_takes_over_what_is_kept() -> None:
 
 def test_what_is_at_hand_is_taken_and_threads_get_what_they_ask_for() -> None:
     made: list[int] = []
-    values = Streamed(40, lambda i: made.append(i) or str(i), len, room=6)
+    values = LruSequence(40, lambda i: made.append(i) or str(i), len, room=6)
     for i in range(40):
         values.keep(i, str(i))
     assert (values[39], values[38]) == ("39", "38")

@@ -14,7 +14,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair
-from msgs_slam.pipelines.structure.adjust import remove_wild, solve
+from msgs_slam.pipelines.structure.adjust import filter_outliers, solve
 from msgs_slam.pipelines.structure.backbone import pose_of
 from msgs_slam.pipelines.structure.consistency import ModelReport, judge
 from msgs_slam.pipelines.structure.seams import LEAST_POINTS, tracks_of
@@ -32,7 +32,7 @@ def mended(
 ) -> tuple[pycolmap.Reconstruction, ModelReport]:  # fmt: skip
     """The model with the two sides of its loose seams in one size, where enough matched features tell it and the result
     falls into fewer parts without agreeing less; else as it is. Arguments as of `judge`, image i + 1 is keyframe i."""
-    for seam in [s for s in report.seams if s.is_loose]:
+    for seam in [s for s in report.seams if s.is_weak_link]:
         owner = {k: n for n, part in enumerate(report.parts) for k in part}
         if {owner[k] for k in owner if k <= seam.before} & {owner[k] for k in owner if k >= seam.after}:
             continue  # a loop holds the two sides
@@ -42,10 +42,10 @@ def mended(
                 continue
             tried = pycolmap.Reconstruction(model)
             resize_behind(tried, shared, ratio)
-            remove_wild(tried)
+            filter_outliers(tried)
             complete_tracks(tried, pairs, seed)
             solve(tried, sorted(tried.reg_image_ids()), refine_camera=False)
-            remove_wild(tried)
+            filter_outliers(tried)
             found = judge(tried, pairs, xy, total, reach)
             if len(found.parts) < len(report.parts) and found.pairs_agreeing >= report.pairs_agreeing:
                 model, report = tried, found

@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 from threading import RLock
 from typing import Generic, TypeVar, overload
 
-from msgs_slam.pipelines.system.memory import give_back
+from msgs_slam.pipelines.system.memory import release_free_memory
 
 T = TypeVar("T")
 
 
-class Streamed(Sequence[T], Generic[T]):
+class LruSequence(Sequence[T], Generic[T]):
     """The values of `make` for 0 to `count` - 1, those used last kept while they need at most `room` bytes together.
 
     `make` gives the same value whenever it is called with the same number, so that nobody sees what is kept. May be
@@ -55,16 +55,16 @@ class Streamed(Sequence[T], Generic[T]):
         with self._lock:
             self._kept.clear()
             self._used = 0
-        give_back()
+        release_free_memory()
 
-    def part(self, numbers: range) -> Streamed[T]:
+    def part(self, numbers: range) -> LruSequence[T]:
         """Those numbers of the same, counted from 0; keeps its own."""
-        return Streamed(len(numbers), lambda i: self._make(numbers[i]), self._size_of, self._room)
+        return LruSequence(len(numbers), lambda i: self._make(numbers[i]), self._size_of, self._room)
 
-    def changed(self, function: Callable[[int, T], T]) -> Streamed[T]:
+    def changed(self, function: Callable[[int, T], T]) -> LruSequence[T]:
         """The same with `function` of number and value applied; takes over what is kept here, and the room."""
         make = self._make
-        other = Streamed(self._count, lambda i: function(i, make(i)), self._size_of, self._room)
+        other = LruSequence(self._count, lambda i: function(i, make(i)), self._size_of, self._room)
         while self._kept:
             key, value = self._kept.popitem(last=False)
             other._kept[key] = function(key, value)

@@ -17,7 +17,7 @@ _GRID = (40, 30)
 def label_likeness(views: Sequence[View]) -> NDArray[np.float64]:
     """(N, N) mean IoU of the views' label images, sampled on a grid; 0 where nothing is known, 1 on the diagonal.
 
-    The article keeps at most 20 of those below T_sem for one step of its mapping; a step here visits one.
+    The paper keeps at most 20 of those below T_sem for one step of its mapping; a step here visits one.
     """
     small = [
         np.asarray(cv2.resize(v.channels.cpu().numpy(), _GRID, interpolation=cv2.INTER_NEAREST), np.uint8)
