@@ -1,5 +1,6 @@
 """Shared fixtures."""
 
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,6 +28,13 @@ def _no_networks_of_the_user(tmp_path_factory: pytest.TempPathFactory) -> Iterat
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MSGS_SLAM_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(autouse=True)
+def _logging_as_at_first() -> Iterator[None]:
+    """A command run in this process sets the level for all that comes after it."""
+    yield
+    logging.getLogger().setLevel(logging.WARNING)
 
 
 @pytest.fixture(scope="session")

@@ -15,6 +15,7 @@ MADE_ELSEWHERE = {"reconstruct", "demo", "view", "doctor", "models"}
 def test_the_tour_can_be_followed(finished_run: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(finished_run.folder, tmp_path / "video.msgs")
     (tmp_path / "DATASET").symlink_to(finished_run.truth)
+    shutil.copyfile(finished_run.folder / "export" / "point_cloud.ply", tmp_path / "scene.ply")
     monkeypatch.chdir(tmp_path)
     lines = re.findall(r"^msgs-slam (.*)$", TOUR.read_text(encoding="utf-8"), flags=re.MULTILINE)
     followed = [words for line in lines if (words := shlex.split(line, comments=True))[0] not in MADE_ELSEWHERE]

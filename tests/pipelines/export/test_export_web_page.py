@@ -35,7 +35,7 @@ SIZE = (640, 480)
 def page(oracle_run: OracleRun, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
     """The page, and the outcome in its world."""
     run, folder = oracle_run(), tmp_path_factory.mktemp("web")
-    assert [p.name for p in export_run(run, folder, "html")] == ["map.html", "world.json"]
+    assert [p.name for p in export_run(run, folder, "html")] == ["map.html", "world.json", "README.txt"]
     world = read_world(folder / "world.json")
     return folder / "map.html", load_outcome(run).moved(world.exported_from_run)
 

@@ -49,7 +49,7 @@ def test_one_contradicted_seam_among_many_good_ones() -> None:
     seams = find_seams(range(COUNT), _checks(torn_at=25), _tracks(), REACH)
     assert len(seams) == COUNT - 1
     assert [(s.before, s.after) for s in worst_contradictions(seams)] == [(24, 25)]
-    assert not any(s.is_loose for s in seams)
+    assert not any(s.is_weak_link for s in seams)
 
 
 def test_things_that_repeat_contradict_no_seam_and_misplace_nobody() -> None:
@@ -117,7 +117,7 @@ def test_where_two_structures_share_one_keyframe_alone_nothing_holds_their_sizes
     assert [s.points for s in seams[19:21]] == [0, 20]  # before the keyframe, and behind it
     assert [len(p) for p in find_parts(range(COUNT), seams, row, REACH)] == [20, 20]
     tied = row + [[19, 20, 21]] * 12
-    assert not any(s.is_loose for s in find_seams(range(COUNT), _checks(0), tied, REACH))
+    assert not any(s.is_weak_link for s in find_seams(range(COUNT), _checks(0), tied, REACH))
     skipping = row + [[19, 21]] * 50  # directions from one to the other, but no size
     assert [s.before for s in find_seams(range(COUNT), _checks(0), skipping, REACH) if s.is_weak_link] == [19]
 
@@ -162,7 +162,7 @@ def _seam(before: int, points: int = 50, agreement: float = 0.9) -> Seam:
     [
         ([_seam(0)], [range(9)], []),
         ([_seam(4, agreement=0.1)], [range(9)], ["folded between frames 8-10"]),
-        ([_seam(4, points=0)], [range(5), range(5, 9)], ["2 parts .* 0-8, 10-16"]),
+        ([_seam(4, points=0)], [range(5), range(5, 9)], ["2 disconnected parts .* 0-8, 10-16"]),
         ([_seam(7, points=0)], [range(8), [8]], [r"1 keyframes .* \(frames 16\)"]),
     ],
     ids=["sound", "folded", "two parts", "one alone"],

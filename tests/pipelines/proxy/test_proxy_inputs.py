@@ -132,7 +132,7 @@ def wrong_weights(folder: Path) -> str:
         (no_card, r"no such file: .*card\.toml"),
         (no_weights, r"no net\.onnx beside the card"),
         (wrong_weights, "its inputs are x"),
-        (lambda folder: "radar", "no provider 'radar'"),
+        (lambda folder: "radar", "no provider or model 'radar'"),
     ],
 )
 def test_bad_input_is_refused_before_the_frames_are_picked(

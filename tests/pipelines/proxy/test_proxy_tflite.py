@@ -152,7 +152,7 @@ def test_auto_takes_the_named_classes_but_never_the_depth_that_is_good_for_metre
     added = ModelStore.open()
     assert added.first_here("depth") is None
     assert added.first_here("depth", metres_only=True) == added.get("my-metres")
-    assert "masks of people are here" in str(missing_networks())
+    assert "no networks for masks of people are installed" in str(missing_networks())
 
 
 # the real files ---------------------------------------------------------------------------------------------------

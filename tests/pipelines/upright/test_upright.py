@@ -107,7 +107,7 @@ def test_a_scene_that_does_not_tell_stays_as_it_was(shapeless: RunFolder) -> Non
     outcome = load_outcome(shapeless)
     world, reasons = find_world(outcome, ExportConfig())
     assert world == FIRST
-    assert "which way is up" in reasons[0]
+    assert "up is unknown" in reasons[0]
     paths = export_run(shapeless, shapeless.root / "out", "tum")
     assert shapeless.root / "out" / "world.json" in paths
     rows = np.loadtxt(shapeless.root / "out" / "trajectory.txt")
