@@ -25,5 +25,5 @@ def write_photos(folder: Path, placed: int, count: int) -> Path:
 def test_how_many_pictures_say_where_they_were_taken(tmp_path: Path) -> None:
     frames = [Frame(i, f"{i}.jpg", float(i), i, 1.0) for i in range(4)]
     some, none = (open_source(write_photos(tmp_path / str(n), n, 4), "auto") for n in (3, 0))
-    assert places_figure(some, frames) == {"gps": "of 3 of 4 pictures"}
+    assert places_figure(some, frames) == {"gps": "of 3 of 4 images"}
     assert places_figure(none, frames) == {}
