@@ -10,7 +10,7 @@ _SHARES = {"frames": 16, "proxy": 33, "tracking": 5, "mapping": 37, "global_ba":
 
 
 class TimeLeft:
-    """Of the stages `wanted`, in order: `seconds` of those that are done, by this process or one before, tell how fast it
+    """Of the stages `wanted`, in order: `seconds` of those that are done, by this process or another, tell how fast it
     goes here. Right to a factor of about two; as long as no stage is done nothing is known."""
 
     def __init__(self, wanted: Sequence[str], seconds: Mapping[str, float]) -> None:
