@@ -65,6 +65,17 @@ def agreements(z: tl.tensor, proxy: tl.tensor, kappa: tl.tensor) -> tl.tensor:
 
 
 @triton.jit
+def pixels_of_tile(width: tl.tensor, height: tl.tensor, TILE: tl.constexpr) -> tl.tensor:
+    """This program's tile; index, whether it is inside the image, and centre (x, y) of each of its pixels."""
+    tile = tl.program_id(0)
+    across = (width + TILE - 1) // TILE
+    lane = tl.arange(0, TILE * TILE)
+    column, row = (tile % across) * TILE + lane % TILE, (tile // across) * TILE + lane // TILE
+    inside = (column < width) & (row < height)
+    return tile, row * width + column, inside, column.to(tl.float32) + 0.5, row.to(tl.float32) + 0.5
+
+
+@triton.jit
 def forward_tile(
     starts: tl.tensor, members: tl.tensor, records: tl.tensor, features: tl.tensor,
     proxy_depth: tl.tensor, kappa: tl.tensor,
@@ -74,13 +85,7 @@ def forward_tile(
     ALPHA_MAX: tl.constexpr, LIGHT_MIN: tl.constexpr,
 ) -> None:  # fmt: skip
     """Blends the Gaussians of one tile and stores its four images."""
-    tile = tl.program_id(0)
-    across = (width + TILE - 1) // TILE
-    lane = tl.arange(0, TILE * TILE)
-    column, row = (tile % across) * TILE + lane % TILE, (tile // across) * TILE + lane // TILE
-    inside = (column < width) & (row < height)
-    pixel = row * width + column
-    x, y = column.to(tl.float32) + 0.5, row.to(tl.float32) + 0.5
+    tile, pixel, inside, x, y = pixels_of_tile(width, height, TILE)
     channel = tl.arange(0, PADDED)
     light = tl.where(inside, 1.0, 0.0)
     depth_light = light
@@ -131,13 +136,7 @@ def backward_tile(
     ALPHA_MAX: tl.constexpr, LIGHT_MIN: tl.constexpr,
 ) -> None:  # fmt: skip
     """Front to back once more; what is behind a Gaussian is the pixel's total minus what has been blended so far."""
-    tile = tl.program_id(0)
-    across = (width + TILE - 1) // TILE
-    lane = tl.arange(0, TILE * TILE)
-    column, row = (tile % across) * TILE + lane % TILE, (tile // across) * TILE + lane // TILE
-    inside = (column < width) & (row < height)
-    pixel = row * width + column
-    x, y = column.to(tl.float32) + 0.5, row.to(tl.float32) + 0.5
+    tile, pixel, inside, x, y = pixels_of_tile(width, height, TILE)
     channel = tl.arange(0, PADDED)
     mask = inside[:, None] & (channel < channels)[None, :]
     at = pixel[:, None] * channels + channel[None, :]
@@ -207,13 +206,7 @@ def inspect_tile(
     COUNTED: tl.constexpr, STEP: tl.constexpr, TILE: tl.constexpr, ALPHA_MAX: tl.constexpr, LIGHT_MIN: tl.constexpr,
 ) -> None:  # fmt: skip
     """Stores the median depth of one tile, and adds its blending weights to those of the Gaussians."""
-    tile = tl.program_id(0)
-    across = (width + TILE - 1) // TILE
-    lane = tl.arange(0, TILE * TILE)
-    column, row = (tile % across) * TILE + lane % TILE, (tile // across) * TILE + lane // TILE
-    inside = (column < width) & (row < height)
-    pixel = row * width + column
-    x, y = column.to(tl.float32) + 0.5, row.to(tl.float32) + 0.5
+    tile, pixel, inside, x, y = pixels_of_tile(width, height, TILE)
     light = tl.where(inside, 1.0, 0.0)
     depth = tl.zeros((TILE * TILE,), tl.float32)
     count = light
