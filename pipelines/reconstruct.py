@@ -130,8 +130,8 @@ def require_run(run: RunFolder) -> None:
     if run.manifest_file.exists():
         return
     what = "does not exist" if not run.root.exists() else "is not a run folder (it has no manifest.json)"
-    near = [f"did you mean {' or '.join(map(str, found))}?"] if (found := runs_near(run.root)) else []
-    raise InputError(" ".join([f"{run.root} {what}.", *near, "Runs are made by `msgs-slam reconstruct VIDEO`"]))
+    near = f"; did you mean {' or '.join(map(str, found))}?" if (found := runs_near(run.root)) else "."
+    raise InputError(f"{run.root} {what}{near} Runs are made by `msgs-slam reconstruct VIDEO`")
 
 
 def runs_near(path: Path, most: int = 3) -> list[Path]:

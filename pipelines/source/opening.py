@@ -208,7 +208,8 @@ _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 def require_source(path: Path) -> None:
     """Raise InputError unless the path is a folder or a file with something in it, and may be read."""
     if _URL.match(str(path)) and not path.exists():
-        raise InputError(f"{path} is an address on the net: download it first, then give the file (nothing is fetched)")
+        address = str(path).replace(":/", "://", 1)
+        raise InputError(f"{address} is a URL: download it first, then give the file (nothing is fetched)")
     with reaching(path):
         if path.is_dir():
             next(path.iterdir(), None)
