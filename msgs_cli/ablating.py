@@ -58,8 +58,8 @@ def ablate(
     """
     set_up_logging(quiet, verbose)
     from msgs_slam.formats.datasets import open_sequence
-    from msgs_slam.pipelines.config import load_config
     from msgs_slam.pipelines.evaluation.ablation import ABLATIONS, ablate, ablation_table
+    from msgs_slam.pipelines.read_config import load_config
     from msgs_slam.pipelines.reconstruct import default_run_folder
 
     texts = [f"mapping.hold_out={hold_out}", *overrides, *source_settings(about_source)]

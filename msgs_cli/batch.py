@@ -60,8 +60,8 @@ def batch(
     require_engine(engine_name, address)
     from msgs_slam.formats.jsonfile import read_toml
     from msgs_slam.pipelines.batch import find_recordings, run_batch, table_rows, write_table
-    from msgs_slam.pipelines.config import load_config
     from msgs_slam.pipelines.engine.shards import Shard
+    from msgs_slam.pipelines.read_config import load_config
 
     recordings = find_recordings(folder.resolve(), out.resolve())
     mine = Shard.parse(shard).of(recordings)

@@ -154,7 +154,7 @@ def reconstruct(
     a changed setting only the stages that depend on it run again.
     """
     set_up_logging(quiet, verbose)
-    from msgs_slam.pipelines.config import load_config
+    from msgs_slam.pipelines.read_config import load_config
     from msgs_slam.pipelines.reconstruct import default_run_folder, existing_config, one_source
     from msgs_slam.pipelines.reconstruct import reconstruct as run_reconstruct
     from msgs_slam.pipelines.run.folder import RunFolder
@@ -193,7 +193,7 @@ def resume(
 ) -> None:
     """Resume RUN where it stopped. Finished stages are kept unless one of their settings is changed."""
     set_up_logging(quiet, verbose)
-    from msgs_slam.pipelines.config import load_config
+    from msgs_slam.pipelines.read_config import load_config
     from msgs_slam.pipelines.reconstruct import require_run
     from msgs_slam.pipelines.reconstruct import resume as run_resume
     from msgs_slam.pipelines.run.folder import RunFolder
@@ -265,8 +265,8 @@ def export(
     set_up_logging(quiet, verbose)
     if (config_file or overrides) and to is None:
         raise click.UsageError("with --set or --config, say where to write with --to")
-    from msgs_slam.pipelines.config import load_config
     from msgs_slam.pipelines.export.stage import export_run
+    from msgs_slam.pipelines.read_config import load_config
     from msgs_slam.pipelines.reconstruct import made_with
 
     run = open_run(run_path)
@@ -303,8 +303,8 @@ def demo(
 ) -> None:
     """Reconstruct a short video of a made-up room, compare with its known truth, print the errors and where to look."""
     set_up_logging(quiet, verbose)
-    from msgs_slam.pipelines.config import load_config
     from msgs_slam.pipelines.demo import demo_summary, run_demo
+    from msgs_slam.pipelines.read_config import load_config
     from msgs_slam.pipelines.reconstruct import reconstruct as run_reconstruct
     from msgs_slam.pipelines.run.folder import RunFolder
 
@@ -339,7 +339,7 @@ def completion(shell: str) -> None:
 @settings_options
 def show_config(config_file: Path | None, overrides: tuple[str, ...]) -> None:
     """Print every setting as commented TOML: save it, change it, pass it with --config."""
-    from msgs_slam.pipelines.config import config_to_toml, load_config
+    from msgs_slam.pipelines.read_config import config_to_toml, load_config
 
     click.echo(config_to_toml(load_config(config_file, overrides)), nl=False)
 

@@ -185,7 +185,7 @@ def source_settings(given: dict[str, str | None]) -> list[str]:
     Raises SettingError, in the words that were typed, for a value that one cannot have.
     """
     from msgs_slam.formats.errors import SettingError
-    from msgs_slam.pipelines.config import load_config
+    from msgs_slam.pipelines.read_config import load_config
 
     texts = []
     for option, (key, *_) in _SOURCE_OPTIONS.items():

@@ -16,9 +16,10 @@ from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import list_images
 from msgs_slam.formats.jsonfile import write_json
-from msgs_slam.pipelines.config import Config, load_config, merge_settings
+from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.engines import Call, Engine
 from msgs_slam.pipelines.engine.workers import code_identity, require_same_world
+from msgs_slam.pipelines.read_config import load_config, merge_settings
 from msgs_slam.pipelines.reconstruct import existing_config, reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import RunBusyError

@@ -1,21 +1,9 @@
-"""Every setting, its default and its meaning, once.
-
-Defaults < a TOML file < `section.key=value` overrides. Unknown keys and wrong types are refused with the nearest name.
-"""
+"""Every setting, its default and its meaning, once; `read_config` reads and writes them."""
 
 from __future__ import annotations
 
-import json
-import math
-import tomllib
-from collections.abc import Iterable, Mapping
-from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
-from pathlib import Path
-from typing import Any, get_args, get_origin, get_type_hints
-
-from msgs_slam.formats.errors import InputError, SettingError
-from msgs_slam.formats.jsonfile import read_toml
-from msgs_slam.pipelines.retired_settings import explain_retired, nearest
+from dataclasses import Field, dataclass, field, fields, is_dataclass
+from typing import Any
 
 
 def setting(
@@ -276,101 +264,15 @@ class Config:
     paper: PaperConfig = field(default_factory=PaperConfig)
 
 
-def load_config(file: Path | None = None, overrides: Iterable[str] = (), base: Config | None = None) -> Config:
-    """The settings of `base` (or the defaults), changed by a TOML file and then by `section.key=value` texts.
-
-    Raises InputError for an unreadable file, an unknown key (with the nearest known one) or a value of a wrong type.
-    """
-    config = base or Config()
-    if file is not None:
-        config = merge_settings(config, read_toml(file), where=str(file))
-    for text in overrides:
-        key, separator, value = text.partition("=")
-        section, dot, name = key.strip().partition(".")
-        if not separator or not dot:
-            raise SettingError(f"--set {text}: expected section.key=value, for example --set frames.rate=5")
-        config = merge_settings(config, {section: {name: _parse_value(value.strip())}}, where=f"--set {text}")
-    return config
-
-
-def merge_settings(config: Config, changes: Mapping[str, Any], where: str) -> Config:
-    """`config` with a mapping section → key → value laid over it; `where` names its source in errors."""
-    sections = {f.name: getattr(config, f.name) for f in fields(config)}
-    for section, values in changes.items():
-        if section not in sections:
-            raise SettingError(f"{where}: there is no section {section!r}{nearest(section, sections)}")
-        if not isinstance(values, Mapping):
-            raise SettingError(f"{where}: {section} is a section of settings, got {values!r:.80}")
-        sections[section] = _merge_section(sections[section], section, values, where)
-    return Config(**sections)
-
-
-def merge_known_settings(config: Config, changes: Mapping[str, Any]) -> tuple[Config, list[str]]:
-    """As `merge_settings`, but what is no setting, or no value of it, is left out; returns the names of those too."""
-    dropped = []
-    for section, values in changes.items():
-        for key, value in values.items() if isinstance(values, Mapping) else [("", values)]:
-            try:
-                config = merge_settings(config, {section: {key: value}}, where="")
-            except InputError:
-                dropped.append(f"{section}.{key}")
-    return config, dropped
-
-
-def _merge_section(section: Any, name: str, values: Mapping[str, Any], where: str) -> Any:
-    types = get_type_hints(type(section))
-    known = {f.name: f for f in fields(section)}
-    if retired := explain_retired(f"{name}.{key}" for key in values if key not in known):
-        raise SettingError(f"{where}: settings of an earlier version: {retired}")
-    checked = {}
-    for key, value in values.items():
-        if key not in known:
-            raise SettingError(f"{where}: there is no setting {name}.{key}{nearest(key, known, name + '.')}")
-        checked[key] = _checked(value, types[key], known[key].metadata["choices"], f"{where}: {name}.{key}")
-        _require_within(checked[key], known[key], f"{where}: {name}.{key}")
-    return replace(section, **checked)
-
-
-def _require_within(value: Any, known: Field[Any], where: str) -> None:
-    if (within := known.metadata["within"]) is None or (known.metadata["or_zero"] and value == 0):
-        return
-    if not within[0] <= value <= within[1]:  # not so of NaN either
-        raise SettingError(f"{where} is {_range_text(known)}; got {value!r:.40}")
-
-
 def allowed_values(known: Field[Any]) -> str:
     """What a setting may be, in words; "" for anything of its type."""
-    return " | ".join(known.metadata["choices"]) or (_range_text(known) if known.metadata["within"] else "")
+    return " | ".join(known.metadata["choices"]) or (range_text(known) if known.metadata["within"] else "")
 
 
-def _range_text(known: Field[Any]) -> str:
+def range_text(known: Field[Any]) -> str:
+    """Return the numbers that a setting may be, in words."""
     low, high = known.metadata["within"]
     return f"{low:.10g} to {high:.10g}" + (", or 0" if known.metadata["or_zero"] else "")
-
-
-def _checked(value: Any, wanted: Any, choices: tuple[str, ...], where: str) -> Any:
-    if get_origin(wanted) is tuple:
-        element = get_args(wanted)[0]
-        if not isinstance(value, list | tuple):
-            raise SettingError(f"{where} expects a list, got {value!r}")
-        return tuple(_checked(v, element, (), where) for v in value)
-    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value) if abs(value) < 2**53 else math.inf
-    if wanted is str and not choices and isinstance(value, int | float) and not isinstance(value, bool):
-        value = str(value)  # strings need no quotes, and a file's name may be a number
-    if not isinstance(value, wanted) or (wanted is int and isinstance(value, bool)):
-        raise SettingError(f"{where} expects {wanted.__name__}, got {value!r:.80}")
-    if choices and value not in choices:
-        raise SettingError(f"{where} is one of {', '.join(choices)}; got {value!r}{nearest(value, choices)}")
-    return value
-
-
-def _parse_value(text: str) -> Any:
-    """A TOML value, or the bare text itself where it is no TOML (so that strings need no quotes)."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except (ValueError, RecursionError):
-        return text
 
 
 def config_to_dict(config: Any) -> dict[str, Any]:
@@ -387,29 +289,3 @@ def settings_of_stage(config: Config, stage: str) -> dict[str, Any]:
         f"paper.{f.name}": getattr(config.paper, f.name) for f in fields(config.paper) if stage in f.metadata["stages"]
     }
     return config_to_dict(getattr(config, stage)) | beside
-
-
-def config_to_toml(config: Config, comments: bool = True) -> str:
-    """The settings as TOML that `load_config` reads back, each with its help text above it."""
-    lines = []
-    for section in fields(config):
-        values = getattr(config, section.name)
-        if comments:
-            lines.append(f"# {(type(values).__doc__ or '').strip()}")
-        lines.append(f"[{section.name}]")
-        for f in fields(values):
-            if comments:
-                allowed = allowed_values(f)
-                lines.append(f"# {f.metadata['help']}" + (f" ({allowed})" if allowed else ""))
-            lines.append(f"{f.name} = {_toml_value(getattr(values, f.name))}")
-        lines.append("")
-    return "\n".join(lines)
-
-
-def _toml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple):
-        return "[" + ", ".join(map(_toml_value, value)) + "]"
-    # JSON strings are valid TOML basic strings.
-    return json.dumps(value) if isinstance(value, str) else repr(value)

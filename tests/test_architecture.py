@@ -18,7 +18,7 @@ FORBIDDEN = {
 
 
 FLOORS = (
-    {"retired_settings", "types"}, {"config", "geometry"}, {"gaussian_map", "system", "voxels"},
+    {"config", "types"}, {"geometry", "read_config"}, {"gaussian_map", "system", "voxels"},
     {"correspondence", "depth", "gaussians", "networks"}, {"doctor", "run", "structure"}, {"engine", "source"},
     {"masks"}, {"frames", "proxy"}, {"mapping", "metres", "tracking"}, {"global_ba", "outcome", "status"}, {"upright"},
     {"export"}, {"reconstruct", "viewer"}, {"batch", "evaluation", "work"}, {"demo", "render_run"},

@@ -114,7 +114,7 @@ def reconstruct(
     for bars on a terminal and a line a stage elsewhere, or an object with `track` and `stage`
     (`msgs_slam.pipelines.system.progress.Progress`). Raises InputError for a source or setting that cannot be used.
     """
-    from msgs_slam.pipelines.config import load_config, merge_settings
+    from msgs_slam.pipelines.read_config import load_config, merge_settings
     from msgs_slam.pipelines.reconstruct import default_run_folder, existing_config
     from msgs_slam.pipelines.reconstruct import reconstruct as run_reconstruct
     from msgs_slam.pipelines.run.folder import RunFolder

@@ -14,9 +14,10 @@ from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.jsonfile import read_json_object, write_json
-from msgs_slam.pipelines.config import Config, config_to_toml, load_config
+from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.evaluation.branch import branch
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
+from msgs_slam.pipelines.read_config import config_to_toml, load_config
 from msgs_slam.pipelines.reconstruct import all_stages, reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_records

@@ -12,7 +12,7 @@ from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.datasets.camera import distortion_names
 from msgs_slam.formats.jsonfile import read_json
 from msgs_slam.formats.reading import read_bytes
-from msgs_slam.pipelines.config import Config, config_to_dict, config_to_toml
+from msgs_slam.pipelines.config import Config, config_to_dict
 from msgs_slam.pipelines.evaluation.facts import Capture, advice, lost_stretches, read_capture
 from msgs_slam.pipelines.evaluation.html import bullets, chips, drawing, page, section, table
 from msgs_slam.pipelines.evaluation.lengths import found_lengths
@@ -25,6 +25,7 @@ from msgs_slam.pipelines.export.stage import on_earth
 from msgs_slam.pipelines.export.writers import IMAGES
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.read_config import config_to_toml
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_source
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress

@@ -14,7 +14,8 @@ from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.jsonfile import read_json_object, write_json
 from msgs_slam.formats.reading import parsing
-from msgs_slam.pipelines.config import Config, config_to_dict, merge_known_settings, settings_of_stage
+from msgs_slam.pipelines.config import Config, config_to_dict, settings_of_stage
+from msgs_slam.pipelines.read_config import merge_known_settings
 from msgs_slam.pipelines.run.layouts import dataclass_from_json
 from msgs_slam.pipelines.run.names import SOURCE_LIST, STAGES
 

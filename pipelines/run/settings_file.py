@@ -10,7 +10,8 @@ from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.jsonfile import MAX_TOML_BYTES, read_toml
 from msgs_slam.formats.reading import opened
-from msgs_slam.pipelines.config import Config, config_to_toml, merge_known_settings
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.read_config import config_to_toml, merge_known_settings
 from msgs_slam.pipelines.run.records import load_records, load_source, recorded_config
 from msgs_slam.pipelines.system.progress import log
 

@@ -26,7 +26,7 @@ PACKAGE = "msgs_slam"
 PLUMBING = frozenset(
     [
         "msgs_slam.pipelines.config",
-        "msgs_slam.pipelines.retired_settings",
+        "msgs_slam.pipelines.read_config",
         "msgs_slam.pipelines.engine.stages",
         "msgs_slam.pipelines.engine.standing",
         "msgs_slam.pipelines.system.progress",

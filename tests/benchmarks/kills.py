@@ -32,7 +32,8 @@ from typing import Any
 from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.jsonfile import read_json_object, write_json
 from msgs_slam.formats.video_writer import write_video
-from msgs_slam.pipelines.config import Config, load_config
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import all_stages, reconstruct, resume
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import STAGES

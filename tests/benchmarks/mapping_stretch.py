@@ -30,7 +30,7 @@ from mapping import ABLATIONS, noisy_depth, noisy_labels
 from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import Sequence, open_sequence
-from msgs_slam.pipelines.config import Config, load_config
+from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.depth.align import fit_fields
 from msgs_slam.pipelines.depth.fields import FINE, field_scales
 from msgs_slam.pipelines.evaluation.depth_error import DepthErrorSum
@@ -40,6 +40,7 @@ from msgs_slam.pipelines.evaluation.views import view_map
 from msgs_slam.pipelines.mapping.load import without_contradicted_depth
 from msgs_slam.pipelines.mapping.optimise import optimise_map
 from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 

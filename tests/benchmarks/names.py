@@ -37,7 +37,7 @@ from scipy.spatial import cKDTree
 from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.mesh import read_mesh_ply
-from msgs_slam.pipelines.config import ProxyConfig, load_config
+from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.evaluation.class_map import Matching, match_classes
 from msgs_slam.pipelines.evaluation.label_score import count_labels, score
@@ -50,6 +50,7 @@ from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.proxy.palette import class_colors
 from msgs_slam.pipelines.proxy.selection import choose_semantics
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.source.source_pixels import FramePixels

@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from msgs_slam.formats.images import read_depth_png, read_rgb, write_grey_png, write_rgb
-from msgs_slam.pipelines.config import load_config
 from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
@@ -40,6 +39,7 @@ from msgs_slam.pipelines.networks.person import person_probability
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.source.source_pixels import FramePixels

@@ -133,7 +133,7 @@ def write_given(source: Path, case: Case, path: Path) -> Path:
 
 def measure(name: str, form: str, work: Path, settings: list[str], until: str) -> dict[str, Any]:
     """One row: the stages run, the poses compared."""
-    from msgs_slam.pipelines.config import load_config
+    from msgs_slam.pipelines.read_config import load_config
     from msgs_slam.pipelines.run.folder import RunFolder
 
     case = recordings(work)[name][form]

@@ -156,7 +156,7 @@ def write_walk(folder: Path, layout: str, frames: int, laps: float) -> Path:
 
 def measure_ours(name: str, work: Path, settings: Sequence[str], until: str) -> dict[str, Any]:
     """Run the stages and compare the trajectory with the truth."""
-    from msgs_slam.pipelines.config import load_config
+    from msgs_slam.pipelines.read_config import load_config
     from msgs_slam.pipelines.run.folder import RunFolder
 
     case = walk_case(name, work) if name.startswith("walk_") else cases(work)[name]

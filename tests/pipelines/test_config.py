@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.config import Config, config_to_dict, config_to_toml, load_config
-from msgs_slam.pipelines.retired_settings import FIXED, GONE, MOVED
+from msgs_slam.pipelines.config import Config, config_to_dict
+from msgs_slam.pipelines.read_config import FIXED, GONE, MOVED, config_to_toml, load_config
 
 
 @pytest.mark.parametrize("comments", [True, False])

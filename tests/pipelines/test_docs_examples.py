@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from msgs_slam.formats.datasets import Sequence, opening
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.pipelines.config import load_config
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.proxy import selection
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, Frame

@@ -10,8 +10,9 @@ import pytest
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines import reconstruct
-from msgs_slam.pipelines.config import Config, load_config
+from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import made_with
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import STAGES

@@ -8,8 +8,9 @@ import pytest
 
 from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.errors import DiskFullError, InputError
-from msgs_slam.pipelines.config import Config, MappingConfig, load_config
+from msgs_slam.pipelines.config import Config, MappingConfig
 from msgs_slam.pipelines.engine.stages import SameSource, Stage, StageContext, run_stages
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.journal import Journal
 from msgs_slam.pipelines.run.names import STAGES

@@ -12,9 +12,10 @@ from click.testing import CliRunner
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.msgs_cli.main import main
-from msgs_slam.pipelines.config import Config, load_config
+from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.evaluation import ablation
 from msgs_slam.pipelines.evaluation.ablation import ABLATIONS, ablate
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 SETTINGS = (

@@ -16,11 +16,12 @@ from onnx import TensorProto, helper, numpy_helper
 
 import msgs_slam.pipelines.frames.learned as learned
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.config import FramesConfig, load_config
+from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.correspondence.matching import match_descriptors
 from msgs_slam.pipelines.frames.learned import EXTRACTOR, MATCHER, LearnedFeatures, learned_inputs, open_learned
 from msgs_slam.pipelines.frames.stage import check
 from msgs_slam.pipelines.networks.registry import ModelStore
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.types import Features
 
 STEP, SIDE = 16, 128

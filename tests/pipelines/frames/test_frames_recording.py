@@ -12,7 +12,7 @@ from layouts import LAYOUTS, START, seven_scenes, tum
 from msgs_slam.formats.datasets import Camera, Sequence, open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.pipelines.config import Config, load_config
+from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
 from msgs_slam.pipelines.frames.prefetch import known_camera
@@ -20,6 +20,7 @@ from msgs_slam.pipelines.proxy.files.recording import RecordingDepth, RecordingL
 from msgs_slam.pipelines.proxy.inputs import proxy_inputs
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth_files, open_label_files
 from msgs_slam.pipelines.proxy.sequence import Sequence as ProxySequence
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.source.opening import FolderSource, open_source

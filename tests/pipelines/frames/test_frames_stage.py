@@ -17,11 +17,11 @@ import pytest
 from msgs_slam.formats.errors import DiskFullError, InputError
 from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.formats.jsonfile import read_json
-from msgs_slam.pipelines.config import load_config
 from msgs_slam.pipelines.correspondence.snapshots import Snapshots
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import BACKBONE, SPARSE, RunFolder, load_sparse_model, save_sparse
 from msgs_slam.pipelines.run.layouts import dataclass_from_json
 from msgs_slam.pipelines.source.opening import source_digest

@@ -10,12 +10,12 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.config import load_config
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair
 from msgs_slam.pipelines.frames.stage import STAGE
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
 from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import RunFolder, save_calibration
 from msgs_slam.pipelines.run.records import Manifest, Source, StageRecord, checksums, write_manifest
 from msgs_slam.pipelines.structure.adjust import adjust, reprojection_errors

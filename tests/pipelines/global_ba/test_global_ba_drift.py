@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.config import load_config
 from msgs_slam.pipelines.depth.fields import FINE, DepthFields
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.depth_error import DepthErrorSum
@@ -21,6 +20,7 @@ from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.stage import STAGE
 from msgs_slam.pipelines.mapping.views import occurring_classes
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import (
     RunFolder,
     save_depth_fields,

@@ -12,7 +12,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.config import Config, load_config
+from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.gaussian_map import GaussianMap
@@ -22,6 +22,7 @@ from msgs_slam.pipelines.geometry.camera import unproject
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.stage import STAGE
 from msgs_slam.pipelines.mapping.views import occurring_classes
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import (
     RunFolder,
     save_depth_fields,

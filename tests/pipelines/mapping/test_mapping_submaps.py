@@ -15,7 +15,7 @@ from scipy import sparse
 
 from msgs_slam.formats.gaussian_ply import read_gaussian_ply
 from msgs_slam.formats.tensors import load_tensors
-from msgs_slam.pipelines.config import Config, MappingConfig, RunConfig, merge_settings
+from msgs_slam.pipelines.config import Config, MappingConfig, RunConfig
 from msgs_slam.pipelines.depth.posed import PosedDepth
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.export.tiles import write_tiles
@@ -30,6 +30,7 @@ from msgs_slam.pipelines.mapping.divided import refine_divided
 from msgs_slam.pipelines.mapping.gauge import SeenExposures, common_exposure
 from msgs_slam.pipelines.mapping.submaps import BORDER, divide, nearest_seeing
 from msgs_slam.pipelines.outcome import load_outcome, maps_around
+from msgs_slam.pipelines.read_config import merge_settings
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.memory import LEAST_SUBMAP, submap_size
 from msgs_slam.pipelines.system.progress import SilentProgress

@@ -12,9 +12,10 @@ from proxy_room import Room, write_source
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
-from msgs_slam.pipelines.config import Config, load_config
+from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.proxy.inputs import check_proxy, proxy_inputs
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress

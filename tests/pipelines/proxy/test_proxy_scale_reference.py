@@ -10,12 +10,12 @@ from proxy_room import UNIT, Room
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
-from msgs_slam.pipelines.config import load_config
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry.camera import unproject, unproject_depth
 from msgs_slam.pipelines.proxy.inputs import check_proxy
 from msgs_slam.pipelines.proxy.scale_reference import Reference, parse_reference
 from msgs_slam.pipelines.proxy.stage import run
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress

@@ -19,7 +19,6 @@ from tokenizers import Tokenizer, models, normalizers, pre_tokenizers
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.tensors import save_arrays
 from msgs_slam.msgs_cli.main import main
-from msgs_slam.pipelines.config import load_config
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.label_score import count_labels, score
 from msgs_slam.pipelines.networks.card import read_card
@@ -28,6 +27,7 @@ from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.networks.words import MOST_WORDS, with_words
 from msgs_slam.pipelines.proxy.inputs import check_proxy, proxy_inputs
 from msgs_slam.pipelines.proxy.stage import run
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.types import VOID
 from tests.world.room import CLASSES
 

@@ -9,7 +9,8 @@ import pytest
 from finished import note_finished
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.config import Config, ExportConfig, config_to_toml
+from msgs_slam.pipelines.config import Config, ExportConfig
+from msgs_slam.pipelines.read_config import config_to_toml
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_records, load_source
 from msgs_slam.pipelines.run.settings_file import load_settings, save_settings

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.formats.trajectory import write_matrices
-from msgs_slam.pipelines.config import load_config
 from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from msgs_slam.pipelines.config import load_config
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import save_sparse
 from msgs_slam.pipelines.tracking.stage import STAGE
 from tests.pipelines.tracking.conftest import MadeRun

@@ -10,11 +10,12 @@ import pytest
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_rgb
-from msgs_slam.pipelines.config import Config, load_config
+from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import load_sparse_model, save_sparse_model
 from msgs_slam.pipelines.tracking import adjust, stage
 from msgs_slam.pipelines.tracking.stage import STAGE, stretches

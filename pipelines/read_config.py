@@ -1,0 +1,192 @@
+"""Reading settings: defaults < a TOML file < `section.key=value` overrides, and writing them as TOML.
+
+Unknown keys and wrong types are refused with the nearest name; what was a setting once, with what became of it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import Field, fields, replace
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
+
+from msgs_slam.formats.errors import InputError, SettingError
+from msgs_slam.formats.jsonfile import read_toml
+from msgs_slam.pipelines.config import Config, allowed_values, range_text
+
+
+def load_config(file: Path | None = None, overrides: Iterable[str] = (), base: Config | None = None) -> Config:
+    """The settings of `base` (or the defaults), changed by a TOML file and then by `section.key=value` texts.
+
+    Raises InputError for an unreadable file, an unknown key (with the nearest known one) or a value of a wrong type.
+    """
+    config = base or Config()
+    if file is not None:
+        config = merge_settings(config, read_toml(file), where=str(file))
+    for text in overrides:
+        key, separator, value = text.partition("=")
+        section, dot, name = key.strip().partition(".")
+        if not separator or not dot:
+            raise SettingError(f"--set {text}: expected section.key=value, for example --set frames.rate=5")
+        config = merge_settings(config, {section: {name: _parse_value(value.strip())}}, where=f"--set {text}")
+    return config
+
+
+def merge_settings(config: Config, changes: Mapping[str, Any], where: str) -> Config:
+    """`config` with a mapping section → key → value laid over it; `where` names its source in errors."""
+    sections = {f.name: getattr(config, f.name) for f in fields(config)}
+    for section, values in changes.items():
+        if section not in sections:
+            raise SettingError(f"{where}: there is no section {section!r}{nearest(section, sections)}")
+        if not isinstance(values, Mapping):
+            raise SettingError(f"{where}: {section} is a section of settings, got {values!r:.80}")
+        sections[section] = _merge_section(sections[section], section, values, where)
+    return Config(**sections)
+
+
+def merge_known_settings(config: Config, changes: Mapping[str, Any]) -> tuple[Config, list[str]]:
+    """As `merge_settings`, but what is no setting, or no value of it, is left out; returns the names of those too."""
+    dropped = []
+    for section, values in changes.items():
+        for key, value in values.items() if isinstance(values, Mapping) else [("", values)]:
+            try:
+                config = merge_settings(config, {section: {key: value}}, where="")
+            except InputError:
+                dropped.append(f"{section}.{key}")
+    return config, dropped
+
+
+def _merge_section(section: Any, name: str, values: Mapping[str, Any], where: str) -> Any:
+    types = get_type_hints(type(section))
+    known = {f.name: f for f in fields(section)}
+    if retired := explain_retired(f"{name}.{key}" for key in values if key not in known):
+        raise SettingError(f"{where}: settings of an earlier version: {retired}")
+    checked = {}
+    for key, value in values.items():
+        if key not in known:
+            raise SettingError(f"{where}: there is no setting {name}.{key}{nearest(key, known, name + '.')}")
+        checked[key] = _checked(value, types[key], known[key].metadata["choices"], f"{where}: {name}.{key}")
+        _require_within(checked[key], known[key], f"{where}: {name}.{key}")
+    return replace(section, **checked)
+
+
+def _require_within(value: Any, known: Field[Any], where: str) -> None:
+    if (within := known.metadata["within"]) is None or (known.metadata["or_zero"] and value == 0):
+        return
+    if not within[0] <= value <= within[1]:  # not so of NaN either
+        raise SettingError(f"{where} is {range_text(known)}; got {value!r:.40}")
+
+
+def _checked(value: Any, wanted: Any, choices: tuple[str, ...], where: str) -> Any:
+    if get_origin(wanted) is tuple:
+        element = get_args(wanted)[0]
+        if not isinstance(value, list | tuple):
+            raise SettingError(f"{where} expects a list, got {value!r}")
+        return tuple(_checked(v, element, (), where) for v in value)
+    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value) if abs(value) < 2**53 else math.inf
+    if wanted is str and not choices and isinstance(value, int | float) and not isinstance(value, bool):
+        value = str(value)  # strings need no quotes, and a file's name may be a number
+    if not isinstance(value, wanted) or (wanted is int and isinstance(value, bool)):
+        raise SettingError(f"{where} expects {wanted.__name__}, got {value!r:.80}")
+    if choices and value not in choices:
+        raise SettingError(f"{where} is one of {', '.join(choices)}; got {value!r}{nearest(value, choices)}")
+    return value
+
+
+def _parse_value(text: str) -> Any:
+    """A TOML value, or the bare text itself where it is no TOML (so that strings need no quotes)."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
+        return text
+
+
+def config_to_toml(config: Config, comments: bool = True) -> str:
+    """The settings as TOML that `load_config` reads back, each with its help text above it."""
+    lines = []
+    for section in fields(config):
+        values = getattr(config, section.name)
+        if comments:
+            lines.append(f"# {(type(values).__doc__ or '').strip()}")
+        lines.append(f"[{section.name}]")
+        for f in fields(values):
+            if comments:
+                allowed = allowed_values(f)
+                lines.append(f"# {f.metadata['help']}" + (f" ({allowed})" if allowed else ""))
+            lines.append(f"{f.name} = {_toml_value(getattr(values, f.name))}")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return "[" + ", ".join(map(_toml_value, value)) + "]"
+    # JSON strings are valid TOML basic strings.
+    return json.dumps(value) if isinstance(value, str) else repr(value)
+
+
+MOVED = {
+    "proxy.symmetry": "paper.symmetry_weight",
+    "tracking.depth_weight": "paper.tracking_depth_weight",
+    "tracking.label_weight": "paper.tracking_label_weight",
+    "mapping.boundary_clip": "paper.boundary_clip",
+    "mapping.densify_classes": "paper.class_growth",
+    "mapping.edge_weight": "paper.edge_weight",
+    "mapping.kappa": "paper.kappa",
+    "mapping.label_loss": "paper.label_image",
+    "mapping.symmetry_weight": "paper.symmetry_weight",
+}
+"""Old name → the one that decides it now."""
+
+_FIXED = {
+    "frames": "max_match_error peak_threshold",
+    "proxy": "alpha beta gamma theta_slope theta_middle",
+    "tracking": "flow_window flow_levels flow_error flow_sd feature_sd pose_error min_inliers new_points "
+    "keyframe_share relocalise_candidates silhouette color_weight render_loss depth_sd grid_rows grid_columns "
+    "adjust_iterations adjust_frames snapshot_every",
+    "mapping": "fine_share flat_share window_steps coarse_share color_weight ssim_weight depth_nu label_every "
+    "edge_sharpness size_weight size_limit silhouette_weight depth_fields depth_check silhouette_threshold "
+    "depth_tolerance densify_every densify_until split_radius prune_opacity prune_weight prune_radius mean_rate "
+    "radius_rate opacity_rate color_rate class_rate rate_decay pose_rate exposure_rate low_trust_step time_decay "
+    "reliability_decay region_prior",
+    "global_ba": "features words loop_shared_points richness loop_similarity miou_weight appearance_weight "
+    "structure_weight loop_error loop_share loop_sure_inliers loop_rotation loop_translation loop_drift "
+    "loop_angle_drift loop_scale_drift loop_inliers drift_px joint_px loop_candidates loop_appearance",
+    "export": "truncation least_weight least_piece",
+}
+FIXED = frozenset(f"{section}.{name}" for section, names in _FIXED.items() for name in names.split())
+"""Constants now, beside the code that uses them, at what was their default."""
+
+
+GONE = {"frames.max_frames": "however many frames there are, they are taken"}
+
+
+def explain_retired(keys: Iterable[str]) -> str:
+    """What has become of the settings among `keys` (section.name) that there were once; "" for none of them."""
+    keys = list(keys)
+    moved = [f"{k} is {MOVED[k]} now (off unless set)" for k in keys if k in MOVED]
+    fixed = [k for k in keys if k in FIXED]
+    moved += [f"{k} is no more: {GONE[k]}" for k in keys if k in GONE]
+    if fixed:
+        moved.append(f"{', '.join(fixed)}: fixed at what was the default")
+    return "; ".join(moved)
+
+
+_SAME_AS = {"article": "paper", "gpu": "cuda", "nvidia": "cuda", "cuda:0": "cuda", "video": "images", "mp4": "images"}
+"""What people type for a choice that has another name."""
+
+
+def nearest(word: str, known: Iterable[str], prefix: str = "") -> str:
+    """; did you mean ...?, or what is known where nothing is near."""
+    known = list(known)
+    if (meant := _SAME_AS.get(str(word).lower())) in known:
+        return f"; did you mean {meant}?"
+    matches = difflib.get_close_matches(str(word), known, n=1, cutoff=0.4)
+    return f"; did you mean {prefix}{matches[0]}?" if matches else f"; known: {', '.join(known)}"
