@@ -233,12 +233,6 @@ class PaperConfig:
         stages=_MAPPING,
         within=(0, 1_000_000),
     )
-    symmetry_weight: float = setting(
-        0.0,
-        "look for mirror symmetry, and pull the two halves of what is mirror-symmetric together; 0 = off",
-        stages=("proxy", "mapping"),
-        within=(0, 1000),
-    )
     tracking_depth_weight: float = setting(
         0.0,
         "λ_D of eq. (16), depths in units of the median; for frames with proxies (proxy.frames=all); 0 = off",

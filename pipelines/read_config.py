@@ -133,7 +133,6 @@ def _toml_value(value: Any) -> str:
 
 
 MOVED = {
-    "proxy.symmetry": "paper.symmetry_weight",
     "tracking.depth_weight": "paper.tracking_depth_weight",
     "tracking.label_weight": "paper.tracking_label_weight",
     "mapping.boundary_clip": "paper.boundary_clip",
@@ -141,7 +140,6 @@ MOVED = {
     "mapping.edge_weight": "paper.edge_weight",
     "mapping.kappa": "paper.kappa",
     "mapping.label_loss": "paper.label_image",
-    "mapping.symmetry_weight": "paper.symmetry_weight",
 }
 """Old name → the one that decides it now."""
 
@@ -165,7 +163,10 @@ FIXED = frozenset(f"{section}.{name}" for section, names in _FIXED.items() for n
 """Constants now, beside the code that uses them, at what was their default."""
 
 
-GONE = {"frames.max_frames": "however many frames there are, they are taken"}
+GONE = {
+    "frames.max_frames": "however many frames there are, they are taken",
+    "paper.symmetry_weight": "pulling mirror-symmetric halves together cost 0.1 dB",
+}
 
 
 def explain_retired(keys: Iterable[str]) -> str:

@@ -179,30 +179,6 @@ class ProxyMaps:
 
 
 @dataclass(frozen=True)
-class MirrorPairs:
-    """Pixels of one keyframe that show the two halves of something mirror-symmetric.
-
-    pairs (K, 4) float32: x, y of a pixel and x, y of its mirror image, pixels of the undistorted frame; confidence (K,)
-    float32 in (0, 1]. The mirror need not run through the camera, so the depths of the two differ by a known rule:
-    depth at the second = gain * depth at the first + offset; gain (K,) and offset (K,) float32, the offset in the unit
-    of the keyframe's proxy depth.
-    """
-
-    pairs: NDArray[np.float32]
-    confidence: NDArray[np.float32]
-    gain: NDArray[np.float32]
-    offset: NDArray[np.float32]
-
-    def __post_init__(self) -> None:
-        require_shape("pairs", self.pairs, (None, 4))
-        for name in ("confidence", "gain", "offset"):
-            require_shape(name, getattr(self, name), (len(self.pairs),))
-
-    def __len__(self) -> int:
-        return len(self.pairs)
-
-
-@dataclass(frozen=True)
 class ClassTable:
     """Names and display colours (RGB 0..255) of the classes; a label is an index into both."""
 

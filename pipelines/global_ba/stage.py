@@ -236,9 +236,9 @@ def refine(
         )
         kept = (made.gaussian_map, made.cam_from_world, made.log_gains, made.offsets)
         return Refined(*kept, before, after, after >= before)
-    paper, memory = context.config.paper, context.memory_room
+    memory = context.memory_room
     class_ids = context.run.load_class_ids()
-    views = load_views(context.run, trajectory, mapping, paper, context.device, fields, memory, class_ids).views
+    views = load_views(context.run, trajectory, mapping, context.device, fields, memory, class_ids).views
     if steps := context.config.paper.loop_steps:
         ends = loop_keyframes(found.loops, [v.frame_id for v in views])
         views = adjust_views(views, ends, gaussian_map, mapping, steps)
@@ -261,10 +261,10 @@ def at_loop_ends(
     steps, ends = context.config.paper.loop_steps, loop_keyframes(found.loops, keyframe_ids.tolist())
     if not steps or not ends:
         return trajectory
-    mapping, paper, memory = context.config.mapping, context.config.paper, context.memory_room
+    mapping, memory = context.config.mapping, context.memory_room
     around = rows_of(trajectory, np.array(sorted(ends)))
     class_ids = context.run.load_class_ids()
-    views = load_views(context.run, around, mapping, paper, context.device, fields, memory, class_ids).views
+    views = load_views(context.run, around, mapping, context.device, fields, memory, class_ids).views
     poses = poses_of(trajectory, keyframe_ids).copy()
     for frame_id, pose in adjusted_poses(views, gaussian_map, mapping, steps).items():
         poses[np.searchsorted(keyframe_ids, frame_id)] = pose

@@ -10,11 +10,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.config import MappingConfig, PaperConfig
+from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.depth.see_through import contradicted
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.mapping.paper.mirrors import Mirrors
 from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
@@ -35,7 +34,6 @@ def load_views(
     run: RunFolder,
     trajectory: Trajectory,
     settings: MappingConfig,
-    paper: PaperConfig | None = None,
     device: torch.device | str = "cpu",
     fields: DepthFields | None = None,
     memory: float = math.inf,
@@ -52,7 +50,6 @@ def load_views(
     full = run.load_calibration().intrinsics
     intrinsics = full.at_most(settings.max_side)
     fields = fields or run.load_depth_fields("tracking")
-    symmetry = run.load_symmetry() if paper and paper.symmetry_weight > 0 else {}
     kept, measured = split_frames(trajectory, settings.hold_out)
     channels = survey(run, kept)[0] if class_ids is None else class_ids
     poses = dict(zip(trajectory.frame_ids.tolist(), trajectory.cam_from_world, strict=True))
@@ -61,11 +58,7 @@ def load_views(
         frame = frames[frame_id]
         maps = run.find_proxy(frame_id)
         scaled = None if maps is None else fields.in_world(frame_id, maps)
-        view = load_view(run, frame, intrinsics, poses[frame_id], scaled, channels, device)
-        if frame_id not in symmetry:
-            return view
-        field = torch.from_numpy(fields.scales(frame_id, *view.depth.shape)).to(device)
-        return replace(view, mirrors=Mirrors.of(symmetry[frame_id], full, intrinsics, device).scaled(field))
+        return load_view(run, frame, intrinsics, poses[frame_id], scaled, channels, device)
 
     memory = room_on(device, memory)
 

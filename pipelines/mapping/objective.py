@@ -12,7 +12,6 @@ from msgs_slam.pipelines.mapping import losses
 from msgs_slam.pipelines.mapping.paper.boundary_clip import clip_beside_boundary
 from msgs_slam.pipelines.mapping.paper.edge_term import edge_loss
 from msgs_slam.pipelines.mapping.paper.label_image import label_image_loss
-from msgs_slam.pipelines.mapping.paper.mirrors import label_symmetry_loss, symmetry_loss
 from msgs_slam.pipelines.mapping.photo_loss import photo_loss
 from msgs_slam.pipelines.mapping.views import View
 
@@ -33,7 +32,7 @@ class Objective:
 
     def uses_labels(self, iteration: int) -> bool:
         """Whether the semantic terms count at this step."""
-        wanted = max(self.settings.label_weight, self.paper.edge_weight, self.paper.symmetry_weight) > 0
+        wanted = max(self.settings.label_weight, self.paper.edge_weight) > 0
         return self.classes > 0 and wanted and iteration % LABEL_EVERY == 0
 
     def of(self, view: View, exposure: Tensor, rendering: Rendering, log_radii: Tensor, with_labels: bool) -> Tensor:
@@ -49,8 +48,6 @@ class Objective:
         if s.depth_weight > 0 and s.use_proxy_depth:
             weight = losses.depth_weight(view.trust)
             loss = loss + s.depth_weight * losses.depth_loss(rendering.depth, view.depth, weight, self.unit)
-        if paper.symmetry_weight > 0 and view.mirrors is not None:
-            loss = loss + paper.symmetry_weight * symmetry_loss(rendering.depth, view.mirrors, self.unit)
         if with_labels:
             loss = loss + LABEL_EVERY * self._semantic(view, rendering.depth, logits)
         return loss
@@ -64,6 +61,4 @@ class Objective:
             loss = loss + weight * compare(logits, view.channels, view.label_weight)
         if paper.edge_weight > 0:
             loss = loss + paper.edge_weight * edge_loss(depth, view.channels, self.unit)
-        if paper.symmetry_weight > 0 and view.mirrors is not None:
-            loss = loss + paper.symmetry_weight * label_symmetry_loss(logits, view.mirrors)
         return loss

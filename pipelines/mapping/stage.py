@@ -45,7 +45,7 @@ def map_whole(context: StageContext, trajectory: Trajectory, class_ids: tuple[in
     """Views, depth that agrees between them, one map."""
     settings, seed, paper = context.config.mapping, context.config.run.seed, context.config.paper
     given = load_views(
-        context.run, trajectory, settings, paper, context.device, memory=context.memory_room, class_ids=class_ids
+        context.run, trajectory, settings, context.device, memory=context.memory_room, class_ids=class_ids
     )
     views = given.views
     result = optimise_map(

@@ -96,9 +96,7 @@ class SubmapTask:
         """The keyframes of a trajectory, and its frames held out."""
         settings = replace(self.config.mapping, hold_out=hold_out)
         memory = memory_room(self.config.run.memory_mb)
-        return load_views(
-            self.run, trajectory, settings, self.config.paper, self.device, self.fields, memory, self.class_ids
-        )
+        return load_views(self.run, trajectory, settings, self.device, self.fields, memory, self.class_ids)
 
 
 @dataclass(frozen=True)

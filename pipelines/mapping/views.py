@@ -13,7 +13,6 @@ from torch import Tensor
 
 from msgs_slam.pipelines.depth.posed import PosedDepth
 from msgs_slam.pipelines.depth.resize import resize_depth, resize_maps
-from msgs_slam.pipelines.mapping.paper.mirrors import Mirrors
 from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 
 
@@ -23,7 +22,7 @@ class View:
 
     cam_from_world (4, 4) float64, on the host wherever the others lie; image (H, W, 3) uint8; depth (H, W) float32 in
     the world's unit, 0 = unknown; reliability U (H, W) uint8 0..255; channels (H, W) uint8: the class *channel* of each
-    pixel, VOID where unknown; channel_confidence (H, W) uint8; mirrors: where a symmetry was found; scene (H, W) bool:
+    pixel, VOID where unknown; channel_confidence (H, W) uint8; scene (H, W) bool:
     False where the picture shows what is no part of the scene, None where all of it is. Kept in bytes: a run has
     hundreds of views.
     """
@@ -36,7 +35,6 @@ class View:
     reliability: Tensor
     channels: Tensor
     channel_confidence: Tensor
-    mirrors: Mirrors | None = None
     scene: Tensor | None = None
 
     @property
@@ -143,7 +141,6 @@ def halved(view: View) -> View:
         reliability=sampled(view.reliability),
         channels=sampled(view.channels),
         channel_confidence=sampled(view.channel_confidence),
-        mirrors=None if view.mirrors is None else view.mirrors.halved(size[1], size[0]),
         scene=None if view.scene is None else halved_scene(view.scene, size),
     )
 

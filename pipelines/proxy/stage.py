@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -10,7 +9,6 @@ import numpy as np
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import ProxyConfig
-from msgs_slam.pipelines.correspondence.features import extract_features, to_grey
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.masks.moving import find_moving
 from msgs_slam.pipelines.proxy.inputs import check_proxy, left_to_auto, proxy_inputs
@@ -23,7 +21,6 @@ from msgs_slam.pipelines.proxy.providers import (
 from msgs_slam.pipelines.proxy.scale import DepthScale, measure_scale
 from msgs_slam.pipelines.proxy.selection import open_depth, open_semantics
 from msgs_slam.pipelines.proxy.sequence import Sequence
-from msgs_slam.pipelines.proxy.symmetry import find_mirror_planes, mirror_pairs
 from msgs_slam.pipelines.proxy.tasks import (
     by_workers,
     depth_pass,
@@ -45,9 +42,9 @@ from msgs_slam.pipelines.run.folder import (
     save_frame_scales,
     save_left_out,
 )
-from msgs_slam.pipelines.run.proxy_files import load_proxy_maps, proxy_path, save_mirror_pairs
+from msgs_slam.pipelines.run.proxy_files import load_proxy_maps, proxy_path
 from msgs_slam.pipelines.system.progress import log
-from msgs_slam.pipelines.types import VOID, Features, Frame
+from msgs_slam.pipelines.types import VOID, Frame
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -79,13 +76,9 @@ def run(context: StageContext) -> dict[str, Any]:
     agreements = [m for part, _ in made for m in part]
     save_descriptors(context.folder, {i: looks for _, part in made for i, looks in part.items()})
     save_frame_scales(context.folder, scale.of_frame, scale.spread_in)
-    mirrors = (
-        _symmetry_pass(context, sequence, frames, scale, metres) if context.config.paper.symmetry_weight > 0 else {}
-    )
     report = {
         **_report(context, frames, depths, semantics, agreements),
         **scale_figures(depths, scale, reference),
-        **mirrors,
         **moving,
     }
     _warn_of_focal(context, sequence, report.get("network_focal_px"))
@@ -150,38 +143,6 @@ def _moving_pass(
         save_left_out(context.folder / "masks", posed[k], shown)
     share = round(float(np.mean([m.mean() for m in found.values()])), 4) if found else 0.0
     return {"moving_frames": len(found), "moving_share": share} if found else {}
-
-
-def _symmetry_pass(
-    context: StageContext, sequence: Sequence, frames: list[Frame], scale: DepthScale, metres: float
-) -> dict[str, Any]:
-    """Mirror planes of the scene, and the pixels they pair in every frame; says how many it found."""
-    enlarge = sequence.calibration.intrinsics.width / sequence.intrinsics.width
-
-    def features_of(frame: Frame) -> Features:
-        kept = context.run.load_features(frame.id)
-        assert kept is not None  # every frame with a pose is a keyframe
-        if kept.descriptors.dtype != np.uint8:  # nobody knows how a learned descriptor looks in a mirror
-            kept = extract_features(to_grey(context.run.image(frame)), context.config.frames.max_features)
-        return replace(kept, keypoints=(kept.keypoints / [enlarge, enlarge, enlarge, 1]).astype(np.float32))
-
-    planes = find_mirror_planes(
-        sequence,
-        frames,
-        lambda frame: scale.in_backbone_unit(load_depth(context, frame)),
-        features_of,
-        context.progress,
-    )
-    pairs_of = {}
-    for frame in frames if planes else []:
-        if (pose := sequence.cam_from_world.get(frame.id)) is not None:
-            maps = load_proxy_maps(proxy_path(context.folder, frame.id))
-            # The planes are in the backbone's unit, the maps in the depth's.
-            in_cam = [(p.in_cam(pose) * [1, 1, 1, scale.value * metres], p.confidence) for p in planes]
-            pairs = mirror_pairs(sequence.image(frame), maps.depth, maps.confidence, sequence.intrinsics, in_cam)
-            pairs_of[frame.id] = replace(pairs, pairs=pairs.pairs * np.float32(enlarge))
-    save_mirror_pairs(context.folder, pairs_of)
-    return {"mirror_planes": len(planes), "mirror_pairs": sum(map(len, pairs_of.values()))}
 
 
 # report ---------------------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run import layouts
 from msgs_slam.pipelines.run.finished_files import FinishedFiles
 from msgs_slam.pipelines.run.layouts import dataclass_from_json, load_layout, reading
-from msgs_slam.pipelines.run.proxy_files import SYMMETRY, load_mirror_pairs, load_proxy_maps, proxy_name
+from msgs_slam.pipelines.run.proxy_files import load_proxy_maps, proxy_name
 from msgs_slam.pipelines.types import (
     VOID,
     Calibration,
@@ -37,7 +37,6 @@ from msgs_slam.pipelines.types import (
     Features,
     Frame,
     LoopEdge,
-    MirrorPairs,
     ProxyMaps,
     Trajectory,
     Vocabulary,
@@ -142,10 +141,6 @@ class RunFolder(FinishedFiles):
     def find_proxy(self, frame_id: int) -> ProxyMaps | None:
         """Proxy maps of one frame, None when it has none."""
         return self.load_proxy(frame_id) if self.has_proxy(frame_id) else None
-
-    def load_symmetry(self) -> dict[int, MirrorPairs]:
-        """Frame id → pairs of pixels that show each other's mirror image; {} where no symmetry was found."""
-        return load_mirror_pairs(self.file("proxy", SYMMETRY)) if self.has("proxy", SYMMETRY) else {}
 
     def load_descriptors(self) -> dict[int, NDArray[np.float32]]:
         """Frame id → (F,) unit vector by which a network tells how the frame looks; {} where none did."""

@@ -38,7 +38,6 @@ PROXY_MAPS = {"inverse_depth": "f H W", "confidence": "i H W", "labels": "i H W"
 EXPOSURE = {"frame_ids": "i N", "log_gains": "f N 3", "offsets": "f N 3"}
 DESCRIPTORS = {"frame_ids": "i N", "vectors": "f N F"}
 DEPTH_FIELDS = {"frame_ids": "i N", "log_scales": "f N R C"}
-MIRROR_PAIRS = {"of_frame": "i K", "pairs": "f K 4", "confidence": "f K", "gain": "f K", "offset": "f K"}
 
 
 def what_to_do(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""Files of the proxy stage that hold one frame each, or pairs of pixels."""
+"""Files of the proxy stage that hold one frame each."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import numpy as np
 from msgs_slam.formats.tensors import save_arrays
 from msgs_slam.pipelines.run import layouts
 from msgs_slam.pipelines.run.layouts import load_layout
-from msgs_slam.pipelines.types import MirrorPairs, ProxyMaps
-
-SYMMETRY = "symmetry.npz"
+from msgs_slam.pipelines.types import ProxyMaps
 
 
 def proxy_path(folder: Path, frame_id: int) -> Path:
@@ -52,23 +50,3 @@ def load_proxy_maps(path: Path) -> ProxyMaps:
         labels=arrays["labels"],
         label_confidence=arrays["label_confidence"].astype(np.float32) / np.float32(255),
     )
-
-
-def save_mirror_pairs(folder: Path, pairs_of: dict[int, MirrorPairs]) -> None:
-    """One npz of all frames that have any; nothing where none has."""
-    kept = {i: p for i, p in pairs_of.items() if len(p)}
-    if not kept:
-        return
-    arrays = {n: np.concatenate([getattr(p, n) for p in kept.values()]) for n in _PAIR_ARRAYS}
-    of_frame = np.repeat(np.array(list(kept), np.int64), [len(p) for p in kept.values()])
-    save_arrays(folder / SYMMETRY, {"of_frame": of_frame, **arrays})
-
-
-def load_mirror_pairs(path: Path) -> dict[int, MirrorPairs]:
-    """Inverse of `save_mirror_pairs`."""
-    arrays = load_layout(path, layouts.MIRROR_PAIRS)
-    of_frame = arrays["of_frame"]
-    return {int(i): MirrorPairs(*(arrays[n][of_frame == i] for n in _PAIR_ARRAYS)) for i in np.unique(of_frame)}
-
-
-_PAIR_ARRAYS = ("pairs", "confidence", "gain", "offset")

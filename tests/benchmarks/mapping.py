@@ -71,7 +71,6 @@ ABLATIONS = {
     "without splitting": ("mapping.split_error=0.0",),
     "densified by classes": ("paper.class_growth=true",),
     "gradients clipped at boundaries": ("paper.boundary_clip=1.0",),
-    "with symmetry": ("paper.symmetry_weight=0.05",),
     "without exposure": ("mapping.exposure=false",),
     "without pose refinement": ("mapping.refine_poses=false",),
 }

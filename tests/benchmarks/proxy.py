@@ -1,4 +1,4 @@
-"""Measures depth, its reliability, labels and symmetry of the proxy stage against truth.
+"""Measures depth, its reliability, and labels of the proxy stage against truth.
 
     python tests/benchmarks/proxy.py --work RUNS                         the embedded providers, all sequences
     python tests/benchmarks/proxy.py --work RUNS replica --json rows.json
@@ -163,41 +163,6 @@ def measure_depth(case: Case, run: RunFolder) -> dict[str, Any]:
     }
 
 
-def measure_symmetry(case: Case, run: RunFolder) -> dict[str, Any]:
-    """Errors of the depth that the mirror pairs predict from one half for the other; nothing without pairs.
-
-    truth: the true depth mirrored, against the true depth there; unsure: our own depth mirrored to where ours is not
-    reliable, beside what ours says there.
-    """
-    names = sorted((p.name for p in case.pictures.glob(case.glob)), key=natural_key)
-    frames, camera = {f.id: f for f in run.load_frames()}, run.load_calibration().intrinsics
-    rows = []
-    scale = run_scale(case, run)
-    for frame_id, found in run.load_symmetry().items():
-        maps = run.load_proxy(frame_id)
-        height, width = maps.depth.shape
-        truth = case.truth(names[frames[frame_id].source_index], width, height) * scale
-        pixels = np.floor(found.pairs * (width / camera.width)).astype(int)
-        here, there = (np.minimum(pixels[:, k : k + 2], [width - 1, height - 1]).T for k in (0, 2))
-        wanted = truth[there[1], there[0]]
-        known = (truth[here[1], here[0]] > 0) & (wanted > 0)
-        own = maps.depth[there[1], there[0]]
-        columns = [found.gain * d[here[1], here[0]] + found.offset for d in (truth, maps.depth)]
-        columns = [np.abs(c / np.maximum(wanted, 1e-9) - 1) for c in (*columns, own)]
-        rows.append(np.stack([*columns, maps.confidence[there[1], there[0]]], 1)[known])
-    if not rows:
-        return {}
-    errors = np.concatenate(rows)
-    unsure = errors[errors[:, 3] <= RELIABLE]
-    return {
-        "mirrored_truth_median": round(float(np.median(errors[:, 0])), 5),
-        "mirrored_truth_p90": round(float(np.percentile(errors[:, 0], 90)), 5),
-        "unsure_pairs": len(unsure),
-        "unsure_by_mirror": round(float(np.median(unsure[:, 1])), 5) if len(unsure) else None,
-        "unsure_by_own_depth": round(float(np.median(unsure[:, 2])), 5) if len(unsure) else None,
-    }
-
-
 def run_scale(case: Case, run: RunFolder) -> float:
     """Depth of the maps over true depth, over the reliable pixels of all keyframes."""
     names = sorted((p.name for p in case.pictures.glob(case.glob)), key=natural_key)
@@ -287,20 +252,15 @@ def write_deeplab_card(work: Path) -> Path:
 
 
 def write_sheet(run: RunFolder, target: Path, count: int = 4) -> None:
-    """Picture, depth, reliability and labels of a few keyframes, and the pixels that mirror symmetry pairs."""
+    """Picture, depth, reliability and labels of a few keyframes."""
     frames = keyframes(run)
-    symmetry, colors = run.load_symmetry(), np.array([*run.load_classes().colors], np.uint8)
+    colors = np.array([*run.load_classes().colors], np.uint8)
     rows = []
     for frame in frames[:: max(1, len(frames) // count)][:count]:
         maps = run.load_proxy(frame.id)
         image = cv2.resize(run.image(frame), maps.depth.shape[::-1], interpolation=cv2.INTER_AREA)
         mixed = (image // 2 + colored_labels(maps, colors) // 2).astype(np.uint8)
-        paired = image.copy()
-        if frame.id in symmetry:
-            shrink = maps.depth.shape[1] / run.load_calibration().intrinsics.width
-            for x0, y0, x1, y1 in (symmetry[frame.id].pairs[::25] * shrink).tolist():
-                cv2.line(paired, (int(x0), int(y0)), (int(x1), int(y1)), (255, 60, 0), 1, cv2.LINE_AA)
-        rows.append(np.concatenate([image, colored_depth(maps), grey(maps.confidence), mixed, paired], 1))
+        rows.append(np.concatenate([image, colored_depth(maps), grey(maps.confidence), mixed], 1))
     sheet = np.concatenate(rows)
     small = cv2.resize(sheet, (1900, round(sheet.shape[0] * 1900 / sheet.shape[1])), interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(target), cv2.cvtColor(small, cv2.COLOR_RGB2BGR))
@@ -338,15 +298,12 @@ def run_of(name: str, work: Path, first: int, suffix: str = "") -> RunFolder:
 def measure_embedded(name: str, work: Path, first: int) -> dict[str, Any]:
     """One row: the providers that need no weights."""
     run = run_of(name, work, first)
-    progress = run_proxy(pictures_of(name, work, first), run, "paper.symmetry_weight=0.05")
+    progress = run_proxy(pictures_of(name, work, first), run)
     seconds = progress.seconds
     report = run.load_proxy_report()
     row = {
         **measure_depth(CASES[name], run),
         "flicker": flicker(run),
-        "mirror_planes": report.get("mirror_planes"),
-        "mirror_pairs": report.get("mirror_pairs"),
-        **measure_symmetry(CASES[name], run),
         "kilobytes_a_frame": report["kilobytes_a_frame"],
     }
     if "stereo" in seconds:

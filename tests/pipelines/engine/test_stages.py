@@ -74,7 +74,7 @@ def test_changed_setting_reruns_its_stage_and_what_follows(recorder: Recorder, t
 
 @pytest.mark.parametrize(
     ("setting", "first"),
-    [("kappa=5.0", "mapping"), ("symmetry_weight=0.1", "proxy"), ("tracking_depth_weight=1.0", "tracking")],
+    [("kappa=5.0", "mapping"), ("tracking_depth_weight=1.0", "tracking")],
 )
 def test_a_term_of_the_article_reruns_the_stages_that_read_it(
     recorder: Recorder, tmp_path: Path, setting: str, first: str
