@@ -1,4 +1,7 @@
-"""COLMAP models: written in the format every version and every splatting trainer reads, read by pycolmap."""
+"""COLMAP models: written in the format every version and every splatting trainer reads, read by pycolmap.
+
+pycolmap 4.2's own writers report no error on a full disk and leave truncated files, so writing is ours.
+"""
 
 from __future__ import annotations
 
