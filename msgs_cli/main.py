@@ -17,7 +17,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from msgs_slam.formats.errors import InputError, SettingError
 from msgs_slam.msgs_cli import looking
-from msgs_slam.msgs_cli.ablating import ablate
 from msgs_slam.msgs_cli.batch import batch
 from msgs_slam.msgs_cli.doctor import doctor
 from msgs_slam.msgs_cli.json_lines import Interrupted, is_asked_for, only_json
@@ -111,7 +110,6 @@ def main() -> None:
     msgs-slam render video.msgs out.mp4 the map along its camera path
     msgs-slam view video.msgs           the map in the browser
     msgs-slam evaluate video.msgs --truth DATASET    errors against a known truth
-    msgs-slam ablate SOURCE --truth DATASET          ablation: what each term contributes
     msgs-slam models list               learned models for metric depth and named classes
     msgs-slam doctor                    check this machine and suggest fixes
     msgs-slam config                    every setting with its default and meaning
@@ -366,7 +364,6 @@ def _results(root: Path, records: dict[str, Any]) -> dict[str, Path]:
 for command in (looking.evaluate, looking.report, looking.render, looking.view):
     main.add_command(command)
 main.add_command(models)
-main.add_command(ablate)
 main.add_command(batch)
 main.add_command(work)
 main.add_command(doctor)

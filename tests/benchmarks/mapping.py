@@ -31,13 +31,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import open_sequence
-from msgs_slam.pipelines.evaluation.ablation import ABLATIONS as ARTICLE_ABLATIONS
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.system.progress import SilentProgress
+from tests.benchmarks.ablate import ABLATIONS as ARTICLE_ABLATIONS
 
 
 @dataclass(frozen=True)

@@ -7,16 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.evaluation import ablation
-from msgs_slam.pipelines.evaluation.ablation import ABLATIONS, ablate
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.system.progress import SilentProgress
+from tests.benchmarks import ablate as ablation
+from tests.benchmarks.ablate import ABLATIONS, ablate
 
 SETTINGS = (
     "run.threads=2", "frames.rate=4", "proxy.depth=files", "proxy.semantics=files", "mapping.max_side=120",
@@ -113,9 +111,6 @@ def test_mistakes_are_explained(truth: Sequence, config: Config, tmp_path: Path)
     for seeds in ((), (1, 1)):
         with pytest.raises(InputError, match="different numbers"):
             run(truth, tmp_path / "new", config, seeds)
-    arguments = ["ablate", str(truth.root), "--truth", str(truth.root), "--out", str(tmp_path / "new")]
-    wrong = CliRunner().invoke(main, [*arguments, "--only", "without luck"])
-    assert wrong.exit_code == 1
-    assert all(name in wrong.stderr for name in ABLATIONS)
-    assert CliRunner().invoke(main, [*arguments, "--seeds", "0,x"]).exit_code == 2
+    with pytest.raises(InputError, match=", ".join(ABLATIONS)):
+        ablate(truth.root, truth, tmp_path / "new", config, (0,), SilentProgress(), ("without luck",))
     assert not (tmp_path / "new").exists()

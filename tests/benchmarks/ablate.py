@@ -1,27 +1,36 @@
-"""What each term of the method earns: the same run with one switched off, measured over seeds."""
+"""What each term of the method earns: the same run with one switched off, measured over seeds.
+
+    python tests/benchmarks/ablate.py SOURCE --truth DATASET [--seeds 0,1,2] [--only NAME] [--set section.key=value]
+
+Stopped at any moment, the same command goes on where it was.
+"""
 
 from __future__ import annotations
 
+import argparse
 import re
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
 import numpy as np
 
 from msgs_slam.formats.atomic import write_text
-from msgs_slam.formats.datasets import Sequence
+from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.jsonfile import read_json_object, write_json
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.evaluation.branch import branch
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
 from msgs_slam.pipelines.read_config import config_to_toml, load_config
 from msgs_slam.pipelines.reconstruct import all_stages, reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_records
-from msgs_slam.pipelines.system.progress import Progress
+from msgs_slam.pipelines.system.progress import Progress, SilentProgress
+from tests.benchmarks.branch import branch
 
 COMPLETE = "complete"
 ABLATIONS: dict[str, tuple[str, ...]] = {
@@ -241,3 +250,29 @@ def _cell(row: dict[str, Any], column: str) -> str:
     mean, sd = row["mean"][column], row["sd"].get(column)
     digits = 0 if column == "Gaussians" else 4 if column in ("SSIM", "LPIPS") else 2
     return f"{mean:.{digits}f}" + ("" if sd is None else f" ± {sd:.{digits}f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", type=Path)
+    parser.add_argument("--truth", type=Path, required=True, help="a data set with true poses")
+    parser.add_argument("--out", type=Path, help="default: the source's name + .ablation, here")
+    parser.add_argument("--seeds", default="0", help="one run of every row with each seed")
+    parser.add_argument("--only", action="append", default=[], metavar="NAME", help=", ".join(ABLATIONS))
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of all rows")
+    arguments = parser.parse_args()
+    config = load_config(overrides=["mapping.hold_out=8", *arguments.set])
+    result = ablate(
+        arguments.source,
+        open_sequence(arguments.truth),
+        arguments.out or Path(arguments.source.stem + ".ablation"),
+        config,
+        tuple(map(int, arguments.seeds.split(","))),
+        SilentProgress(),
+        tuple(arguments.only) or tuple(ABLATIONS),
+    )
+    print(ablation_table(result))
+
+
+if __name__ == "__main__":
+    main()
