@@ -8,9 +8,11 @@ Stopped at any moment, the same command goes on where it was.
 from __future__ import annotations
 
 import argparse
+import os
 import re
+import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,13 +26,15 @@ from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.jsonfile import read_json_object, write_json
 from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.engine.stages import Stage
+from msgs_slam.pipelines.engine.standing import next_upstream, stage_fingerprint
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
 from msgs_slam.pipelines.read_config import config_to_toml, load_config
 from msgs_slam.pipelines.reconstruct import all_stages, reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import load_records
+from msgs_slam.pipelines.run.records import Manifest, StageRecord, load_records, load_source, write_manifest
+from msgs_slam.pipelines.run.settings_file import load_settings, save_settings
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress
-from tests.benchmarks.branch import branch
 
 COMPLETE = "complete"
 ABLATIONS: dict[str, tuple[str, ...]] = {
@@ -250,6 +254,53 @@ def _cell(row: dict[str, Any], column: str) -> str:
     mean, sd = row["mean"][column], row["sd"].get(column)
     digits = 0 if column == "Gaussians" else 4 if column in ("SSIM", "LPIPS") else 2
     return f"{mean:.{digits}f}" + ("" if sd is None else f" ± {sd:.{digits}f}")
+
+
+def branch(
+    origin: RunFolder, target: RunFolder, names: Iterable[str], accept: tuple[list[Stage], Config] | None = None
+) -> None:
+    """Make `target` with these stages of `origin`, as hard links where the disk allows it, and its settings.
+
+    With accept = (all stages, settings) the taken stages count as made with those settings and that seed, which they
+    may not have had: for comparisons that vary what comes after them, such as over seeds from one set of proxies. The
+    target is there whole or not at all; where it is there already, nothing happens. Raises InputError for a damaged
+    manifest of `origin`.
+    """
+    if target.manifest_file.exists():
+        return
+    unfinished = RunFolder(target.root.with_name(target.root.name + ".partial"))
+    shutil.rmtree(unfinished.root, ignore_errors=True)
+    unfinished.root.mkdir(parents=True)
+    source, records = load_source(origin), load_records(origin)
+    taken = {name: records[name] for name in names if name in records}
+    for name in taken:
+        shutil.copytree(origin.stage(name), unfinished.stage(name), copy_function=_link)
+    config = load_settings(origin)
+    if accept is not None:
+        taken, config = _accepted(taken, *accept, source.digest), accept[1]
+    write_manifest(unfinished.manifest_file, Manifest(source, taken))
+    save_settings(unfinished, config)
+    os.replace(unfinished.root, target.root)
+
+
+def _accepted(
+    records: dict[str, StageRecord], stages: list[Stage], config: Config, upstream: str
+) -> dict[str, StageRecord]:
+    accepted = {}
+    for stage in stages:
+        if (record := records.get(stage.name)) is None:
+            break
+        accepted[stage.name] = replace(record, fingerprint=stage_fingerprint(stage, config, upstream, record.inputs))
+        upstream = next_upstream(upstream, record)
+    return accepted
+
+
+def _link(source: str, target: str) -> str:
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+    return str(Path(target))
 
 
 def main() -> None:
