@@ -8,6 +8,7 @@ Loops run in the order of the observations, in one thread: the same input gives 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msgs_slam.pipelines.system.jit import kernel
 
@@ -169,45 +170,61 @@ def border(  # type: ignore[no-untyped-def]
 
 @kernel
 def invert_points(point_block, damping):  # type: ignore[no-untyped-def]
-    """Inverses (P, 3, 3) of the damped point blocks."""
+    """Inverses (P, 3, 3) of the damped point blocks, which are symmetric and positive definite: by M = L D L^T."""
     out = np.empty_like(point_block)
     for q in range(len(point_block)):
-        m = point_block[q].copy()
+        m, inverse, more = point_block[q], out[q], 1.0 + damping
         floor = 1e-9 * (m[0, 0] + m[1, 1] + m[2, 2]) + 1e-12
-        for i in range(3):
-            m[i, i] += damping * m[i, i] + floor
-        out[q] = np.linalg.inv(m)
+        d0 = more * m[0, 0] + floor
+        l10, l20 = m[1, 0] / d0, m[2, 0] / d0
+        d1 = more * m[1, 1] + floor - l10 * m[1, 0]
+        l21 = (m[2, 1] - l20 * m[1, 0]) / d1
+        d2 = more * m[2, 2] + floor - l20 * m[2, 0] - l21 * l21 * d1
+        down = l10 * l21 - l20  # of the inverse of L, whose others are -l10 and -l21
+        inverse[2, 2] = 1.0 / d2
+        inverse[2, 1] = inverse[1, 2] = -l21 / d2
+        inverse[2, 0] = inverse[0, 2] = down / d2
+        inverse[1, 1] = 1.0 / d1 + l21 * l21 / d2
+        inverse[1, 0] = inverse[0, 1] = -l10 / d1 - l21 * down / d2
+        inverse[0, 0] = 1.0 / d0 + l10 * l10 / d1 + down * down / d2
     return out
 
 
-@kernel
-def number_blocks(starts, obs_cam, count):  # type: ignore[no-untyped-def]
+def number_blocks(
+    starts: NDArray[np.int64], obs_cam: NDArray[np.int64], count: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The pairs a <= b of cameras that share a point, row by row: those of camera a have the numbers from rows[a] to
-    rows[a + 1] (N + 1,), their second cameras, ascending, are columns (B,)."""
-    point = np.empty(len(obs_cam), np.int64)
-    for q in range(len(starts) - 1):
-        point[starts[q] : starts[q + 1]] = q
-    order = np.argsort(obs_cam, kind="mergesort")
+    rows[a + 1] (N + 1,), their second cameras, ascending, are columns (B,).
+
+    Sorting is left to numpy: numba takes ten seconds to compile a sort.
+    """
+    ends = np.repeat(starts[1:], np.diff(starts))
+    order = np.argsort(obs_cam, kind="stable")
     rows, columns = np.zeros(count + 1, np.int64), np.empty(16 * count, np.int64)
     seen, place = np.full(count, -1, np.int64), 0
     for a in range(count):
-        first = rows[a]
-        used = first
-        if used + count > len(columns):
+        if rows[a] + count > len(columns):
             columns = np.concatenate((columns, np.empty(len(columns) + count, np.int64)))
-        columns[used], seen[a] = a, a
-        used += 1
-        while place < len(order) and obs_cam[order[place]] == a:
-            o = order[place]
-            for other in range(o + 1, starts[point[o] + 1]):
-                b = obs_cam[other]
-                if seen[b] != a:
-                    columns[used], seen[b] = b, a
-                    used += 1
-            place += 1
-        columns[first:used] = np.sort(columns[first:used])
-        rows[a + 1] = used
+        place, rows[a + 1] = _list_partners(a, order, place, ends, obs_cam, seen, columns, rows[a])
+        columns[rows[a] : rows[a + 1]].sort()
     return rows, columns[: rows[count]].copy()
+
+
+@kernel
+def _list_partners(a, order, place, ends, obs_cam, seen, columns, used):  # type: ignore[no-untyped-def]
+    """Camera a and who shares a point with it, into `columns` from `used` on; the next place in the order of the
+    cameras' observations, and where the columns end."""
+    columns[used], seen[a] = a, a
+    used += 1
+    while place < len(order) and obs_cam[order[place]] == a:
+        o = order[place]
+        for other in range(o + 1, ends[o]):
+            b = obs_cam[other]
+            if seen[b] != a:
+                columns[used], seen[b] = b, a
+                used += 1
+        place += 1
+    return place, used
 
 
 @kernel
@@ -221,7 +238,10 @@ def eliminate_points(  # type: ignore[no-untyped-def]
     `number_blocks`.
     """
     residual, jac_cam, jac_point, weight = np.empty(3), np.empty((3, 6)), np.empty((3, 3)), np.empty(3)
-    left, mixed = np.empty((6, 3)), np.empty((np.max(np.diff(starts)) if len(starts) > 1 else 0, 6, 3))
+    most = 0
+    for q in range(len(starts) - 1):
+        most = max(most, starts[q + 1] - starts[q])
+    left, mixed = np.empty((6, 3)), np.empty((most, 6, 3))
     for q in range(len(starts) - 1):
         first, count = starts[q], starts[q + 1] - starts[q]
         for a in range(count):
@@ -242,9 +262,11 @@ def eliminate_points(  # type: ignore[no-untyped-def]
                     left[i, j] = value
                     total += value * point_right[q, j]
                 right[6 * cam + i] -= total
-            number, end = rows[cam], rows[cam + 1]
+            number = rows[cam]
             for b in range(a, count):
-                number += np.searchsorted(columns[number:end], obs_cam[first + b])
+                # The cameras of a point ascend, and all are among the columns of this row.
+                while columns[number] < obs_cam[first + b]:
+                    number += 1
                 block, twice = blocks[number], b != a and obs_cam[first + b] == cam
                 for i in range(6):
                     for j in range(6):
