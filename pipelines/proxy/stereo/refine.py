@@ -9,9 +9,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.proxy.stereo.bands import BAND_ROWS, Bands
-from msgs_slam.pipelines.proxy.stereo.window import RADIUS, best_mean, correlate_row, warp_row, weigh_windows
-from msgs_slam.pipelines.system.jit import kernel
+from msgs_slam.pipelines.gaussians.render.jit import kernel
+from msgs_slam.pipelines.gaussians.render.lanes import store
+from msgs_slam.pipelines.proxy.stereo.bands import Bands
+from msgs_slam.pipelines.proxy.stereo.window import (
+    RADIUS,
+    SAMPLED_ROWS,
+    best_mean,
+    row_length,
+    warp_row,
+    weigh_windows,
+)
 
 _ALIKE = 1e3
 """Likeness by which all pixels of a window count alike: it lies on the surface itself, and needs all of its texture."""
@@ -56,26 +64,27 @@ def _refine_band(
     refined: NDArray[np.float32],
 ) -> None:
     height, width = image.shape
-    views = others.shape[0]
-    padded = width + 2 * RADIUS
-    warped = np.empty((BAND_ROWS + 2 * RADIUS, padded), np.float32)
-    seen = np.empty((BAND_ROWS + 2 * RADIUS, width), np.uint8)
+    views, rows, columns = others.shape
+    length = row_length(width)
+    samples = np.zeros(views * SAMPLED_ROWS * length, np.float32)
+    seen = np.zeros(views * SAMPLED_ROWS * length, np.float32)
+    surface, top = np.zeros(length, np.float32), np.empty(16 * best, np.float32)
     weights, weighted, moments = weigh_windows(image, first, last, _ALIKE)
-    sums = np.empty((3, width), np.float32)
-    scores = np.empty((BAND_ROWS, views, width), np.float32)
-    total = np.empty((2 * reach + 1, BAND_ROWS, width), np.float32)
+    total = np.empty((2 * reach + 1, last - first, length), np.float32)
     for d in range(2 * reach + 1):
-        for n in range(views):
-            for k in range(last - first + 2 * RADIUS):
-                y = min(max(first + k - RADIUS, 0), height - 1)
-                warp_row(others[n], warps[n], inverse_depth[y], (d - reach) * step, y, warped[k], seen[k])
-            for k in range(last - first):
-                correlate_row(
-                    warped[k:], weights[k], weighted[k], moments[k], seen[k + RADIUS], sums, scores[k, n]
+        for k in range(last - first + 2 * RADIUS):
+            y = min(max(first + k - RADIUS, 0), height - 1)
+            surface[:width] = inverse_depth[y]
+            for n in range(views):
+                warp_row(
+                    others[n].reshape(-1), columns, rows, warps[n], surface, (d - reach) * step, y, width, samples,
+                    seen, (n * SAMPLED_ROWS + k) * length,
                 )  # fmt: skip
+        penalty = np.float32(stiffness * (d - reach) ** 2)
         for k in range(last - first):
-            for x in range(width):
-                total[d, k, x] = best_mean(scores[k], x, best) - np.float32(stiffness * (d - reach) ** 2)
+            for x in range(0, width, 16):
+                score = best_mean(samples, seen, weights, weighted, moments, length, views, k, x, top)
+                store(total[d, k], x, score - penalty)
     for k in range(last - first):
         for x in range(width):
             b = reach

@@ -9,9 +9,21 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.proxy.stereo.bands import BAND_ROWS, Bands
-from msgs_slam.pipelines.proxy.stereo.window import LIKENESS, RADIUS, best_mean, correlate_row, warp_row, weigh_windows
-from msgs_slam.pipelines.system.jit import kernel
+from msgs_slam.pipelines.gaussians.render.jit import kernel
+from msgs_slam.pipelines.gaussians.render.lanes import splat, store
+from msgs_slam.pipelines.proxy.stereo.bands import Bands
+from msgs_slam.pipelines.proxy.stereo.window import (
+    LIKENESS,
+    RADIUS,
+    SAMPLED_ROWS,
+    best_mean,
+    row_length,
+    warp_row,
+    weigh_windows,
+)
+
+_PLANES = 16
+"""So many at a time fit into the cache."""
 
 
 def warps_to(
@@ -63,29 +75,30 @@ def _sweep_band(
     cost: NDArray[np.float32],
 ) -> None:
     height, width = image.shape
-    views = others.shape[0]
-    padded = width + 2 * RADIUS
-    warped = np.empty((BAND_ROWS + 2 * RADIUS, padded), np.float32)
-    seen = np.empty((BAND_ROWS + 2 * RADIUS, width), np.uint8)
-    plane = np.zeros(width, np.float32)
+    views, rows, columns = others.shape
+    length = row_length(width)
+    samples = np.zeros(views * SAMPLED_ROWS * length, np.float32)
+    seen = np.zeros(views * SAMPLED_ROWS * length, np.float32)
+    plane, top = np.zeros(length, np.float32), np.empty(16 * best, np.float32)
     weights, weighted, moments = weigh_windows(image, first, last, LIKENESS)
-    sums = np.empty((3, width), np.float32)
-    scores = np.empty((BAND_ROWS, views, width), np.float32)
-    block = np.empty((len(inverse_depths), last - first, width), np.float32)
-    for d in range(len(inverse_depths)):
-        for n in range(views):
-            for k in range(last - first + 2 * RADIUS):
-                y = min(max(first + k - RADIUS, 0), height - 1)
-                warp_row(others[n], warps[n], plane, inverse_depths[d], y, warped[k], seen[k])
+    block = np.empty(_PLANES * (last - first) * length, np.float32)
+    for start in range(0, len(inverse_depths), _PLANES):
+        count = min(_PLANES, len(inverse_depths) - start)
+        for d in range(count):
+            for n in range(views):
+                picture = others[n].reshape(-1)
+                for k in range(last - first + 2 * RADIUS):
+                    y = min(max(first + k - RADIUS, 0), height - 1)
+                    warp_row(
+                        picture, columns, rows, warps[n], plane, inverse_depths[start + d], y, width, samples, seen,
+                        (n * SAMPLED_ROWS + k) * length,
+                    )  # fmt: skip
             for k in range(last - first):
-                correlate_row(
-                    warped[k:], weights[k], weighted[k], moments[k], seen[k + RADIUS], sums, scores[k, n]
-                )  # fmt: skip
+                for x in range(0, width, 16):
+                    score = best_mean(samples, seen, weights, weighted, moments, length, views, k, x, top)
+                    store(block, (d * (last - first) + k) * length + x, splat(np.float32(1)) - score)
+        # Turned round some planes at a time: writing each into (H, W, D) would miss the cache at every pixel.
         for k in range(last - first):
             for x in range(width):
-                block[d, k, x] = np.float32(1) - best_mean(scores[k], x, best)
-    # Turned round in one go: writing plane by plane into (H, W, D) would miss the cache at every pixel.
-    for k in range(last - first):
-        for x in range(width):
-            for d in range(len(inverse_depths)):
-                cost[first + k, x, d] = block[d, k, x]
+                for d in range(count):
+                    cost[first + k, x, start + d] = block[(d * (last - first) + k) * length + x]

@@ -98,6 +98,14 @@ def board_before_wall(cam_from_world: NDArray) -> tuple[NDArray[np.float32], NDA
     return np.where(on_board, 0.8 + board, 0.3 + wall).astype(np.float32), on_board
 
 
+def test_windows_that_touch_what_is_no_scene_are_not_compared() -> None:
+    image, others, warps, _ = scene(0.3)
+    planes = np.linspace(1 / 3, 1 / 1.4, 7)
+    alone = sweep_cost(image, others[1:], warps[1:], planes, 2, Bands(1))
+    others[0] = np.nan
+    assert np.array_equal(sweep_cost(image, others, warps, planes, 2, Bands(1)), alone)
+
+
 def test_objects_do_not_grow_into_what_lies_behind_them() -> None:
     image, on_board = board_before_wall(np.eye(4))
     others = np.stack([board_before_wall(c)[0] for c in CAMERAS])
