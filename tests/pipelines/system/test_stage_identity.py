@@ -9,7 +9,7 @@ from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.system.identity import ROOT, TABLE, source_digest, stage_identity, stage_sources
 
-REPOSITORY = Path(__file__).resolve().parents[2]
+REPOSITORY = Path(__file__).resolve().parents[3]
 
 
 def sources(stage: str) -> set[str]:
