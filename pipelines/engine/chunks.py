@@ -1,4 +1,4 @@
-"""A stage's work on many things alike (keyframes, blocks of pairs), portion by portion, by its workers."""
+"""A stage's work on many things alike (keyframes, blocks of pairs, regions of a mesh) as tasks over ranges of them."""
 
 from __future__ import annotations
 
@@ -43,18 +43,20 @@ class Chunk:
         return load_value(self.file)
 
     def context(self, progress: Progress) -> StageContext:
-        """The stage's, without workers."""
+        """The stage's; a task hands out none itself."""
         return StageContext(self.run, self.source, self.config, self.folder, progress)
 
 
 def in_chunks(context: StageContext, work: Callable[[Chunk, Progress], R], count: int, **known: Any) -> list[R]:
-    """What `work` returns of each portion of `count` things, with what is known of all; nothing where there are no
-    workers: then this process does it its own way, without going over the disk."""
-    if context.workers is None or count == 0:
-        return []
+    """What `work` returns of each range of `count` things, in order, with what is `known` of all.
+
+    This process alone does all of them as one range; workers get several each. Either way a task has what it needs
+    from files, and leaves files in the stage's folder.
+    """
     file = context.snapshot / f"{work.__name__}.npz"
     save_value(file, known)
-    parts = min(_CHUNKS_PER_WORKER * context.workers.at_once, count)
+    wanted = 1 if context.workers is None else _CHUNKS_PER_WORKER * context.workers.at_once
+    parts = max(min(wanted, count), 1)
     ends = [count * n // parts for n in range(parts + 1)]
     task = Chunk(context.run, context.source, context.config, context.folder, file, 0, 0)
     return context.each(work, [replace(task, first=a, last=b) for a, b in pairwise(ends)])

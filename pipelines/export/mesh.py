@@ -37,25 +37,23 @@ def keyframe_rows(outcome: Outcome) -> list[int]:
     return np.flatnonzero(outcome.trajectory.is_keyframe).tolist()
 
 
-def drawn_views(
-    outcome: Outcome, settings: ExportConfig, scratch: Path, progress: Progress, numbers: range | None = None
-) -> Sequence[DrawnView]:
-    """What the map shows in the `keyframe_rows`, of which those with `numbers` (all) are drawn where they are not in
-    `scratch`; those used last are in memory."""
-    rows = keyframe_rows(outcome)
-    count = len(rows)
-    files = [scratch / f"view_{number:06d}.npz" for number in range(count)]
-    wanted = range(count) if numbers is None else numbers
-    t, camera, near = (
-        outcome.trajectory,
-        outcome.calibration.intrinsics.at_most(settings.mesh_side),
-        maps_around(outcome),
-    )
-    for number in progress.track(wanted, "drawing", len(wanted)):
-        if not files[number].exists():
+def draw(outcome: Outcome, settings: ExportConfig, scratch: Path, progress: Progress, numbers: range) -> None:
+    """What the map shows in the `keyframe_rows` with these numbers, into `scratch`; what is there stays."""
+    rows, t, near = keyframe_rows(outcome), outcome.trajectory, maps_around(outcome)
+    camera = outcome.calibration.intrinsics.at_most(settings.mesh_side)
+    for number in progress.track(numbers, "drawing", len(numbers)):
+        if not (file := _view_file(scratch, number)).exists():
             row = rows[number]
-            save_value(files[number], drawn_view(near(int(t.frame_ids[row])), t.cam_from_world[row], camera))
-    return LruSequence(count, lambda number: load_value(files[number]), lambda view: view.size, _KEPT_BYTES)
+            save_value(file, drawn_view(near(int(t.frame_ids[row])), t.cam_from_world[row], camera))
+
+
+def drawn_views(scratch: Path, count: int) -> Sequence[DrawnView]:
+    """What `draw` has left of so many keyframes; those used last are in memory."""
+    return LruSequence(count, lambda n: load_value(_view_file(scratch, n)), lambda view: view.size, _KEPT_BYTES)
+
+
+def _view_file(scratch: Path, number: int) -> Path:
+    return scratch / f"view_{number:06d}.npz"
 
 
 def make_grid_of(views: Sequence[DrawnView], settings: ExportConfig) -> Grid:
@@ -65,36 +63,42 @@ def make_grid_of(views: Sequence[DrawnView], settings: ExportConfig) -> Grid:
     return make_grid(shown, settings.voxel * _median_depth(shown), TRUNCATION, most)
 
 
-def fused_regions(
-    outcome: Outcome,
+def fuse_regions(
     views: Sequence[DrawnView],
     grid: Grid,
+    class_ids: tuple[int, ...],
     scratch: Path,
     progress: Progress,
-    numbers: range | None = None,
-) -> Callable[[], Iterable[Region]]:
-    """The surface of the map as the keyframes see it, region by region of the grid, from `scratch`, where those with
-    `numbers` (all) are made that are not yet there."""
+    numbers: range,
+) -> None:
+    """The surface of the map as the keyframes see it, in the grid's regions with these numbers, into `scratch`; what is
+    there stays. `class_ids`: the label of each class channel."""
     parts = list(grid.regions())
-    files = [scratch / f"region_{number:06d}.npz" for number in range(len(parts))]
-    for number in range(len(parts)) if numbers is None else numbers:
-        if not files[number].exists():
+    for number in numbers:
+        if not (file := _region_file(scratch, number)).exists():
             of = f", {number + 1} of {len(parts)}" if len(parts) > 1 else ""
-            save_value(files[number], make_region(outcome, views, grid, parts[number], progress, of))
-    return lambda: map(load_value, files)
+            save_value(file, make_region(views, grid, class_ids, parts[number], progress, of))
+
+
+def fused_regions(scratch: Path, count: int) -> Callable[[], Iterable[Region]]:
+    """What `fuse_regions` has left of so many regions, one in memory at a time."""
+    return lambda: (load_value(_region_file(scratch, number)) for number in range(count))
+
+
+def _region_file(scratch: Path, number: int) -> Path:
+    return scratch / f"region_{number:06d}.npz"
 
 
 def make_region(
-    outcome: Outcome,
     views: Sequence[DrawnView],
     grid: Grid,
+    class_ids: tuple[int, ...],
     chunks: NDArray[np.int32],
     progress: Progress,
     of: str = "",
 ) -> Region:
     """One of the regions of the grid, from the views that see it; `of` tells progress which."""
-    near = grid.views_of(chunks)
-    least, class_ids = LEAST_WEIGHT if len(views) >= 4 else 0.5, tuple(outcome.label_of_channel.tolist())
+    near, least = grid.views_of(chunks), LEAST_WEIGHT if len(views) >= 4 else 0.5
     fusing = (views[n].shown for n in progress.track(near, "fusing" + of, len(near)))
     triangles = chunk_surfaces(fuse(grid, chunks, fusing, get_threads()), chunks, least)
     surface = weld(triangles, chunks, grid.voxel)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,12 @@ from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.gps import read_track
 from msgs_slam.formats.mesh import mesh_blocks, read_mesh_ply, write_mesh_glb, write_mesh_ply
 from msgs_slam.pipelines.config import Config, ExportConfig
+from msgs_slam.pipelines.engine.chunks import in_chunks
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.export.joined import joined
-from msgs_slam.pipelines.export.mesh import drawn_views, fused_regions, make_grid_of, mesh_figures
+from msgs_slam.pipelines.export.mesh import drawn_views, fused_regions, keyframe_rows, make_grid_of, mesh_figures
 from msgs_slam.pipelines.export.pieces import make_pieces
-from msgs_slam.pipelines.export.tasks import MeshWorkers, scratch_of
+from msgs_slam.pipelines.export.tasks import draw_keyframes, fuse_views, scratch_of
 from msgs_slam.pipelines.export.textured import make_textured, write_textured
 from msgs_slam.pipelines.export.tiles import write_tiles
 from msgs_slam.pipelines.export.web_page import write_web_page
@@ -32,7 +33,7 @@ from msgs_slam.pipelines.export.writers import (
     write_trajectory,
     write_world,
 )
-from msgs_slam.pipelines.mapping.depth_views import DrawnView, Shown
+from msgs_slam.pipelines.mapping.depth_views import Shown
 from msgs_slam.pipelines.metres.files import save_metres
 from msgs_slam.pipelines.metres.find import Machine, find_metres
 from msgs_slam.pipelines.networks.identity import card_identity
@@ -64,14 +65,10 @@ def run(context: StageContext) -> dict[str, Any]:
     write_all_but_mesh(outcome, world, settings, context.folder)
     if world.earth is not None:
         save_metres(context.folder, metres)
-    workers = MeshWorkers(context, world.exported_from_run) if context.workers is not None else None
-    job = MeshJob(
-        settings, mesh_kinds(settings), context.folder, scratch_of(context), context.progress, workers, keep=True
-    )
-    views, gaussians = views_for_meshes(job, outcome), len(outcome.require_map())
-    outcome = replace(outcome, gaussian_map=None)  # a mesh is made of views
+    gaussians = len(outcome.require_map())
+    outcome = replace(outcome, gaussian_map=None)  # who draws it loads it
     release_free_memory()
-    write_meshes(job, outcome, views, world)
+    write_meshes(MeshJob(context, mesh_kinds(settings), context.folder, keep=True), outcome, world)
     mesh = mesh_blocks(context.folder / "mesh.ply")
     if mesh.face_count == 0:
         context.warn("the mesh is empty: no surface is seen by enough keyframes")
@@ -87,15 +84,17 @@ def run(context: StageContext) -> dict[str, Any]:
 @dataclass(frozen=True)
 class MeshJob:
     """Which `kinds` of the mesh ("mesh", "texture") go into a folder; a mesh.ply and mesh.glb that are there to `keep`
-    stay. What does not fit into memory lies in `scratch`; `workers` draw and fuse."""
+    stay. The tasks are those of `context`, whose snapshot has what does not fit into memory."""
 
-    settings: ExportConfig
+    context: StageContext
     kinds: tuple[str, ...]
     folder: Path
-    scratch: Path
-    progress: Progress
-    workers: MeshWorkers | None = None
     keep: bool = False
+
+    @property
+    def scratch(self) -> Path:
+        """Where views and regions lie."""
+        return scratch_of(self.context)
 
     @property
     def ply(self) -> Path:
@@ -108,31 +107,26 @@ class MeshJob:
         return self.keep and self.ply.exists()
 
 
-def views_for_meshes(job: MeshJob, outcome: Outcome) -> Sequence[DrawnView]:
-    """What `write_meshes` needs the map for: what it shows in the keyframes; nothing where no mesh is left to make."""
-    if job.is_made and "texture" not in job.kinds:
-        return ()
-    if job.workers:
-        job.workers.draw(outcome)
-    return drawn_views(outcome, job.settings, job.scratch, job.progress)
-
-
-def write_meshes(job: MeshJob, outcome: Outcome, views: Sequence[DrawnView], world: World) -> list[Path]:
-    """What the job asks for, made of views; the map may be gone."""
+def write_meshes(job: MeshJob, outcome: Outcome, world: World) -> list[Path]:
+    """What the job asks for; `outcome` has been moved, and may be without its map."""
     names, axes = outcome.classes.names, world.gltf_from_exported
-    glb = job.folder / "mesh.glb"
+    glb, count = job.folder / "mesh.glb", len(keyframe_rows(outcome))
+    views = drawn_views(job.scratch, count)
+    if not job.is_made or "texture" in job.kinds:
+        in_chunks(job.context, draw_keyframes, count, move=outcome.move)
     if not job.is_made:
-        grid = make_grid_of(views, job.settings)
-        if job.workers:
-            job.workers.fuse(grid)
-        write_mesh_ply(job.ply, joined(fused_regions(outcome, views, grid, job.scratch, job.progress)), names)
+        grid = make_grid_of(views, job.context.config.export)
+        regions, class_ids = len(list(grid.regions())), tuple(outcome.label_of_channel.tolist())
+        in_chunks(job.context, fuse_views, regions, grid=grid, views=count, class_ids=class_ids)
+        write_mesh_ply(job.ply, joined(fused_regions(job.scratch, regions)), names)
     mesh = mesh_blocks(job.ply)
     if "mesh" in job.kinds and mesh.face_count and not (job.keep and glb.exists()):
         write_mesh_glb(glb, mesh, names, axes)
     paths = [job.ply, glb][: 1 + (mesh.face_count > 0)] if "mesh" in job.kinds else []
     if "texture" in job.kinds and mesh.face_count:
         whole = SemanticMesh(**vars(read_mesh_ply(job.ply)))
-        paths += write_textured(make_textured(outcome, whole, Shown(views), job.progress), names, job.folder, axes)
+        texture = make_textured(outcome, whole, Shown(views), job.context.progress)
+        paths += write_textured(texture, names, job.folder, axes)
     return paths
 
 
@@ -245,8 +239,9 @@ def export_run(
     def mesh(*kinds: str) -> list[Path]:
         empty(scratch := folder / ".mesh")  # what a killed export has left
         try:
-            job = MeshJob(settings, kinds, folder, scratch, progress or SilentProgress())
-            return write_meshes(job, outcome, views_for_meshes(job, outcome), world)
+            config = replace(found.config, export=settings)
+            context = StageContext(run, Path(), config, scratch, progress or SilentProgress())
+            return write_meshes(MeshJob(context, kinds, folder), outcome, world)
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
 

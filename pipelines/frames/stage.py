@@ -249,7 +249,8 @@ def _structure(
     known = {"frames": frames, "keyframes": keyframes}
 
     def ahead(name: str, count: int, more: dict[str, NDArray]) -> None:
-        in_chunks(context, PREFETCH[name], count, **known, **more)
+        if context.workers is not None:
+            in_chunks(context, PREFETCH[name], count, **known, **more)
 
     structure = structure_from_motion(context, *camera, frames, masks, rig, given, ahead).run(keyframes)
     warn_of_structure(context, structure, [frames[k].id for k in keyframes])

@@ -60,7 +60,9 @@ class _Opened:
 def by_workers(
     context: StageContext, work: Callable[[Chunk, Progress], R], frames: list[Frame], **known: Any
 ) -> list[R]:
-    """`in_chunks` of the frames."""
+    """`in_chunks` of the frames; nothing where this process is alone."""
+    if context.workers is None:
+        return []
     ids = np.array([f.id for f in frames], np.int64)
     return in_chunks(context, work, len(frames), frame_ids=ids, **known)
 
