@@ -22,7 +22,8 @@ _CHUNKS_PER_WORKER = 3
 
 @dataclass(frozen=True)
 class Chunk:
-    """The things first to last - 1, in a stage's unfinished `folder`; `file` tells what is known of all of them."""
+    """The things first to last - 1, in a stage's unfinished `folder`; `file` tells what is known of all of them, and
+    `opened` is what the stage has open already where its own process does the task."""
 
     run: RunFolder
     source: Path
@@ -31,6 +32,7 @@ class Chunk:
     file: Path
     first: int
     last: int
+    opened: Any = None
 
     @property
     def numbers(self) -> range:
@@ -47,7 +49,9 @@ class Chunk:
         return StageContext(self.run, self.source, self.config, self.folder, progress)
 
 
-def in_chunks(context: StageContext, work: Callable[[Chunk, Progress], R], count: int, **known: Any) -> list[R]:
+def in_chunks(
+    context: StageContext, work: Callable[[Chunk, Progress], R], count: int, opened: Any = None, **known: Any
+) -> list[R]:
     """What `work` returns of each range of `count` things, in order, with what is `known` of all.
 
     This process alone does all of them as one range; workers get several each. Either way a task has what it needs
@@ -55,8 +59,8 @@ def in_chunks(context: StageContext, work: Callable[[Chunk, Progress], R], count
     """
     file = context.snapshot / f"{work.__name__}.npz"
     save_value(file, known)
-    wanted = 1 if context.workers is None else _CHUNKS_PER_WORKER * context.workers.at_once
+    wanted, here = (_CHUNKS_PER_WORKER * context.workers.at_once, None) if context.workers else (1, opened)
     parts = max(min(wanted, count), 1)
     ends = [count * n // parts for n in range(parts + 1)]
-    task = Chunk(context.run, context.source, context.config, context.folder, file, 0, 0)
+    task = Chunk(context.run, context.source, context.config, context.folder, file, 0, 0, here)
     return context.each(work, [replace(task, first=a, last=b) for a, b in pairwise(ends)])

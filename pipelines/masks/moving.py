@@ -69,12 +69,12 @@ def find_moving(
     load: Callable[[int], MovingView],
     camera: Intrinsics,
     progress: Progress,
-    first: dict[int, NDArray[np.bool_]] | None = None,
+    first: dict[int, NDArray[np.bool_]],
 ) -> dict[int, NDArray[np.bool_]]:
     """Index of a keyframe → (h, w) what of it moved, for those with any. `camera` has the size of the views, poses
     (N, 4, 4) cam_from_world. A second and third round let what was found before speak neither for nor against; `first`:
-    what the first round has found, where that is done."""
-    found = look_once(range(len(poses)), poses, load, camera, progress) if first is None else first
+    what `look_once` at all has found."""
+    found = first
     for _ in range(_ROUNDS - 1 if found else 0):
         found = {**found, **look_once(sorted(found), poses, load, camera, progress, found, _AGAIN)}
     return found

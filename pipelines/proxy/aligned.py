@@ -48,6 +48,10 @@ class AlignedDepth:
         """The frames that have no pose, so that nothing tells their scale."""
         return [f for f in frames if f.id not in self._sequence.cam_from_world]
 
+    def look(self, frames: list[Frame]) -> None:
+        """The network's pass."""
+        self._learned.look(frames)
+
     def prepare(self, frames: list[Frame]) -> None:
         """The network's pass, then scale and shift of every frame."""
         self._learned.prepare(frames)

@@ -47,6 +47,11 @@ class FusedDepth:
         """The frames that neither knows."""
         return [f for f in self._learned.missing(frames) if f in self._stereo.missing(frames)]
 
+    def look(self, frames: list[Frame]) -> None:
+        """Both providers' passes."""
+        self._learned.look(frames)
+        self._stereo.look(frames)
+
     def prepare(self, frames: list[Frame]) -> None:
         """Both providers' passes, then the scale between them."""
         self._learned.prepare(frames)

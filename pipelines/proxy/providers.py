@@ -96,6 +96,9 @@ class DepthProvider(Provider, Protocol):
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames it will know nothing of."""
 
+    def look(self, frames: list[Frame]) -> None:
+        """What `prepare` does of each of these frames by itself; what is done stays."""
+
     def prepare(self, frames: list[Frame]) -> None:
         """Slow passes over all frames that `estimate` builds on; goes on where it was interrupted."""
 

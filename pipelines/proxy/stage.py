@@ -8,32 +8,21 @@ import cv2
 import numpy as np
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.masks.moving import find_moving
 from msgs_slam.pipelines.proxy.inputs import check_proxy, left_to_auto, proxy_inputs
 from msgs_slam.pipelines.proxy.metres import reference_scale, scale_figures
-from msgs_slam.pipelines.proxy.providers import (
-    DepthProvider,
-    SemanticsProvider,
-    prepared,
-)
+from msgs_slam.pipelines.proxy.providers import prepared
 from msgs_slam.pipelines.proxy.scale import DepthScale, measure_scale
-from msgs_slam.pipelines.proxy.selection import open_depth, open_semantics
-from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.proxy.scale_reference import ReferenceScale
 from msgs_slam.pipelines.proxy.tasks import (
-    by_workers,
-    depth_pass,
-    load_depth,
-    load_sequence,
-    look_at_pictures,
+    ProxyWork,
+    in_frames,
+    look_for_depth,
+    look_for_labels,
     look_for_moving,
     make_depths,
     make_maps,
-    maps_pass,
-    moving_views,
-    prepare_depths,
-    surroundings,
 )
 from msgs_slam.pipelines.run.folder import (
     save_classes,
@@ -49,123 +38,113 @@ from msgs_slam.pipelines.types import VOID, Frame
 
 def run(context: StageContext) -> dict[str, Any]:
     """Provide maps of every keyframe (every frame without a backbone, or on request)."""
-    config = context.config.proxy
-    sequence = load_sequence(context)
-    around = surroundings(context, sequence)
-    depths = open_depth(around)
-    semantics = open_semantics(around)
-    log.info("proxy: depth by %s, classes by %s", depths.name, semantics.name)
-    frames = _frames_to_do(context, sequence, config, depths)
-    _warn_of_missing(context, frames, depths, semantics)
-    _warn_of_distortion(context, sequence, depths, semantics)
-    by_workers(context, prepare_depths, frames)
-    depths.prepare(frames)
-    by_workers(context, make_depths, frames, depths=prepared(depths))
-    depth_pass(context, sequence, frames, depths)
-    scale = measure_scale(sequence, frames, lambda frame: load_depth(context, frame))
-    moving = _moving_pass(context, sequence, frames, scale) if config.moving == "auto" else {}
-    reference = reference_scale(context, sequence, frames, depths, scale, lambda frame: load_depth(context, frame))
-    metres = reference.factor if reference else 1.0
-    by_workers(context, look_at_pictures, frames)
-    semantics.prepare(frames, lambda frame: scale.in_backbone_unit(load_depth(context, frame)))
-    for message in semantics.warnings():
-        context.warn(message)
-    save_classes(context.folder, semantics.classes())
-    made = by_workers(context, make_maps, frames, scale=scale, metres=metres, semantics=prepared(semantics))
-    made = made or [maps_pass(context, sequence, frames, None, semantics, scale, metres)]
-    agreements = [m for part, _ in made for m in part]
-    save_descriptors(context.folder, {i: looks for _, part in made for i, looks in part.items()})
-    save_frame_scales(context.folder, scale.of_frame, scale.spread_in)
-    report = {
-        **_report(context, frames, depths, semantics, agreements),
-        **scale_figures(depths, scale, reference),
-        **moving,
-    }
-    _warn_of_focal(context, sequence, report.get("network_focal_px"))
-    save_figures(context.folder, "proxy", report)
-    return report
+    work = ProxyWork(context)
+    log.info("proxy: depth by %s, classes by %s", work.depths.name, work.semantics.name)
+    frames = _frames_to_do(work)
+    _warn_of_missing(work, frames)
+    _compute_depths(work, frames)
+    scale = measure_scale(work.sequence, frames, work.depth)
+    moving = _leave_out_moving(work, frames, scale)
+    reference = reference_scale(context, work.sequence, frames, work.depths, scale, work.depth)
+    agreements = _compute_maps(work, frames, scale, reference)
+    figures = _figures(work, frames, agreements) | scale_figures(work.depths, scale, reference) | moving
+    _warn_of_focal(work, figures.get("network_focal_px"))
+    save_figures(context.folder, "proxy", figures)
+    return figures
 
 
-def _frames_to_do(context: StageContext, sequence: Sequence, config: ProxyConfig, depths: DepthProvider) -> list[Frame]:
-    if (config.frames == "all" and depths.metric) or sequence.backbone is None:
+def _frames_to_do(work: ProxyWork) -> list[Frame]:
+    sequence, wanted = work.sequence, work.context.config.proxy.frames
+    if (wanted == "all" and work.depths.metric) or sequence.backbone is None:
         return sequence.frames
-    if config.frames == "all":
-        context.warn(f"proxy.frames=all: {depths.name} knows only keyframes, the other frames get no maps")
-    return [f for f in sequence.frames if f.id in sequence.cam_from_world]
+    if wanted == "all":
+        work.context.warn(f"proxy.frames=all: {work.depths.name} knows only keyframes, the other frames get no maps")
+    return work.posed(sequence.frames)
 
 
-def _warn_of_missing(
-    context: StageContext, frames: list[Frame], depths: DepthProvider, semantics: SemanticsProvider
-) -> None:
-    for kind, provider in (("depth", depths), ("label", semantics)):
+def _warn_of_missing(work: ProxyWork, frames: list[Frame]) -> None:
+    """Of frames without a map, and of maps that show what the frames no longer do."""
+    for kind, provider in (("depth", work.depths), ("label", work.semantics)):
         missing = provider.missing(frames)
         if len(missing) == len(frames):
             raise InputError(f"{provider.name}: no {kind} map belongs to any keyframe. Check the names of the files")
         if missing:
-            context.warn(f"{len(missing)} of {len(frames)} frames have no {kind} map, the first is {missing[0].name}")
-
-
-def _warn_of_distortion(
-    context: StageContext, sequence: Sequence, depths: DepthProvider, semantics: SemanticsProvider
-) -> None:
-    """Files show the source; the frames have had their distortion removed."""
-    strongest = max(map(abs, sequence.calibration.distortion))
-    if strongest > 0.005 and any(p.name.startswith("files:") for p in (depths, semantics)):
-        context.warn(
+            work.context.warn(
+                f"{len(missing)} of {len(frames)} frames have no {kind} map, the first is {missing[0].name}"
+            )
+    strongest = max(map(abs, work.sequence.calibration.distortion))
+    if strongest > 0.005 and any(p.name.startswith("files:") for p in (work.depths, work.semantics)):
+        work.context.warn(
             f"the frames were undistorted (coefficients up to {strongest:.3f}), but map files are taken as they are: "
             "towards the borders they are some pixels off. Give maps of undistorted images"
         )
 
 
-def _warn_of_focal(context: StageContext, sequence: Sequence, network_focal: float | None) -> None:
+def _compute_depths(work: ProxyWork, frames: list[Frame]) -> None:
+    """Into the snapshot."""
+    in_frames(work, look_for_depth, frames)
+    work.depths.prepare(frames)
+    in_frames(work, make_depths, frames, depths=prepared(work.depths))
+
+
+def _compute_maps(
+    work: ProxyWork, frames: list[Frame], scale: DepthScale, reference: ReferenceScale | None
+) -> list[float]:
+    """The result, in metres where there is a `reference`; how well each frame's labels agree with those before."""
+    folder, semantics = work.context.folder, work.semantics
+    in_frames(work, look_for_labels, frames)
+    semantics.prepare(frames, lambda frame: scale.in_backbone_unit(work.depth(frame)))
+    for message in semantics.warnings():
+        work.context.warn(message)
+    save_classes(folder, semantics.classes())
+    metres = reference.factor if reference else 1.0
+    made = in_frames(work, make_maps, frames, scale=scale, metres=metres, semantics=prepared(semantics))
+    save_descriptors(folder, {i: looks for _, part in made for i, looks in part.items()})
+    save_frame_scales(folder, scale.of_frame, scale.spread_in)
+    return [m for part, _ in made for m in part]
+
+
+def _warn_of_focal(work: ProxyWork, network_focal: float | None) -> None:
     """A network that tells the camera from one picture is good to some per cent: it can only doubt a calibration."""
-    calibration = sequence.calibration
+    calibration = work.sequence.calibration
     focal = calibration.intrinsics.fx
     if network_focal is None or calibration.origin == "given" or abs(network_focal / focal - 1) < 0.15:
         return
-    context.warn(
+    work.context.warn(
         f"the depth network sees a focal length of {network_focal:.0f} pixels, the calibration ({calibration.origin}) "
         f"says {focal:.0f} +- {calibration.focal_sd:.0f}: give --intrinsics if you know the camera"
     )
 
 
-def _moving_pass(
-    context: StageContext, sequence: Sequence, frames: list[Frame], scale: DepthScale
-) -> dict[str, float | int]:
+def _leave_out_moving(work: ProxyWork, frames: list[Frame], scale: DepthScale) -> dict[str, float | int]:
     """Masks of what moved; says in how many frames, and how much of those. Made anew from the depth when resumed."""
-    posed = [f for f in frames if f.id in sequence.cam_from_world]
-    parts = by_workers(context, look_for_moving, posed, scale=scale)
-    first = {k: moved for part in parts for k, moved in part.items()} if parts else None
-    found = find_moving(*moving_views(context, sequence, posed, scale), context.progress, first)
-    full = sequence.calibration.intrinsics
+    if work.context.config.proxy.moving != "auto":
+        return {}
+    posed = work.posed(frames)
+    first = {k: moved for part in in_frames(work, look_for_moving, posed, scale=scale) for k, moved in part.items()}
+    found = find_moving(*work.moving_views(posed, scale), work.context.progress, first)
+    full = work.sequence.calibration.intrinsics
     for k, moved in found.items():
         shown = cv2.resize(moved.astype(np.float32), (full.width, full.height), interpolation=cv2.INTER_LINEAR) > 0.5
-        save_left_out(context.folder / "masks", posed[k], shown)
+        save_left_out(work.context.folder / "masks", posed[k], shown)
     share = round(float(np.mean([m.mean() for m in found.values()])), 4) if found else 0.0
     return {"moving_frames": len(found), "moving_share": share} if found else {}
 
 
-# report ---------------------------------------------------------------------------------------------------------
-
-
-def _report(
-    context: StageContext,
-    frames: list[Frame],
-    depths: DepthProvider,
-    semantics: SemanticsProvider,
-    agreements: list[float],
-) -> dict[str, Any]:
+def _figures(work: ProxyWork, frames: list[Frame], agreements: list[float]) -> dict[str, Any]:
+    """For the report."""
     sizes, reliable, void = [], [], []
     invalid = 0
     for frame in frames:
-        path = proxy_path(context.folder, frame.id)
-        invalid += load_depth(context, frame).invalid
+        path = proxy_path(work.context.folder, frame.id)
+        invalid += work.depth(frame).invalid
         maps = load_proxy_maps(path)
         sizes.append(path.stat().st_size)
         reliable.append(float((maps.confidence > 0.35).mean()))
         void.append(float((maps.labels == VOID).mean()))
     if invalid:
-        context.warn(f"{invalid} depth values were NaN, infinite or negative; they count as unknown")
+        work.context.warn(f"{invalid} depth values were NaN, infinite or negative; they count as unknown")
+    depths, semantics = work.depths, work.semantics
     return {
         "depth": depths.name,
         "semantics": semantics.name,

@@ -1,9 +1,9 @@
-"""What workers do of a proxy stage, some frames at a time: networks, depths, labels."""
+"""A proxy stage as tasks over ranges of its frames: networks, depths, what moved, maps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -41,87 +41,80 @@ MadeMaps = tuple[list[float], dict[int, NDArray[np.float32]]]
 """Semantic agreement m_t of each frame with the one before it, and what a network says of how frames look, by id."""
 
 
-@dataclass(frozen=True)
-class _Opened:
-    """The stage's context, its sequence, all frames that it is about, those of the portion, what is known of all."""
+class ProxyWork:
+    """What the stage and its tasks work with: the frames and their cameras, the providers, and the depths that are
+    computed so far."""
 
-    context: StageContext
-    sequence: Sequence
-    frames: list[Frame]
-    part: list[Frame]
-    known: dict[str, Any]
+    def __init__(self, context: StageContext) -> None:
+        self.context, self.sequence = context, load_sequence(context)
 
-    @property
-    def around(self) -> ProviderContext:
+    @cached_property
+    def depths(self) -> DepthProvider:
+        """Opened when it is first asked for."""
+        return open_depth(self._around)
+
+    @cached_property
+    def semantics(self) -> SemanticsProvider:
+        """Opened when it is first asked for."""
+        return open_semantics(self._around)
+
+    @cached_property
+    def _around(self) -> ProviderContext:
         """What the providers are made from."""
-        return surroundings(self.context, self.sequence)
+        context, config = self.context, self.context.config
+        recording = open_recording(context.source, config.run.format)
+        return ProviderContext(
+            context.source, self.sequence, config.proxy, lambda name: context.snapshot / name, context.threads,
+            context.device, context.progress, recording, config.run.cache_mb,
+        )  # fmt: skip
 
+    def posed(self, frames: list[Frame]) -> list[Frame]:
+        """Those of the frames that have a pose."""
+        return [f for f in frames if f.id in self.sequence.cam_from_world]
 
-def by_workers(
-    context: StageContext, work: Callable[[Chunk, Progress], R], frames: list[Frame], **known: Any
-) -> list[R]:
-    """`in_chunks` of the frames; nothing where this process is alone."""
-    if context.workers is None:
-        return []
-    ids = np.array([f.id for f in frames], np.int64)
-    return in_chunks(context, work, len(frames), frame_ids=ids, **known)
+    def depth(self, frame: Frame) -> DepthEstimate:
+        """Unknown where something moved, once that has been looked for."""
+        found = self.computed_depth(frame)
+        moved = load_left_out(self.context.folder / "masks", frame)
+        if moved is None:
+            return found
+        height, width = found.depth.shape
+        return found.without(cv2.resize(moved.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0)
 
+    def computed_depth(self, frame: Frame) -> DepthEstimate:
+        """What `make_depths` has left."""
+        stored = load_scratch(self._depth_path(frame))
+        return DepthEstimate(stored["depth"], stored["confidence"], int(stored["invalid"]), stored.get("normals"))
 
-def _opened(task: Chunk, progress: Progress) -> _Opened:
-    context, known = task.context(progress), task.known
-    sequence, wanted = load_sequence(context), set(known["frame_ids"].tolist())
-    frames = [f for f in sequence.frames if f.id in wanted]
-    return _Opened(context, sequence, frames, frames[task.first : task.last], known)
+    def save_depth(self, frame: Frame) -> None:
+        """Depth of what the frame shows of the scene, to the snapshot; what is there stays."""
+        if not (path := self._depth_path(frame)).exists():
+            estimate = self.depths.estimate(frame).without(self.sequence.left_out(frame))
+            arrays = {"depth": estimate.depth, "confidence": estimate.confidence, "invalid": np.array(estimate.invalid)}
+            normals = {} if estimate.normals is None else {"normals": estimate.normals}
+            save_scratch(path, **arrays, **normals)
 
+    def _depth_path(self, frame: Frame) -> Path:
+        return self.context.snapshot / "depth" / f"{frame.id:06d}.npz"
 
-def prepare_depths(task: Chunk, progress: Progress) -> None:
-    """What each frame's depth needs of the others: the slow passes over the frames."""
-    o = _opened(task, progress)
-    open_depth(o.around).prepare(o.part)
+    def labels(self, frame: Frame, seen: DepthEstimate) -> LabelEstimate:
+        """Of what the frame shows of the scene; `seen` in the unit of the backbone."""
+        return self.semantics.estimate(frame, seen).without(self.sequence.left_out(frame))
 
+    def moving_views(
+        self, posed: list[Frame], scale: DepthScale
+    ) -> tuple[NDArray[np.float64], Callable[[int], MovingView], Intrinsics]:
+        """What `find_moving` is to look at: poses, views, and their camera."""
+        sequence, camera = self.sequence, self.sequence.intrinsics.at_most(SIDE)
 
-def make_depths(task: Chunk, progress: Progress) -> None:
-    """The depths of the frames."""
-    o = _opened(task, progress)
-    depths = open_depth(o.around)
-    take_prepared(depths, o.known["depths"])
-    depth_pass(o.context, o.sequence, o.part, depths)
+        def view(k: int) -> MovingView:
+            seen = scale.in_backbone_unit(self.computed_depth(posed[k]))
+            sure = reliability(seen.depth, seen.confidence, 1.0)
+            depth, trust = (resample_nearest(a, camera.height, camera.width) for a in (seen.depth, sure))
+            lab = to_lab(resize_area(sequence.image(posed[k]), camera.width, camera.height))
+            return MovingView(depth, trust, lab, sequence.cam_from_world[posed[k].id])
 
-
-def look_for_moving(task: Chunk, progress: Progress) -> dict[int, NDArray[np.bool_]]:
-    """The first round of `find_moving` over the frames."""
-    o = _opened(task, progress)
-    return look_once(task.numbers, *moving_views(o.context, o.sequence, o.frames, o.known["scale"]), progress)
-
-
-def look_at_pictures(task: Chunk, progress: Progress) -> None:
-    """What a network says of each frame by itself."""
-    o = _opened(task, progress)
-    open_semantics(o.around).look(o.part)
-
-
-def make_maps(task: Chunk, progress: Progress) -> MadeMaps:
-    """The maps of the frames."""
-    o = _opened(task, progress)
-    semantics = open_semantics(o.around)
-    take_prepared(semantics, o.known["semantics"])
-    previous = o.frames[task.first - 1] if task.first else None
-    return maps_pass(o.context, o.sequence, o.part, previous, semantics, o.known["scale"], o.known["metres"])
-
-
-def surroundings(context: StageContext, sequence: Sequence) -> ProviderContext:
-    """What the providers are made from."""
-    return ProviderContext(
-        context.source,
-        sequence,
-        context.config.proxy,
-        lambda name: context.snapshot / name,
-        context.threads,
-        context.device,
-        context.progress,
-        open_recording(context.source, context.config.run.format),
-        context.config.run.cache_mb,
-    )
+        return np.array([sequence.cam_from_world[f.id] for f in posed]).reshape(-1, 4, 4), view, camera
 
 
 def load_sequence(context: StageContext) -> Sequence:
@@ -137,88 +130,67 @@ def load_sequence(context: StageContext) -> Sequence:
     return Sequence(run.load_frames(), calibration, camera, run.load_backbone(), run.image, left_out)
 
 
-def depth_pass(context: StageContext, sequence: Sequence, frames: list[Frame], depths: DepthProvider) -> None:
-    """Depth of what every frame shows of the scene, to the snapshot; what is there stays."""
-    for frame in context.progress.track(frames, "depth", len(frames)):
-        path = _depth_path(context.snapshot, frame)
-        if not path.exists():
-            estimate = depths.estimate(frame).without(sequence.left_out(frame))
-            arrays = {"depth": estimate.depth, "confidence": estimate.confidence, "invalid": np.array(estimate.invalid)}
-            normals = {} if estimate.normals is None else {"normals": estimate.normals}
-            save_scratch(path, **arrays, **normals)
+def in_frames(work: ProxyWork, task: Callable[[Chunk, Progress], R], frames: list[Frame], **known: Any) -> list[R]:
+    """What a task returns of each range of the frames."""
+    ids = np.array([f.id for f in frames], np.int64)
+    return in_chunks(work.context, task, len(frames), work, frame_ids=ids, **known)
 
 
-def _depth_path(snapshot: Path, frame: Frame) -> Path:
-    return snapshot / "depth" / f"{frame.id:06d}.npz"
+def _opened(task: Chunk, progress: Progress) -> tuple[ProxyWork, list[Frame]]:
+    """What the task works with, and all frames that the stage is about."""
+    work = task.opened or ProxyWork(task.context(progress))
+    wanted = set(task.known["frame_ids"].tolist())
+    return work, [f for f in work.sequence.frames if f.id in wanted]
 
 
-def load_depth(context: StageContext, frame: Frame) -> DepthEstimate:
-    """Unknown where something moved, once that has been looked for."""
-    found = computed_depth(context, frame)
-    moved = load_left_out(context.folder / "masks", frame)
-    if moved is None:
-        return found
-    height, width = found.depth.shape
-    return found.without(cv2.resize(moved.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0)
+def look_for_depth(task: Chunk, progress: Progress) -> None:
+    """What a depth provider finds of each frame by itself: the slow passes."""
+    work, frames = _opened(task, progress)
+    work.depths.look(frames[task.first : task.last])
 
 
-def computed_depth(context: StageContext, frame: Frame) -> DepthEstimate:
-    """What `depth_pass` has left."""
-    stored = load_scratch(_depth_path(context.snapshot, frame))
-    return DepthEstimate(stored["depth"], stored["confidence"], int(stored["invalid"]), stored.get("normals"))
+def make_depths(task: Chunk, progress: Progress) -> None:
+    """The depths of the frames."""
+    work, frames = _opened(task, progress)
+    take_prepared(work.depths, task.known["depths"])
+    for frame in progress.track(frames[task.first : task.last], "depth", len(task.numbers)):
+        work.save_depth(frame)
 
 
-def moving_views(
-    context: StageContext, sequence: Sequence, posed: list[Frame], scale: DepthScale
-) -> tuple[NDArray[np.float64], Callable[[int], MovingView], Intrinsics]:
-    """What `find_moving` is to look at: poses, views, and their camera."""
-    camera = sequence.intrinsics.at_most(SIDE)
-
-    def view(k: int) -> MovingView:
-        seen = scale.in_backbone_unit(computed_depth(context, posed[k]))
-        sure = reliability(seen.depth, seen.confidence, 1.0)
-        depth, trust = (resample_nearest(a, camera.height, camera.width) for a in (seen.depth, sure))
-        lab = to_lab(resize_area(sequence.image(posed[k]), camera.width, camera.height))
-        return MovingView(depth, trust, lab, sequence.cam_from_world[posed[k].id])
-
-    return np.array([sequence.cam_from_world[f.id] for f in posed]).reshape(-1, 4, 4), view, camera
+def look_for_moving(task: Chunk, progress: Progress) -> dict[int, NDArray[np.bool_]]:
+    """The first round of `find_moving` over the frames."""
+    work, frames = _opened(task, progress)
+    return look_once(task.numbers, *work.moving_views(frames, task.known["scale"]), progress)
 
 
-def maps_pass(
-    context: StageContext,
-    sequence: Sequence,
-    frames: list[Frame],
-    previous: Frame | None,
-    semantics: SemanticsProvider,
-    scale: DepthScale,
-    metres: float,
-) -> MadeMaps:
-    """Labels and reliability of every frame; `previous` stands before the first of them.
+def look_for_labels(task: Chunk, progress: Progress) -> None:
+    """What a network says of each frame by itself."""
+    work, frames = _opened(task, progress)
+    work.semantics.look(frames[task.first : task.last])
 
-    `metres` turns the provider's depth into that of the maps.
-    """
+
+def make_maps(task: Chunk, progress: Progress) -> MadeMaps:
+    """Labels and reliability of the frames; known["metres"] turns the provider's depth into that of the maps."""
+    work, frames = _opened(task, progress)
+    take_prepared(work.semantics, task.known["semantics"])
+    scale, metres = task.known["scale"], np.float32(task.known["metres"])
     agreements: list[float] = []
     descriptors = {}
-
-    def labels_of(frame: Frame, seen: DepthEstimate) -> LabelEstimate:
-        return semantics.estimate(frame, seen).without(sequence.left_out(frame))
-
-    before = None
-    if previous is not None:
-        before = labels_of(previous, scale.in_backbone_unit(load_depth(context, previous))).labels
-    for frame in context.progress.track(frames, "classes", len(frames)):
-        path = proxy_path(context.folder, frame.id)
-        depth = load_depth(context, frame)
+    previous = before = None
+    if task.first:
+        previous = frames[task.first - 1]
+        before = work.labels(previous, scale.in_backbone_unit(work.depth(previous))).labels
+    for frame in progress.track(frames[task.first : task.last], "classes", len(task.numbers)):
+        depth = work.depth(frame)
         seen = scale.in_backbone_unit(depth)
-        labels = labels_of(frame, seen)
-        m = _agreement(sequence, frame, previous, seen, labels.labels, before)
+        labels = work.labels(frame, seen)
+        m = _agreement(work.sequence, frame, previous, seen, labels.labels, before)
         agreements.append(m)
         if labels.descriptor is not None:
             descriptors[frame.id] = labels.descriptor
-        if not path.exists():
-            trust = theta(m)
-            u = reliability(depth.depth, depth.confidence, trust)
-            scaled = (depth.depth * np.float32(metres)).astype(np.float32)
+        if not (path := proxy_path(work.context.folder, frame.id)).exists():
+            u = reliability(depth.depth, depth.confidence, theta(m))
+            scaled = (depth.depth * metres).astype(np.float32)
             save_proxy_maps(path, compact(ProxyMaps(scaled, u, labels.labels, labels.confidence)))
         previous, before = frame, labels.labels
     return agreements, descriptors

@@ -45,6 +45,9 @@ class FilesDepth:
         self._confidences = _match_confidence(path, sequence, is_video)
         self.estimate(next(f for f in sequence.frames if f.id in self._files))
 
+    def look(self, frames: list[Frame]) -> None:
+        """Nothing to do."""
+
     def prepare(self, frames: list[Frame]) -> None:
         """Nothing to do."""
 

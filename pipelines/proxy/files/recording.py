@@ -49,6 +49,9 @@ class RecordingDepth(_RecordingMaps):
             raise InputError(f"{recording.root}: this {recording.format} recording has no depth: --depth files:FOLDER")
         super().__init__(recording, sequence)
 
+    def look(self, frames: list[Frame]) -> None:
+        """Nothing to do."""
+
     def prepare(self, frames: list[Frame]) -> None:
         """Nothing to do."""
 

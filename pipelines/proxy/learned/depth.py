@@ -39,9 +39,13 @@ class OnnxDepth:
         """None: a network sees every frame."""
         return []
 
-    def prepare(self, frames: list[Frame]) -> None:
+    def look(self, frames: list[Frame]) -> None:
         """Run the network; what is on disk stays."""
         self._pass.run(frames)
+
+    def prepare(self, frames: list[Frame]) -> None:
+        """Run the network over all frames."""
+        self.look(frames)
         self._frames = frames
 
     def _compute(self, image: NDArray[np.uint8]) -> Arrays:

@@ -87,6 +87,10 @@ class MultiviewDepth:
     # first pass -------------------------------------------------------------------------------------------------
 
     def prepare(self, frames: list[Frame]) -> None:
+        """Look at all: nothing is found out of them together."""
+        self.look(frames)
+
+    def look(self, frames: list[Frame]) -> None:
         """A raw depth map of every keyframe, on disk."""
         for frame in self._progress.track([f for f in frames if f.id in self._index], "stereo"):
             path = self._path(frame.id)

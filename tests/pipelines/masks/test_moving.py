@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.masks.moving import MovingView, find_moving
+from msgs_slam.pipelines.masks.moving import MovingView, find_moving, look_once
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Intrinsics
 from msgs_slam.pipelines.voxels.voxels import to_lab
@@ -43,7 +43,8 @@ def clip(stands_at: float | None) -> tuple[list[MovingView], list[NDArray[np.boo
 
 def find(views: list[MovingView]) -> dict[int, NDArray[np.bool_]]:
     poses = np.array([v.cam_from_world for v in views])
-    return find_moving(poses, lambda k: views[k], CAMERA, SilentProgress())
+    shown = poses, lambda k: views[k], CAMERA, SilentProgress()
+    return find_moving(*shown, look_once(range(len(views)), *shown))
 
 
 def test_a_thing_that_walks_along_a_wall_is_found() -> None:

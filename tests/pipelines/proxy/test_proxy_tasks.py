@@ -13,7 +13,7 @@ from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.proxy.stage import run
 from tests.pipelines.travelling import Travelling
 
-KINDS = {"prepare_depths", "make_depths", "look_for_moving", "look_at_pictures", "make_maps"}
+KINDS = {"look_for_depth", "make_depths", "look_for_moving", "look_for_labels", "make_maps"}
 
 
 def card(folder: Path) -> str:
