@@ -19,7 +19,7 @@ from msgs_slam.formats.tensors import load_arrays, save_arrays
 _TREE = "tree"
 _OURS = "msgs_slam.pipelines."
 TASK_MODULES = (
-    "msgs_slam.pipelines.frames.prefetch",
+    "msgs_slam.pipelines.frames.tasks",
     "msgs_slam.pipelines.proxy.tasks",
     "msgs_slam.pipelines.mapping.submap_tasks",
     "msgs_slam.pipelines.export.tasks",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from msgs_slam.formats.gps import photo_places
 from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.formats.jsonfile import read_json, write_json
 from msgs_slam.formats.video import VideoFrame
-from msgs_slam.pipelines.config import Config, FramesConfig
+from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.correspondence.bridges import Picture
 from msgs_slam.pipelines.engine.chunks import in_chunks
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
@@ -25,8 +25,9 @@ from msgs_slam.pipelines.frames.findings import settled_origin, warn_of_given, w
 from msgs_slam.pipelines.frames.keyframes import KeyframeChoice, choose_keyframes
 from msgs_slam.pipelines.frames.learned import learned_inputs, open_learned
 from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
-from msgs_slam.pipelines.frames.prefetch import (
-    PREFETCH,
+from msgs_slam.pipelines.frames.picking import pick_frames
+from msgs_slam.pipelines.frames.tasks import (
+    TASKS,
     AnySource,
     grey_of,
     known_camera,
@@ -48,7 +49,6 @@ from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
 from msgs_slam.pipelines.source.known_poses import check_poses, given_poses, pose_inputs
 from msgs_slam.pipelines.source.opening import FolderSource, Source, open_source
-from msgs_slam.pipelines.source.pick import sharpest_of_windows
 from msgs_slam.pipelines.source.sharpness import reduce_image
 from msgs_slam.pipelines.structure.backbone import to_sparse_model
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
@@ -75,7 +75,7 @@ def run(context: StageContext) -> dict[str, Any]:
         )
     camera, origin = known_camera(context, source, faces)
     _require_several(source)
-    frames = _pick(context, source, faces)
+    frames = pick_frames(context, source, faces)
     given = given_poses(context.config.frames, source, frames)
     rig = rig_of(1 if faces is None else len(faces), len(frames))
     masks = masks_of(context, source, faces, rig)
@@ -141,62 +141,6 @@ def _require_several(source: AnySource) -> None:
         raise InputError(f"{source.path} holds one image only; a reconstruction needs several views of a scene")
 
 
-# picking --------------------------------------------------------------------------------------------------------
-
-
-def _pick(context: StageContext, source: AnySource, faces: Faces | None) -> list[Frame]:
-    table = context.snapshot / "picked.json"
-    if table.exists():
-        stored = read_json(table, None)
-        frames = [Frame(**row) for row in stored["frames"]]
-        if all(picked(context, f.name).exists() for f in frames):
-            for message in stored["warnings"]:
-                context.warn(message)
-            return frames
-    config = context.config.frames
-    pictures = source.read(warn=context.warn)
-    pictures = context.progress.track(pictures, "picking", source.expected_frames or None)
-    rate = config.rate if source.has_times else 0.0
-    frames = []
-    for picture, score in sharpest_of_windows(pictures, rate):
-        frame_id = len(frames)
-        timestamp = picture.timestamp if source.has_times else _untimed(config, frame_id)
-        name = source.name(frame_id, picture.source_index)
-        frames.append(Frame(frame_id, name, timestamp, picture.source_index, score))
-        _savepicked(context, source, picture, name, faces)
-    context.same_source()
-    if len(frames) < 2:
-        raise InputError(f"{source.path} gives one frame only; a reconstruction needs several views of a scene")
-    if faces is not None:
-        frames = _of_all_directions(frames, faces)
-    write_json(table, {"frames": [asdict(f) for f in frames], "warnings": context.warnings})
-    return frames
-
-
-def _of_all_directions(frames: list[Frame], faces: Faces) -> list[Frame]:
-    """Direction by direction, as `Rig` counts."""
-    named = [(c, f, faces.names(f.name)[c]) for c in range(len(faces)) for f in frames]
-    return [replace(f, id=c * len(frames) + f.id, name=name) for c, f, name in named]
-
-
-def _untimed(config: FramesConfig, frame_id: int) -> float:
-    return frame_id / (config.rate if config.rate > 0 else 1.0)
-
-
-def _savepicked(context: StageContext, source: AnySource, picture: VideoFrame, name: str, faces: Faces | None) -> None:
-    if faces is not None:
-        for face, rgb in zip(faces.names(name), faces.cut(picture.rgb), strict=True):
-            write_rgb(picked(context, face), rgb)
-        return
-    path = picked(context, name)
-    reduced = reduce_image(picture.rgb, context.config.frames.max_side)
-    original = source.original(picture.source_index) if reduced is picture.rgb else None
-    if original is None:
-        write_rgb(path, reduced)
-    else:
-        copy_file(original, path)
-
-
 # keyframes and structure ----------------------------------------------------------------------------------------
 
 
@@ -246,13 +190,12 @@ def _structure(
     rig: Rig,
     given: GivenPoses | None,
 ) -> Structure:
-    known = {"frames": frames, "keyframes": keyframes}
+    def divide(name: str, count: int, known: dict[str, NDArray]) -> None:
+        if count:
+            in_chunks(context, TASKS[name], count, motion, frames=frames, keyframes=keyframes, **known)
 
-    def ahead(name: str, count: int, more: dict[str, NDArray]) -> None:
-        if context.workers is not None:
-            in_chunks(context, PREFETCH[name], count, **known, **more)
-
-    structure = structure_from_motion(context, *camera, frames, masks, rig, given, ahead).run(keyframes)
+    motion = structure_from_motion(context, *camera, frames, masks, rig, given, divide)
+    structure = motion.run(keyframes)
     warn_of_structure(context, structure, [frames[k].id for k in keyframes])
     return structure
 

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -14,6 +15,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.jsonfile import read_json, write_json
 from msgs_slam.pipelines.correspondence.bridges import Picture, weakly_connected, with_bridges
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair, match_pair
 from msgs_slam.pipelines.correspondence.retrieval import (
@@ -46,13 +48,13 @@ from msgs_slam.pipelines.types import Features, Vocabulary
 _PAIRS_PER_BLOCK = 64
 _FEATURES_SHARE = 0.25
 """Of the memory that there is: what has no room there is read again from the snapshot."""
-Prefetch = Callable[[str, int, dict[str, NDArray]], None]
+Divide = Callable[[str, int, dict[str, NDArray]], None]
 T = TypeVar("T")
 R = TypeVar("R")
 
 
-def no_prefetch(name: str, count: int, known: dict[str, NDArray]) -> None:
-    """All is done here."""
+def when_asked(name: str, count: int, known: dict[str, NDArray]) -> None:
+    """Nothing beforehand: what is not in the snapshots is made when it is asked for."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +82,8 @@ class Structure:
 class StructureFromMotion(Candidates):
     """`extract(frame_id)` gives a frame's features, `picture` what they are of, `match` the pairs of two frames' that
     are alike. time(frame_id): seconds at which a frame was taken; `given` (F, 4, 4): poses of all frames by another
-    program, NaN where none. ahead("features" | "pairs" | "windows", count, known) may have others leave those in the
-    snapshots beforehand."""
+    program, NaN where none. divide("features" | "pairs" | "windows", count, known) has so many of those left in the
+    snapshots, by whoever does the tasks."""
 
     extract: Callable[[int], Features]
     picture: Callable[[int], Picture]
@@ -90,24 +92,26 @@ class StructureFromMotion(Candidates):
     threads: int
     memory: float = math.inf
     window: int = SIZE
-    ahead: Prefetch = no_prefetch
+    divide: Divide = when_asked
     given: NDArray[np.float64] | None = None
 
     def run(self, keyframe_ids: Sequence[int]) -> Structure:
         """Raises InputError when the keyframes have no parallax or too little in common."""
-        self.ahead("features", len(keyframe_ids), {})
+        self.divide("features", len(keyframe_ids), {})
         features = self.features_of(keyframe_ids)
         vocabulary = learn_vocabulary(features, self.seed)
         tried = self._proposed(features, vocabulary)
+        features.forget()  # whoever does the tasks loads what it needs
         proposed = {"pairs": np.array(tried, np.int64).reshape(-1, 2)}
-        self.ahead("pairs", len(_blocks(tried)), proposed)
+        self.divide("pairs", len(_blocks(tried)), proposed)
+        windows = self._windows(len(features))
+        self.divide("windows", len(windows) if len(windows) > 1 else 0, proposed)
         views, pairs = self._bridged(keyframe_ids, features, self.pairs_of(features, tried))
         features = views.features
-        self.ahead("windows", self._windows(len(features)), proposed)
         known_focal = self.camera.mean_focal_length() if self.camera.has_prior_focal_length else None
         if self.given is None:
             require_parallax(pairs, views.xy, (self.camera.width, self.camera.height), known_focal)
-        found = self._in_windows(views, pairs) or self._calibrated(views, pairs) or self._as_given(views, pairs)
+        found = self._solved(windows, views, pairs) or self._as_given(views, pairs)
         if found is None:
             raise InputError(
                 f"no structure could be found: {len(pairs)} pairs of {len(features)} views match. The views have too "
@@ -132,18 +136,21 @@ class StructureFromMotion(Candidates):
         focal_sd = 0.0 if self.is_fixed else model.cameras[1].mean_focal_length()
         return Adjusted(model, GIVEN_ALONE, focal_sd, 0.0, NO_READOUT)
 
-    def _in_windows(self, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
-        """Of a long recording the models of its windows, joined, in the camera of the window that is surest of it.
-        None of a shorter one, of panoramas, and where the windows do not hang together."""
-        windows = windows_of(len(views.xy), self.window)
-        if not self._windows(len(views.xy)):
-            return None
+    def _windows(self, count: int) -> list[range]:
+        """Which keyframes are mapped at once: of panoramas all."""
+        return windows_of(count, self.window) if len(self.cam_from_rig) == 1 else [range(count)]
+
+    def _solved(self, windows: Sequence[range], views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
+        """The model of one window; of several theirs, joined, in the camera of the one that is surest of it. Where they
+        do not hang together, all are one window after all."""
+        if len(windows) == 1:
+            return self._calibrated(views, pairs)
         views.features.forget()
         joined, surest = Joined(), None
         for window in self.progress.track(windows, "windows", len(windows)):
-            found = self._window(window, views.part(window), pairs)
+            found = self._window(window, views, pairs)
             if found is None or not joined.add(found.model, window.start):
-                return None
+                return self._solved([range(len(views.xy))], views, pairs)
             surest = found if surest is None or found.focal_sd < surest.focal_sd else surest
         assert surest is not None
         whole = replace(surest, model=joined.model(surest.model.cameras[1], views.xy))
@@ -152,23 +159,34 @@ class StructureFromMotion(Candidates):
         adjust_joined(whole.model, views.xy, views.times, whole.readout, pairs, windows, bool(views.weak))
         return whole
 
-    def _windows(self, count: int) -> int:
-        """How many there are; 0 where all is made at once."""
-        windows = len(windows_of(count, self.window))
-        return windows if windows > 1 and len(self.cam_from_rig) == 1 else 0
-
     def _window(self, window: range, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
-        inside = [replace(p, first=p.first - window.start, second=p.second - window.start)
-                  for p in pairs if p.first in window and p.second in window]  # fmt: skip
+        """The model of one of several, made unless it is stored."""
         snapshots = Snapshots(self.snapshots.folder / f"window_{window.start:06d}_{window.stop:06d}")
         snapshots.folder.mkdir(exist_ok=True)
-        return replace(self, is_stated=False, snapshots=snapshots)._calibrated(views, inside)
+        figures = snapshots.folder / "adjusted.json"
 
-    def map_window(self, number: int, keyframe_ids: Sequence[int], proposed: Sequence[tuple[int, int]]) -> None:
-        """Leave the models of a window in the snapshots; all features and pairs are there."""
-        window, features = windows_of(len(keyframe_ids), self.window)[number], self.features_of(keyframe_ids, range(0))
+        def solve(_: Path) -> pycolmap.Reconstruction | None:
+            inside = [replace(p, first=p.first - window.start, second=p.second - window.start)
+                      for p in pairs if p.first in window and p.second in window]  # fmt: skip
+            alone = replace(self, is_stated=False, snapshots=snapshots)
+            if (found := alone._calibrated(views.part(window), inside)) is None:
+                return None
+            write_json(figures, [found.mapper, found.focal_sd, found.score, found.readout])
+            return found.model
+
+        if (model := snapshots.model("adjusted", solve)) is None:
+            return None
+        mapper, focal_sd, score, readout = read_json(figures, None)
+        return Adjusted(model, mapper, focal_sd, score, tuple(readout))
+
+    def map_windows(
+        self, numbers: Iterable[int], keyframe_ids: Sequence[int], proposed: Sequence[tuple[int, int]]
+    ) -> None:
+        """Leave the models of some of several windows in the snapshots; all features and pairs are there."""
+        features = self.features_of(keyframe_ids, range(0))
         views, pairs = self._bridged(keyframe_ids, features, self.pairs_of(features, proposed))
-        self._window(window, views.part(window), pairs)
+        for number in numbers:
+            self._window(self._windows(len(keyframe_ids))[number], views, pairs)
 
     def _pieces(
         self, views: Views, pairs: Sequence[VerifiedPair], model: pycolmap.Reconstruction

@@ -15,7 +15,7 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
-from msgs_slam.pipelines.frames.prefetch import known_camera
+from msgs_slam.pipelines.frames.tasks import known_camera
 from msgs_slam.pipelines.proxy.files.recording import RecordingDepth, RecordingLabels
 from msgs_slam.pipelines.proxy.inputs import proxy_inputs
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth_files, open_label_files

@@ -1,4 +1,4 @@
-"""What structure from motion starts from: the pictures that were picked, what is known of their camera, masks."""
+"""Structure from motion as tasks, and what it starts from: images that were picked, their camera, masks."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pycolmap
 
@@ -29,7 +28,7 @@ from msgs_slam.pipelines.source.sharpness import reduced_size
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
 from msgs_slam.pipelines.structure.given import GivenPoses
 from msgs_slam.pipelines.structure.lens import FOCAL_GUESS, to_pycolmap, unknown_camera
-from msgs_slam.pipelines.structure.sfm import Prefetch, StructureFromMotion, no_prefetch
+from msgs_slam.pipelines.structure.sfm import Divide, StructureFromMotion, when_asked
 from msgs_slam.pipelines.structure.window_size import window_size
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Features, Frame
@@ -84,7 +83,7 @@ def structure_from_motion(
     masks: FrameMasks,
     rig: Rig,
     given: GivenPoses | None,
-    ahead: Prefetch = no_prefetch,
+    divide: Divide = when_asked,
 ) -> StructureFromMotion:
     """Of these frames; `origin` as of `known_camera`."""
     settings, size = context.config.frames, (camera.width, camera.height)
@@ -111,46 +110,47 @@ def structure_from_motion(
         memory=context.memory_room,
         window=window_size(context.config.run.memory_mb, camera.width * camera.height),
         cam_from_rig=rig.cam_from_rig,
-        ahead=ahead,
+        divide=divide,
     )
 
 
-# by workers -----------------------------------------------------------------------------------------------------
+# tasks ----------------------------------------------------------------------------------------------------------
 
 
-def _begun(task: Chunk, progress: Progress) -> tuple[StructureFromMotion, dict[str, Any]]:
-    context, known = task.context(progress), task.known
-    source, frames = open_source(context.source, context.config.run.format), known["frames"]
+def _opened(task: Chunk, progress: Progress) -> StructureFromMotion:
+    if task.opened is not None:
+        return task.opened
+    context, frames = task.context(progress), task.known["frames"]
+    source = open_source(context.source, context.config.run.format)
     faces = find_faces(source, context.config.frames)
     camera, origin = known_camera(context, source, faces)
     rig = rig_of(1 if faces is None else len(faces), len(frames))
     masks = masks_of(context, source, faces, rig)
-    if "pairs" in known:
-        known = known | {"pairs": [(i, j) for i, j in known["pairs"].tolist()]}
     given = given_poses(context.config.frames, source, frames)
-    return structure_from_motion(context, camera, origin, frames, masks, rig, given), known
+    return structure_from_motion(context, camera, origin, frames, masks, rig, given)
+
+
+def _proposed(task: Chunk) -> list[tuple[int, int]]:
+    return [(i, j) for i, j in task.known["pairs"].tolist()]
 
 
 def extract_features(task: Chunk, progress: Progress) -> None:
     """Of some keyframes."""
-    structure, known = _begun(task, progress)
-    structure.features_of(known["keyframes"], task.numbers)
+    _opened(task, progress).features_of(task.known["keyframes"], task.numbers)
 
 
 def match_pairs(task: Chunk, progress: Progress) -> None:
     """Some blocks of the pairs."""
-    structure, known = _begun(task, progress)
-    structure.pairs_of(structure.features_of(known["keyframes"], range(0)), known["pairs"], task.numbers)
+    structure = _opened(task, progress)
+    structure.pairs_of(structure.features_of(task.known["keyframes"], range(0)), _proposed(task), task.numbers)
 
 
 def map_windows(task: Chunk, progress: Progress) -> None:
     """Some windows."""
-    structure, known = _begun(task, progress)
-    for number in task.numbers:
-        structure.map_window(number, known["keyframes"], known["pairs"])
+    _opened(task, progress).map_windows(task.numbers, task.known["keyframes"], _proposed(task))
 
 
-PREFETCH: dict[str, Callable[[Chunk, Progress], None]] = {
+TASKS: dict[str, Callable[[Chunk, Progress], None]] = {
     "features": extract_features, "pairs": match_pairs, "windows": map_windows,
 }  # fmt: skip
-"""What workers may leave in the snapshots before structure from motion asks for it."""
+"""Which task leaves what of structure from motion in the snapshots."""
