@@ -12,7 +12,7 @@ is given the folder of the running stage.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from itertools import count, takewhile
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -30,6 +30,7 @@ from msgs_slam.pipelines.run import layouts
 from msgs_slam.pipelines.run.finished_files import FinishedFiles
 from msgs_slam.pipelines.run.layouts import dataclass_from_json, load_layout, reading
 from msgs_slam.pipelines.run.proxy_files import load_proxy_maps, proxy_name
+from msgs_slam.pipelines.run.sparse_files import load_sparse_model, save_sparse_model
 from msgs_slam.pipelines.types import (
     VOID,
     Calibration,
@@ -268,22 +269,6 @@ def save_matching(folder: Path, vocabulary: Vocabulary, tried: dict[tuple[int, i
     save_arrays(folder / VOCABULARY, vars(vocabulary))
     rows = np.array([(*pair, count) for pair, count in tried.items()], np.int64).reshape(-1, 3)
     save_arrays(folder / TRIED, {"rows": rows})
-
-
-def save_sparse_model(path: Path, model: SparseModel) -> None:
-    """One npz."""
-    save_arrays(path, {field.name: getattr(model, field.name) for field in fields(model)})
-
-
-def load_sparse_model(path: Path) -> SparseModel:
-    """Inverse of `save_sparse_model`."""
-    arrays = load_layout(path, layouts.SPARSE_MODEL)
-    with reading(path, "sparse model"):
-        layouts.require_increasing("frame_ids", arrays["frame_ids"])
-        layouts.require_rigid("the poses", arrays["cam_from_world"])
-        layouts.require_indices("obs_frame", arrays["obs_frame"], len(arrays["frame_ids"]))
-        layouts.require_indices("obs_point", arrays["obs_point"], len(arrays["points_in_world"]))
-        return SparseModel(**arrays)
 
 
 def save_backbone(folder: Path, model: SparseModel) -> None:

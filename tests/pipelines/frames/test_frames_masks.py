@@ -10,7 +10,7 @@ from msgs_slam.formats.images import read_grey_png, read_rgb, write_grey_png, wr
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.geometry.alignment import align_points
-from msgs_slam.pipelines.run.folder import load_sparse_model
+from msgs_slam.pipelines.run.sparse_files import load_sparse_model
 from tests.pipelines.frames.conftest import HEIGHT, WIDTH, Walk
 
 Moving = tuple[Path, Path, list[np.ndarray]]

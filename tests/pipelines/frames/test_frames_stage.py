@@ -22,8 +22,9 @@ from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.read_config import load_config
-from msgs_slam.pipelines.run.folder import BACKBONE, SPARSE, RunFolder, load_sparse_model, save_sparse
+from msgs_slam.pipelines.run.folder import BACKBONE, SPARSE, RunFolder, save_sparse
 from msgs_slam.pipelines.run.layouts import dataclass_from_json
+from msgs_slam.pipelines.run.sparse_files import load_sparse_model
 from msgs_slam.pipelines.source.opening import source_digest
 from msgs_slam.pipelines.structure import candidates, sfm
 from msgs_slam.pipelines.structure.adjust import adjust

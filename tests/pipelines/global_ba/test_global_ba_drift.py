@@ -26,10 +26,10 @@ from msgs_slam.pipelines.run.folder import (
     save_depth_fields,
     save_exposure,
     save_map,
-    save_sparse_model,
     save_trajectory,
     write_json,
 )
+from msgs_slam.pipelines.run.sparse_files import save_sparse_model
 from msgs_slam.pipelines.types import Trajectory
 from tests.pipelines.global_ba.test_global_ba_stage import FIRST_AGAIN, seeded_map
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames

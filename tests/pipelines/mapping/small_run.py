@@ -17,11 +17,11 @@ from msgs_slam.pipelines.run.folder import (
     save_classes,
     save_depth_fields,
     save_frames,
-    save_sparse_model,
     save_trajectory,
     write_json,
 )
 from msgs_slam.pipelines.run.proxy_files import proxy_path, save_proxy_maps
+from msgs_slam.pipelines.run.sparse_files import save_sparse_model
 from msgs_slam.pipelines.types import VOID, Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, Trajectory
 
 SIZE = (80, 60)

@@ -18,15 +18,9 @@ from msgs_slam.pipelines.correspondence.flow import corners
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry.camera import project, unproject
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.run.folder import (
-    RunFolder,
-    save_calibration,
-    save_classes,
-    save_frames,
-    save_sparse_model,
-    write_json,
-)  # fmt: skip
+from msgs_slam.pipelines.run.folder import RunFolder, save_calibration, save_classes, save_frames, write_json
 from msgs_slam.pipelines.run.proxy_files import proxy_path, save_proxy_maps
+from msgs_slam.pipelines.run.sparse_files import save_sparse_model
 from msgs_slam.pipelines.structure.bundle import Bundle
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, ClassTable, Frame, Intrinsics, ProxyMaps

@@ -16,7 +16,7 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.read_config import load_config
-from msgs_slam.pipelines.run.folder import load_sparse_model, save_sparse_model
+from msgs_slam.pipelines.run.sparse_files import load_sparse_model, save_sparse_model
 from msgs_slam.pipelines.tracking import adjust, stage
 from msgs_slam.pipelines.tracking.stage import STAGE, stretches
 from tests.pipelines.tracking.conftest import MadeRun
