@@ -21,7 +21,7 @@ intrinsic: Any = extending.intrinsic  # its own annotation hides the arguments o
 
 WIDTH = 16
 FLAGS = ("contract", "nsz", "arcp")
-_FLOAT, _I32, I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
+_FLOAT, I32, I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 
 
 class LanesType(types.Type):
@@ -52,17 +52,17 @@ def vector_type(length: int = WIDTH, element: ir.Type = _FLOAT) -> ir.VectorType
     return ir.VectorType(element, length)
 
 
-def _constant(value: float, length: int = WIDTH, element: ir.Type = _FLOAT) -> ir.Constant:
+def constant(value: float, length: int = WIDTH, element: ir.Type = _FLOAT) -> ir.Constant:
     return ir.Constant(vector_type(length, element), [value] * length)
 
 
 def splat_lanes(builder: ir.IRBuilder, scalar: ir.Value, length: int = WIDTH) -> ir.Value:
     undefined = ir.Constant(vector_type(length), ir.Undefined)
-    first = builder.insert_element(undefined, scalar, _I32(0))
-    return builder.shuffle_vector(first, undefined, _constant(0, length, _I32))
+    first = builder.insert_element(undefined, scalar, I32(0))
+    return builder.shuffle_vector(first, undefined, constant(0, length, I32))
 
 
-def _call(builder: ir.IRBuilder, name: str, result: ir.Type, *values: ir.Value) -> ir.Value:
+def call_llvm(builder: ir.IRBuilder, name: str, result: ir.Type, *values: ir.Value) -> ir.Value:
     kind = ir.FunctionType(result, [value.type for value in values])
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), values)
 
@@ -167,7 +167,7 @@ def where(typing_context: Any, condition: Any, value: Any) -> Any:
     """value where the condition holds, else 0."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return builder.select(args[0], args[1], _constant(0.0))
+        return builder.select(args[0], args[1], constant(0.0))
 
     return lanes(mask, lanes), emit
 
@@ -191,10 +191,10 @@ def reciprocal(typing_context: Any, value: Any) -> Any:
     """
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        bits = builder.bitcast(args[0], vector_type(element=_I32))
-        guess = builder.bitcast(builder.sub(_constant(0x7EF311C7, element=_I32), bits), vector_type())
+        bits = builder.bitcast(args[0], vector_type(element=I32))
+        guess = builder.bitcast(builder.sub(constant(0x7EF311C7, element=I32), bits), vector_type())
         for _ in range(3):
-            miss = builder.fsub(_constant(2.0), builder.fmul(args[0], guess, flags=FLAGS), flags=FLAGS)
+            miss = builder.fsub(constant(2.0), builder.fmul(args[0], guess, flags=FLAGS), flags=FLAGS)
             guess = builder.fmul(guess, miss, flags=FLAGS)
         return guess
 
@@ -245,84 +245,6 @@ def largest(typing_context: Any, value: Any, other: Any) -> Any:
 
 
 @intrinsic
-def smallest(typing_context: Any, value: Any, other: Any) -> Any:
-    """The smaller of two numbers, lane by lane."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return builder.select(builder.fcmp_ordered("<", *args), *args)
-
-    return lanes(lanes, lanes), emit
-
-
-@intrinsic
-def choose(typing_context: Any, condition: Any, value: Any, other: Any) -> Any:
-    """value where the condition holds, else the other."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return builder.select(*args)
-
-    return lanes(mask, lanes, lanes), emit
-
-
-@intrinsic
-def square_root(typing_context: Any, value: Any) -> Any:
-    """Of each lane."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return _call(builder, f"llvm.sqrt.v{WIDTH}f32", vector_type(), args[0])
-
-    return lanes(lanes), emit
-
-
-@intrinsic
-def interpolate(typing_context: Any, array: Any, columns: Any, across: Any, down: Any) -> Any:
-    """Samples of a flat picture, `columns` wide, between its pixels: `across` (lanes) columns and `down` rows from its
-    first, both >= 0 and below the last.
-
-    Neighbours are read in pairs: instructions that gather numbers from all over take several times as long.
-    """
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        whole, parts = zip(*(_whole_and_rest(builder, position) for position in args[2:]), strict=True)
-        wide = ir.VectorType(I64, WIDTH)
-        row_length = builder.insert_element(ir.Constant(wide, ir.Undefined), args[1], _I32(0))
-        row_length = builder.shuffle_vector(row_length, row_length, _constant(0, element=_I32))
-        top = builder.add(builder.mul(builder.zext(whole[1], wide), row_length), builder.zext(whole[0], wide))
-        rows = []
-        for places in (top, builder.add(top, row_length)):
-            left, right = _load_pairs(context, builder, sig.args[0], args[0], places)
-            change = builder.fsub(right, left, flags=FLAGS)
-            rows.append(builder.fadd(left, builder.fmul(parts[0], change, flags=FLAGS), flags=FLAGS))
-        change = builder.fsub(rows[1], rows[0], flags=FLAGS)
-        return builder.fadd(rows[0], builder.fmul(parts[1], change, flags=FLAGS), flags=FLAGS)
-
-    return lanes(array, types.intp, lanes, lanes), emit
-
-
-def _whole_and_rest(builder: ir.IRBuilder, value: ir.Value) -> tuple[ir.Value, ir.Value]:
-    """Of numbers >= 0."""
-    whole = builder.fptosi(value, vector_type(element=_I32))
-    return whole, builder.fsub(value, builder.sitofp(whole, vector_type()), flags=FLAGS)
-
-
-def _load_pairs(
-    context: Any, builder: ir.IRBuilder, array_type: Any, array: ir.Value, places: ir.Value
-) -> tuple[ir.Value, ir.Value]:
-    """array[place] and array[place + 1] for each of the places."""
-    parts = []
-    for lane in range(WIDTH):
-        place = builder.extract_element(places, _I32(lane))
-        parts.append(load_lanes(builder, address_of(context, builder, array_type, array, place), 2))
-    while len(parts) > 1:
-        length = 2 * parts[0].type.count
-        order = ir.Constant(vector_type(length, _I32), list(range(length)))
-        parts = [builder.shuffle_vector(a, b, order) for a, b in zip(parts[::2], parts[1::2], strict=True)]
-    orders = (ir.Constant(vector_type(element=_I32), list(range(first, 2 * WIDTH, 2))) for first in (0, 1))
-    left, right = (builder.shuffle_vector(parts[0], parts[0], order) for order in orders)
-    return left, right
-
-
-@intrinsic
 def any_of(typing_context: Any, condition: Any) -> Any:
     """Whether the condition holds in any lane."""
 
@@ -337,7 +259,7 @@ def halves(typing_context: Any, low: Any, high: Any) -> Any:
     """Eight times one number, then eight times the other."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        order = ir.Constant(vector_type(element=_I32), [0] * 8 + [WIDTH] * 8)
+        order = ir.Constant(vector_type(element=I32), [0] * 8 + [WIDTH] * 8)
         return builder.shuffle_vector(splat_lanes(builder, args[0]), splat_lanes(builder, args[1]), order)
 
     return lanes(types.float32, types.float32), emit
@@ -349,7 +271,7 @@ def load_twice(typing_context: Any, array: Any, index: Any) -> Any:
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         half = load_lanes(builder, address_of(context, builder, sig.args[0], *args), 8)
-        order = ir.Constant(vector_type(element=_I32), [*range(8), *range(8)])
+        order = ir.Constant(vector_type(element=I32), [*range(8), *range(8)])
         return builder.shuffle_vector(half, ir.Constant(half.type, ir.Undefined), order)
 
     return lanes(array, types.intp), emit
@@ -362,7 +284,7 @@ def add_products(typing_context: Any, sums: Any, value: Any, weight: Any) -> Any
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         weighted = builder.fmul(args[1], args[2], flags=FLAGS)
         for p in range(6):
-            order = ir.Constant(vector_type(element=_I32), [p] * 8 + [8 + p] * 8)
+            order = ir.Constant(vector_type(element=I32), [p] * 8 + [8 + p] * 8)
             factor = builder.shuffle_vector(weighted, ir.Constant(vector_type(), ir.Undefined), order)
             target = address_of(context, builder, sig.args[0], args[0], I64(WIDTH * p))
             product = builder.fmul(factor, args[1], flags=FLAGS)
@@ -381,16 +303,16 @@ def exp(typing_context: Any, value: Any) -> Any:
     """e to each lane, for arguments <= 0 (less than -80 counts as -80); relative error about 1e-7."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        limit = _constant(-80.0)
+        limit = constant(-80.0)
         argument = builder.select(builder.fcmp_ordered(">", args[0], limit), args[0], limit)
-        power = builder.fmul(argument, _constant(1.4426950408889634))
-        whole = _call(builder, f"llvm.rint.v{WIDTH}f32", vector_type(), power)
+        power = builder.fmul(argument, constant(1.4426950408889634))
+        whole = call_llvm(builder, f"llvm.rint.v{WIDTH}f32", vector_type(), power)
         part = builder.fsub(power, whole)
-        result: ir.Value = _constant(_EXP2[-1])
+        result: ir.Value = constant(_EXP2[-1])
         for coefficient in _EXP2[-2::-1]:
-            result = builder.fadd(builder.fmul(result, part, flags=FLAGS), _constant(coefficient), flags=FLAGS)
-        exponent = builder.add(builder.fptosi(whole, vector_type(element=_I32)), _constant(127, element=_I32))
-        scale = builder.bitcast(builder.shl(exponent, _constant(23, element=_I32)), vector_type())
+            result = builder.fadd(builder.fmul(result, part, flags=FLAGS), constant(coefficient), flags=FLAGS)
+        exponent = builder.add(builder.fptosi(whole, vector_type(element=I32)), constant(127, element=I32))
+        scale = builder.bitcast(builder.shl(exponent, constant(23, element=I32)), vector_type())
         return builder.fmul(result, scale)
 
     return lanes(lanes), emit
@@ -400,16 +322,16 @@ def _fold(builder: ir.IRBuilder, value: ir.Value, join: Callable[[ir.Value, ir.V
     """Halves onto halves: a fixed order, four steps for sixteen lanes."""
     undefined = ir.Constant(vector_type(), ir.Undefined)
     for step in (8, 4, 2, 1):
-        order = ir.Constant(vector_type(element=_I32), [(i + step) % WIDTH for i in range(WIDTH)])
+        order = ir.Constant(vector_type(element=I32), [(i + step) % WIDTH for i in range(WIDTH)])
         value = join(value, builder.shuffle_vector(value, undefined, order))
-    return builder.extract_element(value, _I32(0))
+    return builder.extract_element(value, I32(0))
 
 
 def four_sums(builder: ir.IRBuilder, values: list[ir.Value]) -> ir.Value:
     """Sums over the lanes of four vectors, as one vector of 4: halves are added pair by pair, then together."""
 
     def mix(left: ir.Value, right: ir.Value, order: list[int]) -> ir.Value:
-        return builder.shuffle_vector(left, right, ir.Constant(vector_type(len(order), _I32), order))
+        return builder.shuffle_vector(left, right, ir.Constant(vector_type(len(order), I32), order))
 
     def add_halves(left: ir.Value, right: ir.Value, half: int) -> ir.Value:
         # Lanes come in runs of 2 * half that belong to one sum; runs of `left` first, then those of `right`.

@@ -16,18 +16,15 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.gaussians.render.jit import inner
 from msgs_slam.pipelines.gaussians.render.lanes import (
     at_most,
-    choose,
     counting,
-    interpolate,
     largest,
     load,
-    smallest,
     splat,
-    square_root,
     store,
     where,
 )
 from msgs_slam.pipelines.proxy.stereo.bands import BAND_ROWS
+from msgs_slam.pipelines.proxy.stereo.lane_sampling import choose, interpolate, smallest, square_root
 
 RADIUS = 3
 STEP = 2
