@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -35,26 +34,18 @@ def loop_keyframes(loops: Sequence[Loop], keyframe_ids: Sequence[int]) -> set[in
     return {k for n in ends for k in keyframe_ids[max(n - _AROUND, 0) : n + _AROUND + 1]}
 
 
-def adjust_views(
-    views: Sequence[View], chosen: Collection[int], gaussian_map: GaussianMap, settings: MappingConfig, steps: int
-) -> list[View]:
-    """The views, those of the `chosen` frame ids at the poses that best explain labels and depth, near where they were.
-
-    A pose that explains them no better than before stays.
-    """
-    unit = scene_depth(views)
-    return [_adjusted(v, gaussian_map, settings, steps, unit) if v.frame_id in chosen else v for v in views]
-
-
 def adjusted_poses(
     views: Sequence[View], gaussian_map: GaussianMap, settings: MappingConfig, steps: int
 ) -> dict[int, NDArray[np.float64]]:
-    """Frame id → the pose that `adjust_views` finds for it, one view in memory at a time."""
+    """Frame id → the pose that best explains labels and depth of a view, near where it was; one view in memory at a
+    time. A pose that explains them no better than before stays."""
     unit = scene_depth(views)
-    return {v.frame_id: _adjusted(v, gaussian_map, settings, steps, unit).cam_from_world.numpy() for v in views}
+    return {v.frame_id: _adjusted(v, gaussian_map, settings, steps, unit) for v in views}
 
 
-def _adjusted(view: View, gaussian_map: GaussianMap, settings: MappingConfig, steps: int, unit: float) -> View:
+def _adjusted(
+    view: View, gaussian_map: GaussianMap, settings: MappingConfig, steps: int, unit: float
+) -> NDArray[np.float64]:
     weight = losses.depth_weight(view.trust)
     table = AdamTable({"twist": torch.zeros(6)})
     best, pose = float("inf"), view.cam_from_world
@@ -72,4 +63,4 @@ def _adjusted(view: View, gaussian_map: GaussianMap, settings: MappingConfig, st
             best, pose = value, se3.exp(twist.detach().double()) @ view.cam_from_world
         (gradient,) = gradients_of(loss, (table.values,))
         table.step(gradient, {"twist": _RATE})
-    return replace(view, cam_from_world=pose)
+    return pose.numpy()

@@ -18,13 +18,12 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.candidates import loop_candidates
 from msgs_slam.pipelines.global_ba.close import Closed, close_loops
-from msgs_slam.pipelines.global_ba.joint import Refined, refine_together
-from msgs_slam.pipelines.global_ba.local import adjust_views, adjusted_poses, loop_keyframes
+from msgs_slam.pipelines.global_ba.local import adjusted_poses, loop_keyframes
 from msgs_slam.pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_found
 from msgs_slam.pipelines.global_ba.move_map import follow_keyframes, move_map
 from msgs_slam.pipelines.global_ba.semantics import LabelSummary, summarise_labels
 from msgs_slam.pipelines.global_ba.verify import KeyframeView, Loop, make_view
-from msgs_slam.pipelines.mapping.divided import refine_divided, rows_of
+from msgs_slam.pipelines.mapping.build import Refined, refine_map, rows_of
 from msgs_slam.pipelines.mapping.load import load_views, with_rigid_panoramas
 from msgs_slam.pipelines.mapping.poses import move_trajectory
 from msgs_slam.pipelines.run.folder import (
@@ -224,28 +223,9 @@ def refine(
     fields: DepthFields,
     found: FoundLoops,
 ) -> Refined:
-    """Map and poses together."""
-    settings = context.config.global_ba
-    mapping = context.config.mapping
-    exposure = context.run.load_exposure()
-    if context.run.load_submaps():
-        exposures = exposure["log_gains"], exposure["offsets"]
-        trajectory = at_loop_ends(context, gaussian_map, trajectory, fields, found, exposure["frame_ids"])
-        before, made, after = refine_divided(
-            context, gaussian_map, trajectory, fields, exposures, settings.joint_passes
-        )
-        kept = (made.gaussian_map, made.cam_from_world, made.log_gains, made.offsets)
-        return Refined(*kept, before, after, after >= before)
-    memory = context.memory_room
-    class_ids = context.run.load_class_ids()
-    views = load_views(context.run, trajectory, mapping, context.device, fields, memory, class_ids).views
-    if steps := context.config.paper.loop_steps:
-        ends = loop_keyframes(found.loops, [v.frame_id for v in views])
-        views = adjust_views(views, ends, gaussian_map, mapping, steps)
-    gains = {int(i): g for i, g in zip(exposure["frame_ids"], exposure["log_gains"], strict=True)}
-    offsets = {int(i): o for i, o in zip(exposure["frame_ids"], exposure["offsets"], strict=True)}
-    exposures = np.array([gains[v.frame_id] for v in views]), np.array([offsets[v.frame_id] for v in views])
-    return refine_together(context, gaussian_map, views, exposures, len(class_ids), mapping, settings.joint_passes)
+    """Map and poses together, against all keyframes (second term of MSGS-SLAM eq. 26)."""
+    trajectory = at_loop_ends(context, gaussian_map, trajectory, fields, found)
+    return refine_map(context, gaussian_map, trajectory, fields, context.config.global_ba.joint_passes)
 
 
 def at_loop_ends(
@@ -254,10 +234,9 @@ def at_loop_ends(
     trajectory: Trajectory,
     fields: DepthFields,
     found: FoundLoops,
-    keyframe_ids: NDArray[np.int64],
 ) -> Trajectory:
-    """The poses at the ends of loops by labels and depth, eq. (25), in a map that was made in submaps; the other
-    keyframes where they were."""
+    """The poses at the ends of loops by labels and depth, eq. (25); the other keyframes where they were."""
+    keyframe_ids = context.run.load_exposure()["frame_ids"]
     steps, ends = context.config.paper.loop_steps, loop_keyframes(found.loops, keyframe_ids.tolist())
     if not steps or not ends:
         return trajectory
@@ -283,10 +262,11 @@ def save(
 ) -> dict[str, Any]:
     """Write the result, with mapping's own map where there is no other; returns its key figures."""
     exposure = context.run.load_exposure()
-    if refined is not None and refined.kept:
-        gaussian_map = refined.gaussian_map
-        trajectory = move_trajectory(trajectory, exposure["frame_ids"], refined.cam_from_world)
-        exposure |= {"log_gains": refined.log_gains, "offsets": refined.offsets}
+    if refined is not None and refined.is_better:
+        result = refined.result
+        gaussian_map = result.gaussian_map
+        trajectory = move_trajectory(trajectory, exposure["frame_ids"], result.cam_from_world)
+        exposure |= {"log_gains": result.log_gains, "offsets": result.offsets}
     save_trajectory(context.folder, trajectory)
     save_sparse(context.folder, model)
     if gaussian_map is None:
@@ -303,7 +283,7 @@ def save(
         "loops": len(found.loops) if closed is not None else 0,
         "moved_px": round(moved_px, 3),
         "reprojection_px": None if closed is None else closed.report.figures["reprojection_px"],
-        "joint": "not run" if refined is None else "kept" if refined.kept else "thrown away",
+        "joint": "not run" if refined is None else "kept" if refined.is_better else "thrown away",
         "joint_psnr_before": None if refined is None else round(refined.psnr_before, 3),
         "joint_psnr_after": None if refined is None else round(refined.psnr_after, 3),
     }

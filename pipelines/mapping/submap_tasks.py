@@ -7,7 +7,7 @@ does nothing. So tasks of one kind may run in any order, on any machine that see
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -37,6 +37,7 @@ from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Intrinsics, Trajectory
 
 MADE, JOINED, REFINED, AGREED = "made", "joined", "refined", "agreed"
+_LABELS = {MADE: "mapping", REFINED: "refining"}
 _ARRAYS = ("frame_ids", "cam_from_world", "log_gains", "offsets", "depths", "steps", "rows", "weights")
 REFINING_SHARE, REFINING_RATE = 5 / 9, 0.9
 """Visits of each view once the maps are joined, as a share of those that made them, and the learning rates of the first
@@ -131,7 +132,7 @@ def make_submap(task: SubmapTask, progress: Progress) -> None:
         result = _result(task, made, given.views)
         ids = np.array([v.frame_id for v in given.views])
         save_arrays(task.exposures, {"frame_ids": ids, "log_gains": made.log_gains, "offsets": made.offsets})
-        task.save(MADE, replace(result, depths=_depths(result, task.camera)))
+        task.save(MADE, replace(result, depths=_depths(result, task.camera)) if task.submap.beside else result)
 
 
 def join_submap(task: SubmapTask, progress: Progress) -> None:
@@ -176,9 +177,9 @@ def _shown(
     views: Iterable[View], maps: Sequence[GaussianMap]
 ) -> tuple[GaussianMap, NDArray[np.int64], NDArray[np.float32]]:
     """What the views show of the maps, as one: its Gaussians, their rows in the maps they are from (M,), and how many
-    pixels each fills (M,)."""
+    pixels each fills (M,). One map alone is all that they show."""
     whole, places = together(maps), torch.cat([torch.arange(len(m)) for m in maps])
-    weights = _pixels(whole, views)
+    weights = _pixels(whole, views) if len(maps) > 1 else torch.ones(len(whole), device=whole.means.device)
     shown = weights > 0
     return whole.only(shown), places[shown.cpu()].numpy(), weights[shown].cpu().numpy()
 
@@ -204,6 +205,12 @@ def agree_submap(task: SubmapTask, progress: Progress) -> None:
             share = (weights / total[rows]).reshape(-1, *[1] * (values.ndim - 1))
             values[rows] += share * (said - values[rows])
     task.save(AGREED, replace(told, gaussian_map=agreed, rows=told.rows[:0], weights=told.weights[:0]))
+
+
+STEPS: dict[str, Callable[[SubmapTask, Progress], None]] = {
+    MADE: make_submap, JOINED: join_submap, REFINED: refine_submap, AGREED: agree_submap,
+}  # fmt: skip
+"""Which task leaves which kind of result; each needs those before it, of its own submap and those beside."""
 
 
 def in_order(results: Sequence[SubmapResult]) -> tuple[NDArray[np.int64], NDArray[np.float64], Exposures]:
@@ -241,10 +248,11 @@ def _optimise(
     """From a snapshot where there is one, which goes when the result is written."""
     settings, seed = replace(task.config.mapping, hold_out=0), task.config.run.seed
     visits = REFINING_SHARE * settings.passes if task.passes is None else task.passes
-    passes, rate = (None, 1.0) if initial is None else (visits, REFINING_RATE)
+    passes, rate = (None, 1.0) if initial is None else (visits, REFINING_RATE if task.submap.beside else 1.0)
+    of = f" submap {task.number + 1}" if task.submap.beside else ""
     return optimise_map(
         given.views, len(task.class_ids), settings, seed, initial, passes,
-        progress=progress, snapshot=task.file(f"{kind}_state"), label=f"submap {task.number + 1}, {kind}",
+        progress=progress, snapshot=task.file(f"{kind}_state"), label=_LABELS[kind] + of,
         exposure=exposure, paper=task.config.paper, first_rate=rate,
     )  # fmt: skip
 

@@ -35,6 +35,11 @@ class Submap:
     border: Ids
     beside: tuple[int, ...] = ()
 
+    @staticmethod
+    def alone(frame_ids: Ids) -> Submap:
+        """One of all keyframes."""
+        return Submap(frame_ids, frame_ids[:0])
+
     @property
     def views(self) -> Ids:
         """All that it is made from, sorted."""

@@ -35,7 +35,7 @@ from msgs_slam.pipelines.config import MappingConfig, PaperConfig
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
-from msgs_slam.pipelines.global_ba.local import adjust_views
+from msgs_slam.pipelines.global_ba.local import adjusted_poses
 from msgs_slam.pipelines.mapping import schedule
 from msgs_slam.pipelines.mapping.load import MappingInput, load_view, load_views
 from msgs_slam.pipelines.mapping.measure import mean_figures, measure_view
@@ -96,10 +96,10 @@ def local_trial(run: RunFolder, truth: Path | None) -> dict[str, dict[str, float
             replace(v, cam_from_world=torch.from_numpy(se3.exp(t)) @ v.cam_from_world)
             for v, t in zip(chosen, twists, strict=True)
         ]
-        found = adjust_views(start, {v.frame_id for v in chosen}, gaussian_map, MappingConfig(), 20)
-        for when, group in (("before", start), ("after", found)):
-            ours = se3.inverse(np.array([v.cam_from_world.numpy() for v in group]))
-            theirs = se3.inverse(np.array([true[v.frame_id] for v in group]))
+        found = adjusted_poses(start, gaussian_map, MappingConfig(), 20)
+        for when, poses in (("before", {v.frame_id: v.cam_from_world.numpy() for v in start}), ("after", found)):
+            ours = se3.inverse(np.array(list(poses.values())))
+            theirs = se3.inverse(np.array([true[i] for i in poses]))
             away = np.linalg.norm(ours[:, :3, 3] - theirs[:, :3, 3], axis=1)
             turned = np.degrees(se3.rotation_angle(se3.inverse(ours) @ theirs))
             out[f"{name}, {when}"] = {

@@ -60,7 +60,7 @@ def test_sigterm_ends_softly_and_the_run_goes_on_to_the_same_bytes(copied_run: C
     assert process.returncode == 128 + signal.SIGTERM, errors
     assert "Stopping at the next snapshot" in errors
     assert f"msgs-slam resume {stopped}" in errors
-    assert (stopped / "mapping.partial" / "snapshot" / "state.safetensors").exists()
+    assert (stopped / "mapping.partial" / "snapshot" / "submaps_1" / "made_state_0000.safetensors").exists()
     for run in (stopped, whole):
         assert invoke("resume", run, *change, "-q").exit_code == 0
     found, expected = (records.load_records(RunFolder(r)) for r in (stopped, whole))

@@ -45,7 +45,7 @@ LATER = ("mapping", "global_ba", "export")
 def test_changed_setting_then_ctrl_c(finished_run: FinishedRun, copied_run: Callable[[str], Path]) -> None:
     run = copied_run("run.msgs")
     assert states(run) == dict.fromkeys(("frames", "tracking", *LATER), "done")
-    snapshot = run / "mapping.partial" / "snapshot" / "state.safetensors"
+    snapshot = run / "mapping.partial" / "snapshot" / "submaps_1" / "made_state_0000.safetensors"
     stopped = interrupt_when(
         snapshot.exists, "resume", run, "--set", "mapping.hold_out=4", "--set", "mapping.min_iterations=4000"
     )

@@ -28,10 +28,10 @@ from msgs_slam.pipelines.run.folder import (
     save_depth_fields,
     save_exposure,
     save_map,
-    save_sparse_model,
     save_trajectory,
     write_json,
 )
+from msgs_slam.pipelines.run.sparse_files import save_sparse_model
 from msgs_slam.pipelines.types import Trajectory
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames, small_motion
 from tests.world.clip import WorldFrame
@@ -189,7 +189,7 @@ def test_joint_refinement_is_kept_only_where_it_helps_and_survives_interruption(
             StageContext(context.run, context.source, config, context.folder, BreakOff("refining", keyframes + 3))
         )
     assert (context.snapshot / "loops.npz").exists()
-    assert (context.snapshot / "joint.safetensors").exists()
+    assert (context.snapshot / "submaps_1" / "refined_state_0000.safetensors").exists()
     finish(open_stage(broken.run, "global_ba", config))
     for name in ("trajectory.npz", "map.safetensors", "sparse.npz", "loops.json"):
         assert (whole.run.stage("global_ba") / name).read_bytes() == (broken.run.stage("global_ba") / name).read_bytes()

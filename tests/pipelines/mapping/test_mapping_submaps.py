@@ -26,7 +26,7 @@ from msgs_slam.pipelines.global_ba.stage import refine
 from msgs_slam.pipelines.global_ba.verify import Loop
 from msgs_slam.pipelines.mapping import gauge, submaps
 from msgs_slam.pipelines.mapping import stage as mapping_stage
-from msgs_slam.pipelines.mapping.divided import refine_divided
+from msgs_slam.pipelines.mapping.build import refine_map
 from msgs_slam.pipelines.mapping.gauge import SeenExposures, common_exposure
 from msgs_slam.pipelines.mapping.submaps import BORDER, divide, nearest_seeing
 from msgs_slam.pipelines.outcome import load_outcome, maps_around
@@ -214,16 +214,16 @@ def finished(small_run: RunFolder, divided: tuple[Path, dict], tmp_path_factory:
 
 
 def test_a_shaken_map_is_refined_in_its_parts(finished: RunFolder, tmp_path: Path) -> None:
-    gaussian_map, exposure = finished.load_map("mapping"), finished.load_exposure()
+    gaussian_map = finished.load_map("mapping")
     noise = torch.randn(gaussian_map.colors.shape, generator=torch.Generator().manual_seed(0))
     shaken = replace(gaussian_map, colors=gaussian_map.colors + 0.05 * noise)
     context = StageContext(finished, finished.root, CONFIG, tmp_path, SilentProgress())
     poses, fields = finished.load_trajectory("mapping"), finished.load_depth_fields("tracking")
-    exposures = exposure["log_gains"], exposure["offsets"]
-    before, made, after = refine_divided(context, shaken, poses, fields, exposures, 2.0)
-    assert after > before + 1
-    assert 0.8 < len(made.gaussian_map) / len(gaussian_map) < 1.6
-    assert made.cam_from_world.shape == (14, 4, 4)
+    refined = refine_map(context, shaken, poses, fields, 2.0)
+    assert refined.is_better
+    assert refined.psnr_after > refined.psnr_before + 1
+    assert 0.8 < len(refined.result.gaussian_map) / len(gaussian_map) < 1.6
+    assert refined.result.cam_from_world.shape == (14, 4, 4)
 
 
 def test_poses_at_the_ends_of_a_loop_are_adjusted_in_parts_too(finished: RunFolder, tmp_path: Path) -> None:
@@ -237,7 +237,7 @@ def test_poses_at_the_ends_of_a_loop_are_adjusted_in_parts_too(finished: RunFold
     refined = refine(
         context, finished.load_map("mapping"), replace(poses, cam_from_world=off),
         finished.load_depth_fields("tracking"), FoundLoops([loop], 1, 0, 0, 0),
-    ).cam_from_world  # fmt: skip
+    ).result.cam_from_world  # fmt: skip
 
     def apart(pose: NDArray[np.float64]) -> float:
         return float(np.linalg.norm(se3.log(pose @ se3.inverse(true[1]))))

@@ -1,4 +1,5 @@
-"""The map of a long recording, made submap by submap and joined: at any time no more than one of them is in work."""
+"""The map, made and refined submap by submap: at any time no more than one of them is in work. A recording of the
+usual length is one submap."""
 
 from __future__ import annotations
 
@@ -20,17 +21,16 @@ from msgs_slam.pipelines.mapping.state import Exposures, OptimisedMap
 from msgs_slam.pipelines.mapping.submap_tasks import (
     AGREED,
     JOINED,
+    MADE,
+    REFINED,
+    STEPS,
     SubmapResult,
     SubmapTask,
-    agree_submap,
     belonging,
     in_order,
-    join_submap,
-    make_submap,
     measure_submap,
-    refine_submap,
 )
-from msgs_slam.pipelines.mapping.submaps import Submap, divide
+from msgs_slam.pipelines.mapping.submaps import Submap, divide, submap_count
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.memory import submap_size
 from msgs_slam.pipelines.types import Trajectory
@@ -39,8 +39,7 @@ from msgs_slam.pipelines.types import Trajectory
 @dataclass(frozen=True)
 class Mapped:
     """A map with what was made beside it: poses and exposures of the keyframes keyframe_ids (N,), label of each
-    channel, all frames moved with them, the figures of keyframes and of frames held out, and the submaps (none of a map
-    made whole)."""
+    channel, all frames moved with them, the figures of keyframes and of frames held out, and the submaps."""
 
     result: OptimisedMap
     keyframe_ids: NDArray[np.int64]
@@ -48,53 +47,78 @@ class Mapped:
     moved: Trajectory
     keyframes: Sequence[ViewFigures]
     held_out: Sequence[ViewFigures]
-    submaps: Sequence[Submap] = ()
+    submaps: Sequence[Submap]
 
 
-def map_divided(context: StageContext, trajectory: Trajectory, class_ids: tuple[int, ...]) -> Mapped:
-    """Every submap made, joined, refined, agreed upon and measured: each kind of work once the one before is done."""
-    run = context.run
+@dataclass(frozen=True)
+class Refined:
+    """A refined map, its keyframes' poses and exposures, and their mean PSNR before and after."""
+
+    result: OptimisedMap
+    psnr_before: float
+    psnr_after: float
+
+    @property
+    def is_better(self) -> bool:
+        """Or at least no worse: else what was there before stays."""
+        return self.psnr_after >= self.psnr_before
+
+
+def build_map(context: StageContext, trajectory: Trajectory, class_ids: tuple[int, ...]) -> Mapped:
+    """The map of the keyframes; channel c of its classes is label class_ids[c]."""
     kept, _ = split_frames(trajectory, context.config.mapping.hold_out)
-    fields = run.load_depth_fields("tracking")
-    size = submap_size(context.config, run.load_calibration().intrinsics)
-    submaps = divide(np.array(kept), overlaps(_depths(run, trajectory, fields, kept)), size)
+    fields = context.run.load_depth_fields("tracking")
+    submaps = _submaps(context, trajectory, fields, kept)
     tasks = submap_tasks(context, submaps, trajectory, fields, class_ids)
-    for work in (make_submap, join_submap, refine_submap, agree_submap):
-        context.each(work, tasks)
-    made = _survey(tasks, AGREED)
+    kind = _each(context, tasks, MADE, JOINED, REFINED, AGREED)
+    made = _survey(tasks, kind)
     moved = move_trajectory(trajectory, made.ids, made.cam_from_world)
-    keyframes, held_out = measure(context, tasks, moved, made.ids, made.exposure, AGREED, fields)
-    result = all_together(tasks, AGREED, made)  # last: whole it is the largest thing there is
-    return Mapped(result, made.ids, tasks[0].class_ids, moved, keyframes, held_out, submaps)
+    keyframes, held_out = measure(context, tasks, moved, made.ids, made.exposure, kind, fields)
+    result = all_together(tasks, kind, made)  # last: whole it is the largest thing there is
+    return Mapped(result, made.ids, class_ids, moved, keyframes, held_out, submaps)
 
 
-def refine_divided(
-    context: StageContext,
-    gaussian_map: GaussianMap,
-    trajectory: Trajectory,
-    fields: DepthFields,
-    exposure: Exposures,
-    passes: float,
-) -> tuple[float, OptimisedMap, float]:
-    """A map that was made in submaps, its keyframes with `exposure` (N, 3) each, refined in them: mean keyframe PSNR
-    before, the refined map, PSNR after."""
-    run, anchors = context.run, gaussian_map.anchor_frame_ids.cpu().numpy()
-    submaps = [Submap(s["own"], s["border"], tuple(s["beside"].tolist())) for s in run.load_submaps()]
-    ids = np.sort(np.concatenate([s.own for s in submaps]))
-    tasks = submap_tasks(context, submaps, trajectory, fields, run.load_class_ids())
+def refine_map(
+    context: StageContext, gaussian_map: GaussianMap, trajectory: Trajectory, fields: DepthFields, passes: float
+) -> Refined:
+    """A map that is there, and the poses of its keyframes, refined together: every view visited `passes` times."""
+    exposure = context.run.load_exposure()
+    ids, exposures = exposure["frame_ids"], (exposure["log_gains"], exposure["offsets"])
+    stored = [Submap(s["own"], s["border"], tuple(s["beside"].tolist())) for s in context.run.load_submaps()]
+    submaps, anchors = stored or [Submap.alone(ids)], gaussian_map.anchor_frame_ids.cpu().numpy()
+    tasks = submap_tasks(context, submaps, trajectory, fields, context.run.load_class_ids())
+    tasks = [replace(task, passes=passes) for task in tasks]
     for task in tasks:
         rows = np.isin(ids, task.submap.own)
         poses = rows_of(trajectory, task.submap.own).cam_from_world
-        own = belonging(gaussian_map, anchors, task.submap)
+        own = belonging(gaussian_map, anchors, task.submap) if len(tasks) > 1 else gaussian_map
         nothing = np.zeros((0, 1, 1), np.float32), np.zeros(1, np.int64)
-        task.save(JOINED, SubmapResult(own, ids[rows], poses, exposure[0][rows], exposure[1][rows], *nothing))
-    for work in (refine_submap, agree_submap):
-        context.each(work, [replace(task, passes=passes) for task in tasks])
-    before, _ = measure(context, tasks, trajectory, ids, exposure, JOINED, fields)
-    made = _survey(tasks, AGREED)
+        task.save(JOINED, SubmapResult(own, ids[rows], poses, exposures[0][rows], exposures[1][rows], *nothing))
+    kind = _each(context, tasks, REFINED, AGREED)
+    before, _ = measure(context, tasks, trajectory, ids, exposures, JOINED, fields)
+    made = _survey(tasks, kind)
     moved = move_trajectory(trajectory, made.ids, made.cam_from_world)
-    after, _ = measure(context, tasks, moved, made.ids, made.exposure, AGREED, fields)
-    return _mean_psnr(before), all_together(tasks, AGREED, made), _mean_psnr(after)
+    after, _ = measure(context, tasks, moved, made.ids, made.exposure, kind, fields)
+    return Refined(all_together(tasks, kind, made), _mean_psnr(before), _mean_psnr(after))
+
+
+def _each(context: StageContext, tasks: Sequence[SubmapTask], *kinds: str) -> str:
+    """Every submap brought from kind to kind of result, all to one before any to the next; the last kind. One submap
+    alone has nobody to join and to agree with: the first is the last."""
+    kinds = kinds if len(tasks) > 1 else kinds[:1]
+    for kind in kinds:
+        context.each(STEPS[kind], tasks)
+    return kinds[-1]
+
+
+def _submaps(
+    context: StageContext, trajectory: Trajectory, fields: DepthFields, keyframe_ids: Sequence[int]
+) -> list[Submap]:
+    run, ids = context.run, np.array(keyframe_ids)
+    size = submap_size(context.config, run.load_calibration().intrinsics)
+    if submap_count(len(ids), size) == 1:  # what they share need not be known
+        return [Submap.alone(ids)]
+    return divide(ids, overlaps(_depths(run, trajectory, fields, keyframe_ids)), size)
 
 
 def _mean_psnr(figures: Sequence[ViewFigures]) -> float:
@@ -202,8 +226,10 @@ def measure(
         wanted = np.append(task.submap.own, np.array(held, np.int64)[np.isin(before, task.submap.own)])
         part = rows_of(moved, wanted)
         gains, offsets = (interpolate_rows(part.timestamps, times, a) for a in exposure)
-        own = _only(fields, wanted)
-        measuring.append(replace(task, trajectory=part, exposure=(gains, offsets), fields=own, measured=kind))
+        own, rows = np.isin(part.frame_ids, task.submap.own), np.isin(ids, task.submap.own)
+        gains[own], offsets[own] = exposure[0][rows], exposure[1][rows]  # others may be taken at the same time
+        known = _only(fields, wanted)
+        measuring.append(replace(task, trajectory=part, exposure=(gains, offsets), fields=known, measured=kind))
     found = context.each(measure_submap, measuring)
     ranked = np.argsort(np.concatenate([task.submap.own for task in tasks]))
     keyframes = [figures for own, _ in found for figures in own]
