@@ -148,6 +148,10 @@ class ModelStore:
         path = self.path(model)
         if model.sha256 and path.is_file() and file_sha256(path) == model.sha256:
             return path
+        if not model.urls:
+            raise InputError(
+                f"{model.name} has no address. Bring its file: msgs-slam models pull {model.name} --from FOLDER"
+            )
         if not model.sha256 and not trust:
             raise InputError(f"{model.name}: its sha256 is unknown. Pull it with --trust to accept the first download")
         if offline:
@@ -179,7 +183,8 @@ class ModelStore:
 
         digest, size = file_sha256(file), file.stat().st_size
         model = Model(name or file.stem, family, (), size, digest, "the user's own file", False)
-        if any(m.name == model.name and m.urls for m in self.models):
+        own = self._load_own()
+        if model.name in {m.name for m in self.models} - {row["name"] for row in own["added"]}:
             raise InputError(f"{model.name} is the name of a known model. Give another with --name")
         if not _NAME.fullmatch(model.name):
             raise InputError(f"{model.name!r} is no name for a model: letters, digits, dot, dash and underscore")
@@ -187,7 +192,6 @@ class ModelStore:
         Network(card_from_values(values, _TABLE), 1, "cpu")
         with atomic_path(self.path(model)) as temporary:
             shutil.copyfile(file, temporary)
-        own = self._load_own()
         row = {k: getattr(model, k) for k in ("name", "family", "bytes", "sha256", "licence", "commercial")}
         own["added"] = [r for r in own["added"] if r["name"] != model.name] + [row]
         self._save_own(own)
