@@ -34,7 +34,7 @@ class Lpips:
 
 
 def open_lpips() -> Lpips | str:
-    """The measure, or why there is none: neither its file nor the package with its weights is here. Downloads nothing."""
+    """The measure, or why there is none: the file, or the package with its weights, is not here. Downloads nothing."""
     store = ModelStore.open()
     model = store.first_here("perceptual")
     return _by_package() if model is None else _by_file(store, model)

@@ -12,6 +12,7 @@ from msgs_slam.pipelines.metres.evidence import Evidence, measured
 from msgs_slam.pipelines.metres.heights import floor_trust, over_floor, stays_on_floor
 from msgs_slam.pipelines.metres.scene import Scene
 from msgs_slam.pipelines.metres.sizes import DOOR, DOORS, SURFACE, TOPS, Sizes
+from msgs_slam.pipelines.proxy.regions.belonging import disputed
 from msgs_slam.pipelines.voxels.layout import SURFACE as UNNAMED
 from msgs_slam.pipelines.voxels.layout import levels
 
@@ -45,8 +46,9 @@ def sizes_of_things(scene: Scene) -> list[Evidence]:
 
 
 def _tops(scene: Scene, heights: Array, upward: Array) -> list[Evidence]:
-    """Upper sides of things with a name."""
+    """Upper sides of things with a name that their parts agree on."""
     above = (upward > _LEVEL) & (heights > _OVER_FLOOR * scene.median_depth)
+    above &= ~disputed(scene.label, scene.names, scene.voxels)
     known: dict[str, list[tuple[float, Sizes]]] = defaultdict(list)
     for name, (told, sizes) in TOPS.items():
         for members in _instances(scene, above & scene.named((name,)), _LEAST_TOP):

@@ -1,6 +1,6 @@
 """Measures names: a network by itself, its frames fused in the world, the map, and the mesh.
 
-    python tests/benchmarks/names.py --work RUNS                          whiteroom, replica and kitchen, all defaults
+    python tests/benchmarks/names.py --work RUNS                          every recording, all defaults
     python tests/benchmarks/names.py --work RUNS whiteroom --json rows.json
     python tests/benchmarks/names.py --work RUNS --semantics onnx:CARD.toml --set mapping.max_side=320
 
@@ -39,7 +39,7 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.depth.resize import resample_nearest
-from msgs_slam.pipelines.evaluation.class_map import Matching, match_classes
+from msgs_slam.pipelines.evaluation.class_map import ClassMap, Matching, match_classes, read_class_map
 from msgs_slam.pipelines.evaluation.label_score import count_labels, score
 from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.evaluation.pictures import Picture, label_picture
@@ -60,9 +60,13 @@ from msgs_slam.pipelines.upright.world import FIRST, load_world
 DATA = ROOT.parent / "shared" / "data"
 SOURCES = {
     "whiteroom": (DATA / "whiteroom" / "video.mp4", DATA / "whiteroom"),
+    "whiteroom_2": (DATA / "whiteroom_2" / "video.mp4", DATA / "whiteroom_2"),
+    "staircase": (DATA / "staircase" / "video.mp4", DATA / "staircase"),
     "replica": (DATA / "replica_office0" / "rgb", DATA / "replica_office0"),
     "kitchen": (DATA / "videos" / "kitchen_640x480_30fps.mp4", None),
 }
+OWN_MAPS = {"staircase": Path(__file__).with_name("staircase.toml")}
+"""Class maps of recordings for which none comes with the program."""
 KINDS = ("network", "fused", "map", "mesh")
 TOLERANCES = (2, 6)
 SHEET_ROWS = 6
@@ -161,10 +165,10 @@ class Labelled:
         return np.where(known, np.append(self._mesh_labels, VOID)[vertex], VOID).astype(np.uint8)
 
 
-def measure(labelled: Labelled, truth: Sequence) -> dict[str, dict[str, Any]]:
+def measure(labelled: Labelled, truth: Sequence, own_map: ClassMap | None) -> dict[str, dict[str, Any]]:
     """Figures by kind over the keyframes with true labels."""
     outcome = labelled.outcome
-    matching = match_classes(labelled.names, outcome.vocabulary, truth.class_names, None)
+    matching = match_classes(labelled.names, outcome.vocabulary, truth.class_names, own_map)
     if matching is None:
         raise SystemExit(f"no class map joins {', '.join(labelled.names)} with {', '.join(truth.class_names)}")
     shape = (len(truth.class_names), len(labelled.names) + 1)
@@ -248,7 +252,8 @@ def main() -> None:
             "cpu seconds a keyframe": round(spent / keyframes, 2),
         }
         if truth is not None:
-            rows[name] |= measure(labelled, truth)
+            own_map = read_class_map(OWN_MAPS[name]) if name in OWN_MAPS else None
+            rows[name] |= measure(labelled, truth, own_map)
         write_sheet(labelled, truth, arguments.work / f"{name}_names.png")
         print(name, json.dumps(rows[name], indent=1), flush=True)
     if arguments.json:

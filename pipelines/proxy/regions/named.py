@@ -18,7 +18,7 @@ from scipy.sparse import csr_matrix
 from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.geometry.camera import unproject_depth
 from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
-from msgs_slam.pipelines.proxy.regions.belonging import one_name_each, place_likelihood
+from msgs_slam.pipelines.proxy.regions.belonging import one_name_each
 from msgs_slam.pipelines.proxy.regions.orientation import name_likelihood
 from msgs_slam.pipelines.proxy.regions.parts import cut_parts, cut_patches
 from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels, label_pixels
@@ -45,14 +45,13 @@ class Vocabulary:
 @dataclass(frozen=True)
 class NamedScene:
     """keys (V,) of voxels of `size`; share (V, K) probability of each of `names`; kept (K,) the network's class that
-    each name is, -1 for a numbered object; of_place (C,) likelihood of the network's classes in such a place."""
+    each name is, -1 for a numbered object."""
 
     size: float
     keys: NDArray[np.int64]
     share: NDArray[np.float32]
     names: tuple[str, ...]
     kept: NDArray[np.int64]
-    of_place: NDArray[np.float32]
 
     @staticmethod
     def gather(
@@ -76,12 +75,10 @@ class NamedScene:
         centres = [np.linalg.inv(pose)[:3, 3] for pose in sequence.cam_from_world.values()]
         eye = float(np.median(np.array(centres) @ gravity.up))
         share *= name_likelihood(vocabulary.names, voxels, gravity, kind, eye)
-        of_place = place_likelihood(share, vocabulary.names, voxels.weight / voxels.weight.sum())
-        share *= of_place
         share /= np.maximum(share.sum(1, keepdims=True), 1e-9)
         one_name_each(share, vocabulary.names, voxels)
-        columns, names, kept = _settle(share, voxels, vocabulary, elsewhere * of_place)
-        return NamedScene(voxels.size, voxels.keys, columns, names, kept, of_place)
+        columns, names, kept = _settle(share, voxels, vocabulary, elsewhere)
+        return NamedScene(voxels.size, voxels.keys, columns, names, kept)
 
     def estimate(
         self, sequence: Sequence, frame: Frame, depth: DepthEstimate, own: NDArray[np.float32]
@@ -93,7 +90,7 @@ class NamedScene:
         at = self._places(sequence, frame, depth)
         known = self.kept >= 0
         votes = np.zeros((*at.shape, len(self.names)), np.float32)
-        votes[..., known] = resample_linear((own * self.of_place)[..., self.kept[known]], *at.shape)
+        votes[..., known] = resample_linear(own[..., self.kept[known]], *at.shape)
         seen = at >= 0
         votes[seen] = self.share[at[seen]]
         trust = np.where(seen, depth.confidence, _ALONE).astype(np.float32)

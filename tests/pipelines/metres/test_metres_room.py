@@ -174,6 +174,15 @@ def test_tables_and_seats_are_measured_each_by_itself() -> None:
         assert min(abs(m.log_scale) for m in piece.modes) < 0.08  # a voxel is 7 % of a table's height
 
 
+def test_a_thing_of_two_names_tells_nothing() -> None:
+    """Half of it is called a bed, the other half a chair."""
+    bed, seat = (plane((x, x + 0.6), (3, 3.6), 0.5) for x in (0.0, 0.6))
+    halves = [(bed, OTHER, "bed"), (seat, OTHER, "chair")]
+    assert sizes_of_things(scene([FLOOR_PART, *halves], CENTRES)) == []
+    agreed = sizes_of_things(scene([FLOOR_PART, (np.concatenate([bed, seat]), OTHER, "bed")], CENTRES))
+    assert [p.source for p in agreed] == ["bed"]
+
+
 def test_a_table_top_that_is_lowest_is_no_floor() -> None:
     only_table = scene([(FLOOR_PART[0], FLOOR, "table")], CENTRES)
     assert floor_trust(only_table) is None

@@ -11,7 +11,7 @@ from proxy_room import UNIT, Room
 from msgs_slam.pipelines.evaluation.label_score import count_labels, score
 from msgs_slam.pipelines.networks.labels import best_classes
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.regions.belonging import one_name_each, place_likelihood
+from msgs_slam.pipelines.proxy.regions.belonging import disputed, one_name_each
 from msgs_slam.pipelines.proxy.regions.named import NamedScene, Vocabulary
 from msgs_slam.pipelines.proxy.regions.orientation import name_likelihood
 from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
@@ -127,13 +127,20 @@ def test_a_thing_has_one_name_and_its_neighbour_another() -> None:
     assert np.allclose(share.sum(1), 1)
 
 
-def test_rooms_hold_no_cars_and_streets_do() -> None:
-    names, weight = ("wall", "car", "chair"), np.full(10, 0.1)
-    room = np.eye(3, dtype=np.float32)[[0] * 7 + [2] * 2 + [1]]
-    street = np.eye(3, dtype=np.float32)[[1] * 5 + [0] * 5]
-    assert place_likelihood(room, names, weight)[1] < 0.2
-    assert (place_likelihood(room, names, weight)[[0, 2]] == 1).all()
-    assert (place_likelihood(street, names, weight) == 1).all()
+def test_parts_that_do_not_agree_keep_their_own_names() -> None:
+    """A chair beside what passes for a bed: as much of one as of the other."""
+    names = ("bed", "seating", "floor")
+    voxels = voxels_of([(x, 0, 0) for x in range(6)], [(0, 0, 1)] * 6)
+    share = np.array([[0.9, 0.1, 0]] * 3 + [[0.3, 0.7, 0]] * 2 + [[0, 0, 1]], np.float32)
+    before = share.copy()
+    one_name_each(share, names, voxels)
+    assert (share == before).all()
+    assert disputed(share.argmax(1), names, voxels).tolist() == [True] * 5 + [False]
+    share[3] = [0.6, 0.4, 0]
+    assert not disputed(share.argmax(1), names, voxels).any()
+    one_name_each(share, names, voxels)
+    assert share.argmax(1).tolist() == [0] * 5 + [2]
+    assert not disputed(np.full(6, VOID, np.uint8), names, voxels).any()
 
 
 def test_voxels_of_many_frames_are_summed_as_they_come(monkeypatch: pytest.MonkeyPatch) -> None:
