@@ -148,7 +148,7 @@ def fisheye_face(camera: Camera, max_side: int) -> Faces:
     size = reduced_size(camera.width, camera.height, max_side)
     small = camera.resized(*size)
     lens = make_lens(to_pycolmap(small))
-    return Faces(lens.pinhole, size, (lens.maps(),), small)
+    return Faces(lens.pinhole, size, (lens.maps,), small)
 
 
 def level_mosaic(faces: list[NDArray[Pixel]]) -> NDArray[Pixel]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -85,15 +86,17 @@ class Lens:
 
     def undistort_image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """(H, W, 3) of the source as the pinhole sees it."""
-        x, y = self.maps()
+        x, y = self.maps
         return cv2.remap(rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.uint8, copy=False)
 
     def undistort_mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """(H, W) of the source as the pinhole sees it."""
-        x, y = self.maps()
+        x, y = self.maps
         return cv2.remap(mask.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) > 0
 
+    @cached_property
     def maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(H, W) columns and rows of the source, as OpenCV counts them, of the pixels of the pinhole."""
         columns, rows = np.meshgrid(np.arange(self.pinhole.width) + 0.5, np.arange(self.pinhole.height) + 0.5)
         source = _distort(self.camera, self.pinhole, np.stack([columns.ravel(), rows.ravel()], axis=1))
         # OpenCV counts pixel centres from (0, 0).
