@@ -1,6 +1,7 @@
 """Counts what a card is asked to do in steady mapping: operations, reads by the host, bytes copied to and fro.
 
     python tests/benchmarks/launches.py                   the table
+    python tests/benchmarks/launches.py --causes          also by the function that asks for them
     python tests/benchmarks/launches.py --json rows.json  the same as rows
 
 No card is needed: the work runs as on one, over tensors that only pretend to lie there (`tests/pretend_device.py`) and
@@ -56,12 +57,14 @@ _WAITING = (
 
 
 class Counting(TorchDispatchMode):
-    """Counts, within, the operations that touch tensors of the pretended device; `names`: which ones, how often."""
+    """Counts, within, the operations that touch tensors of the pretended device; `names`: which ones, how often;
+    `causes`: launches by the function of the program that asked for them."""
 
     def __init__(self) -> None:
         super().__init__()
         self.counts: Counter[str] = Counter(dict.fromkeys(COLUMNS, 0))
         self.names: Counter[str] = Counter()
+        self.causes: Counter[str] = Counter()
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         result = function(*args, **(kwargs or {}))
@@ -89,12 +92,24 @@ class Counting(TorchDispatchMode):
         """One more launch."""
         self.counts["launches"] += 1
         self.names[name] += 1
+        self.causes[_cause()] += 1
 
     def copied(self, way: str, size: int) -> None:
         """A copy of so many bytes; those to the host make it wait."""
         self.counts[way] += size
         self.counts["reads"] += way == "bytes from it"
         self.names[f"copies: {way}"] += 1
+
+
+def _cause() -> str:
+    """The innermost function of the program that is being run; what autograd does by itself is its caller's."""
+    frame = sys._getframe(1)
+    while frame is not None:
+        path = Path(frame.f_code.co_filename)
+        if path.is_relative_to(ROOT / "pipelines"):
+            return f"{path.relative_to(ROOT / 'pipelines').with_suffix('')}: {frame.f_code.co_qualname}"
+        frame = frame.f_back  # type: ignore[assignment]
+    return "elsewhere"
 
 
 def _is_view(function: Any) -> bool:
@@ -205,14 +220,16 @@ def measure() -> dict[str, Counting]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--causes", action="store_true", help="also list which functions ask for the launches")
     parser.add_argument("--operations", action="store_true", help="also list which operations they are")
     options = parser.parse_args()
     rows = measure()
     print("| steady work | " + " | ".join(COLUMNS) + " |\n|" + " --- |" * (len(COLUMNS) + 1))
     for name, found in rows.items():
         print(f"| {name} | " + " | ".join(str(found.counts[c]) for c in COLUMNS) + " |")
-        if options.operations:
-            print("\n".join(f"    {count:4d} {operation}" for operation, count in found.names.most_common()))
+        for wanted, listed in ((options.causes, found.causes), (options.operations, found.names)):
+            if wanted:
+                print("\n".join(f"    {count:4d} {name}" for name, count in listed.most_common()))
     if options.json is not None:
         options.json.write_text(json.dumps({n: dict(f.counts) for n, f in rows.items()}, indent=1))
 
