@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -9,6 +10,7 @@ from torch import Tensor
 from msgs_slam.pipelines.config import MappingConfig, PaperConfig
 from msgs_slam.pipelines.gaussians.render import Rendering
 from msgs_slam.pipelines.mapping import losses
+from msgs_slam.pipelines.mapping.card_loss import TermWeights, card_loss
 from msgs_slam.pipelines.mapping.paper.boundary_clip import clip_beside_boundary
 from msgs_slam.pipelines.mapping.paper.edge_term import edge_loss
 from msgs_slam.pipelines.mapping.paper.label_image import label_image_loss
@@ -35,30 +37,55 @@ class Objective:
         wanted = max(self.settings.label_weight, self.paper.edge_weight) > 0
         return self.classes > 0 and wanted and iteration % LABEL_EVERY == 0
 
-    def of(self, view: View, exposure: Tensor, rendering: Rendering, log_radii: Tensor, with_labels: bool) -> Tensor:
-        """Scalar; `exposure` (2, 3) is the view's, `log_radii` (M,) the map's."""
-        s, paper = self.settings, self.paper
-        if paper.boundary_clip > 0:
-            clip_beside_boundary(rendering.features, view.channels, paper.boundary_clip)
+    def of(
+        self,
+        view: View,
+        exposure: Tensor,
+        rendering: Rendering,
+        log_radii: Tensor,
+        with_labels: bool,
+        in_view: Tensor | None = None,
+    ) -> Tensor:
+        """Scalar; `exposure` (2, 3) is the view's, `log_radii` (M,) those of the Gaussians in view, or of all Gaussians
+        of a card, of which `in_view` (M,) bool tells them."""
+        if self.paper.boundary_clip > 0:
+            clip_beside_boundary(rendering.features, view.channels, self.paper.boundary_clip)
         # split, not slices: the gradient of each slice would be a whole image of zeros around it.
-        shown, logits = rendering.features.split([3, rendering.features.shape[-1] - 3], dim=-1)
-        loss = photo_loss(shown, exposure, view.image, view.scene)
+        parts = rendering.features.split([3, rendering.features.shape[-1] - 3], dim=-1)
+        if in_view is None:
+            loss = self._seen(view, exposure, rendering, parts, with_labels)
+            loss = loss + losses.size_loss(log_radii, self.unit)
+        else:
+            weights = TermWeights(SILHOUETTE_WEIGHT, self._depth_weight, self._label_weight(with_labels), self.unit)
+            loss = card_loss(view, exposure, rendering, log_radii, in_view, weights)
+        return self._with_paper(loss, view, rendering.depth, parts[1], with_labels)
+
+    @property
+    def _depth_weight(self) -> float:
+        return self.settings.depth_weight if self.settings.use_proxy_depth else 0.0
+
+    def _label_weight(self, with_labels: bool) -> float:
+        return LABEL_EVERY * self.settings.label_weight if with_labels and not self.paper.label_image else 0.0
+
+    def _seen(
+        self, view: View, exposure: Tensor, rendering: Rendering, parts: Sequence[Tensor], with_labels: bool
+    ) -> Tensor:
+        """The terms of every view: what `card_loss` has for cards, without the sizes."""
+        loss = photo_loss(parts[0], exposure, view.image, view.scene)
         loss = loss + SILHOUETTE_WEIGHT * losses.silhouette_loss(view.of_scene(rendering.silhouette, 1.0))
-        loss = loss + losses.size_loss(log_radii, self.unit)
-        if s.depth_weight > 0 and s.use_proxy_depth:
+        if self._depth_weight > 0:
             weight = losses.depth_weight(view.trust)
-            loss = loss + s.depth_weight * losses.depth_loss(rendering.depth, view.depth, weight, self.unit)
-        if with_labels:
-            loss = loss + LABEL_EVERY * self._semantic(view, rendering.depth, logits)
+            loss = loss + self._depth_weight * losses.depth_loss(rendering.depth, view.depth, weight, self.unit)
+        if (weight_of_labels := self._label_weight(with_labels)) > 0:
+            loss = loss + weight_of_labels * losses.label_loss(parts[1], view.channels, view.label_weight)
         return loss
 
-    def _semantic(self, view: View, depth: Tensor, logits: Tensor) -> Tensor:
-        """Labels, and what the paper has beside them."""
-        paper, weight = self.paper, self.settings.label_weight
-        loss = depth.new_zeros(())
-        if weight > 0:
-            compare = label_image_loss if paper.label_image else losses.label_loss
-            loss = loss + weight * compare(logits, view.channels, view.label_weight)
-        if paper.edge_weight > 0:
-            loss = loss + paper.edge_weight * edge_loss(depth, view.channels, self.unit)
+    def _with_paper(self, loss: Tensor, view: View, depth: Tensor, logits: Tensor, with_labels: bool) -> Tensor:
+        """And what the paper has beside them."""
+        paper = self.paper
+        if with_labels and paper.label_image and self.settings.label_weight > 0:
+            weight = LABEL_EVERY * self.settings.label_weight
+            loss = loss + weight * label_image_loss(logits, view.channels, view.label_weight)
+        if with_labels and paper.edge_weight > 0:
+            loss = loss + LABEL_EVERY * paper.edge_weight * edge_loss(depth, view.channels, self.unit)
         return loss

@@ -10,10 +10,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+import msgs_slam.pipelines.gaussians.render.cards as cards
 from msgs_slam.pipelines.config import MappingConfig, PaperConfig
 from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.gaussians.adam import AdamTable, gradients_of
-from msgs_slam.pipelines.gaussians.render import Rendering, blending_weights, in_view, render
+from msgs_slam.pipelines.gaussians.adam import gradients_of
+from msgs_slam.pipelines.gaussians.render import Rendering, blending_weights, in_view, marked_in_view, render
+from msgs_slam.pipelines.mapping.card_loss import color_errors_on_card, fit_exposure_on_card
 from msgs_slam.pipelines.mapping.exposure import SOLID, expose, fit_exposure
 from msgs_slam.pipelines.mapping.growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
 from msgs_slam.pipelines.mapping.objective import Objective
@@ -97,25 +99,9 @@ class MapOptimiser:
         view = (self.halves if step.coarse else self.views)[step.view]
         if step.seed is not Seeding.NOTHING:
             self._seed(step.view, step.seed)
-        parameters, table = self.state.parameters, self.state.view_tables[step.view]
-        if len(parameters) == 0:
+        if len(self.state.parameters) == 0:
             return
-        with_labels = self.objective.uses_labels(step.iteration)
-        with_classes = with_labels or (step.grow and self.paper.class_growth)
-        # What the view does not show has no gradient and would wait anyway.
-        pose, radii = self.state.cam_from_world(step.view, view), torch.exp(parameters["log_radii"].detach())
-        rows = in_view(parameters["means"].detach(), radii, pose, view.intrinsics)
-        values = {k: parameters[k].detach()[rows].requires_grad_() for k in (KEYS if with_classes else COLOR_KEYS)}
-        rendering = self.draw(view, table, values)
-        if self.settings.exposure:
-            self._expose(step.view, view, rendering)
-        exposure = self.state.exposures[step.view]
-        loss = self.objective.of(view, exposure, rendering, values["log_radii"], with_labels) * step.weight
-        of_map, of_view = gradients_of(loss, (values, table.values))
-        rates = {key: rate * step.rate for key, rate in MAP_RATES.items()}
-        parameters.table.step(of_map, rates, self._shares(rows, values["log_radii"].detach()), rows)
-        refines = self.settings.refine_poses and step.refine_pose
-        table.step(of_view, {"twist": POSE_RATE * step.rate if refines else 0.0})
+        rendering = self._step(step, view)
         if step.grow:
             self.growth.grow(step.view, Rendering(*(x.detach() for x in vars(rendering).values())))
         if step.split and self.settings.split_error > 0:
@@ -123,12 +109,38 @@ class MapOptimiser:
         if step.prune:
             self.growth.prune(self._blending_weights)
 
+    def _step(self, step: Step, view: View) -> Rendering:
+        """Compare and move the map, the view's pose and its exposure; returns what the view showed before."""
+        parameters, on_card = self.state.parameters, cards.takes_kernels(self.state.parameters["means"])
+        with_labels = self.objective.uses_labels(step.iteration)
+        keys = KEYS if with_labels or (step.grow and self.paper.class_growth) else COLOR_KEYS
+        pose, radii = self.state.cam_from_world(step.view, view), torch.exp(parameters["log_radii"].detach())
+        seeing = (parameters["means"].detach(), radii, pose, view.intrinsics)
+        rows, seen = None, None
+        if on_card:  # a list of rows would keep the host waiting for its length
+            seen, pose = marked_in_view(*seeing), pose.to(radii)
+            values = {k: parameters[k] for k in keys}
+        else:  # what the view does not show has no gradient and would wait anyway
+            rows = in_view(*seeing)
+            values = {k: parameters[k].detach()[rows].requires_grad_() for k in keys}
+        refines = self.settings.refine_poses and step.refine_pose
+        rendering = self.draw(view, pose.requires_grad_(refines), values)
+        if self.settings.exposure:
+            self._expose(step.view, view, rendering)
+        exposure = self.state.exposures[step.view]
+        loss = self.objective.of(view, exposure, rendering, values["log_radii"], with_labels, seen) * step.weight
+        of_map, of_view = gradients_of(loss, (values, {"pose": pose} if refines else {}))
+        rates = {key: rate * step.rate for key, rate in MAP_RATES.items()}
+        parameters.table.step(of_map, rates, self._shares(rows, values["log_radii"].detach()), rows)
+        self.state.step_pose(step.view, view, of_view.get("pose"), POSE_RATE * step.rate)
+        return rendering
+
     @torch.no_grad()
     def _seed(self, index: int, what: Seeding) -> None:
         known = len(self.state.parameters) > 0
-        view, table = self.views[index], self.state.view_tables[index]
-        values = {k: self.state.parameters[k] for k in COLOR_KEYS}
-        self.growth.seed(index, what, self.draw(view, table, values) if known else None)
+        view = self.views[index]
+        pose, values = self.state.cam_from_world(index, view), {k: self.state.parameters[k] for k in COLOR_KEYS}
+        self.growth.seed(index, what, self.draw(view, pose, values) if known else None)
 
     def _blame(self) -> DensificationError:
         """What each Gaussian answers for in the view where that is most."""
@@ -142,11 +154,16 @@ class MapOptimiser:
     @torch.no_grad()
     def _color_errors(self, index: int, colors: Tensor) -> Tensor:
         """(H, W) mean difference between the view's photo and the (H, W, 3) colours of the map."""
-        view = self.views[index]
-        return view.of_scene((expose(colors, self.state.exposures[index]) - view.colors).abs().mean(-1))
+        view, exposure = self.views[index], self.state.exposures[index]
+        if cards.takes_kernels(colors):
+            return color_errors_on_card(colors, view, exposure)
+        return view.of_scene((expose(colors, exposure) - view.colors).abs().mean(-1))
 
     def _expose(self, index: int, view: View, rendering: Rendering) -> None:
         """The view's exposure by what the map shows of it now."""
+        if cards.takes_kernels(rendering.silhouette):
+            fit_exposure_on_card(rendering, view, self.state.exposures[index])
+            return
         known, shown = view.of_scene(rendering.silhouette.detach()) > SOLID, rendering.features.detach()[..., :3]
         exposure = self.state.exposures[index]
         exposure.copy_(fit_exposure(shown, view.colors, known, exposure))
@@ -165,28 +182,28 @@ class MapOptimiser:
             largest = torch.maximum(largest, seen)
         return largest
 
-    def draw(self, view: View, table: AdamTable, values: Mapping[str, Tensor]) -> Rendering:
-        """Gaussians of raw parameters as the view's camera sees them now, with class logits where they have any."""
+    def draw(self, view: View, cam_from_world: Tensor, values: Mapping[str, Tensor]) -> Rendering:
+        """Gaussians of raw parameters as the view sees them from (4, 4), with class logits where they have any."""
         kappa, colors = self.paper.kappa, values["colors"]
         return render(
             values["means"],
             torch.exp(values["log_radii"]),
             torch.sigmoid(values["opacity_logits"]),
             torch.cat([colors, values["class_logits"]], dim=1) if "class_logits" in values else colors,
-            view.cam_from_world,
+            cam_from_world,
             view.intrinsics,
             proxy_depth=view.depth if kappa > 0 else None,
             kappa=kappa / self.unit**2,
-            twist=table.values["twist"] if self.settings.refine_poses else None,
         )
 
-    def _shares(self, rows: Tensor, log_radii: Tensor) -> dict[str, Tensor]:
-        """(n,) step sizes of some rows by confidence class (MSGS-SLAM 3.4), those of positions times the radius.
+    def _shares(self, rows: Tensor | None, log_radii: Tensor) -> dict[str, Tensor]:
+        """(n,) step sizes of some rows, None for all, by confidence class (MSGS-SLAM 3.4), those of positions times the
+        radius.
 
         The paper has small steps where depth is unreliable. Measured, the contrary helps: what stands in the wrong
         place has farther to go, and colours have to lead it there.
         """
-        trust = self.state.parameters.trust[rows]
+        trust = self.state.parameters.trust if rows is None else self.state.parameters.trust[rows]
         shares = torch.where(trust > LOW_RELIABILITY, math.sqrt(LOW_TRUST_STEP), LOW_TRUST_STEP)
         shares = torch.where(trust > HIGH_RELIABILITY, 1.0, shares)
         return {**dict.fromkeys(KEYS, shares), "means": shares * torch.exp(log_radii)}

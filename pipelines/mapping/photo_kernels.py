@@ -1,4 +1,4 @@
-"""Triton kernels of the photo loss: what `photo_loss` compiles for a CPU, on a card.
+"""Triton kernels of the photo loss and the exposure: what `photo_loss` compiles for a CPU, on a card.
 
 Pictures are flat: number i is a colour of pixel i // 3. The sums are atomic additions: their last bits may differ from
 run to run. The interpreter of Triton (environment variable TRITON_INTERPRET=1) runs these kernels on CPU tensors.
@@ -11,25 +11,38 @@ import triton.language as tl
 
 
 @triton.jit
+def scene_at(scene: tl.tensor, pixel: tl.tensor, inside: tl.tensor, MASKED: tl.constexpr) -> tl.tensor:
+    """Which of some pixels show the scene: all inside where the view has no mask."""
+    is_scene = inside
+    if MASKED:
+        is_scene = tl.load(scene + pixel, mask=inside, other=0) != 0
+    return is_scene
+
+
+@triton.jit
+def photo_at(photo: tl.tensor, number: tl.tensor, inside: tl.tensor) -> tl.tensor:
+    """Numbers of a photo in 0..1."""
+    return tl.load(photo + number, mask=inside, other=0).to(tl.float32) / 255
+
+
+@triton.jit
 def expose_colors(
     shown: tl.tensor, stride: tl.tensor, exposure: tl.tensor, photo: tl.tensor, scene: tl.tensor, planes: tl.tensor,
-    sums: tl.tensor, size: tl.tensor, MASKED: tl.constexpr, BLOCK: tl.constexpr,
+    loss: tl.tensor, size: tl.tensor, SHARE: tl.constexpr, MASKED: tl.constexpr, BLOCK: tl.constexpr,
 ) -> None:  # fmt: skip
-    """Exposed colours a, photo b and the products aa, bb and ab into the five planes; adds |a - b| to sums[0]."""
+    """Exposed colours a, photo b and the products aa, bb and ab into the five planes; adds what |a - b| counts."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < size
     pixel, color = i // 3, i % 3
     gain = tl.exp(tl.load(exposure + color))
     a = tl.load(shown + pixel * stride + color, mask=inside, other=0.0) * gain + tl.load(exposure + 3 + color)
-    b = tl.load(photo + i, mask=inside, other=0).to(tl.float32) / 255
-    if MASKED:
-        b = tl.where(tl.load(scene + pixel, mask=inside, other=0) != 0, b, a)
+    b = tl.where(scene_at(scene, pixel, inside, MASKED), photo_at(photo, i, inside), a)
     tl.store(planes + i, a, mask=inside)
     tl.store(planes + size + i, b, mask=inside)
     tl.store(planes + 2 * size + i, a * a, mask=inside)
     tl.store(planes + 3 * size + i, b * b, mask=inside)
     tl.store(planes + 4 * size + i, a * b, mask=inside)
-    tl.atomic_add(sums, tl.sum(tl.where(inside, tl.abs(a - b), 0.0), axis=0))
+    tl.atomic_add(loss, tl.sum(tl.where(inside, tl.abs(a - b), 0.0), axis=0) * ((1 - SHARE) / size))
 
 
 @triton.jit
@@ -52,10 +65,10 @@ def blur_planes(
 
 @triton.jit
 def compare_moments(
-    moments: tl.tensor, planes: tl.tensor, sums: tl.tensor, size: tl.tensor,
-    C1: tl.constexpr, C2: tl.constexpr, BLOCK: tl.constexpr,
+    moments: tl.tensor, planes: tl.tensor, loss: tl.tensor, size: tl.tensor,
+    C1: tl.constexpr, C2: tl.constexpr, SHARE: tl.constexpr, BLOCK: tl.constexpr,
 ) -> None:  # fmt: skip
-    """The similarity's derivatives by mean, variance and covariance into planes 2 to 4; adds it to sums[1]."""
+    """The similarity's derivatives by mean, variance and covariance into planes 2 to 4; adds what it counts."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < size
     x = tl.load(moments + i, mask=inside, other=0.0)
@@ -73,15 +86,16 @@ def compare_moments(
     tl.store(planes + 2 * size + i, by_mean, mask=inside)
     tl.store(planes + 3 * size + i, by_var, mask=inside)
     tl.store(planes + 4 * size + i, by_cov, mask=inside)
-    tl.atomic_add(sums + 1, tl.sum(tl.where(inside, value, 0.0), axis=0))
+    tl.atomic_add(loss, tl.sum(tl.where(inside, 1.0 - value, 0.0), axis=0) * (SHARE / size))
 
 
 @triton.jit
 def differentiate(
-    planes: tl.tensor, blurred: tl.tensor, exposure: tl.tensor, scene: tl.tensor, gradient: tl.tensor, size: tl.tensor,
-    SHARE: tl.constexpr, MASKED: tl.constexpr, BLOCK: tl.constexpr,
+    planes: tl.tensor, blurred: tl.tensor, exposure: tl.tensor, scene: tl.tensor, gradient: tl.tensor,
+    stride: tl.tensor, size: tl.tensor, SHARE: tl.constexpr, MASKED: tl.constexpr, BLOCK: tl.constexpr,
 ) -> None:  # fmt: skip
-    """The loss's gradient by what was shown; `blurred`: the three derivatives, 0 where there is no scene."""
+    """The loss's gradient by what was shown, a pixel every `stride` numbers; `blurred`: the three derivatives, 0 where
+    there is no scene."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < size
     a = tl.load(planes + i, mask=inside, other=0.0)
@@ -91,6 +105,68 @@ def differentiate(
     likeness += b * tl.load(blurred + 2 * size + i, mask=inside, other=0.0)
     sign = tl.where(a > b, 1.0, 0.0) - tl.where(a < b, 1.0, 0.0)
     found = ((1 - SHARE) * sign - SHARE * likeness) * tl.exp(tl.load(exposure + i % 3)) / size
-    if MASKED:
-        found = tl.where(tl.load(scene + i // 3, mask=inside, other=0) != 0, found, 0.0)
-    tl.store(gradient + i, found, mask=inside)
+    found = tl.where(scene_at(scene, i // 3, inside, MASKED), found, 0.0)
+    tl.store(gradient + (i // 3) * stride + i % 3, found, mask=inside)
+
+
+@triton.jit
+def color_errors(
+    shown: tl.tensor, stride: tl.tensor, exposure: tl.tensor, photo: tl.tensor, scene: tl.tensor, errors: tl.tensor,
+    pixels: tl.tensor, MASKED: tl.constexpr, BLOCK: tl.constexpr,
+) -> None:  # fmt: skip
+    """Mean difference of each pixel's three exposed colours from the photo's, 0 where it shows no scene."""
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = pixel < pixels
+    total = tl.zeros((BLOCK,), tl.float32)
+    for k in tl.static_range(3):
+        a = tl.load(shown + pixel * stride + k, mask=inside, other=0.0) * tl.exp(tl.load(exposure + k))
+        total += tl.abs(a + tl.load(exposure + 3 + k) - photo_at(photo, pixel * 3 + k, inside))
+    tl.store(errors + pixel, tl.where(scene_at(scene, pixel, inside, MASKED), total / 3, 0.0), mask=inside)
+
+
+@triton.jit
+def fit_color(
+    shown: tl.tensor, stride: tl.tensor, silhouette: tl.tensor, photo: tl.tensor, scene: tl.tensor,
+    exposure: tl.tensor, width: tl.tensor, height: tl.tensor,
+    STRIDE: tl.constexpr, SOLID: tl.constexpr, LEAST: tl.constexpr, OUTLIER: tl.constexpr, RIDGE: tl.constexpr,
+    MOST_GAIN: tl.constexpr, MASKED: tl.constexpr, BLOCK: tl.constexpr,
+) -> None:  # fmt: skip
+    """`exposure.fit_exposure` of one colour, in place; one program sees all pixels that tell, so that sums are those of
+    one order."""
+    color = tl.program_id(0)
+    across = (width + STRIDE - 1) // STRIDE
+    told = across * ((height + STRIDE - 1) // STRIDE)
+    old_gain, old_offset = tl.load(exposure + color), tl.load(exposure + 3 + color)
+    gain, offset = tl.exp(old_gain.to(tl.float64)), old_offset.to(tl.float64)
+    # In double precision, as variances from sums of squares want.
+    nothing = tl.zeros((BLOCK,), tl.float64)
+    used, total, sum_x, sum_y, sum_xx, sum_xy = nothing, nothing, nothing, nothing, nothing, nothing
+    first = 0
+    while first < told:
+        place = first + tl.arange(0, BLOCK)
+        inside = place < told
+        pixel = (place // across) * STRIDE * width + (place % across) * STRIDE
+        solid = tl.load(silhouette + pixel, mask=inside, other=0.0) > SOLID
+        solid = solid & scene_at(scene, pixel, inside, MASKED)
+        x = tl.load(shown + pixel * stride + color, mask=inside, other=0.0).to(tl.float64)
+        y = photo_at(photo, pixel * 3 + color, inside).to(tl.float64)
+        weight = tl.where(solid, 1.0, 0.0).to(tl.float64)
+        used += weight
+        weight = weight / tl.maximum(tl.abs(y - x * gain - offset), OUTLIER)
+        total += weight
+        sum_x += weight * x
+        sum_y += weight * y
+        sum_xx += weight * x * x
+        sum_xy += weight * x * y
+        first += BLOCK
+    weights = tl.maximum(tl.sum(total, axis=0), 1e-30)
+    mean_x, mean_y = tl.sum(sum_x, axis=0) / weights, tl.sum(sum_y, axis=0) / weights
+    variance = tl.maximum(tl.sum(sum_xx, axis=0) / weights - mean_x * mean_x, 0.0)
+    together = tl.sum(sum_xy, axis=0) / weights - mean_x * mean_y
+    slope = tl.minimum(tl.maximum(together / tl.maximum(variance, 1e-12), 1 / MOST_GAIN), MOST_GAIN)
+    certain = slope * slope * variance
+    log_gain = tl.log(slope) * certain / (certain + RIDGE)
+    new_offset = (mean_y - tl.exp(log_gain) * mean_x) / (1 + RIDGE)
+    enough = tl.sum(used, axis=0) >= LEAST
+    tl.store(exposure + color, tl.where(enough, log_gain.to(tl.float32), old_gain))
+    tl.store(exposure + 3 + color, tl.where(enough, new_offset.to(tl.float32), old_offset))

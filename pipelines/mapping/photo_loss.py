@@ -11,18 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-import msgs_slam.pipelines.gaussians.render.cards as cards
 from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
 from msgs_slam.pipelines.gaussians.render.lanes import counting, load, splat, store, total, where
 from msgs_slam.pipelines.gaussians.render.threads import for_each
-from msgs_slam.pipelines.gaussians.ssim import C1, C2, TAPS, WINDOW, blur_array, ssim_map
+from msgs_slam.pipelines.gaussians.ssim import C1, C2, blur_array, ssim_map
 from msgs_slam.pipelines.mapping.exposure import expose
 
 SSIM_WEIGHT = 0.2
 """Share of 1 - SSIM in eq. (20)."""
 _ROWS = 16
-_BLOCK = 512
-"""Numbers a program of the kernels."""
 _ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
 _C1, _C2, _SHARE = np.float32(C1), np.float32(C2), np.float32(SSIM_WEIGHT)
 
@@ -33,13 +30,11 @@ def photo_loss(shown: Tensor, exposure: Tensor, photo: Tensor, scene: Tensor | N
     shown (H, W, 3) 0..1, exposure (2, 3), photo (H, W, 3) uint8; differentiable in the first. Where
     scene (H, W) is False the photo is no part of the scene: there it looks as the map does, and asks for nothing.
     The paper prints ω = 0.2 before the absolute difference; the weights of 3DGS, which has the same formula, are the
-    other way round, and so are the ones here. float32 on a CPU takes compiled loops, on a card kernels; everything else
-    plain torch.
+    other way round, and so are the ones here. float32 on a CPU takes compiled loops, everything else plain torch; of a
+    card's views it is a part of `card_loss`.
     """
     if shown.device.type == "cpu" and shown.dtype == torch.float32:
         return _PhotoLoss.apply(shown, exposure, photo, scene)
-    if cards.takes_kernels(shown):
-        return photo_loss_by_kernels(shown, exposure, photo, scene)
     return plain_photo_loss(shown, exposure, photo, scene)
 
 
@@ -51,55 +46,6 @@ def plain_photo_loss(shown: Tensor, exposure: Tensor, photo: Tensor, scene: Tens
         colors, target = (torch.where(scene[..., None], x, beside) for x in (colors, target))
     difference = (colors - target).abs().mean()
     return (1 - SSIM_WEIGHT) * difference + SSIM_WEIGHT * (1 - ssim_map(colors, target).mean())
-
-
-def photo_loss_by_kernels(shown: Tensor, exposure: Tensor, photo: Tensor, scene: Tensor | None) -> Tensor:
-    """The same by kernels of Triton, on float32 tensors of one card."""
-    return _OnCard.apply(shown, exposure, photo, scene)
-
-
-class _OnCard(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, shown: Tensor, exposure: Tensor, photo: Tensor, scene: Tensor | None) -> Tensor:
-        import msgs_slam.pipelines.mapping.photo_kernels as kernels  # imports triton
-
-        width = photo.shape[1]
-        size, row = photo.numel(), 3 * width
-        # Rendered colours may be a slice of more features: pixels follow each other, their colours too.
-        lies = shown.stride() == (width * shown.stride(1), shown.stride(1), 1)
-        picture = shown.detach() if lies else shown.detach().contiguous()
-        exposed, target = exposure.detach().contiguous(), photo.contiguous()
-        mask = target if scene is None else scene.contiguous().view(torch.uint8)
-        planes, moments, half = (shown.new_empty(5, size) for _ in range(3))
-        sums, gradient = shown.new_zeros(2), shown.new_empty(photo.shape)
-        window, masked = _window(shown.device), scene is not None
-
-        def run(kernel_: Any, count: int, *arguments: Any, **settings: Any) -> None:
-            cards.launch(kernel_, -(-count // _BLOCK), *arguments, BLOCK=_BLOCK, **settings)
-
-        def blur(numbers: int, of: Tensor) -> None:
-            run(kernels.blur_planes, numbers, of, half, window, size, row, 3, numbers, TAPS=TAPS)
-            run(kernels.blur_planes, numbers, half, moments, window, size, size, row, numbers, TAPS=TAPS)
-
-        given = (picture, picture.stride(1), exposed, target, mask)
-        run(kernels.expose_colors, size, *given, planes, sums, size, MASKED=masked)
-        blur(5 * size, planes)
-        run(kernels.compare_moments, size, moments, planes, sums, size, C1=C1, C2=C2)
-        blur(3 * size, planes[2:])
-        places = (exposed, mask, gradient, size)
-        run(kernels.differentiate, size, planes, moments, *places, SHARE=SSIM_WEIGHT, MASKED=masked)
-        ctx.save_for_backward(gradient)
-        difference, likeness = (sums / size).unbind(0)
-        return (1 - SSIM_WEIGHT) * difference + SSIM_WEIGHT * (1 - likeness)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        return ctx.saved_tensors[0] * grads[0], None, None, None
-
-
-@lru_cache(maxsize=2)
-def _window(device: torch.device) -> Tensor:
-    return torch.tensor(WINDOW, dtype=torch.float32, device=device)
 
 
 @lru_cache(maxsize=2)

@@ -13,8 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.gaussians.render import blending_weights, render
-from msgs_slam.pipelines.gaussians.render.rendering import project_map
+from msgs_slam.pipelines.gaussians.render import error_shares
 from msgs_slam.pipelines.types import Intrinsics
 
 CHILDREN = 4
@@ -50,10 +49,9 @@ def densification_error(
     Densification in Gaussian Splatting", ECCV 2024).
     """
     m = gaussian_map
-    shown = render(m.means, m.radii, m.opacities, m.colors, cam_from_world, intrinsics).features
-    weights = blending_weights(m.means, m.radii, m.opacities, cam_from_world, intrinsics, counts=error_of(shown))
-    _, _, footprint, _ = project_map(m.means, m.radii, cam_from_world, intrinsics)
-    return DensificationError(weights.total, footprint)
+    return DensificationError(
+        *error_shares(m.means, m.radii, m.opacities, m.colors, cam_from_world, intrinsics, error_of)
+    )
 
 
 def split(gaussian_map: GaussianMap, rows: Tensor) -> GaussianMap:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from torch import Tensor
 from msgs_slam.formats.tensors import load_tensors, save_tensors
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.gaussians.adam import AdamTable
+from msgs_slam.pipelines.gaussians.render.rendering import moved
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.mapping.parameters import MapParameters, empty_map
 from msgs_slam.pipelines.mapping.views import View
@@ -35,17 +36,29 @@ class OptimisedMap:
     iterations: int
 
 
+@dataclass(frozen=True)
+class PoseStep:
+    """A view's pose before it was refined, and the gradient by which its twist is to move; None for not at all."""
+
+    cam_from_world: Tensor
+    gradient: Tensor | None
+    rate: float
+
+
 @dataclass
 class OptimiserState:
     """The map's parameters, each view's twist, the exposures (N, 2, 3) of all views, and the number of steps done.
 
-    Twists and poses stay on the host, wherever the map lies: six numbers at a time are no work for a card.
+    Twists and poses stay on the host, wherever the map lies: six numbers at a time are no work for a card. Gradients
+    found on a card wait there until somebody asks for a pose of theirs: all views' come in one copy, where one a visit
+    would make the host wait for each.
     """
 
     parameters: MapParameters
     view_tables: list[AdamTable]
     exposures: Tensor
     iteration: int = 0
+    _waiting: dict[int, PoseStep] = field(default_factory=dict)
 
     @staticmethod
     def fresh(
@@ -72,6 +85,7 @@ class OptimiserState:
 
     def save(self, snapshot: Path) -> None:
         """Into one file, whole or not at all."""
+        self.settle_poses()
         out = {**self.parameters.to_tensors(), "exposures": self.exposures, "iteration": torch.tensor(self.iteration)}
         for i, table in enumerate(self.view_tables):
             out |= table.to_tensors(f"view{i}")
@@ -79,7 +93,30 @@ class OptimiserState:
 
     def cam_from_world(self, index: int, view: View) -> Tensor:
         """(4, 4) float64 on the host: the view's pose as it is refined by now."""
+        if index in self._waiting:
+            self.settle_poses()
         return se3.exp(self.view_tables[index].values["twist"].detach().double()) @ view.cam_from_world
+
+    def step_pose(self, index: int, view: View, gradient: Tensor | None, rate: float) -> None:
+        """One step of Adam for the view's twist by the gradient of its pose (4, 4), wherever that lies."""
+        self._waiting[index] = PoseStep(view.cam_from_world, gradient, rate)
+        if gradient is None or gradient.device.type == "cpu":
+            self.settle_poses()
+
+    def settle_poses(self) -> None:
+        """Take the steps that wait, of which a card brings the gradients in one copy."""
+        steps, self._waiting = self._waiting, {}
+        given = [s.gradient for s in steps.values() if s.gradient is not None]
+        found = iter(torch.stack(given).cpu() if given else ())
+        for index, step in steps.items():
+            table = self.view_tables[index]
+            twist = table.values["twist"]
+            gradients: dict[str, Tensor | None] = {}
+            if step.gradient is not None:
+                with torch.enable_grad():
+                    pose = moved(step.cam_from_world, twist)
+                gradients["twist"] = torch.autograd.grad(pose, twist, next(found).to(pose))[0]
+            table.step(gradients, {"twist": step.rate})
 
     def result(self, views: Sequence[View], iterations: int) -> OptimisedMap:
         """The values without the optimiser's own."""

@@ -195,13 +195,13 @@ def optimiser() -> MapOptimiser:
     state = OptimiserState.fresh(views, CLASSES, made_map(generator), None)
     out = MapOptimiser(views, CLASSES, MappingConfig(), PaperConfig(), state)
     for iteration in range(2):
-        out.visit(step(iteration))
+        out.visit(step(iteration, 1))
     return out
 
 
-def step(iteration: int, split: bool = False, prune: bool = False) -> Step:
-    """A visit of the second view; labels count in every second iteration."""
-    return Step(iteration, 1, 1.0, 0.5, False, Seeding.NOTHING, False, split, prune, True)
+def step(iteration: int, view: int) -> Step:
+    """A visit; labels count in every second iteration."""
+    return Step(iteration, view, 1.0, 0.5, False, Seeding.NOTHING, False, False, False, True)
 
 
 def measure() -> dict[str, Counting]:
@@ -209,9 +209,11 @@ def measure() -> dict[str, Counting]:
     with pytest.MonkeyPatch.context() as patch, pretend_device.pretended(patch):
         as_on_a_card(patch)
         mapper = optimiser()
-        return {
-            "a visit, colours": counted(lambda: mapper.visit(step(3))),
-            "a visit, with labels": counted(lambda: mapper.visit(step(4))),
+        mapper.state.settle_poses()
+        rows = {"a visit, colours": counted(lambda: mapper.visit(step(3, view=1)))}
+        rows["a visit, with labels"] = counted(lambda: mapper.visit(step(4, view=2)))
+        return rows | {
+            "poses, once a pass": counted(mapper.state.settle_poses),
             f"weights for pruning, {VIEWS} views": counted(mapper._blending_weights),
             f"blame for splitting, {VIEWS} views": counted(mapper._blame),
         }

@@ -5,10 +5,11 @@
 """
 
 from msgs_slam.pipelines.gaussians.render.compositing import Composite, composite
-from msgs_slam.pipelines.gaussians.render.culling import in_view
+from msgs_slam.pipelines.gaussians.render.culling import in_view, marked_in_view
 from msgs_slam.pipelines.gaussians.render.inspection import (
     BlendingWeights,
     blending_weights,
+    error_shares,
     median_and_seen,
     median_depth,
 )
@@ -23,8 +24,10 @@ __all__ = [
     "Rendering",
     "blending_weights",
     "composite",
+    "error_shares",
     "get_threads",
     "in_view",
+    "marked_in_view",
     "median_and_seen",
     "median_depth",
     "render",

@@ -64,7 +64,7 @@ def check_arguments(
         raise ValueError(f"image size must be positive, got {width}x{height}")
     if not 0 <= kappa < float("inf"):
         raise ValueError(f"kappa: got {kappa}, expected a finite number >= 0")
-    count = len(arguments["u"])
+    count = len(next(iter(arguments.values())))
     for name, tensor in arguments.items():
         wanted = 2 if name == "features" else 1
         if tensor.ndim != wanted or len(tensor) != count:

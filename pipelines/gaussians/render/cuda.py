@@ -5,7 +5,6 @@ Gradients are summed by atomic additions: their last bits may differ from run to
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -13,11 +12,20 @@ from torch import Tensor
 
 import msgs_slam.pipelines.gaussians.render.cards as cards
 import msgs_slam.pipelines.gaussians.render.rules as rules
-from msgs_slam.pipelines.gaussians.render.cuda_kernels import backward_tile, forward_tile, inspect_tile
+from msgs_slam.pipelines.gaussians.render.cuda_kernels import (
+    backward_tile,
+    divide_back_pixels,
+    divide_pixels,
+    forward_tile,
+    inspect_tile,
+)
+from msgs_slam.pipelines.gaussians.render.cuda_projection import project, record
+from msgs_slam.pipelines.gaussians.render.cuda_tiles import TILE, list_tiles
 
-__all__ = ["composite", "inspect"]
+__all__ = ["composite", "composite_records", "depth_ratio", "inspect", "inspect_records", "list_tiles", "project"]
 
-TILE, STEP = 16, 16
+STEP = 16
+_BLOCK = 1024
 
 
 def composite(
@@ -34,9 +42,23 @@ def composite(
     near: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Feature image (H, W, C), depth sum, depth silhouette and silhouette (H, W) of float32 tensors on one card."""
+    records = record((u, v, sigma_px, z, opacity), width, height, near)
+    return composite_records(records, features, width, height, proxy_depth, kappa)
+
+
+def composite_records(
+    records: Tensor,
+    features: Tensor,
+    width: int,
+    height: int,
+    proxy_depth: Tensor | None,
+    kappa: float,
+    tiles: tuple[Tensor, Tensor] | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The same of the Gaussians' records (M, 6); `tiles`: what `list_tiles` says of them, where that is known."""
     if features.dtype != torch.float32:
         raise ValueError(f"the cuda backend renders float32, got {features.dtype}")
-    return _Composite.apply(u, v, sigma_px, z, opacity, features, width, height, proxy_depth, kappa, near)
+    return _Composite.apply(records, features, width, height, proxy_depth, kappa, tiles)
 
 
 def inspect(
@@ -45,8 +67,15 @@ def inspect(
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Median depth (H, W), and summed and largest blending weight of each Gaussian, (M,) each, of float32 tensors on
     one card. In the sums a pixel counts as counts (H, W) says, as 1 where None."""
-    geometry = [x.detach() for x in (u, v, sigma_px, z, opacity)]
-    starts, members, records = _tiled(geometry, width, height, near)
+    return inspect_records(record((u, v, sigma_px, z, opacity), width, height, near), width, height, counts)
+
+
+def inspect_records(
+    records: Tensor, width: int, height: int, counts: Tensor | None, tiles: tuple[Tensor, Tensor] | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The same of the Gaussians' records (M, 6)."""
+    records = records.detach()
+    starts, members = tiles or list_tiles(records, width, height)
     counted = records if counts is None else counts.to(records).contiguous()
     median, weights = records.new_empty(height, width), records.new_zeros(2, len(records))
     settings = {key: value for key, value in _settings(False, 1).items() if key not in ("GUIDED", "PADDED")}
@@ -57,14 +86,19 @@ def inspect(
     return median, weights[0], weights[1]
 
 
+def depth_ratio(depth_sum: Tensor, depth_silhouette: Tensor) -> Tensor:
+    """`rendering.depth_ratio` of tensors on one card."""
+    return _Ratio.apply(depth_sum, depth_silhouette)
+
+
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        geometry, features = [x.detach() for x in arguments[:5]], arguments[5].detach().contiguous()
-        width, height, proxy_depth, kappa, near = arguments[6:]
+        records, features = (x.detach().contiguous() for x in arguments[:2])
+        width, height, proxy_depth, kappa, tiles = arguments[2:]
         guided = proxy_depth is not None and kappa > 0
-        proxy = proxy_depth.to(features).contiguous() if guided else features.new_zeros(1)
-        starts, members, records = _tiled(geometry, width, height, near)
+        proxy = proxy_depth.to(features).contiguous() if guided else records
+        starts, members = tiles or list_tiles(records, width, height)
         image = features.new_empty(height, width, features.shape[1])
         planes = [features.new_empty(height, width) for _ in range(3)]
         inputs = (starts, members, records, features, proxy, kappa)
@@ -85,10 +119,31 @@ class _Composite(torch.autograd.Function):
             torch.zeros_like(image) if gradient is None else gradient.contiguous()
             for image, gradient in zip(images, gradients, strict=True)
         ]
-        d_records, d_features = features.new_zeros(len(records), 5), torch.zeros_like(features)
-        results = (d_records, d_features, *ctx.size)
-        cards.launch(backward_tile, len(starts) - 1, *inputs, ctx.kappa, *images, *upstream, *results, **ctx.settings)
-        return (*d_records.t().contiguous().unbind(0), d_features, *[None] * 5)
+        results = features.new_zeros(records.numel() + features.numel()).split([records.numel(), features.numel()])
+        given = (*results, *ctx.size)
+        cards.launch(backward_tile, len(starts) - 1, *inputs, ctx.kappa, *images, *upstream, *given, **ctx.settings)
+        return results[0].view_as(records), results[1].view_as(features), *[None] * 5
+
+
+class _Ratio(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *arguments: Tensor) -> Tensor:
+        above, below = (x.detach().contiguous() for x in arguments)
+        depth = torch.empty_like(above)
+        cards.launch(
+            divide_pixels, -(-depth.numel() // _BLOCK), above, below, depth, depth.numel(), BLOCK=_BLOCK
+        )  # fmt: skip
+        ctx.save_for_backward(depth, below)
+        return depth
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:
+        depth, below = ctx.saved_tensors
+        pulls = (gradients[0].contiguous(), torch.empty_like(depth), torch.empty_like(depth))
+        cards.launch(
+            divide_back_pixels, -(-depth.numel() // _BLOCK), depth, below, *pulls, depth.numel(), BLOCK=_BLOCK
+        )  # fmt: skip
+        return pulls[1], pulls[2]
 
 
 def _settings(guided: bool, channels: int) -> dict[str, Any]:
@@ -103,45 +158,3 @@ def _settings(guided: bool, channels: int) -> dict[str, Any]:
         "LIGHT_MIN": rules.TRANSMITTANCE_MIN,
         "num_warps": 8,
     }
-
-
-def _tiled(geometry: Sequence[Tensor], width: int, height: int, near: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Starts and members of `list_tiles`, and the Gaussians' records (M, 6)."""
-    u, v, sigma_px, z, opacity = geometry
-    reach = reach_of(u, v, sigma_px, z, opacity, width, height, near)
-    return *list_tiles(u, v, z, reach, width, height), torch.stack([*geometry, reach], dim=1)
-
-
-def reach_of(
-    u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, width: int, height: int, near: float
-) -> Tensor:
-    """(M,) pixels from its centre to where a Gaussian ends, 0 where it is not in the image."""
-    reach2 = (2 * torch.log((opacity / rules.ALPHA_MIN).clamp(min=1.0))).clamp(max=rules.CUT_SIGMAS**2)
-    reach = sigma_px.clamp(min=0) * reach2.sqrt()
-    seen = (z > near) & (u + reach >= 0.5) & (u - reach <= width - 0.5)
-    return torch.where(seen & (v + reach >= 0.5) & (v - reach <= height - 0.5), reach, 0.0)
-
-
-def list_tiles(u: Tensor, v: Tensor, z: Tensor, reach: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """The Gaussians that may touch tile t, near to far: members[starts[t]:starts[t + 1]]."""
-    across, down = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    order = torch.argsort(z, stable=True)
-    x, y, r = u[order], v[order], reach[order]
-    left, right = _tile(x - r - 0.5, across), _tile(x + r - 0.5, across)
-    top, bottom = _tile(y - r - 0.5, down), _tile(y + r - 0.5, down)
-    wide = right - left + 1
-    counts = wide * (bottom - top + 1) * (r > 0)
-    ends = torch.cumsum(counts, 0)
-    # How many pairs there are is the one number that the host has to know.
-    pairs = int(ends[-1]) if len(ends) else 0
-    owner = torch.repeat_interleave(torch.arange(len(order), device=u.device), counts, output_size=pairs)
-    nth = torch.arange(pairs, device=u.device) - (ends - counts)[owner]
-    tile = (top[owner] + torch.div(nth, wide[owner], rounding_mode="floor")) * across + left[owner] + nth % wide[owner]
-    tile, permutation = torch.sort(tile, stable=True)
-    starts = torch.searchsorted(tile, torch.arange(across * down + 1, device=u.device))
-    return starts, order[owner[permutation]]
-
-
-def _tile(pixel: Tensor, count: int) -> Tensor:
-    """The tile of a pixel coordinate; clamped before it becomes an integer, which huge floats do not fit."""
-    return (pixel / TILE).floor().clamp(0, count - 1).long()

@@ -11,9 +11,6 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-RECORD = 6
-"""Numbers per Gaussian: u, v, sigma_px, z, opacity, reach."""
-
 
 @triton.jit
 def load_step(
@@ -188,7 +185,7 @@ def backward_tile(
         d_alpha += before * q - left / (1.0 - alpha)
         m = tl.where(live & (alpha < ALPHA_MAX), d_alpha * alpha, 0.0)
         precision = 1.0 / (sigma * sigma)
-        target = d_records + index * 5
+        target = d_records + index * 6
         tl.atomic_add(target, tl.sum(m * dx, axis=0) * precision, mask=used)
         tl.atomic_add(target + 1, tl.sum(m * dy, axis=0) * precision, mask=used)
         tl.atomic_add(target + 2, tl.sum(m * distance2, axis=0) * precision / sigma, mask=used)
@@ -224,3 +221,32 @@ def inspect_tile(
         tl.atomic_max(most + index, tl.max(weight, axis=0), mask=used)
         first += STEP
     tl.store(median + pixel, depth, mask=inside)
+
+
+@triton.jit
+def divide_pixels(
+    above: tl.tensor, below: tl.tensor, depth: tl.tensor, count: tl.tensor, BLOCK: tl.constexpr
+) -> None:  # fmt: skip
+    """The depth of a block of pixels, 0 where no Gaussian is seen."""
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = pixel < count
+    seen = tl.load(below + pixel, mask=inside, other=0.0)
+    shown = seen > 1e-6
+    found = tl.load(above + pixel, mask=inside, other=0.0) / tl.where(shown, seen, 1.0)
+    tl.store(depth + pixel, tl.where(shown, found, 0.0), mask=inside)
+
+
+@triton.jit
+def divide_back_pixels(
+    depth: tl.tensor, below: tl.tensor, pull: tl.tensor, d_above: tl.tensor, d_below: tl.tensor, count: tl.tensor,
+    BLOCK: tl.constexpr,
+) -> None:  # fmt: skip
+    """Gradients of both sums by that of the depth."""
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = pixel < count
+    seen = tl.load(below + pixel, mask=inside, other=0.0)
+    shown = seen > 1e-6
+    share = tl.load(pull + pixel, mask=inside, other=0.0) / tl.where(shown, seen, 1.0)
+    share = tl.where(shown, share, 0.0)
+    tl.store(d_above + pixel, share, mask=inside)
+    tl.store(d_below + pixel, -share * tl.load(depth + pixel, mask=inside, other=0.0), mask=inside)

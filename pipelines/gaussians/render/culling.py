@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+import msgs_slam.pipelines.gaussians.render.cards as cards
 import msgs_slam.pipelines.gaussians.render.rules as rules
 from msgs_slam.pipelines.gaussians.render.compositing import require_finite
 from msgs_slam.pipelines.gaussians.render.jit import kernel
@@ -28,10 +29,21 @@ def in_view(means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: In
         camera = np.array([k.fx, k.fy, k.cx, k.cy, k.width, k.height, near], np.float32)
         arrays = (x.detach().contiguous().numpy() for x in (means, radii, pose))
         return torch.from_numpy(_list_in_view(*arrays, camera))
+    if cards.takes_kernels(means):
+        return torch.nonzero(marked_in_view(means, radii, pose, k, near))[:, 0]
     u, v, sigma_px, z = project_gaussians(se3.transform(pose, means), radii, k, near)
     reach = rules.CUT_SIGMAS * sigma_px + 1
     seen = (z > near) & (u > -reach) & (u < k.width + reach) & (v > -reach) & (v < k.height + reach)
     return torch.nonzero(seen)[:, 0]
+
+
+def marked_in_view(
+    means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float = NEAR
+) -> Tensor:
+    """(M,) bool: which are `in_view`, of tensors of one card; unlike a list it keeps nobody waiting for its length."""
+    from msgs_slam.pipelines.gaussians.render.cuda_projection import mark_in_view  # imports triton
+
+    return mark_in_view(means, radii, cam_from_world.to(means), intrinsics, near)
 
 
 @kernel

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from msgs_slam.pipelines.gaussians.render.compositing import choose_backend, require_finite
 from msgs_slam.pipelines.gaussians.render.culling import NEAR, in_view
-from msgs_slam.pipelines.gaussians.render.rendering import project_map
+from msgs_slam.pipelines.gaussians.render.rendering import kernels_for, project_map, render
 from msgs_slam.pipelines.types import Intrinsics
 
 
@@ -60,6 +61,30 @@ def blending_weights(
     return BlendingWeights(*_inspect(means, radii, opacities, cam_from_world, intrinsics, near, backend, counts)[1:])
 
 
+def error_shares(
+    means: Tensor,
+    radii: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    cam_from_world: Tensor,
+    intrinsics: Intrinsics,
+    error_of: Callable[[Tensor], Tensor],
+) -> tuple[Tensor, Tensor]:
+    """The errors of the pixels, weighed by each Gaussian's part in them and summed, and its radius in pixels; (M,)
+    each. `error_of`: (H, W, 3) colours of the map to (H, W) errors. No gradients; the others as in `render`."""
+    seen = (means.detach(), radii.detach(), opacities.detach())
+    if (kernels := kernels_for(None, means)) is None:
+        shown = render(*seen, colors.detach(), cam_from_world, intrinsics).features
+        weights = blending_weights(*seen, cam_from_world, intrinsics, counts=error_of(shown))
+        return weights.total, project_map(*seen[:2], cam_from_world, intrinsics)[2]
+    # Projected and listed once for both.
+    size = (intrinsics.width, intrinsics.height)
+    records = kernels.project(*seen, cam_from_world.to(means), intrinsics, NEAR)
+    tiles = kernels.list_tiles(records, *size)
+    shown = kernels.composite_records(records, colors.detach(), *size, None, 0.0, tiles)[0]
+    return kernels.inspect_records(records, *size, error_of(shown), tiles)[1], records[:, 2]
+
+
 def _inspect(
     means: Tensor,
     radii: Tensor,
@@ -70,6 +95,13 @@ def _inspect(
     backend: str | None,
     counts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
+    if (kernels := kernels_for(backend, means)) is not None:
+        pose = cam_from_world.detach().to(means)
+        records = kernels.project(means.detach(), radii.detach(), opacities.detach(), pose, intrinsics, near)
+        found: tuple[Tensor, Tensor, Tensor] = kernels.inspect_records(
+            records, intrinsics.width, intrinsics.height, counts
+        )
+        return found
     require_finite("opacities", opacities)
     rows = in_view(means, radii, cam_from_world, intrinsics, near)
     drawn = means.detach()[rows], radii.detach()[rows]

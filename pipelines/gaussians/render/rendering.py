@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render.compositing import composite, require_finite
+import msgs_slam.pipelines.gaussians.render.cards as cards
+from msgs_slam.pipelines.gaussians.render.compositing import (
+    check_arguments,
+    choose_backend,
+    composite,
+    require_finite,
+)
 from msgs_slam.pipelines.gaussians.render.culling import NEAR, in_view
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project_gaussians
@@ -45,6 +52,12 @@ def render(
     for NaN and infinity in what lies on the CPU.
     """
     pose = cam_from_world if twist is None else moved(cam_from_world, twist)
+    if (kernels := kernels_for(backend, means)) is not None:
+        size = (intrinsics.width, intrinsics.height)
+        check_arguments({"radii": radii, "opacities": opacities, "features": features}, *size, proxy_depth, kappa)
+        records = kernels.project(means, radii, opacities, beside(pose, means), intrinsics, near)
+        shown, above, below, silhouette = kernels.composite_records(records, features, *size, proxy_depth, kappa)
+        return Rendering(shown, kernels.depth_ratio(above, below), silhouette)
     if not torch.is_grad_enabled():
         rows = in_view(means, radii, pose, intrinsics, near)
         means, radii, opacities, features = means[rows], radii[rows], opacities[rows], features[rows]
@@ -54,6 +67,13 @@ def render(
     )
     depth = depth_ratio(image.depth_sum, image.depth_silhouette)
     return Rendering(image.features, depth, image.silhouette)
+
+
+def kernels_for(backend: str | None, example: Tensor) -> ModuleType | None:
+    """The kernels that also project, where tensors like `example` take them; they need no culling before."""
+    if backend != "cuda" and (backend is not None or not cards.takes_kernels(example)):
+        return None
+    return choose_backend("cuda", example)
 
 
 def moved(cam_from_world: Tensor, twist: Tensor) -> Tensor:

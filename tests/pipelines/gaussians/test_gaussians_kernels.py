@@ -1,8 +1,6 @@
 """Triton's kernels around the renderer against torch's own functions: on a card, else in Triton's interpreter."""
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,8 +12,8 @@ if not ON_CARD:
 pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip install 'msgs-slam[cuda-check]'")
 
 from msgs_slam.pipelines.gaussians.adam import descend_by_kernel, plain_descend  # noqa: E402
+from tests.card_builds import build  # noqa: E402
 
-ROOT = Path(__file__).resolve().parents[3]
 DEVICE = "cuda" if ON_CARD else "cpu"
 
 
@@ -49,22 +47,6 @@ def test_adams_kernel_takes_the_plain_step(shape: tuple[int, ...], shared: bool,
 
 @pytest.mark.skipif(ON_CARD, reason="the test above compiles and runs the kernel")
 def test_adams_kernel_compiles_for_cards(tmp_path: Path) -> None:
-    """The interpreter accepts more than the compiler does; compiling needs no card."""
-    environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"} | {"TRITON_CACHE_DIR": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-c", COMPILE], env=environment, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
-
-
-COMPILE = """
-import triton
-from triton.compiler import ASTSource
-from triton.backends.compiler import GPUTarget
-from msgs_slam.pipelines.gaussians.adam_kernels import descend_rows
-constants = dict(
-    BETA1=0.9, BETA2=0.999, NEW1=0.1, NEW2=0.001, EPSILON=1e-15, CHOSEN=True, SHARED=True, BLOCK=1024
-)
-kinds = dict(rows="*i64", count="i32", width="i32", stride="i32", scale="fp32", root="fp32")
-signature = {n: "constexpr" if n in constants else kinds.get(n, "*fp32") for n in descend_rows.arg_names}
-source = ASTSource(descend_rows, signature, constexprs=constants)
-assert triton.compile(source, target=GPUTarget("cuda", 80, 32)).asm["ptx"]
-"""
+    constants = {"BETA1": 0.9, "BETA2": 0.999, "NEW1": 0.1, "NEW2": 0.001, "EPSILON": 1e-15, "BLOCK": 1024}
+    kinds = {**dict.fromkeys(("count", "width", "stride"), "i32"), "rows": "*i64", "scale": "fp32", "root": "fp32"}
+    build({"gaussians.adam_kernels": ["descend_rows"]}, constants | {"CHOSEN": True, "SHARED": True}, kinds, tmp_path)

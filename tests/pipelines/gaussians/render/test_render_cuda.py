@@ -1,9 +1,6 @@
 """The Triton kernels against the float64 reference: on a card where there is one, else by Triton's interpreter."""
 
 import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -15,9 +12,20 @@ pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip
 
 from render_scenes import IMAGES, NAMES, random_gaussians, random_proxy, room  # noqa: E402
 
-from msgs_slam.pipelines.gaussians.render import composite, cuda, reference, render  # noqa: E402
+from msgs_slam.pipelines.gaussians.render import (  # noqa: E402
+    cards,
+    composite,
+    cuda,
+    cuda_projection,
+    cuda_tiles,
+    error_shares,
+    in_view,
+    reference,
+    render,
+)
+from msgs_slam.pipelines.geometry import se3  # noqa: E402
+from tests.card_builds import build  # noqa: E402
 
-ROOT = Path(__file__).resolve().parents[4]
 DEVICE = "cuda" if ON_CARD else "cpu"
 SIZE = (161, 113) if ON_CARD else (37, 21)
 COUNT = 20_000 if ON_CARD else 250
@@ -104,24 +112,91 @@ def test_full_size_room():
 )
 def test_kernels_compile_for_cards_and_fit_their_shared_memory(name, guided, padded, tmp_path):
     """The interpreter accepts more than the compiler does; compiling needs no card."""
-    code = COMPILE.format(name=name, guided=guided, padded=padded)
-    environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"} | {"TRITON_CACHE_DIR": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert 0 < int(done.stdout.split()[-1]) <= 99 * 1024  # what a program may have on compute capability 8.6
+    constants = {"GUIDED": guided, "COUNTED": guided, "PADDED": padded, "STEP": 16, "TILE": 16, "ALPHA_MAX": 0.99}
+    kinds = {**dict.fromkeys(("width", "height", "channels"), "i32"), "kappa": "fp32", "starts": "*i64"}
+    of = {"gaussians.render.cuda_kernels": [name]}
+    build(of, constants | {"LIGHT_MIN": 1e-4, "num_warps": 8}, kinds | {"members": "*i64"}, tmp_path)
 
 
-COMPILE = """
-import triton
-from triton.compiler import ASTSource
-from triton.backends.compiler import GPUTarget
-from msgs_slam.pipelines.gaussians.render import cuda_kernels
-kernel = cuda_kernels.{name}
-constants = dict(GUIDED={guided}, COUNTED={guided}, PADDED={padded}, STEP=16, TILE=16, ALPHA_MAX=0.99, LIGHT_MIN=1e-4)
-kinds = dict(width="i32", height="i32", channels="i32", kappa="fp32", starts="*i64", members="*i64")
-constants = {{n: x for n, x in constants.items() if n in kernel.arg_names}}
-signature = {{n: "constexpr" if n in constants else kinds.get(n, "*fp32") for n in kernel.arg_names}}
-source = ASTSource(kernel, signature, constexprs=constants)
-compiled = triton.compile(source, target=GPUTarget("cuda", 80, 32), options=dict(num_warps=8))
-print(compiled.metadata.shared)
-"""
+@pytest.mark.skipif(ON_CARD, reason="the tests above compile and run the kernels")
+def test_what_projects_and_lists_compiles_for_cards(tmp_path):
+    constants = {"ALPHA_MIN": 1 / 255, "CUT_SIGMAS": 3.0, "TILE": 16, "BLOCK": 256, "MOVES": True}
+    long = dict.fromkeys(("touched", "ends", "keys", "order", "owners", "members", "starts"), "*i64")
+    numbers = dict.fromkeys(("width", "height", "count", "pairs", "tiles"), "i32")
+    numbers |= dict.fromkeys(("fx", "fy", "cx", "cy", "focal", "near"), "fp32")
+    kernels = {
+        "gaussians.render.cuda_projection": ["project_rows", "record_rows", "mark_rows", "back_project_rows"],
+        "gaussians.render.cuda_tiles": ["count_tiles", "list_pairs", "order_members"],
+        "gaussians.render.cuda_kernels": ["divide_pixels", "divide_back_pixels"],
+    }
+    build(kernels, constants, {**long, **numbers, "marks": "*u8"}, tmp_path)
+
+
+POSE = se3.exp(torch.tensor([0.1, -0.05, 0.02, 0.03, -0.04, 0.05], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("kappa", [0.0, 3.0])
+def test_a_map_is_rendered_as_by_the_reference(kappa):
+    """With gradients of all that moves, the pose among it; some Gaussians lie behind the camera and some beside it."""
+    scene = room(SIZE[0], SIZE[1], COUNT, 5)
+    means = torch.cat([scene.means, scene.means[:40] * torch.tensor([1.0, 1.0, -1.0]), scene.means[:40] * 9])
+    rest = [torch.cat([x, x[:40], x[:40]]) for x in (scene.radii, scene.opacities, scene.colors)]
+    proxy, found = random_proxy(*SIZE, seed=2), []
+    for backend, device, kind in (("cuda", DEVICE, torch.float32), ("reference", "cpu", torch.float64)):
+        leaves = [x.to(device, kind, copy=True).requires_grad_() for x in (means, *rest, POSE)]
+        image = render(*leaves, scene.intrinsics, proxy.to(device), kappa, backend=backend)
+        images = [image.features, image.depth, image.silhouette]
+        generator = torch.Generator().manual_seed(5)
+        pulls = [torch.randn(x.shape, generator=generator).to(x) for x in images]
+        gradients = torch.autograd.grad(images, leaves, pulls)
+        found.append([x.detach().cpu().double() for x in (*images, *gradients)])
+    for number, (ours, exact) in enumerate(zip(*found, strict=True)):
+        assert exact.abs().max() > 0
+        assert (ours - exact).norm() <= 1e-3 * exact.norm(), number
+
+
+def test_lists_are_sorted_by_tile_then_depth_then_index():
+    """Against the same said tile by tile; many Gaussians share their depth, some have one below 0."""
+    scene = random_gaussians(COUNT, *SIZE, 1, seed=8, sigma=(0.1, 30.0))
+    geometry = [scene[name].to(DEVICE) for name in ("u", "v", "sigma_px", "z", "opacity")]
+    geometry[3] = (geometry[3] * 2).round() - 3
+    records = cuda_projection.record(tuple(geometry), *SIZE, -10.0)
+    starts, members = cuda_tiles.list_tiles(records, *SIZE)
+    u, v, _, z, _, reach = records.cpu().unbind(1)
+    across, tile = -(-SIZE[0] // 16), 0
+    for tile in range(len(starts) - 1):
+        x, y = 16 * (tile % across), 16 * (tile // across)
+        seen = (reach > 0) & (u + reach - 0.5 >= x) & (u - reach - 0.5 < x + 16)
+        seen &= (v + reach - 0.5 >= y) & (v - reach - 0.5 < y + 16)
+        # Tiles on the rim take what lies beyond it, too; it touches no pixel of theirs.
+        rows = members[starts[tile] : starts[tile + 1]].cpu()
+        assert set(torch.nonzero(seen)[:, 0].tolist()) <= set(rows.tolist())
+        assert rows.tolist() == sorted(rows.tolist(), key=lambda i: (float(z[i]), i))
+    assert tile == len(starts) - 2 > 3
+    assert starts[-1] == len(members) > 200
+
+
+def test_what_is_in_view_is_marked_as_on_the_cpu():
+    scene = room(40, 30, 400, 3)
+    means = scene.means * torch.tensor([3.0, 3.0, 1.0])
+    means[::5, 2] *= -1
+    marks = cuda_projection.mark_in_view(
+        means.to(DEVICE), scene.radii.to(DEVICE), POSE.float().to(DEVICE), scene.intrinsics, 0.01
+    )
+    rows = in_view(means, scene.radii, POSE, scene.intrinsics)
+    assert torch.nonzero(marks.cpu())[:, 0].tolist() == rows.tolist()
+    assert 20 < len(rows) < 380
+
+
+def test_errors_are_shared_out_by_one_drawing(monkeypatch):
+    """As by drawing and inspecting apart; the errors depend on what is drawn."""
+    scene = room(*SIZE, COUNT, 3)
+    found = []
+    for takes, device in ((True, DEVICE), (False, "cpu")):
+        monkeypatch.setattr(cards, "takes_kernels", lambda example, takes=takes: takes)
+        tensors = [x.to(device) for x in (scene.means, scene.radii, scene.opacities, scene.colors)]
+        found.append(error_shares(*tensors, POSE, scene.intrinsics, lambda colors: (colors - 0.3).abs().mean(-1)))
+    for ours, theirs in zip(*found, strict=True):
+        seen = found[1][0] > 0
+        assert seen.any()
+        torch.testing.assert_close(ours.cpu()[seen], theirs[seen], rtol=2e-3, atol=1e-4)

@@ -1,0 +1,152 @@
+"""The loss of a view on a card: photo, silhouette, depth, classes and sizes by kernels of Triton, in one operation.
+
+`objective` has the same terms by torch's own functions, and says what they are.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import msgs_slam.pipelines.gaussians.render.cards as cards
+from msgs_slam.pipelines.gaussians.render import Rendering
+from msgs_slam.pipelines.gaussians.ssim import C1, C2, TAPS, WINDOW
+from msgs_slam.pipelines.mapping.exposure import LEAST, MOST_GAIN, OUTLIER, RIDGE, SOLID, STRIDE
+from msgs_slam.pipelines.mapping.losses import NU, SIZE_LIMIT
+from msgs_slam.pipelines.mapping.photo_loss import SSIM_WEIGHT
+from msgs_slam.pipelines.mapping.views import View
+
+_BLOCK = 512
+"""Numbers a program of the kernels, pixels of one that reads classes a quarter of it."""
+
+
+@dataclass(frozen=True)
+class TermWeights:
+    """What silhouette, depth and labels count beside the photo; `unit`: the scene's median depth."""
+
+    silhouette: float
+    depth: float
+    labels: float
+    unit: float
+
+
+def card_loss(
+    view: View, exposure: Tensor, rendering: Rendering, log_radii: Tensor, in_view: Tensor, weights: TermWeights
+) -> Tensor:
+    """Scalar, differentiable in the rendering and the log radii (M,), of which those count that are in_view (M,)."""
+    images = (rendering.features, rendering.depth, rendering.silhouette)
+    return _CardLoss.apply(*images, log_radii, view, exposure, in_view, weights)
+
+
+@torch.no_grad()
+def fit_exposure_on_card(rendering: Rendering, view: View, exposure: Tensor) -> None:
+    """`fit_exposure` of what the map covers in a view, in place, on a contiguous exposure (2, 3)."""
+    from msgs_slam.pipelines.mapping.photo_kernels import fit_color  # imports triton
+
+    height, width = rendering.silhouette.shape
+    shown, silhouette = rendering.features.detach(), rendering.silhouette.detach().contiguous()
+    given = (shown, shown.shape[-1], silhouette, view.image, _mask(view), exposure, width, height)
+    rules = {"SOLID": SOLID, "LEAST": LEAST, "OUTLIER": OUTLIER, "RIDGE": RIDGE, "MOST_GAIN": MOST_GAIN}
+    cards.launch(fit_color, 3, *given, STRIDE=STRIDE, **rules, MASKED=view.scene is not None, BLOCK=1024)
+
+
+def color_errors_on_card(colors: Tensor, view: View, exposure: Tensor) -> Tensor:
+    """(H, W) mean difference between the exposed (H, W, C) colours and the view's photo, 0 where that is no scene."""
+    from msgs_slam.pipelines.mapping.photo_kernels import color_errors  # imports triton
+
+    errors = torch.empty(colors.shape[:2], device=colors.device)
+    given = (colors.contiguous(), colors.shape[-1], exposure, view.image, _mask(view), errors)
+    _run(color_errors, errors.numel(), *given, errors.numel(), MASKED=view.scene is not None)
+    return errors
+
+
+def _mask(view: View) -> Tensor:
+    """A kernel takes no None: a mask that is not there is not read."""
+    return view.image if view.scene is None else view.scene.view(torch.uint8)
+
+
+def _run(kernel: Any, count: int, *arguments: Any, BLOCK: int = _BLOCK, **settings: Any) -> None:
+    cards.launch(kernel, -(-count // BLOCK), *arguments, BLOCK=BLOCK, **settings)
+
+
+@lru_cache(maxsize=2)
+def _window(device: torch.device) -> Tensor:
+    return torch.tensor(WINDOW, dtype=torch.float32, device=device)
+
+
+class _CardLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> Tensor:
+        features, depth, silhouette, log_radii = (x.detach().contiguous() for x in arguments[:4])
+        view, exposure, in_view, weights = arguments[4:]
+        loss, d_features = features.new_zeros(()), torch.empty_like(features)
+        _add_photo(features, exposure, view, loss, d_features)
+        d_depth, d_silhouette = _add_maps(features, depth, silhouette, view, weights, loss, d_features)
+        d_log_radii = _add_sizes(log_radii, in_view, weights.unit, loss)
+        ctx.save_for_backward(d_features, d_depth, d_silhouette, d_log_radii)
+        return loss
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        return *torch._foreach_mul(ctx.saved_tensors, gradients[0]), *[None] * 4
+
+
+def _add_photo(features: Tensor, exposure: Tensor, view: View, loss: Tensor, gradient: Tensor) -> None:
+    """`photo_loss` of the first three features, their gradient into the gradient's first three."""
+    import msgs_slam.pipelines.mapping.photo_kernels as kernels  # imports triton
+
+    size, row, stride = view.image.numel(), 3 * view.image.shape[1], features.shape[-1]
+    planes, moments, half = (features.new_empty(5, size) for _ in range(3))
+    window = _window(features.device)
+    mask: dict[str, Any] = {"MASKED": view.scene is not None, "SHARE": SSIM_WEIGHT}
+
+    def blur(numbers: int, of: Tensor) -> None:
+        _run(kernels.blur_planes, numbers, of, half, window, size, row, 3, numbers, TAPS=TAPS)
+        _run(kernels.blur_planes, numbers, half, moments, window, size, size, row, numbers, TAPS=TAPS)
+
+    given = (features, stride, exposure, view.image, _mask(view))
+    _run(kernels.expose_colors, size, *given, planes, loss, size, **mask)
+    blur(5 * size, planes)
+    _run(kernels.compare_moments, size, moments, planes, loss, size, C1=C1, C2=C2, SHARE=SSIM_WEIGHT)
+    blur(3 * size, planes[2:])
+    _run(kernels.differentiate, size, planes, moments, exposure, _mask(view), gradient, stride, size, **mask)
+
+
+def _add_maps(
+    features: Tensor,
+    depth: Tensor,
+    silhouette: Tensor,
+    view: View,
+    weights: TermWeights,
+    loss: Tensor,
+    gradient: Tensor,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Silhouette, depth and labels; returns the gradients of the first two."""
+    from msgs_slam.pipelines.mapping.map_kernels import compare_maps  # imports triton
+
+    pixels, classes = depth.numel(), features.shape[-1] - 3
+    d_depth, d_silhouette = torch.empty_like(depth), torch.empty_like(silhouette)
+    maps = (view.depth, view.reliability, view.channels, view.channel_confidence, _mask(view))
+    results = (loss, gradient, d_depth, d_silhouette)
+    counts = (weights.silhouette, weights.depth / weights.unit, weights.labels)
+    _run(
+        compare_maps, pixels, features, depth, silhouette, *maps, *results, pixels, classes, *counts, NU=NU,
+        LABELS=weights.labels > 0, PADDED=classes and max(2, 1 << (classes - 1).bit_length()),
+        MASKED=view.scene is not None, BLOCK=_BLOCK // 4,
+    )  # fmt: skip
+    return d_depth, d_silhouette
+
+
+def _add_sizes(log_radii: Tensor, in_view: Tensor, unit: float, loss: Tensor) -> Tensor:
+    """`size_loss`; returns the gradient."""
+    from msgs_slam.pipelines.mapping.map_kernels import weigh_sizes  # imports triton
+
+    gradient, limit = torch.empty_like(log_radii), math.log(SIZE_LIMIT * unit)
+    given = (log_radii, in_view.view(torch.uint8), in_view.sum(), loss, gradient, limit, len(log_radii))
+    _run(weigh_sizes, len(log_radii), *given)
+    return gradient

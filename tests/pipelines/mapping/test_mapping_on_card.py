@@ -1,0 +1,178 @@
+"""Mapping by Triton's kernels against the same by torch's own functions: on a card, else in Triton's interpreter."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+ON_CARD = torch.cuda.is_available()
+if not ON_CARD:
+    os.environ["TRITON_INTERPRET"] = "1"  # read when triton is imported and again when the kernels are
+pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip install 'msgs-slam[cuda-check]'")
+
+from msgs_slam.pipelines.config import MappingConfig, PaperConfig  # noqa: E402
+from msgs_slam.pipelines.gaussians.render import Rendering, cards  # noqa: E402
+from msgs_slam.pipelines.mapping import losses  # noqa: E402
+from msgs_slam.pipelines.mapping.card_loss import color_errors_on_card, fit_exposure_on_card  # noqa: E402
+from msgs_slam.pipelines.mapping.exposure import expose, fit_exposure  # noqa: E402
+from msgs_slam.pipelines.mapping.load import MappingInput  # noqa: E402
+from msgs_slam.pipelines.mapping.objective import Objective  # noqa: E402
+from msgs_slam.pipelines.mapping.optimise import MapOptimiser, optimise_map  # noqa: E402
+from msgs_slam.pipelines.mapping.parameters import KEYS  # noqa: E402
+from msgs_slam.pipelines.mapping.schedule import Seeding, Step  # noqa: E402
+from msgs_slam.pipelines.mapping.state import OptimiserState  # noqa: E402
+from msgs_slam.pipelines.mapping.views import View  # noqa: E402
+from msgs_slam.pipelines.types import VOID, Intrinsics  # noqa: E402
+from tests.card_builds import build  # noqa: E402
+
+DEVICE = "cuda" if ON_CARD else "cpu"
+EXPOSURE = torch.tensor([[0.1, -0.2, 0.05], [0.01, 0.02, -0.1]])
+UNIT = 2.0
+
+
+@pytest.fixture(autouse=True)
+def kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The interpreter takes the tensors of the CPU: float32 ones go to the kernels, as those of a card would."""
+    monkeypatch.setattr(cards, "takes_kernels", lambda example: example.dtype == torch.float32)
+
+
+def made_view(size: tuple[int, int], classes: int, masked: bool, generator: torch.Generator) -> tuple[View, Tensor]:
+    """A view of random maps, some of them unknown, and features (H, W, 3 + classes) that resemble its photo."""
+    features = torch.randn(*size, 3 + classes, generator=generator)
+    features[..., :3] = torch.rand(*size, 3, generator=generator)
+    photo = 255 * (0.7 * features[..., :3] + 0.3 * torch.rand(*size, 3, generator=generator))
+    labels = torch.randint(0, max(classes, 1), size, generator=generator)
+    bytes_of = [torch.randint(0, 256, size, generator=generator).to(torch.uint8) for _ in range(2)]
+    view = View(
+        0, Intrinsics(size[1], size[0], 50, 50, size[1] / 2, size[0] / 2), torch.eye(4, dtype=torch.float64),
+        photo.to(torch.uint8), (4 * torch.rand(size, generator=generator) - 1).clamp(min=0), bytes_of[0],
+        torch.where(torch.rand(size, generator=generator) < 0.2, VOID, labels).to(torch.uint8), bytes_of[1],
+        scene=torch.rand(size, generator=generator) > 0.3 if masked else None,
+    )  # fmt: skip
+    return view, features
+
+
+def there(view: View) -> View:
+    tensors = {k: x.to(DEVICE) for k, x in vars(view).items() if isinstance(x, Tensor) and k != "cam_from_world"}
+    return replace(view, **tensors)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize(("size", "classes", "labels"), [((24, 31), 0, False), ((5, 70), 5, True), ((64, 8), 1, False)])
+def test_the_loss_has_the_plain_value_and_gradient(
+    size: tuple[int, int], classes: int, labels: bool, masked: bool
+) -> None:
+    """Also of pictures smaller than the window, with classes that do not count and with none."""
+    generator = torch.Generator().manual_seed(3)
+    view, features = made_view(size, classes, masked, generator)
+    depth, silhouette = (torch.rand(size, generator=generator) * k for k in (3, 1))
+    log_radii = torch.randn(700, generator=generator) - 2.0
+    in_view = torch.rand(700, generator=generator) > 0.4
+    objective, found = Objective(MappingConfig(), PaperConfig(), classes, UNIT), []
+    for place, device, kind in ((there, DEVICE, torch.float32), (lambda v: v, "cpu", torch.float64)):
+        leaves = [x.to(device, kind, copy=True).requires_grad_() for x in (features, depth, silhouette, log_radii)]
+        marks = in_view.to(device) if kind == torch.float32 else None
+        sizes = leaves[3] if marks is not None else leaves[3][in_view]
+        drawn = Rendering(*leaves[:3])
+        value = objective.of(place(view), EXPOSURE.to(device, kind), drawn, sizes, labels, marks)
+        found.append([value.detach(), *torch.autograd.grad(3 * value, leaves)])
+    for mine, theirs in zip(*found, strict=True):
+        assert theirs.abs().max() > 0
+        assert (mine.cpu().double() - theirs).abs().max() < 1e-5 * theirs.abs().max()
+
+
+def test_the_loss_without_depth_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(1)
+    view, features = made_view((9, 12), 0, False, generator)
+    leaves = [x.to(DEVICE).requires_grad_() for x in (features, torch.rand(9, 12), torch.rand(9, 12))]
+    objective = Objective(MappingConfig(use_proxy_depth=False), PaperConfig(), 0, UNIT)
+    rest = (torch.zeros(3, device=DEVICE), False, torch.ones(3, dtype=torch.bool, device=DEVICE))
+    value = objective.of(there(view), EXPOSURE.to(DEVICE), Rendering(*leaves), *rest)
+    assert torch.autograd.grad(value, leaves[1])[0].abs().max() == 0
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("size", [(60, 83), (12, 16)])
+def test_the_exposure_is_fitted_in_place(size: tuple[int, int], masked: bool) -> None:
+    """As in double precision; too few pixels change nothing."""
+    generator = torch.Generator().manual_seed(4)
+    view, features = made_view(size, 2, masked, generator)
+    silhouette = 0.8 + 0.2 * torch.rand(size, generator=generator)
+    rendering = Rendering(features.to(DEVICE), silhouette.to(DEVICE), silhouette.to(DEVICE))
+    exposures = EXPOSURE.repeat(2, 1, 1).to(DEVICE)
+    fit_exposure_on_card(rendering, there(view), exposures[1])
+    known = view.of_scene(silhouette) > 0.9
+    exact = fit_exposure(features[..., :3].double(), view.colors.double(), known, EXPOSURE.double())
+    torch.testing.assert_close(exposures[1].cpu().double(), exact, rtol=1e-5, atol=1e-6)
+    assert torch.equal(exposures[0].cpu(), EXPOSURE)
+    assert torch.equal(exact, EXPOSURE.double()) == (size == (12, 16))
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_errors_of_colors_are_the_plain_ones(masked: bool) -> None:
+    view, features = made_view((23, 40), 1, masked, torch.Generator().manual_seed(5))
+    found = color_errors_on_card(features.to(DEVICE), there(view), EXPOSURE.to(DEVICE)).cpu()
+    plain = view.of_scene((expose(features[..., :3], EXPOSURE) - view.colors).abs().mean(-1))
+    torch.testing.assert_close(found, plain, rtol=1e-5, atol=1e-6)
+    assert 0.01 < plain.mean() < 0.5
+
+
+@pytest.fixture(scope="module")
+def started(room: MappingInput) -> Any:
+    """A map of the room's first views, and the views."""
+    views = [room.views[i] for i in range(3)]
+    settings = MappingConfig(passes=1.0, min_iterations=0, seed_stride=3)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cards, "takes_kernels", lambda example: False)
+        return views, optimise_map(views, len(room.class_ids), settings, seed=0), len(room.class_ids)
+
+
+def test_visits_are_those_of_the_cpu(started: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Map, poses and exposures after a pass, with labels and without, and what the map is pruned and split by."""
+    views, first, classes = started
+    found = []
+    for takes, place in ((True, there), (False, lambda v: v)):
+        monkeypatch.setattr(cards, "takes_kernels", lambda example, takes=takes: takes)
+        own = [place(v) for v in views]
+        gaussians = type(first.gaussian_map)(
+            **{k: x.to(own[0].image.device) for k, x in vars(first.gaussian_map).items()}
+        )
+        state = OptimiserState.fresh(own, classes, gaussians, (first.log_gains, first.offsets))
+        before = {k: state.parameters[k].detach().cpu().clone() for k in KEYS}
+        optimiser = MapOptimiser(own, classes, MappingConfig(), PaperConfig(), state)
+        for i in (0, 1, 2, 1):
+            optimiser.visit(Step(i, i, 1.3, 0.5, False, Seeding.NOTHING, False, False, False, i > 0))
+        blame = optimiser._blame()
+        result = state.result(own, 4)
+        moved = {k: state.parameters[k].detach().cpu() - before[k] for k in KEYS}
+        poses = torch.from_numpy(result.cam_from_world - first.cam_from_world)
+        exposures = torch.from_numpy(np.stack([result.log_gains, result.offsets]))
+        rest = {"weights": optimiser._blending_weights(), "blame": blame.error, "poses": poses, "exposures": exposures}
+        found.append({k: x.cpu().double() for k, x in (moved | rest).items()})
+    for name, mine in found[0].items():
+        theirs = found[1][name]
+        assert theirs.abs().max() > 0
+        # Where a gradient is nearly 0, rounding may turn it, and Adam's first steps are as long for small ones.
+        assert (mine - theirs).norm() < 0.02 * theirs.norm(), name
+
+
+@pytest.mark.skipif(ON_CARD, reason="the tests above compile and run the kernels")
+def test_the_kernels_compile_for_cards(tmp_path: Path) -> None:
+    kernels = {
+        "mapping.photo_kernels": [
+            "expose_colors", "blur_planes", "compare_moments", "differentiate", "color_errors", "fit_color",
+        ],
+        "mapping.map_kernels": ["compare_maps", "weigh_sizes"],
+    }  # fmt: skip
+    constants = {"MASKED": True, "BLOCK": 128, "TAPS": 11, "C1": 1e-4, "C2": 9e-4, "SHARE": 0.2, "STRIDE": 4}
+    constants |= {"SOLID": 0.9, "LEAST": 100, "OUTLIER": 0.02, "RIDGE": 0.003, "MOST_GAIN": 5.0, "NU": losses.NU}
+    constants |= {"LABELS": True, "PADDED": 32}
+    numbers = ("stride", "size", "row", "step", "numbers", "width", "height", "pixels", "classes", "count")
+    kinds = dict.fromkeys(numbers, "i32") | dict.fromkeys(("limit", "by_silhouette", "by_depth", "by_label"), "fp32")
+    masks = ("photo", "scene", "reliability", "labels", "confidence", "in_view")
+    build(kernels, constants, kinds | dict.fromkeys(masks, "*u8") | {"number": "*i64"}, tmp_path)
