@@ -2,11 +2,13 @@
 
 A primitive of points whose attributes are POSITION and, prefixed with the extension's name, ROTATION (x y z w), SCALE
 (standard deviations), OPACITY (0..1) and SH_DEGREE_0_COEF_0 (colour = 0.5 + 0.2821 * it). COLOR_0 is for programs that
-do not know the extension: they show a cloud of coloured points.
+do not know the extension: they show a cloud of coloured points. With KHR_gaussian_splatting_compression_spz_2 (Khronos,
+draft) the attributes are an SPZ file of version 2 in a buffer view: a tenth of the size, and all that CesiumJS draws.
 """
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +18,13 @@ from numpy.typing import NDArray
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gaussian_ply import SH_C0
 from msgs_slam.formats.gaussians import GaussianCloud, unit_quaternions
-from msgs_slam.formats.glb import FLOAT, WIDTHS, Part, glb_parts, write_primitive
+from msgs_slam.formats.glb import FLOAT, WIDTHS, Part, glb_parts, write_glb, write_primitive
 from msgs_slam.formats.reading import parsing, read_bytes
+from msgs_slam.formats.spz import read_spz_stream, spz_bytes
 
 EXTENSION = "KHR_gaussian_splatting"
+COMPRESSION = "KHR_gaussian_splatting_compression_spz_2"
+_PROPERTIES = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
 _LABEL = "_LABEL"
 # glTF's y is up and its z comes towards the viewer; splats have x right, y down, z forward.
 _FLIP = np.array([1, -1, -1], dtype=np.float32)
@@ -50,9 +55,40 @@ def write_gaussian_glb(path: Path, cloud: GaussianCloud, class_names: tuple[str,
     parts = [
         Part.of(name, array, **({"normalized": True} if name == "COLOR_0" else {})) for name, array in arrays.items()
     ]
-    properties = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    primitive = {"mode": 0, "extensions": {EXTENSION: properties}}
+    primitive = {"mode": 0, "extensions": {EXTENSION: _PROPERTIES}}
     write_primitive(path, parts, primitive, class_names, {}, extensions=[EXTENSION])
+
+
+def write_compressed_glb(path: Path, cloud: GaussianCloud) -> None:
+    """Write a cloud's colours as `write_gaussian_glb` does, compressed: rounded as SPZ rounds, without classes.
+
+    Raises ValueError for an empty cloud or places that SPZ cannot hold, InputError when the disk refuses.
+    """
+    if len(cloud) == 0:
+        raise ValueError("write_compressed_glb: glTF has no way to store an empty cloud")
+    packed, means = spz_bytes(cloud, 2), cloud.means * _FLIP
+    floats: dict[str, Any] = {"componentType": FLOAT, "count": len(cloud)}
+    accessors = {
+        "POSITION": {**floats, "type": "VEC3", "min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()},
+        "COLOR_0": {**floats, "type": "VEC4", "componentType": 5121, "normalized": True},
+        f"{EXTENSION}:SCALE": {**floats, "type": "VEC3"},
+        f"{EXTENSION}:ROTATION": {**floats, "type": "VEC4"},
+    }
+    properties = {**_PROPERTIES, "extensions": {COMPRESSION: {"bufferView": 0}}}
+    attributes = {name: number for number, name in enumerate(accessors)}
+    document = {
+        "asset": {"version": "2.0", "generator": "msgs-slam"},
+        "extensionsUsed": [EXTENSION, COMPRESSION],
+        "extensionsRequired": [EXTENSION, COMPRESSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"mode": 0, "attributes": attributes, "extensions": {EXTENSION: properties}}]}],
+        "accessors": list(accessors.values()),
+        "bufferViews": [{"buffer": 0, "byteLength": len(packed)}],
+        "buffers": [{"byteLength": len(packed)}],
+    }
+    write_glb(path, document, [], packed)
 
 
 def read_gaussian_glb(path: Path) -> GaussianCloud:
@@ -68,6 +104,11 @@ def read_gaussian_glb(path: Path) -> GaussianCloud:
         found = next((p for p in primitives if EXTENSION in p.get("extensions", {})), None)
         if found is None:
             raise InputError(f"{path} holds no Gaussians ({EXTENSION}): it is a GLB of something else")
+        splats = found["extensions"][EXTENSION]
+        if COMPRESSION in splats.get("extensions", {}):
+            view = document["bufferViews"][splats["extensions"][COMPRESSION]["bufferView"]]
+            start, size = int(view.get("byteOffset", 0)), int(view["byteLength"])
+            return read_spz_stream(io.BytesIO(binary[start : start + size]), size, path)
         arrays = {name: _accessor(document, binary, i) for name, i in found["attributes"].items() if name != "COLOR_0"}
         return _cloud(arrays)
 

@@ -85,11 +85,11 @@ def write_primitive(
         "bufferViews": views if picture else views[: len(parts)],
         "buffers": [{"byteLength": starts[-1]}],
     }
-    _write_glb(path, document, parts, picture)
+    write_glb(path, document, parts, picture)
 
 
-def _write_glb(path: Path, document: dict[str, Any], parts: Sequence[Part], picture: bytes) -> None:
-    """Atomically; both chunks are padded to four bytes."""
+def write_glb(path: Path, document: dict[str, Any], parts: Sequence[Part], rest: bytes = b"") -> None:
+    """The document, and as its one buffer the parts and then the `rest`; both chunks are padded to four bytes."""
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     length = document["buffers"][0]["byteLength"]
@@ -104,7 +104,7 @@ def _write_glb(path: Path, document: dict[str, Any], parts: Sequence[Part], pict
                 file.write(np.ascontiguousarray(block, part.dtype).data)
             if file.tell() != end:
                 raise ValueError(f"write_primitive: {part.name or 'faces'}: {file.tell() - end} bytes too many")
-        file.write(picture + padding)
+        file.write(rest + padding)
 
 
 def glb_parts(data: bytes) -> tuple[dict[str, Any], bytes]:

@@ -115,11 +115,18 @@ def _seconds(text: str) -> float:
 
 def enu_from_geodetic(places: Array, origin: Array) -> Array:
     """(N, 3) latitude, longitude (degrees), altitude -> (N, 3) metres east, north, up of `origin` (3,), on WGS 84."""
+    earth = ecef_from_enu(origin)
+    return np.asarray((_ecef(places) - earth[:3, 3]) @ earth[:3, :3])
+
+
+def ecef_from_enu(origin: Array) -> Array:
+    """(4, 4) from metres east, north, up of `origin` (3,) latitude, longitude, altitude to Earth-centred metres."""
     lat, lon = np.radians(origin[0]), np.radians(origin[1])
     east = np.array([-np.sin(lon), np.cos(lon), 0.0])
     up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
-    axes = np.stack([east, np.cross(up, east), up])
-    return np.asarray((_ecef(places) - _ecef(origin[None])) @ axes.T)
+    move = np.eye(4)
+    move[:3] = np.column_stack([east, np.cross(up, east), up, _ecef(origin[None])[0]])
+    return move
 
 
 def _ecef(places: Array) -> Array:

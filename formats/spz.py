@@ -1,4 +1,4 @@
-"""SPZ, Niantic's compressed splat file: 20 bytes a Gaussian before compression.
+"""SPZ, Niantic's compressed splat file: 19 or 20 bytes a Gaussian before compression.
 
 Version 4 is a plain header, a table and a Zstandard stream for each attribute; versions 2 and 3 are one gzip stream.
 Layout by the README of github.com/nianticlabs/spz; version 2 keeps rotations in three bytes, the others in four.
@@ -9,8 +9,8 @@ from __future__ import annotations
 import gzip
 import io
 import struct
-from io import BufferedReader
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import zstandard
@@ -37,15 +37,20 @@ _FLIP = np.array([1, -1, -1], dtype=np.float32)
 
 
 def write_spz(path: Path, cloud: GaussianCloud, version: int = 4) -> None:
-    """Write a cloud as SPZ version 4 (or 3, for older readers) without view-dependent colour; classes are not kept.
+    """Write `spz_bytes` to a file. Raises what that raises, and InputError when the disk refuses."""
+    write_bytes(path, spz_bytes(cloud, version))
+
+
+def spz_bytes(cloud: GaussianCloud, version: int) -> bytes:
+    """A cloud as SPZ version 4 (or 3 or 2, for older readers) without view-dependent colour; classes are not kept.
 
     Positions are fixed point of 24 bits with as many fraction bits as the scene's extent leaves (at most 16), scales
-    steps of 1/16 in the logarithm, opacity and colour 8 bits, rotations 10 bits a component. The same cloud gives the
-    same bytes. Raises ValueError where a position is not finite or beyond 4 million, InputError when the disk refuses.
+    steps of 1/16 in the logarithm, opacity and colour 8 bits, rotations 10 bits a component (8 in version 2). The same
+    cloud gives the same bytes. Raises ValueError where a position is not finite or beyond 4 million.
     """
     extent = float(np.abs(cloud.means).max(initial=0))
     if not np.isfinite(cloud.means).all() or extent >= 2**22:
-        raise ValueError(f"write_spz: positions must be finite and below 4 million, got {extent:g}")
+        raise ValueError(f"spz_bytes: positions must be finite and below 4 million, got {extent:g}")
     fraction_bits = max(0, min(16, 21 - int(np.floor(np.log2(max(extent, 1e-9))))))
     opacity = 1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))
     streams = [
@@ -53,9 +58,13 @@ def write_spz(path: Path, cloud: GaussianCloud, version: int = 4) -> None:
         _byte(opacity * 255).tobytes(),
         _byte((cloud.colors - 0.5) / SH_C0 * (_COLOR_SCALE * 255) + 0.5 * 255).tobytes(),
         _byte((cloud.log_scales + 10) * 16).tobytes(),
-        _packed_rotations(cloud.quat_wxyz[:, [1, 2, 3, 0]] * np.append(_FLIP, 1)).tobytes(),
+        (_three_bytes if version == 2 else _packed_rotations)(
+            cloud.quat_wxyz[:, [1, 2, 3, 0]] * np.append(_FLIP, 1)
+        ).tobytes(),
     ]
-    write_bytes(path, (_container_4 if version == 4 else _container_3)(streams, len(cloud), fraction_bits))
+    if version == 4:
+        return _container_4(streams, len(cloud), fraction_bits)
+    return _container_3(streams, len(cloud), fraction_bits, version)
 
 
 def _container_4(streams: list[bytes], count: int, fraction_bits: int) -> bytes:
@@ -65,11 +74,11 @@ def _container_4(streams: list[bytes], count: int, fraction_bits: int) -> bytes:
     return b"".join([header, *table, *packed])
 
 
-def _container_3(streams: list[bytes], count: int, fraction_bits: int) -> bytes:
+def _container_3(streams: list[bytes], count: int, fraction_bits: int, version: int) -> bytes:
     buffer = io.BytesIO()
     # mtime 0: the clock must not get into the file
     with gzip.GzipFile(fileobj=buffer, mode="wb", mtime=0) as file:
-        file.write(_HEADER.pack(_MAGIC, 3, count, 0, fraction_bits, 0, 0) + b"".join(streams))
+        file.write(_HEADER.pack(_MAGIC, version, count, 0, fraction_bits, 0, 0) + b"".join(streams))
     return buffer.getvalue()
 
 
@@ -78,18 +87,26 @@ def read_spz(path: Path) -> GaussianCloud:
 
     Raises InputError for another version, for a damaged file, and for one that would unpack to far more than it is.
     """
-    most = max(_LEAST_LIMIT, require_file(path) * _HIGHEST_RATIO)
+    size = require_file(path)
     with opened(path) as plain, parsing(path, "SPZ file"):
-        if plain.peek(4)[:4] == _MAGIC:
-            return _read_version_4(plain, path, most)
-        with gzip.open(plain, "rb") as file:
-            magic, version, count, degree, fraction_bits, _, _ = _HEADER.unpack(file.read(_HEADER.size))
-            _require_sane(path, magic == _MAGIC and version in (2, 3), count, degree, fraction_bits, most)
-            streams = [_fields(file, count, width) for width in (9, 1, 3, 3, 3 if version == 2 else 4)]
+        return read_spz_stream(plain, size, path)
+
+
+def read_spz_stream(plain: BinaryIO, size: int, path: Path) -> GaussianCloud:
+    """`read_spz` of `size` bytes that lie open; `path` is for messages. Damage raises whatever comes of it too."""
+    most = max(_LEAST_LIMIT, size * _HIGHEST_RATIO)
+    is_plain = plain.read(4) == _MAGIC
+    plain.seek(0)
+    if is_plain:
+        return _read_version_4(plain, path, most)
+    with gzip.open(plain, "rb") as file:
+        magic, version, count, degree, fraction_bits, _, _ = _HEADER.unpack(file.read(_HEADER.size))
+        _require_sane(path, magic == _MAGIC and version in (2, 3), count, degree, fraction_bits, most)
+        streams = [_fields(file, count, width) for width in (9, 1, 3, 3, 3 if version == 2 else 4)]
     return _unpacked(streams, degree, fraction_bits)
 
 
-def _read_version_4(file: BufferedReader, path: Path, most: int) -> GaussianCloud:
+def _read_version_4(file: BinaryIO, path: Path, most: int) -> GaussianCloud:
     _, version, count, degree, fraction_bits, _, number, table = _HEADER_4.unpack(file.read(_HEADER_4.size))
     _require_sane(path, version == 4 and 5 <= number <= _MOST_STREAMS, count, degree, fraction_bits, most)
     file.seek(table)
@@ -152,6 +169,11 @@ def _first_three(data: NDArray[np.uint8]) -> NDArray[np.float64]:
     xyz = data / 127.5 - 1
     w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(axis=1, keepdims=True)))
     return np.concatenate([xyz, w], axis=1)
+
+
+def _three_bytes(quat_xyzw: NDArray) -> NDArray[np.uint8]:
+    """(M, 3) of (M, 4), as `_first_three` reads them."""
+    return _byte((quat_xyzw[:, :3] * np.where(quat_xyzw[:, 3:] < 0, -1, 1) + 1) * 127.5)
 
 
 def _packed_rotations(quat_xyzw: NDArray) -> NDArray[np.uint32]:

@@ -96,9 +96,11 @@ _ENTRIES = (
     Entry("classes.json", 'number, name and colour of each class; 255 is "unknown".'),
     Entry("scale.json", "how many metres a unit of the run is, its relative standard deviation, and who says so."),
     Entry(
-        "submap_1/ and so on",
-        "where the map was made in parts (mapping.submap): point_cloud.ply of each part, and coarse.ply, about a tenth "
-        "of it for a look from afar; tiles.json says where each lies.",
+        "tiles/",
+        "where the map was made in parts (mapping.submap) or where asked for (msgs-slam export RUN --only tiles): 3D "
+        "Tiles 1.1 of the map's colours, coarse from afar and fine nearby, on the globe where GPS is known; open "
+        "tiles/tileset.json (CesiumJS).",
+        "tiles",
     ),
     Entry(
         "piece_2/ and so on",

@@ -209,11 +209,12 @@ def _check(source: Path, config: Config) -> None:
 
 
 def write_all_but_mesh(outcome: Outcome, world: World, settings: ExportConfig, folder: Path) -> list[Path]:
-    """COLMAP model, PLYs, trajectory, notes; SPZ and GLB where the settings want them. `outcome` stands in `world`."""
+    """COLMAP model, PLYs, trajectory, notes; SPZ and GLB where the settings want them, tiles of a map that was made in
+    parts. `outcome` stands in `world`."""
     paths = write_colmap(outcome, folder) + write_ply(outcome, settings.sh_rest, folder)
     paths += write_spz_file(outcome, world, settings.spz_version, folder) if settings.spz else []
     paths += write_glb_file(outcome, world, folder) if settings.splat_glb else []
-    paths += write_tiles(outcome, folder)
+    paths += write_tiles(outcome, world, folder) if outcome.run.load_submaps() else []
     return paths + write_trajectory(outcome, folder) + write_notes(outcome, world, folder)
 
 
@@ -251,6 +252,7 @@ def export_run(
         "spz": lambda: write_spz_file(outcome, world, settings.spz_version, folder),
         "sog": lambda: write_sog_file(outcome, world, folder),
         "glb": lambda: write_glb_file(outcome, world, folder),
+        "tiles": lambda: write_tiles(outcome, world, folder),
         "html": lambda: write_web_page(outcome, world, folder),
         "mesh": lambda: mesh("mesh"),
         "texture": lambda: mesh("texture"),

@@ -1,70 +1,154 @@
-"""The map of a long recording as tiles, one a submap, each fine and coarse: a viewer loads what it looks at."""
+"""The map as 3D Tiles 1.1: a viewer loads what it looks at, as fine as the screen shows.
+
+A binary tree: the Gaussians are halved along the longest side until a tile is small enough; what is above stands for
+its two halves with fewer, larger Gaussians (`merged`). The file format is that of `write_compressed_glb`.
+"""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from msgs_slam.formats.gaussian_ply import write_gaussian_ply
+from msgs_slam.formats.gaussian_glb import COMPRESSION, EXTENSION, write_compressed_glb
 from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
+from msgs_slam.formats.gps import ecef_from_enu
 from msgs_slam.formats.jsonfile import write_json
-from msgs_slam.pipelines.export.writers import map_cloud
 from msgs_slam.pipelines.outcome import Outcome
+from msgs_slam.pipelines.run.journal import empty
+from msgs_slam.pipelines.upright.world import World
 
-COARSE = 6.0
-"""Side of the cells that each become one Gaussian of the coarse level, in median radii of the tile."""
+Array = NDArray[np.float64]
+
+TILES, TILESET = "tiles", "tileset.json"
+MOST = 50_000
+"""Gaussians of a tile: half a megabyte."""
+_COARSER = 1.25
+"""By which the cells grow until a tile's Gaussians are few enough."""
+_CELL = 3.0
+"""Side of the smallest cells that become one Gaussian, in median radii."""
+_REACH = 3.0
+"""Standard deviations of a Gaussian that lie in the tile's box."""
 _MOST_OPAQUE = 0.99
+_WIDEST = 0.5
+"""Radius to which a merged Gaussian may grow, in sides of its cell."""
+_Z_UP_FROM_IMAGE_AXES = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""What viewers turn the y-up content of a tile by, from x right, y down, z forward."""
 
 
-def write_tiles(outcome: Outcome, folder: Path) -> list[Path]:
-    """submap_1/point_cloud.ply and coarse.ply and so on, and tiles.json, which says where each is; nothing for a map
-    that was made whole."""
-    submaps = outcome.run.load_submaps()
-    if not submaps:
-        return []
-    anchors = outcome.require_map().anchor_frame_ids
-    rows: list[dict[str, Any]] = []
-    for number, submap in enumerate(submaps, 1):
-        own = torch.isin(anchors, torch.as_tensor(submap["own"], device=anchors.device))
-        tile, name = map_cloud(outcome, own), f"submap_{number}"
-        if len(tile) == 0:
-            continue
-        simpler = coarse(tile)
-        write_gaussian_ply(folder / name / "point_cloud.ply", tile, outcome.classes.names)
-        write_gaussian_ply(folder / name / "coarse.ply", simpler, outcome.classes.names)
-        low, high = tile.means.min(0).tolist(), tile.means.max(0).tolist()
-        sizes = {"gaussians": len(tile), "coarse_gaussians": len(simpler)}
-        rows.append({"folder": name, **sizes, "min": low, "max": high, "keyframes": submap["own"].tolist()})
-    write_json(folder / "tiles.json", rows)
-    return [folder / str(row["folder"]) for row in rows] + [folder / "tiles.json"]
+def write_tiles(outcome: Outcome, world: World, folder: Path) -> list[Path]:
+    """tiles/tileset.json and its tiles; nothing where there are no Gaussians. `outcome` stands in `world`.
 
-
-def coarse(cloud: GaussianCloud) -> GaussianCloud:
-    """One Gaussian in place of those in each cell of a grid.
-
-    Each counts by its opacity times its area: means of place, colour and classes; the radius takes in how they are
-    spread; as opaque as their areas together would cover the new one's.
+    tileset.json is written last, and the folder is removed where one of the files cannot be written.
     """
-    radii = np.exp(cloud.log_scales.astype(np.float64).mean(1))
+    m = outcome.require_map()
+    if len(m) == 0:
+        return []
+    means, log_radii, logits, colors = (x.cpu().numpy() for x in (m.means, m.log_radii, m.opacity_logits, m.colors))
+    cloud = isotropic_cloud((means @ world.image_axes_from_exported.T).astype(np.float32), log_radii, logits, colors)
+    empty(target := folder / TILES)
+    try:
+        root, _ = _write_tile(cloud, target, "tile")
+        root["refine"], root["transform"] = "REPLACE", _earth_from_tiles(outcome, world).ravel(order="F").tolist()
+        splats = [EXTENSION, COMPRESSION]
+        document = {
+            "asset": {"version": "1.1", "generator": "msgs-slam"},
+            "extensionsUsed": ["3DTILES_content_gltf"],  # by which CesiumJS knows Gaussians before it loads any
+            "extensions": {"3DTILES_content_gltf": {"extensionsUsed": splats, "extensionsRequired": splats}},
+            "geometricError": float(2 * np.max(root["boundingVolume"]["box"][3:])),
+            "root": root,
+        }
+        write_json(target / TILESET, document)
+    except BaseException:
+        shutil.rmtree(target, ignore_errors=True)
+        raise
+    return [target]
+
+
+def _write_tile(cloud: GaussianCloud, folder: Path, name: str) -> tuple[dict[str, Any], GaussianCloud]:
+    """The tile of a cloud (x right, y down, z forward) as tileset.json has it, and what its own file holds."""
+    children, held, error = [], cloud, 0.0
+    if len(cloud) > MOST:
+        along = cloud.means[:, int(np.ptp(cloud.means, axis=0).argmax())]
+        order = np.argsort(along, kind="stable")
+        halves = [
+            _write_tile(cloud.only(np.sort(rows)), folder, f"{name}{number}")
+            for number, rows in enumerate(np.array_split(order, 2))
+        ]
+        children = [tile for tile, _ in halves]
+        held, error = _fewer(joined_clouds([part for _, part in halves]), max(c["geometricError"] for c in children))
+    write_compressed_glb(folder / f"{name}.glb", held)
+    low, high = _box(held)
+    for child in children:
+        center, half = _center_and_half(child)
+        low, high = np.minimum(low, center - half), np.maximum(high, center + half)
+    tile: dict[str, Any] = {
+        "boundingVolume": {"box": [*((low + high) / 2).tolist(), *np.diag((high - low) / 2).ravel().tolist()]},
+        "geometricError": error,
+        "content": {"uri": f"{name}.glb"},
+    }
+    return (tile | {"children": children} if children else tile), held
+
+
+def _fewer(cloud: GaussianCloud, least: float) -> tuple[GaussianCloud, float]:
+    """At most `MOST` Gaussians, and the side of the cells, more than `least`, that each became one of them."""
+    side = max(_CELL * float(np.median(np.exp(cloud.log_scales[:, 0]))), _COARSER * least)
+    while len(few := merged(cloud, side)) > MOST:
+        side *= _COARSER
+    return few, side
+
+
+def joined_clouds(clouds: list[GaussianCloud]) -> GaussianCloud:
+    """All of them in one, of isotropic ones without classes."""
+    columns = ("means", "log_scales", "opacity_logits", "colors")
+    means, scales, logits, colors = (np.concatenate([getattr(c, name) for c in clouds]) for name in columns)
+    return isotropic_cloud(means, scales[:, 0], logits, colors)
+
+
+def merged(cloud: GaussianCloud, side: float) -> GaussianCloud:
+    """One Gaussian in place of those in each cell of a grid of that side.
+
+    Each counts by its opacity times its area: means of place and colour; the radius takes in how they are spread; as
+    opaque as their areas together would cover the new one's.
+    """
+    radii = np.exp(cloud.log_scales[:, 0].astype(np.float64))
     opacity = 1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))
-    side = COARSE * float(np.median(radii))
     _, cell = np.unique(np.floor(cloud.means / side).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.reshape(-1)
     weight = opacity * radii**2 + 1e-30
     total = np.bincount(cell, weight)
 
-    def mean(values: NDArray) -> NDArray[np.float64]:
+    def mean(values: NDArray) -> Array:
         columns = values.reshape(len(values), -1)
         return np.stack([np.bincount(cell, weight * column) / total for column in columns.T], 1)
 
     center = mean(cloud.means)
     apart = np.square(cloud.means - center[cell]).sum(1) / 2  # they lie side by side on a surface, in two directions
+    # A radius that cannot be opaque enough grows, but not over the cells beside it.
     radius = np.sqrt(mean(np.square(radii) + apart)[:, 0])
+    radius = np.maximum(radius, np.minimum(np.sqrt(total / _MOST_OPAQUE), _WIDEST * side))
     covered = np.clip(total / radius**2, 1e-3, _MOST_OPAQUE)
-    classes = None if cloud.class_probs is None else mean(cloud.class_probs).astype(np.float32)
     logits, colors = np.log(covered / (1 - covered)).astype(np.float32), mean(cloud.colors).astype(np.float32)
-    return isotropic_cloud(center.astype(np.float32), np.log(radius).astype(np.float32), logits, colors, classes)
+    return isotropic_cloud(center.astype(np.float32), np.log(radius).astype(np.float32), logits, colors)
+
+
+def _box(cloud: GaussianCloud) -> tuple[Array, Array]:
+    """Corners, z up."""
+    means, reach = cloud.means @ _Z_UP_FROM_IMAGE_AXES.T, _REACH * np.exp(cloud.log_scales[:, :1].astype(np.float64))
+    return (means - reach).min(axis=0), (means + reach).max(axis=0)
+
+
+def _center_and_half(tile: dict[str, Any]) -> tuple[Array, Array]:
+    box = np.array(tile["boundingVolume"]["box"])
+    return box[:3], box[[3, 7, 11]]
+
+
+def _earth_from_tiles(outcome: Outcome, world: World) -> Array:
+    """(4, 4) to the Earth's centre where GPS tells the place; else to metres, as far as they are known."""
+    if world.earth is not None:
+        return ecef_from_enu(np.array(world.earth.origin))
+    per_unit = 1.0 if outcome.metric or outcome.metres is None else outcome.metres.per_unit
+    return np.diag([per_unit, per_unit, per_unit, 1.0])

@@ -15,7 +15,13 @@ from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gaussian_files import read_gaussians
-from msgs_slam.formats.gaussian_glb import EXTENSION, read_gaussian_glb, write_gaussian_glb
+from msgs_slam.formats.gaussian_glb import (
+    COMPRESSION,
+    EXTENSION,
+    read_gaussian_glb,
+    write_compressed_glb,
+    write_gaussian_glb,
+)
 from msgs_slam.formats.gaussians import GaussianCloud
 
 
@@ -84,6 +90,22 @@ def test_who_does_not_know_the_extension_sees_points(tmp_path: Path) -> None:
     points = next(iter(trimesh.load_scene(tmp_path / "map.glb").geometry.values()))
     np.testing.assert_allclose(points.vertices, cloud.means * (1, -1, -1), atol=1e-6)
     np.testing.assert_allclose(points.colors[:, :3], np.clip(cloud.colors, 0, 1) * 255, atol=0.51)
+
+
+def test_compressed_is_a_tenth_and_read_again(tmp_path: Path) -> None:
+    cloud = _cloud()
+    write_compressed_glb(tmp_path / "small.glb", cloud)
+    read = read_gaussians(tmp_path / "small.glb")
+    assert 0 < np.abs(read.means - cloud.means).max() < 1e-5
+    assert np.abs(read.colors - cloud.colors).max() < 0.004
+    gltf = pygltflib.GLTF2().load(str(tmp_path / "small.glb"))
+    assert gltf.extensionsRequired == [EXTENSION, COMPRESSION]
+    assert all(a.bufferView is None and a.count == len(cloud) for a in gltf.accessors)
+    np.testing.assert_allclose(gltf.accessors[0].max, (cloud.means * (1, -1, -1)).max(axis=0), atol=1e-6)
+    data = (tmp_path / "small.glb").read_bytes()
+    (tmp_path / "cut.glb").write_bytes(data[:-2000])
+    with pytest.raises(InputError, match="damaged"):
+        read_gaussians(tmp_path / "cut.glb")
 
 
 def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def _rotations(cloud: GaussianCloud) -> np.ndarray:
     return Rotation.from_quat(cloud.quat_wxyz[:, [1, 2, 3, 0]]).as_matrix()
 
 
-@pytest.mark.parametrize(("extent", "version"), [(0.01, 4), (5.0, 3), (5.0, 4), (3000.0, 4)])
+@pytest.mark.parametrize(("extent", "version"), [(0.01, 4), (5.0, 2), (5.0, 3), (5.0, 4), (3000.0, 4)])
 def test_spz_round_trip_within_its_steps(tmp_path: Path, extent: float, version: int) -> None:
     cloud = _cloud(extent=extent)
     write_spz(tmp_path / "a.spz", cloud, version)
@@ -52,7 +52,8 @@ def test_spz_round_trip_within_its_steps(tmp_path: Path, extent: float, version:
     assert 0 < np.abs(back.log_scales - cloud.log_scales).max() <= 0.5 / 16 + 1e-5
     assert np.abs(_sigmoid(back.opacity_logits) - _sigmoid(cloud.opacity_logits)).max() <= 0.51 / 255
     assert np.abs(back.colors - cloud.colors).max() <= 0.51 / 255 / 0.15 * 0.2821
-    assert 0 < np.abs(_rotations(back) - _rotations(cloud)).max() < 0.008  # 10 bits a component
+    steps = 255 if version == 2 else 1024  # of a component; where the fourth is small its error is a larger one
+    assert 0 < np.abs(_rotations(back) - _rotations(cloud)).max() < (0.2 if version == 2 else 8 / steps)
     assert (tmp_path / "a.spz").stat().st_size < 25 * len(cloud) + 200
 
 

@@ -1,17 +1,10 @@
 """The viewer's scene as arrays, and the viewer itself in a real browser."""
 
-import base64
-import json
-import shutil
-import subprocess
 import time
-import urllib.request
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -25,6 +18,7 @@ from msgs_slam.formats.gaussian_ply import read_gaussian_ply
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.viewer.scene import load_scenes
 from msgs_slam.pipelines.viewer.tools import round_range
+from tests.browser import BROWSER, Page, browser
 
 OracleRun = Callable[..., RunFolder]
 
@@ -83,81 +77,6 @@ def test_sliders_have_few_digits() -> None:
 
 
 # in the browser -------------------------------------------------------------------------------------------------
-
-BROWSER = next((b for n in ("chromium", "chromium-browser", "google-chrome") if (b := shutil.which(n))), None)
-FLAGS = ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-
-
-class NotReady(Exception):
-    """The tab cannot answer now."""
-
-
-class Page:
-    """One tab, driven over the browser's own protocol."""
-
-    def __init__(self, socket: Any) -> None:
-        self._socket, self._number = socket, 0
-
-    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        self._number += 1
-        self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
-        while True:
-            answer = json.loads(self._socket.recv(timeout=240))
-            if answer.get("id") == self._number:
-                if "error" in answer:  # a tab between two documents has no picture
-                    raise NotReady(answer["error"])
-                return answer["result"]
-
-    def scene(self) -> NDArray[np.uint8]:
-        """The picture left of the controls and below the browser's notice, BGR."""
-        data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[160:, :400]
-
-    def canvas(self) -> tuple[float, float]:
-        """Width and height of what the map is drawn on; it begins at the window's corner."""
-        text = "JSON.stringify(['clientWidth', 'clientHeight'].map(k => document.querySelector('canvas')[k]))"
-        width, height = json.loads(self.call("Runtime.evaluate", expression=text)["result"]["value"])
-        return width, height
-
-    def click(self, x: float, y: float) -> None:
-        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-
-    def press(self, words: str) -> None:
-        """The button with these words, as a finger or a mouse would."""
-        button = f"[...document.querySelectorAll('button')].find(b => b.innerText.includes({words!r}))"
-        self.call("Runtime.evaluate", expression=f"{button}.click()")
-
-    def wait_for(self, seen: Callable[[NDArray[np.uint8]], bool], seconds: float = 240) -> NDArray[np.uint8]:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            with suppress(NotReady):
-                if seen(picture := self.scene()):
-                    return picture
-            time.sleep(1)
-        pytest.fail("the page did not come to show it")
-
-
-@contextmanager
-def browser(profile: Path) -> Iterator[Page]:
-    connect = pytest.importorskip("websockets.sync.client").connect
-    command = [str(BROWSER), *FLAGS, "--remote-debugging-port=0", "--remote-allow-origins=*"]
-    process = subprocess.Popen(
-        [*command, f"--user-data-dir={profile}", "--window-size=760,520", "about:blank"], stderr=subprocess.DEVNULL
-    )
-    try:
-        port_file, end = profile / "DevToolsActivePort", time.monotonic() + 60
-        while not (port_file.exists() and port_file.read_text().strip()):
-            assert time.monotonic() < end, "the browser did not start"
-            time.sleep(0.2)
-        port = port_file.read_text().split()[0]
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json") as answer:
-            tab = next(t for t in json.load(answer) if t["type"] == "page")
-        with connect(tab["webSocketDebuggerUrl"], max_size=None) as socket:
-            yield Page(socket)
-    finally:
-        process.terminate()
-        process.wait()
 
 
 def where_shown(point: NDArray[np.float64], camera: Any, size: tuple[float, float]) -> tuple[float, float]:

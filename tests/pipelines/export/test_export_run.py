@@ -138,6 +138,7 @@ def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
         "sog": "point_cloud.sog",
         "glb": "point_cloud.glb",
         "html": "map.html",
+        "tiles": "tiles/tileset.json",
         "tum": "trajectory.txt",
     }
     for only in set(EXPORTS) - {"mesh", "texture"}:

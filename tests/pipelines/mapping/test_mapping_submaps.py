@@ -1,6 +1,5 @@
 """A map made in parts is as good as one made whole, and the same however often its making is broken off."""
 
-import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,13 +12,10 @@ from finished import note_finished
 from numpy.typing import NDArray
 from scipy import sparse
 
-from msgs_slam.formats.gaussian_ply import read_gaussian_ply
 from msgs_slam.formats.tensors import load_tensors
 from msgs_slam.pipelines.config import Config, MappingConfig, RunConfig
 from msgs_slam.pipelines.depth.posed import PosedDepth
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.export.tiles import write_tiles
-from msgs_slam.pipelines.gaussians.render import render
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.global_ba.loops import FoundLoops
 from msgs_slam.pipelines.global_ba.stage import refine
@@ -244,29 +240,6 @@ def test_poses_at_the_ends_of_a_loop_are_adjusted_in_parts_too(finished: RunFold
 
     assert 0 < apart(refined[1]) < 0.8 * apart(off[ids[1]])
     np.testing.assert_allclose(refined[4:10], true[4:10], atol=1e-6)
-
-
-def test_tiles_are_the_map_and_a_coarse_one(finished: RunFolder, tmp_path: Path) -> None:
-    outcome = load_outcome(finished, "cpu")
-    paths = write_tiles(outcome, tmp_path)
-    rows = json.loads((tmp_path / "tiles.json").read_text())
-    assert [p.name for p in paths] == ["submap_1", "submap_2", "submap_3", "tiles.json"]
-    tiles = [read_gaussian_ply(tmp_path / row["folder"] / "point_cloud.ply") for row in rows]
-    assert sum(len(t) for t in tiles) == len(outcome.require_map())
-    camera = outcome.calibration.intrinsics
-    row = outcome.frame_row(int(finished.load_submaps()[0]["own"][1]))
-    pose = torch.from_numpy(outcome.trajectory.cam_from_world[row])
-    shown = []
-    for name in ("point_cloud.ply", "coarse.ply"):
-        clouds = [read_gaussian_ply(tmp_path / r["folder"] / name) for r in rows]
-        columns = ("means", "log_scales", "opacity_logits", "colors")
-        means, scales, logits, colors = (
-            torch.from_numpy(np.concatenate([getattr(c, n) for c in clouds])) for n in columns
-        )
-        shown.append(render(means, scales[:, 0].exp(), logits.sigmoid(), colors, pose, camera))
-    assert all(row["coarse_gaussians"] < 0.4 * row["gaussians"] for row in rows)
-    assert float((shown[0].features - shown[1].features).abs().mean()) < 0.08
-    assert float(shown[1].silhouette.mean()) > 0.9 * float(shown[0].silhouette.mean())
 
 
 def test_a_view_is_drawn_from_its_submap_and_those_beside_it(finished: RunFolder) -> None:

@@ -1,0 +1,158 @@
+"""The map as 3D Tiles: every level shows the same scene, boxes hold what is in them, and it lies where GPS says."""
+
+import json
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+
+from msgs_slam.formats import atomic
+from msgs_slam.formats.errors import DiskFullError
+from msgs_slam.formats.gaussian_glb import read_gaussian_glb
+from msgs_slam.formats.gaussians import GaussianCloud
+from msgs_slam.pipelines.export import tiles
+from msgs_slam.pipelines.export.stage import export_run
+from msgs_slam.pipelines.gaussians.render import render
+from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.upright.georeference import Georeference
+from msgs_slam.pipelines.upright.world import SAME, World
+
+OracleRun = Callable[..., RunFolder]
+VALIDATE = """
+const validator = require("gltf-validator"), fs = require("fs");
+Promise.all(process.argv.slice(1).map((f) => validator.validateBytes(new Uint8Array(fs.readFileSync(f))))).then(
+  (all) => console.log(JSON.stringify(all.map((r) => r.issues.messages.filter((m) => m.severity < 2)))));
+"""
+
+
+@pytest.fixture
+def written(oracle_run: OracleRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[RunFolder, Path, Any]:
+    """A run, its tiles and what tileset.json says of them."""
+    monkeypatch.setattr(tiles, "MOST", 3000)
+    run = oracle_run()
+    export_run(run, tmp_path, "tiles")
+    return run, tmp_path / "tiles", json.loads((tmp_path / "tiles" / "tileset.json").read_text())
+
+
+def tiles_of(tile: dict[str, Any], level: int = 0) -> Iterator[tuple[int, dict[str, Any]]]:
+    yield level, tile
+    for child in tile.get("children", ()):
+        yield from tiles_of(child, level + 1)
+
+
+def box_of(tile: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    box = np.array(tile["boundingVolume"]["box"])
+    half = np.abs(box[3:].reshape(3, 3)).sum(axis=0)
+    return box[:3] - half, box[:3] + half
+
+
+def z_up(cloud: GaussianCloud) -> np.ndarray:
+    """What a viewer of 3D Tiles makes of the content: y up of glTF is turned to z up."""
+    return np.stack([cloud.means[:, 0], cloud.means[:, 2], -cloud.means[:, 1]], axis=1)
+
+
+def test_the_tree_is_as_the_standard_asks(written: tuple[RunFolder, Path, Any]) -> None:
+    run, folder, tileset = written
+    assert tileset["asset"]["version"] == "1.1"
+    leaves, errors = 0, [tileset["geometricError"]]
+    for level, tile in tiles_of(tileset["root"]):
+        cloud = read_gaussian_glb(folder / tile["content"]["uri"])
+        assert 0 < len(cloud) <= 3000
+        low, high = box_of(tile)
+        assert ((z_up(cloud) > low) & (z_up(cloud) < high)).all()
+        for child in tile.get("children", ()):
+            assert child["geometricError"] < tile["geometricError"]
+            assert (box_of(child)[0] >= low - 1e-9).all()
+            assert (box_of(child)[1] <= high + 1e-9).all()
+        if "children" not in tile:
+            assert (level, tile["geometricError"]) >= (1, 0.0)
+            leaves += len(cloud)
+        errors.append(tile["geometricError"])
+    m = load_outcome(run).require_map()
+    assert leaves == len(m)
+    assert max(errors) == errors[0]
+    assert {p.name for p in folder.iterdir()} == {"tileset.json"} | {
+        tile["content"]["uri"] for _, tile in tiles_of(tileset["root"])
+    }
+
+
+def test_every_level_looks_like_the_map(written: tuple[RunFolder, Path, Any]) -> None:
+    run, folder, tileset = written
+    outcome = load_outcome(run)
+    world = json.loads((folder.parent / "world.json").read_text())["exported_from_run"]
+    rotation, shift = np.array(world["rotation"]), np.array(world["translation"])
+    cam_from_exported = outcome.trajectory.cam_from_world[3].copy()
+    cam_from_exported[:3, :3] = cam_from_exported[:3, :3] @ rotation.T
+    cam_from_exported[:3, 3] -= cam_from_exported[:3, :3] @ shift
+    pictures = []
+    found = list(tiles_of(tileset["root"]))
+    for level in range(max(level for level, _ in found) + 1):
+        shown = [t for k, t in found if k == level or (k < level and "children" not in t)]
+        clouds = [read_gaussian_glb(folder / t["content"]["uri"]) for t in shown]
+        means = torch.from_numpy(np.concatenate([z_up(c) for c in clouds]).astype(np.float32))
+        radii, alpha = (np.concatenate([getattr(c, n) for c in clouds]) for n in ("log_scales", "opacity_logits"))
+        colors = torch.from_numpy(np.concatenate([c.colors for c in clouds]))
+        camera, pose = outcome.calibration.intrinsics, torch.from_numpy(cam_from_exported)
+        scale, opacity = torch.from_numpy(np.exp(radii[:, 0])), torch.from_numpy(alpha).sigmoid()
+        pictures.append(render(means, scale, opacity, colors, pose, camera))
+    assert len(pictures) > 2
+    for coarse in pictures[:-1]:
+        assert 0 < float((coarse.features - pictures[-1].features).abs().mean()) < 0.08
+        assert float(coarse.silhouette.mean()) > 0.9 * float(pictures[-1].silhouette.mean())
+
+
+def test_it_lies_on_the_earth(oracle_run: OracleRun, tmp_path: Path) -> None:
+    origin = (55.698, 13.195, 37.0)
+    world = World("up", "floor", True, SAME, {}, Georeference(origin, 1.0, 9, 9, 0.01))
+    outcome = load_outcome(oracle_run())
+    tiles.write_tiles(outcome, world, tmp_path)
+    root = json.loads((tmp_path / "tiles" / "tileset.json").read_text())["root"]
+    transform = np.array(root["transform"]).reshape(4, 4, order="F")
+    earth = pycolmap.GPSTransform()
+    for east_north_up in ([0.0, 0, 0], [30.0, -20, 5]):
+        place = earth.enu_to_ellipsoid(np.array([east_north_up]), *origin)
+        expected = earth.ellipsoid_to_ecef(place)[0]
+        np.testing.assert_allclose((transform @ [*east_north_up, 1])[:3], expected, atol=2e-3)
+    m = outcome.require_map().means.numpy()
+    low, high = box_of(root)
+    assert ((m > low) & (m < high)).all()  # z up as it is: nothing is turned twice
+
+
+def test_a_full_disk_leaves_nothing_half_written(
+    written: tuple[RunFolder, Path, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, folder, _ = written
+
+    class Full:
+        def writing(self, path: Path, temporary: Path) -> None:
+            if path.name == "tile01.glb":
+                raise OSError(28, "No space left on device", str(path))
+
+        def written(self, path: Path) -> None:
+            pass
+
+    with atomic.watched_by(Full()), pytest.raises(DiskFullError):
+        export_run(run, folder.parent, "tiles")
+    assert not folder.exists()
+
+
+def test_another_validator_has_nothing_against_the_files(written: tuple[RunFolder, Path, Any]) -> None:
+    """`npm install gltf-validator`, and NODE_PATH where it is not found from here. It knows neither extension, and so
+    not the colon that the names of their attributes have."""
+    if not (node := shutil.which("node")):
+        pytest.skip("needs node")
+    files = sorted(str(p) for p in written[1].glob("*.glb"))
+    done = subprocess.run([node, "-e", VALIDATE, *files], capture_output=True, text=True, timeout=120)
+    if "Cannot find module" in done.stderr:
+        pytest.skip("needs gltf-validator from npm")
+    reports = json.loads(done.stdout)
+    assert len(reports) == len(files)
+    for message in (m for report in reports for m in report):
+        assert (message["code"], ":" in message["pointer"]) == ("MESH_PRIMITIVE_INVALID_ATTRIBUTE", True)
