@@ -27,7 +27,7 @@ class Watcher(Protocol):
         """`temporary` is whole and takes the name `path` next."""
 
     def written(self, path: Path) -> None:
-        """`path` is there."""
+        """Note that the file `path` has been written."""
 
 
 _watchers: list[Watcher] = []
@@ -36,7 +36,7 @@ _own_mark: list[str] = []
 
 @contextmanager
 def watched_by(watcher: Watcher) -> Iterator[None]:
-    """In this block `watcher` is told of every file."""
+    """Report every file written inside this block to `watcher`."""
     _watchers.append(watcher)
     try:
         yield
@@ -45,12 +45,12 @@ def watched_by(watcher: Watcher) -> Iterator[None]:
 
 
 def process_mark() -> str:
-    """Of this process: on one disk no other has the same, on this machine or another."""
+    """Return a mark of this process, unique among the processes that share a disk, on this machine or another."""
     return f"{machine_mark()}-{os.getpid()}"
 
 
 def machine_mark() -> str:
-    """Of this machine, or of the container where processes are counted apart from the machine's."""
+    """Return a mark of this machine, or of the container where it has process ids of its own."""
     counted = ""
     with suppress(OSError):
         counted = os.readlink("/proc/self/ns/pid")
@@ -59,8 +59,8 @@ def machine_mark() -> str:
 
 @contextmanager
 def own_temporaries() -> Iterator[None]:
-    """In this block temporary files have names that no other process gives, on this machine or another: several may
-    write the same file at the same time, and the last one renamed stays. What a killed process leaves, stays too."""
+    """Give temporary files inside this block names that no other process uses, on this machine or another: several may
+    write the same file at the same time, and the last rename wins. Files of a killed process remain."""
     _own_mark.append(f"-{process_mark()}")
     try:
         yield
@@ -100,7 +100,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def temporary_of(path: Path) -> Path:
-    """Where `atomic_path` writes first: what a killed process may leave."""
+    """Return the temporary file that `atomic_path` writes first; a killed process may leave it behind."""
     end = f".tmp{''.join(_own_mark[-1:])}{path.suffix}"
     name = f".{path.stem}{end}"
     if len(os.fsencode(name)) > _LONGEST_NAME:

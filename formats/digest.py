@@ -1,4 +1,4 @@
-"""What a file or a list of files holds, as one hash."""
+"""Hashes of a file's content, or of a list of files."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class GaussianCloud:
         return len(self.means)
 
     def only(self, rows: NDArray) -> GaussianCloud:
-        """Those of a mask (M,) or of indices."""
+        """Select Gaussians by a mask (M,) or by indices."""
         arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "dropped_sh_degree"}
         chosen: dict[str, Any] = {name: None if a is None else a[rows] for name, a in arrays.items()}
         return replace(self, **chosen)

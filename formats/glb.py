@@ -38,12 +38,12 @@ class Part:
 
     @property
     def nbytes(self) -> int:
-        """In the file."""
+        """Size in the file, in bytes."""
         return self.count * self.width * np.dtype(self.dtype).itemsize
 
     @staticmethod
     def of(name: str, array: NDArray[Any], **more: Any) -> Part:
-        """Of an array (count,) or (count, width): uint8, uint32, or float32 for all else."""
+        """Make a part from an array (count,) or (count, width): uint8, uint32, or float32 for every other type."""
         kept = np.ascontiguousarray(array, {"u1": "|u1", "u4": "<u4"}.get(array.dtype.str[1:], "<f4"))
         if name == "POSITION":
             more |= {"min": kept.min(axis=0).tolist(), "max": kept.max(axis=0).tolist()}

@@ -37,7 +37,7 @@ def can_tone_map() -> bool:
 
 
 class HdrCapture:
-    """What the reader of videos needs of OpenCV's VideoCapture, for HDR files; frames are tone-mapped."""
+    """Reader of HDR videos with the part of OpenCV's VideoCapture that is used here; frames are tone-mapped."""
 
     def __init__(self, path: Path, transfer: str) -> None:
         import av
@@ -86,7 +86,7 @@ class HdrCapture:
         return True, np.ascontiguousarray(np.rot90(rgb, self._frame.rotation // 90)[..., ::-1])
 
     def release(self) -> None:
-        """Close the file."""
+        """Close the video file."""
         self._container.close()
 
 

@@ -27,7 +27,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path, most: int | None = MAX_JSON_BYTES) -> Any:
-    """What a JSON file holds: numbers are finite and of at most 40 digits, texts are whole Unicode.
+    """Read a JSON file: numbers must be finite and of at most 40 digits, texts valid Unicode.
 
     Raises InputError when it is missing, larger than `most` bytes (None, for what a run holds: of any size), damaged,
     or nested too deep.
@@ -83,7 +83,7 @@ def number(table: dict[str, Any], path: Path, *names: str) -> float:
 
 
 def optional_number(table: dict[str, Any], path: Path, *names: str) -> float | None:
-    """As `number`, but None when no such name is there."""
+    """Return the first number found under `names`, None without any. Raises InputError for other values."""
     name = next((n for n in names if table.get(n) is not None), None)
     if name is None:
         return None

@@ -72,7 +72,7 @@ def write_ply(path: Path, elements: dict[str, Rows], comments: list[str]) -> Non
 
 
 def slices(count: int) -> Iterator[slice]:
-    """Of so many rows those that are written or read at once."""
+    """Split `count` rows into the slices that are written or read at once."""
     return (slice(start, min(start + _ROWS, count)) for start in range(0, count, _ROWS))
 
 

@@ -95,6 +95,6 @@ def require_file(path: Path, most: int | None = None) -> int:
 
 
 def read_bytes(path: Path, most: int | None = None) -> bytes:
-    """What a file holds. Raises as `opened`."""
+    """Read a whole file. Raises as `opened`."""
     with opened(path, most) as file:
         return file.read()

@@ -52,7 +52,7 @@ def video_sphere(path: Path) -> str:
 
 
 def image_sphere(path: Path) -> str:
-    """The same of a picture, by the XMP of Google's Photo Sphere; what is cut out of one is told by its shape alone."""
+    """Return WHOLE, PART or "" for an image, by its Photo Sphere XMP (Google), which a crop may have kept unchanged."""
     try:
         with parsing(path, "image"), Image.open(path) as image:
             xmp = image.info.get("xmp", b"")

@@ -45,7 +45,7 @@ _SHORTEST_STEP = 1e-6
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What the file says of itself; the size is that of the decoded frames, after rotation.
+    """Metadata of a video file; the size is that of the decoded frames, after rotation.
 
     `frame_count_claimed` (0 = not said) and `duration` in seconds come from the header: a truncated file still says
     what it once held. `fps` is the mean rate; single frames may be apart by other times.

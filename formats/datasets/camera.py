@@ -17,7 +17,7 @@ _SAME_SHAPE = 0.01
 
 
 def distortion_names(fisheye: bool) -> tuple[str, ...]:
-    """What a camera's coefficients are called."""
+    """Return the names of a camera's distortion coefficients."""
     return ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
 
 
@@ -65,11 +65,11 @@ class Camera:
         cy: float,
         distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0),
     ) -> Camera:
-        """From a calibration in which the first pixel's centre is (0, 0), as OpenCV and ROS have it."""
+        """Make a camera from a calibration in which the first pixel's centre is (0, 0), as in OpenCV and ROS."""
         return cls(width, height, fx, fy, cx + 0.5, cy + 0.5, distortion)
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same camera after its image is resized to width x height.
+        """Return the camera after its image is resized to width x height.
 
         Raises InputError for images of another shape, by more than 1 % and a pixel of rounding: no resizing makes one
         of the other.

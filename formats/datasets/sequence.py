@@ -150,7 +150,7 @@ class Sequence:
         return table[read_label_png(path)]
 
     def with_used_classes(self) -> Sequence:
-        """The same with only those classes that occur in the label images (reads all of them)."""
+        """Return the sequence with only the classes that occur in the label images (reads all of them)."""
         used = used_label_ids([p for p in self.label_paths if p is not None])
         return replace(self, classes=tuple(c for c in self.classes if not used.isdisjoint((c.id, *c.other_ids))))
 
