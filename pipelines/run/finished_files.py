@@ -1,4 +1,4 @@
-"""Where a run's files lie, and whether they are still what the stages left."""
+"""Files of finished stages: their paths, and whether they are unchanged."""
 
 from __future__ import annotations
 

@@ -175,7 +175,7 @@ class RunFolder(FinishedFiles):
         return load_sparse_model(self.file(stage, str(PurePosixPath(piece, SPARSE))))
 
     def load_depth_fields(self, stage: str) -> DepthFields:
-        """What brings proxy depths into the world of `stage`, tracking or global_ba."""
+        """Load the fields that bring proxy depths into the world of `stage`, tracking or global_ba."""
         path = self.file(stage, DEPTH_FIELDS)
         arrays = load_layout(path, layouts.DEPTH_FIELDS)
         with reading(path, "file of depth fields"):
@@ -211,7 +211,7 @@ class RunFolder(FinishedFiles):
             return ids
 
     def load_submaps(self) -> list[dict[str, NDArray[np.int64]]]:
-        """Of each submap the frame ids "own" and "border" and the numbers "beside" it; [] of a map made whole."""
+        """Load each submap's frame ids "own" and "border" and its neighbours "beside"; [] for an undivided map."""
         with reading(path := self.file("mapping", "mapping.json"), "table of submaps"):
             rows = read_json_object(path, None).get("submaps", [])
             return [{k: np.array(row[k], np.int64).reshape(-1) for k in ("own", "border", "beside")} for row in rows]
@@ -260,7 +260,7 @@ def save_features(folder: Path, frame_id: int, features: Features) -> None:
 
 
 def features_name(frame_id: int) -> str:
-    """Where a keyframe's features lie, inside the stage's folder."""
+    """Return the path of a keyframe's features inside the stage's folder."""
     return f"correspondence/{frame_id:06d}.npz"
 
 
@@ -272,7 +272,7 @@ def save_matching(folder: Path, vocabulary: Vocabulary, tried: dict[tuple[int, i
 
 
 def save_backbone(folder: Path, model: SparseModel) -> None:
-    """What structure from motion found over the frames."""
+    """Write the structure-from-motion model over the frames."""
     save_sparse_model(folder / BACKBONE, model)
 
 
@@ -282,12 +282,12 @@ def save_sparse(folder: Path, model: SparseModel) -> None:
 
 
 def save_figures(folder: Path, stage: str, figures: dict[str, Any]) -> None:
-    """What the stage says of its result, for other programs."""
+    """Write the figures of a stage's result as JSON, for other programs."""
     write_json(folder / f"{stage}.json", figures)
 
 
 def save_classes(folder: Path, classes: ClassTable) -> None:
-    """[{"id", "name", "color"}]."""
+    """Write the class table as [{"id", "name", "color"}]."""
     rows = [
         {"id": i, "name": n, "color": list(c)}
         for i, (n, c) in enumerate(zip(classes.names, classes.colors, strict=True))
@@ -310,14 +310,14 @@ def save_descriptors(folder: Path, vectors: dict[int, NDArray[np.float32]]) -> N
 
 
 def save_trajectory(folder: Path, trajectory: Trajectory) -> None:
-    """One npz."""
+    """Write the trajectory as one npz."""
     arrays = dict(trajectory.__dict__)
     arrays["lost_reasons"] = np.array(trajectory.lost_reasons, dtype=np.str_)
     save_arrays(folder / TRAJECTORY, arrays)
 
 
 def save_map(folder: Path, gaussian_map: GaussianMap) -> None:
-    """One safetensors file."""
+    """Write the Gaussian map as one safetensors file."""
     save_tensors(folder / MAP, {k: v.detach().cpu().contiguous() for k, v in vars(gaussian_map).items()})
 
 
@@ -335,6 +335,6 @@ def save_exposure(
 
 
 def save_loops(folder: Path, loops: list[LoopEdge]) -> None:
-    """The verified loops."""
+    """Write the verified loops as JSON."""
     rows = [{**vars(e), "frame2_from_frame1": e.frame2_from_frame1.tolist()} for e in loops]
     write_json(folder / LOOPS, rows)

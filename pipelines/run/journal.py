@@ -1,4 +1,4 @@
-"""What an unfinished stage has written, so that an attempt that goes on can tell what is whole."""
+"""Journal of an unfinished stage's files, from which a resumed attempt knows which of them are complete."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is read back from a run is what the program writes there, or it is refused: one boundary for all of it.
+"""Layouts of a run's files: data read back must be what the program writes there, or it is refused.
 
 A layout says what an .npz file holds: name → kind and axes, as in "f N 3": kinds are f (finite floats), i (integers),
 b (booleans), u (text); a letter is a length that is the same wherever it occurs; a name that ends in "?" may be

@@ -13,12 +13,12 @@ from msgs_slam.pipelines.types import ProxyMaps
 
 
 def proxy_path(folder: Path, frame_id: int) -> Path:
-    """Where a frame's proxy maps lie."""
+    """Return the path of a frame's proxy maps."""
     return folder / proxy_name(frame_id)
 
 
 def proxy_name(frame_id: int) -> str:
-    """The same, inside the stage's folder."""
+    """Return the path of a frame's proxy maps inside the stage's folder."""
     return f"maps/{frame_id:06d}.npz"
 
 

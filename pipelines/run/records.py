@@ -1,4 +1,4 @@
-"""What a run says of itself: manifest.json, one record a finished stage."""
+"""The manifest of a run, manifest.json: one record for each finished stage."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FORMAT = 2
 
 @dataclass(frozen=True)
 class Source:
-    """What the run was made from: the path, and the identity of what was there (`source_digest`)."""
+    """Source of a run: its path, and the identity of its content (`source_digest`)."""
 
     path: str
     digest: str
@@ -77,7 +77,7 @@ class StageRecord:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What the run was made from, and the finished stages by name, in their order."""
+    """Source of a run, and its finished stages by name, in their order."""
 
     source: Source
     records: dict[str, StageRecord]
@@ -125,7 +125,7 @@ def load_records(run: RunFolder) -> dict[str, StageRecord]:
 
 
 def load_source(run: RunFolder) -> Source:
-    """What the run was made from. Raises InputError for a folder that is no run."""
+    """Load the source of a run. Raises InputError for a folder that is not a run."""
     source = read_manifest(run.manifest_file).source
     inside = run.root / SOURCE_LIST
     # The list of several videos lies in the run, wherever that has been moved to.
@@ -141,7 +141,7 @@ def recorded_config(records: Mapping[str, StageRecord], config: Config) -> Confi
 
 
 def settings_of(config: Config, stage: str) -> dict[str, dict[str, Any]]:
-    """What a record keeps of the settings."""
+    """Return the settings that a stage's record keeps."""
     kept: dict[str, dict[str, Any]] = {"run": config_to_dict(config.run)}
     for key, value in settings_of_stage(config, stage).items():
         section, _, name = key.rpartition(".")
@@ -172,7 +172,7 @@ def content_digest(files: Mapping[str, tuple[int, str]]) -> str:
 
 
 def plain(figures: Any) -> Any:
-    """The same with None for what JSON has no number for (infinite, NaN)."""
+    """Replace numbers that JSON lacks (infinite, NaN) by None, at any depth."""
     if isinstance(figures, dict):
         return {k: plain(v) for k, v in figures.items()}
     if isinstance(figures, list | tuple):

@@ -1,4 +1,4 @@
-"""How far the process that works on a run has come, for whoever asks from beside it: a small file in the run."""
+"""Progress of the process that works on a run, in a small file for other processes to read."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class NotedProgress:
             self._file.unlink(missing_ok=True)
 
     def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
-        """Yield the items."""
+        """Yield the items, and write how many are done to the file every so often."""
         of = total or (len(items) if isinstance(items, Sized) else 0)
         for done, item in enumerate(self._progress.track(items, label, total)):
             if time.monotonic() - self._written > _BETWEEN_WRITES:
@@ -67,7 +67,7 @@ class NotedProgress:
             yield item
 
     def stage(self, event: StageEvent) -> None:
-        """What is tracked from now on is part of this stage."""
+        """Attribute what is tracked from now on to this stage."""
         self._progress.stage(event)
         self._event = event if event.state == BEGUN else self._event
         if event.state == BEGUN:
@@ -85,7 +85,7 @@ class NotedProgress:
 
 
 def load_running(run: RunFolder) -> Running | None:
-    """What a process is making of the run now; None where none is at work, or it has not begun a stage."""
+    """Load the progress of the process at work; None where there is none, or no stage has started."""
     path = Path(run.root / FILE)
     if not path.exists() or not is_led(run):
         return None
