@@ -1,1 +1,1 @@
-"""Where images come from: videos, folders, panoramas, data sets."""
+"""Sources of images: videos, folders, panoramas, data sets."""

@@ -33,11 +33,11 @@ _ROWS = 2
 
 @dataclass(frozen=True)
 class Faces:
-    """What is cut out of each picture of the source, in one direction or the six of `CUBE`, as `pinhole` sees it.
+    """Pinhole images cut out of each source image, in one direction or the six of `CUBE`, with the camera `pinhole`.
 
-    size (width, height): the source's pictures are reduced to it first; maps: for each direction the pixels of the
-    reduced picture, as OpenCV counts them, of a panorama with `_ROWS` more above it. `fisheye` is the lens that is
-    taken away, None for panoramas.
+    size (width, height): source images are resized to it first; maps: for each direction the pixels of the resized
+    image, as OpenCV counts them, of a panorama with `_ROWS` more above it. `fisheye`: the lens that is removed, None
+    for panoramas.
     """
 
     pinhole: Intrinsics
@@ -49,7 +49,7 @@ class Faces:
         return len(self.maps)
 
     def names(self, name: str) -> list[str]:
-        """Of the pictures that are cut out of picture `name`."""
+        """Return the names of the images cut out of the image `name`."""
         return [f"f{c}_{name}" for c in range(len(self))] if len(self) > 1 else [name]
 
     def cut(self, rgb: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
@@ -117,7 +117,7 @@ def _fisheye(source: VideoSource | FolderSource | RecordingSource, config: Frame
 
 
 def panorama_faces(width: int, height: int, max_side: int) -> Faces:
-    """Of equirectangular panoramas: the camera looks at the middle of the picture, which spans 360 by 180 degrees.
+    """Make the faces of an equirectangular panorama: the first looks at its middle; it spans 360 by 180 degrees.
 
     Raises InputError for another shape.
     """

@@ -68,7 +68,7 @@ def check_poses(config: FramesConfig, source: AnySource) -> None:
 
 
 def pose_inputs(config: FramesConfig) -> dict[str, str]:
-    """What changes with the poses' files."""
+    """Return the digest of the pose files; {} without any."""
     path = Path(config.poses).expanduser()
     if not config.poses or not path.exists():
         return {}

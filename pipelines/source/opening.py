@@ -87,7 +87,7 @@ class VideoSource:
                 first, start = first + len(reader.timestamps), start + reader.timestamps[-1] + _PAUSE
 
     def name(self, frame_id: int, index: int) -> str:
-        """000000.jpg, 000001.jpg, ..."""
+        """Return the name of a frame: 000000.jpg, 000001.jpg, ..."""
         return f"{frame_id:06d}.jpg"
 
     def original(self, index: int) -> Path | None:
@@ -95,7 +95,7 @@ class VideoSource:
         return None
 
     def exif_focal(self) -> float | None:
-        """Videos state none."""
+        """Return None: videos state no focal length."""
         return None
 
 
@@ -176,7 +176,7 @@ class FolderSource:
         return self._images[index]
 
     def exif_focal(self) -> float | None:
-        """That of the first readable image."""
+        """Return the focal length in pixels that the first readable image states, if any."""
         for path in self._images:
             if path.name not in self.unreadable:
                 return exif_focal_px(path, self.width, self.height)

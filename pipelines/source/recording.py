@@ -77,7 +77,7 @@ class RecordingSource:
         return path if path is not None and reusable(path) else None
 
     def exif_focal(self) -> float | None:
-        """That of the first image."""
+        """Return the focal length in pixels that the first image states, if any."""
         paths = self.sequence.image_paths
         return exif_focal_px(paths[0], self.width, self.height) if paths else None
 

@@ -1,4 +1,4 @@
-"""How sharp a picture is."""
+"""Sharpness of an image."""
 
 from __future__ import annotations
 

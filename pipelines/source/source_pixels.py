@@ -11,9 +11,9 @@ from msgs_slam.pipelines.types import Calibration
 
 
 class FramePixels:
-    """Where in the source's image each pixel of an undistorted frame comes from.
+    """Pixels of the source's image from which the pixels of an undistorted frame come.
 
-    The way back through the run's own undistortion: right even where its focal length is not.
+    Inverts the run's own undistortion, so it is right even where the focal length is not.
     """
 
     def __init__(self, calibration: Calibration) -> None:
