@@ -110,7 +110,7 @@ def reprojection_errors(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
 
 
 def median_error(model: pycolmap.Reconstruction) -> float:
-    """Of all observations, in pixels; 0 without any."""
+    """Return the median reprojection error of all observations, in pixels; 0 without any."""
     errors = reprojection_errors(model)
     return float(np.median(errors)) if len(errors) else 0.0
 

@@ -1,4 +1,4 @@
-"""From pycolmap's reconstruction to the arrays that the other stages read."""
+"""Conversion of pycolmap's reconstruction to the arrays that the other stages read."""
 
 from __future__ import annotations
 

@@ -51,9 +51,9 @@ _Tried = tuple[pycolmap.Reconstruction, str, ModelReport]
 
 @dataclass(frozen=True)
 class Views:
-    """What is known of the keyframes: features, their pixels (F, 2) again, which are needed when descriptors no longer
-    are, times (K,) in seconds, the numbers of those that hold the path's size badly, and the poses (K, 4, 4) that the
-    user gave, NaN where none, if any."""
+    """Keyframes as structure from motion sees them: features, their pixels (F, 2) again for when descriptors are
+    dropped, times (K,) in seconds, the numbers of those that constrain scale weakly, and the user's poses (K, 4, 4),
+    NaN where none, if any."""
 
     features: LruSequence[Features]
     xy: list[NDArray[np.float64]]
@@ -62,7 +62,7 @@ class Views:
     given: NDArray[np.float64] | None = None
 
     def part(self, window: range) -> Views:
-        """Of the keyframes of a window, counted from 0."""
+        """Select the keyframes of a window, renumbered from 0."""
         numbers = slice(window.start, window.stop)
         weak = [k - window.start for k in self.weak if k in window]
         given = None if self.given is None else self.given[numbers]
@@ -80,9 +80,9 @@ class Adjusted:
 
 @dataclass(frozen=True, kw_only=True)
 class Candidates:
-    """What models of matched keyframes are made with: `camera` is what is known of the camera before, and `is_fixed`
-    says that it is held; `is_stated` that it is only as long as the pictures do not contradict it. cam_from_rig
-    (C, 3, 3): the keyframes come direction by direction, as `Rig` counts frames."""
+    """Inputs of candidate models besides the keyframes: `camera` is the prior, `is_fixed` holds it, `is_stated` holds
+    it unless the images contradict it. cam_from_rig (C, 3, 3): keyframes are ordered direction by direction, as in
+    `Rig`."""
 
     config: FramesConfig
     camera: pycolmap.Camera

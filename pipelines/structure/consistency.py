@@ -1,4 +1,4 @@
-"""How well a model agrees with the matches it was made from."""
+"""Agreement of a model with the matches it was made from."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class ModelReport:
 
     @property
     def contradicted(self) -> list[Seam]:
-        """Where the path may be folded."""
+        """Seams where the path may be folded."""
         return worst_contradictions(self.seams)
 
     @property
@@ -110,7 +110,7 @@ def without_misplaced(
 def check_pairs(
     model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], xy: Sequence[NDArray[np.float64]], total: int
 ) -> list[PairCheck]:
-    """How far the matches of each pair of placed keyframes agree with their poses; by place, see `judge`."""
+    """Count the matches of each pair of placed keyframes that agree with their poses; by station, see `judge`."""
     checks = []
     for pair, error in matched_errors(model, pairs, xy):
         first, second = sorted((pair.first % total, pair.second % total))

@@ -45,8 +45,8 @@ def gain_of_freeing(model: pycolmap.Reconstruction) -> float:
 def unexplained(
     model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], xy: Sequence[NDArray[np.float64]]
 ) -> float:
-    """How badly a model's poses and camera explain the verified matches, whichever of them its points are made of: the
-    mean robust cost of their distances to the epipolar lines."""
+    """Return the mean robust cost of the distances of all verified matches to their epipolar lines under a model's
+    poses and camera, whichever of them its points are made of."""
     errors = [error for _, error in matched_errors(model, pairs, xy)]
     return _cost(np.concatenate(errors)) if errors else float("inf")
 

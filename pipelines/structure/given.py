@@ -51,15 +51,15 @@ class GivenPoses:
 
     @staticmethod
     def load(path: Path) -> GivenPoses:
-        """Inverse of `save`."""
+        """Load what `save` wrote."""
         a = load_arrays(path)
         return GivenPoses(a["cam_from_world"], bool(a["is_metric"]), str(a["what"]))
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How given poses agree with found ones: given = `move`(found); their standard deviations, in the given unit and in
-    degrees, without those that are wrong altogether (`wrong`, (N,)); `scale_sd`: relative."""
+    """Fit of given poses to found ones: given = `move`(found); standard deviations of the inliers, in the given unit
+    and in degrees; `wrong` (N,): outliers; `scale_sd`: relative."""
 
     move: Similarity
     position_sd: float
@@ -69,8 +69,8 @@ class Agreement:
 
 
 def agreement(found: Array, given: Array) -> Agreement | None:
-    """Of cameras (N, 4, 4) in two worlds, by iterated reweighting (Cauchy's weights at the median residual); None
-    where fewer than three, or cameras that hardly moved, tell no scale."""
+    """Fit cameras (N, 4, 4) in two worlds by iterated reweighting (Cauchy's weights at the median residual); None where
+    fewer than three, or cameras that hardly moved, determine no scale."""
     if len(found) < 3:
         return None
     ours, theirs = se3.inverse(found), se3.inverse(given)

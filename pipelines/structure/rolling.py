@@ -43,7 +43,7 @@ FEATURE_SD = 0.5
 
 @dataclass(frozen=True)
 class Shutter:
-    """How a recording was taken: the readout, and the seconds (F,) at which each of its frames was."""
+    """Timing of a recording: the readout, and the time (F,) of each frame in seconds."""
 
     readout: Readout = NO_READOUT
     times: Array = field(default_factory=lambda: np.zeros(0))
@@ -165,7 +165,7 @@ class RollingModel:
         self.now = self.plain
 
     def bundle(self) -> tuple[Bundle, Array, Intrinsics]:
-        """In a pinhole's pixels, its observations as they stand in the model; and (O, 2), as they are in the frames."""
+        """Return the bundle in a pinhole's pixels, as the model has them; (O, 2) as the frames do; and the pinhole."""
         model, camera, count = self.model, self.model.cameras[1], len(self.now)
         focal, half = camera.mean_focal_length(), np.array([camera.width, camera.height]) / 2
         pinhole = Intrinsics(camera.width, camera.height, focal, focal, *half)

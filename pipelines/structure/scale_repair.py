@@ -67,8 +67,8 @@ def _ties(model: pycolmap.Reconstruction, total: int, reach: int) -> Callable[[i
 def size_ratio(
     model: pycolmap.Reconstruction, keyframe: int, pairs: Sequence[VerifiedPair], xy: Sequence[Array], reach: int
 ) -> tuple[float, int]:
-    """How much larger what lies before a keyframe is than what lies behind it, as the median over features matched on
-    both sides of the ratio of their depths, and how many these are. Each side's depth is that of the widest angle."""
+    """Return the scale before a keyframe relative to the scale after it, as the median ratio of depths over features
+    matched on both sides, and their number. Each side's depth is that of the widest angle."""
     camera, pose = model.cameras[1], pose_of(model.images[keyframe + 1])
     rays = {keyframe: _rays(camera, xy[keyframe])}
     depth, angle = np.ones((2, len(xy[keyframe]))), np.zeros((2, len(xy[keyframe])))

@@ -1,4 +1,4 @@
-"""Where a path is torn: neighbouring keyframes whose pictures do not hold the two sides together.
+"""Seams of a path: neighbouring keyframes whose images do not hold the two sides together.
 
 The share of agreeing pairs over a whole model hides one bad place among hundreds of good ones. A seam looks only at
 what crosses between one keyframe and the next.
@@ -22,7 +22,7 @@ _PAIR_AGREES = 0.5
 
 @dataclass(frozen=True)
 class PairCheck:
-    """How many matches of two keyframes (indices, first < second) there are, and how many agree with their poses."""
+    """Number of matches of two keyframes (indices, first < second), and of those that agree with their poses."""
 
     first: int
     second: int
@@ -108,7 +108,7 @@ def _near(track: Sequence[int], place: dict[int, int], reach: int) -> list[NDArr
 
 
 def worst_contradictions(seams: Iterable[Seam]) -> list[Seam]:
-    """Of every run of contradicted seams the worst one: most pairs that cross a seam cross those beside it too."""
+    """Return the worst seam of every run of contradicted ones: pairs that cross one mostly cross its neighbours."""
     runs = [list(run) for bad, run in groupby(seams, key=lambda s: s.is_contradicted) if bad]
     return [min(run, key=lambda s: s.agreement) for run in runs]
 

@@ -249,7 +249,7 @@ class StructureFromMotion(Candidates):
         return replace(found, model=rolled(largest)), [rolled(m) for m in others]
 
     def features_of(self, keyframe_ids: Sequence[int], part: range | None = None) -> LruSequence[Features]:
-        """Of all keyframes; those of a `part` of them (all) are made at once."""
+        """Return the features of all keyframes; those of a `part` of them (all) are extracted at once."""
 
         def stored(frame_id: int) -> Features:
             return self.snapshots.features(frame_id, lambda: self.extract(frame_id))
@@ -273,7 +273,7 @@ class StructureFromMotion(Candidates):
     def pairs_of(
         self, features: LruSequence[Features], proposed: Sequence[tuple[int, int]], part: range | None = None
     ) -> list[VerifiedPair]:
-        """Those of the proposed pairs that obey one geometry; of a `part` of their blocks (all)."""
+        """Verify the proposed pairs, of a `part` of their blocks (all), and return those that obey one geometry."""
         blocks = _blocks(proposed)
         wanted = range(len(blocks)) if part is None else part
 

@@ -70,7 +70,7 @@ class Joined:
         return True
 
     def model(self, camera: pycolmap.Camera, xy: Sequence[Array]) -> pycolmap.Reconstruction:
-        """Of all; image i + 1 has the pixels xy[i]."""
+        """Convert to a pycolmap model of all keyframes; image i + 1 has the pixels xy[i]."""
         model = pycolmap.Reconstruction()
         model.add_camera_with_trivial_rig(camera)
         for i, pose in sorted(self.poses.items()):
