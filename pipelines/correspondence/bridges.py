@@ -57,7 +57,7 @@ def with_bridges(
     picture: Callable[[int], Picture],
     stored: Snapshots,
 ) -> tuple[LruSequence[Features], list[VerifiedPair]]:
-    """What `bridged` finds, made once and read from where it is stored: of all keyframes it would fill the memory."""
+    """Run `bridged` once and keep its features in the snapshots: those of all keyframes would fill the memory."""
 
     def save(k: int, found: Features) -> None:
         stored.features(k, lambda: found)

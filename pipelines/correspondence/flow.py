@@ -18,10 +18,10 @@ FLOW_SD = 0.4
 def follow(
     grey_from: NDArray[np.uint8], grey_to: NDArray[np.uint8], xy: Array, guess: Array, levels: int = LEVELS
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Where the points (Q, 2) of one picture lie in the other, searched from `guess` (Q, 2), and which were found (Q,).
+    """Track points (Q, 2) from one image into another, starting at `guess` (Q, 2); returns places (Q, 2), found (Q,).
 
-    A point is found when following it back ends within RETURN_ERROR pixels of where it began. Points whose guess is not
-    finite or far outside the picture are not found.
+    A point is found when tracking it back ends within RETURN_ERROR pixels of its start. Points whose guess is not
+    finite or far outside the image are not found.
     """
     height, width = grey_to.shape
     found: NDArray[np.bool_] = np.asarray(np.isfinite(guess).all(1))

@@ -67,15 +67,15 @@ def _vlad(features: Features, words: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def unit(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
-    """The same directions (..., D), length one; zeros stay."""
+    """Normalise vectors (..., D) to length one; zeros stay zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
 @dataclass(frozen=True)
 class GlobalDescriptors:
-    """How alike frames look: the mean over kinds of descriptors, each unit vectors (N, D), of their products.
+    """Similarity of frames: the mean over kinds of descriptors, each unit vectors (N, D), of their products.
 
-    Row by row, because nobody has room for the likeness of every pair of a long recording.
+    Computed row by row: the similarity of every pair of a long recording does not fit into memory.
     """
 
     kinds: tuple[NDArray[np.float32], ...]

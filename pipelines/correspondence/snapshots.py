@@ -1,4 +1,4 @@
-"""What the stage has found so far, so that a killed run goes on from it: features, matches, the model."""
+"""Snapshots of the features, matches and models found so far, from which a killed run resumes."""
 
 from __future__ import annotations
 
