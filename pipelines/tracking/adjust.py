@@ -54,7 +54,7 @@ class DepthTies:
 
 @dataclass(frozen=True)
 class Report:
-    """What the adjustment did, for the stage's report."""
+    """Results of the adjustment for the stage's report."""
 
     figures: dict[str, Any]
     frame_ids: list[int]

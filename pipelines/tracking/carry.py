@@ -1,4 +1,4 @@
-"""Where the pictures tell no pose, the given ones carry the path: between what was found on both sides of the gap."""
+"""Gaps without a visual pose filled by given poses, fitted to the poses found on both sides."""
 
 from __future__ import annotations
 

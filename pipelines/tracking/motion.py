@@ -1,4 +1,4 @@
-"""Where a camera probably is before its picture has been looked at."""
+"""Motion model: prediction of a camera's pose before its image is used."""
 
 from __future__ import annotations
 

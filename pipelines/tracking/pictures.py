@@ -37,7 +37,7 @@ class _Recent(Generic[T]):
 
 
 def load_shutter(run: RunFolder) -> Shutter:
-    """How the frames of a run were taken."""
+    """Load the readout and the times of a run's frames."""
     return Shutter(run.load_calibration().readout, np.array([f.timestamp for f in run.load_frames()]))
 
 
@@ -61,7 +61,7 @@ class Pictures:
         return self.run.image(self.frames[frame_id])
 
     def grey(self, frame_id: int) -> NDArray[np.uint8]:
-        """(H, W)."""
+        """Return a frame in grey (H, W)."""
         return self._grey(frame_id)
 
     def left_out(self, frame_id: int) -> NDArray[np.bool_] | None:
@@ -88,7 +88,7 @@ class Pictures:
         return picture_features(self.color(frame_id), self.left_out(frame_id), self.settings, self._learned)
 
     def descriptor(self, frame_id: int) -> NDArray[np.float32]:
-        """How the frame looks, for retrieval."""
+        """Return the global descriptor of a frame, for retrieval."""
         return self._descriptor(frame_id)
 
     def proxy(self, frame_id: int) -> ProxyMaps | None:

@@ -29,7 +29,7 @@ class FramePose:
 
 
 def colmap_camera(intrinsics: Intrinsics) -> pycolmap.Camera:
-    """The same pinhole camera for pycolmap, which also puts the first pixel's centre at (0.5, 0.5)."""
+    """Convert to pycolmap's pinhole camera, which also puts the first pixel's centre at (0.5, 0.5)."""
     params = [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]
     return pycolmap.Camera(model="PINHOLE", width=intrinsics.width, height=intrinsics.height, params=params)
 

@@ -37,7 +37,7 @@ class RenderWeights:
 
     @staticmethod
     def of(paper: PaperConfig) -> RenderWeights:
-        """As the settings say."""
+        """Take the weights from the settings."""
         return RenderWeights(depth=paper.tracking_depth_weight, label=paper.tracking_label_weight)
 
 

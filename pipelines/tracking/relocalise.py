@@ -39,7 +39,7 @@ def relocalise(frame_id: int, state: TrackState, pictures: Pictures, seed: int) 
 def recognise(
     frame_id: int, groups: list[list[int]], state: TrackState, pictures: Pictures, seed: int
 ) -> tuple[Sightings, FramePose | None]:
-    """What `relocalise` answers, of these groups of keyframes alone."""
+    """Relocalise a frame among these groups of keyframes alone; returns what `relocalise` does."""
     answers: list[tuple[Sightings, FramePose, int]] = []
     most = NO_SIGHTINGS
     for group in groups:

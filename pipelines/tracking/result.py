@@ -1,4 +1,4 @@
-"""From the tracking state to what the next stages read."""
+"""Conversion of the tracking state to the arrays that the next stages read."""
 
 from __future__ import annotations
 

@@ -131,7 +131,7 @@ def compare_all(context: StageContext, state: TrackState, pictures: Pictures) ->
 
 
 def save_pieces(context: StageContext, pieces: list[TrackState], frames: list[Frame]) -> None:
-    """What nothing joins to the rest, each in a world and a unit of its own."""
+    """Write the disconnected components, each in a world and a unit of its own."""
     for number, piece in enumerate(pieces, 2):
         folder = context.folder / f"piece_{number}"
         save_trajectory(folder, to_trajectory(piece, frames))
@@ -143,7 +143,7 @@ def save_pieces(context: StageContext, pieces: list[TrackState], frames: list[Fr
 
 
 def describe(state: TrackState, frames: list[Frame], report: Report, metric: bool) -> dict[str, Any]:
-    """Key figures."""
+    """Return the stage's key figures, by name."""
     world = report.ties.world
     return {
         "frames": len(frames),

@@ -1,4 +1,4 @@
-"""What tracking knows while it works: poses, points, and where each frame sees which point."""
+"""State of tracking: poses, points, and which frame sees which point where."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Sightings:
         return len(self.point)
 
     def select(self, keep: NDArray) -> Sightings:
-        """Those of a mask or of indices."""
+        """Select sightings by a mask or by indices."""
         return Sightings(self.point[keep], self.xy[keep], self.sd[keep])
 
     def joined(self, other: Sightings) -> Sightings:
@@ -105,7 +105,7 @@ class TrackState:
             self.add_frame(k, other.poses[k], replace(seen, point=seen.point + first), True, segment)
 
     def add_points(self, points: Array, colors: NDArray[np.uint8]) -> NDArray[np.int64]:
-        """Their indices (Q,)."""
+        """Add points and return their indices (Q,)."""
         first = len(self.points)
         self.points = np.concatenate([self.points, points])
         self.colors = np.concatenate([self.colors, colors])
@@ -123,7 +123,7 @@ class TrackState:
         return dict(zip(ids, velocities(poses, self.shutter.times[ids], worlds), strict=True))
 
     def median_depth(self, frame_id: int) -> float:
-        """Of the points the frame sees; 1 when it sees none."""
+        """Return the median depth of the points that a frame sees; 1 when it sees none."""
         motion, seen = self.poses[frame_id], self.sightings[frame_id]
         depth = self.points[seen.point] @ motion[2, :3] + motion[2, 3]
         return float(np.median(depth)) if len(depth) else 1.0
@@ -159,7 +159,7 @@ class TrackState:
 
     @staticmethod
     def load(path: Path, rig: Rig = ONE_CAMERA, shutter: Shutter | None = None) -> TrackState:
-        """Inverse of `save`."""
+        """Load what `save` wrote."""
         a = load_arrays(path, own=True)
         ends = np.cumsum(a["counts"])
         ids = [int(i) for i in a["ids"]]

@@ -39,7 +39,7 @@ class WorkingMap:
 
 @dataclass(frozen=True)
 class View:
-    """What a frame shows at the working size h x w.
+    """A frame at the working size h x w.
 
     image (h, w, 3) 0..1; depth (h, w) in the world's unit, 0 = unknown, and its reliability U (h, w); unit: the median
     of the depth, 1 without any; labels (h, w, 3): the colours of the classes; None without proxies.
