@@ -1,1 +1,1 @@
-"""What in a picture is not part of the scene: the user's masks, and people. True = left out."""
+"""Masks of what in an image is not part of the scene: the user's, and people. True = left out."""

@@ -1,4 +1,4 @@
-"""What moved while it was filmed, without any network: the other keyframes see what lies behind it.
+"""Detection of moving things without any network: the other keyframes see the background behind them.
 
 Depth and poses carry the surfaces of other keyframes into each one. Where several of them say what should be seen and
 the picture shows another colour, something stood there that was gone for them. A thing of the scene is there for the
