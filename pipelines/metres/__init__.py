@@ -1,1 +1,1 @@
-"""How long the world's unit is in metres, and how sure that is: one file for each source of evidence, one for all."""
+"""Estimate of the world's unit in metres and its uncertainty: one file for each source of evidence, one for all."""

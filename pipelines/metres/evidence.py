@@ -39,10 +39,10 @@ class Mode:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What one source says of s.
+    """Evidence of one source on s, the logarithm of the metres per unit.
 
-    source: its name for people; kind: what shares its errors; modes: weights sum to 1; wrong: the chance that it says
-    nothing of the scale; `is_guess`: whether it only says what is usual in the world.
+    source: its name for people; kind: evidence of one kind shares its errors; modes: weights sum to 1; wrong: the
+    probability that it says nothing about the scale; `is_guess`: whether it only knows what is usual in the world.
     """
 
     source: str
@@ -84,7 +84,7 @@ class Combined:
 
     @property
     def factor(self) -> float:
-        """Metres per unit."""
+        """Scale in metres per unit."""
         return float(np.exp(self.log_scale))
 
 

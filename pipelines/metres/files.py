@@ -1,4 +1,4 @@
-"""What this room reads of a run beside its maps, and the file it leaves in the export."""
+"""Files of a run that this room reads beside the maps, and the one it writes in the export."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _FRAME_SCALES, _TRACKED = "frame_scales.json", "tracking.json"
 
 
 def load_scale_spreads(run: RunFolder) -> tuple[list[float], float]:
-    """How far each frame's proxy depth strays from its triangulated points, relatively, and how exactly tracking could
-    make the world agree with metric depth; ([], 0) where nothing of that is known."""
+    """Load the relative spread of each frame's proxy depth around its triangulated points, and the relative deviation
+    of the scale that tracking fitted to metric depth; ([], 0) where neither is known."""
     sd, spreads = None, []
     if run.has("tracking", _TRACKED):
         sd = read_json_object(run.file("tracking", _TRACKED), None).get("scale_relative_sd")
@@ -33,7 +33,7 @@ def load_scale_spreads(run: RunFolder) -> tuple[list[float], float]:
 
 
 def load_metres(run: RunFolder) -> Metres | None:
-    """How long the world's unit is, as the export found it; None where it did not, or has not run."""
+    """Load the estimate of the world's unit that the export made; None where it made none, or has not run."""
     if not run.has("export", SCALE):
         return None
     if (row := read_json(run.file("export", SCALE))) is None:

@@ -28,7 +28,7 @@ _CONTRADICTION = 3.0
 
 @dataclass(frozen=True)
 class Machine:
-    """Where a network runs."""
+    """Threads and device of the networks."""
 
     threads: int = 1
     device: str = "cpu"
@@ -55,7 +55,7 @@ class Found:
 
 
 def find_metres(run: RunFolder, trajectory: Trajectory, card: Card | None, machine: Machine, guess: bool) -> Found:
-    """How long the unit of the world of `trajectory` is.
+    """Estimate the unit of the world of `trajectory` in metres.
 
     card: a network for metric depth, where there is one; guess: whether what is usual in the world counts. Raises
     InputError for a network that is not what its card says.
@@ -68,7 +68,7 @@ def find_metres(run: RunFolder, trajectory: Trajectory, card: Card | None, machi
 
 
 def usual_evidence(seen: Seen, card: Card | None, machine: Machine) -> list[Evidence]:
-    """What a network, the room and the things in it say; nothing where no frame has reliable depth."""
+    """Collect evidence of a network, the room and the things in it; none where no frame has reliable depth."""
     scene = build_scene(seen.frames, seen.camera, seen.names, seen.is_named) if seen.frames else None
     if scene is None:
         return []
@@ -81,7 +81,7 @@ def usual_evidence(seen: Seen, card: Card | None, machine: Machine) -> list[Evid
 
 
 def scene_evidence(scene: Scene) -> list[Evidence]:
-    """What the room itself says."""
+    """Collect the evidence of the room itself."""
     return [*camera_height(scene), *ceiling_height(scene), *sizes_of_things(scene), usual_distance(scene)]
 
 
@@ -103,7 +103,7 @@ def load_seen(run: RunFolder, trajectory: Trajectory) -> Seen:
 
 
 def known_evidence(run: RunFolder) -> list[Evidence]:
-    """What made the world metric; nothing where nothing did."""
+    """Return evidence of whatever made the world metric; none where it is not."""
     spreads, statistical = load_scale_spreads(run)
     return known_scale(run.load_proxy_report(), spreads, statistical)
 
@@ -143,7 +143,7 @@ def _counted(count: int, source: str) -> str:
 
 
 def contradiction(given: Sequence[Evidence], usual: Sequence[Evidence]) -> str | None:
-    """What to warn of where the given metres are far from everything that is usual; None where they are not."""
+    """Return a warning where the given metres are far from everything that is usual; None where they are not."""
     if not given or not usual:
         return None
     known, guessed = combine(given), combine(usual)

@@ -102,5 +102,5 @@ def ceiling_height(scene: Scene) -> list[Evidence]:
 
 
 def usual_distance(scene: Scene) -> Evidence:
-    """How far away things usually are in a video of a room: weak, and always there."""
+    """Return the evidence of usual distances in a video of a room: weak, and always available."""
     return measured("usual distances", "distance", scene.median_depth, DISTANCE, wrong=0.02)

@@ -21,10 +21,10 @@ MEASURED = "measured"
 
 
 def known_scale(report: Mapping[str, Any], spreads: list[float], statistical_sd: float) -> list[Evidence]:
-    """What made the world metric, as evidence that its unit is a metre; nothing for a run without metres.
+    """Return evidence that the unit is a metre, from whatever made the world metric; none for a run without metres.
 
-    report: the proxy stage's; spreads: how far each frame's depth strays from its triangulated points, relatively;
-    statistical_sd: how exactly tracking could make the world agree with the depth.
+    report: the proxy stage's; spreads: relative spread of each frame's depth around its triangulated points;
+    statistical_sd: relative deviation of the scale that tracking fitted to the depth.
     """
     if not report.get("metric"):
         return []

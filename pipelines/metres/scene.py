@@ -1,4 +1,4 @@
-"""What the scale is read from: the surface that the keyframes saw, its classes, which way is up, and the cameras."""
+"""Inputs of the scale estimate: the surface that the keyframes saw, its classes, the gravity direction, the cameras."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Scene:
         return np.isin(self.label, wanted)
 
     def plane(self, kind: int) -> FloorPlane | None:
-        """Of the floor or the ceiling; None where there is hardly any."""
+        """Fit the plane of the floor or the ceiling; None where too little of it was seen."""
         if (self.kind == kind).sum() < _LEAST_PLANE:
             return None
         return floor_plane(self.voxels, self.kind, self.gravity.up, kind)

@@ -1,4 +1,4 @@
-"""What is usual in the world: sizes of things as (metres, relative standard deviation, weight), with their sources.
+"""Usual sizes of things as (metres, relative standard deviation, weight), with their sources.
 
 Standards give the sizes that things are made to; how far real ones scatter around them is our judgement, wider than
 the standards' own tolerances. Nothing here was fitted to a recording.
