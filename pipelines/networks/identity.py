@@ -1,4 +1,4 @@
-"""What a network is, as one hash: two runs of the same one give the same results."""
+"""Identity of a network as one hash: equal networks give equal results."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def best_classes(probabilities: NDArray[np.float32], void: Sequence[int]) -> tup
 
 
 def network_labels(network: Network, output: NDArray, width: int, height: int) -> tuple[NDArray[np.int64], NDArray]:
-    """What the network alone says of a picture: `best_classes` at its pixels."""
+    """Return `best_classes` at the pixels of an image, from the network alone."""
     return best_classes(network_probabilities(network, output, width, height), network.card.void)
 
 

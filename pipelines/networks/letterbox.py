@@ -27,7 +27,7 @@ class Letterbox:
 
     @property
     def scale(self) -> tuple[float, float]:
-        """What rounding to whole pixels made of the scale in x and y."""
+        """Scale in x and y after rounding to whole pixels."""
         inner = self.inner
         return inner[0] / self.width, inner[1] / self.height
 

@@ -32,7 +32,7 @@ class OnnxRuntime:
             self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
 
     def run(self, outputs: Sequence[str], feed: dict[str, NDArray]) -> list[NDArray]:
-        """As `Runtime.run`."""
+        """Run the network; see `Runtime.run`."""
         try:
             return list(self._session.run(list(outputs), feed))
         except Exception as error:  # onnxruntime's errors share no narrower base class

@@ -1,4 +1,4 @@
-"""Where people are, by a network."""
+"""Person masks by a network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every opened network offers, whatever its file's format."""
+"""Interface of every opened network, whatever its file format."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ class ModelStore:
         return replace(store, models=(*added, *rows))
 
     def path(self, model: Model) -> Path:
-        """Where the model's file lies, or would lie."""
+        """Return the path of the model's file, whether it exists or not."""
         return self.cache / f"{model.name}{self.families[model.family].get('suffix', '.onnx')}"
 
     def is_here(self, model: Model) -> bool:

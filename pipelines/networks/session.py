@@ -63,7 +63,7 @@ class Network:
         self._size = fixed if len(fixed) == 2 else card.size
 
     def box(self, width: int, height: int) -> Letterbox:
-        """How a picture of width x height goes into the network."""
+        """Choose the placement of a width x height image in the network's input."""
         return choose_box(width, height, self._size, self.card.multiple, self.card.pixels)
 
     def run(self, image: NDArray[np.uint8], box: Letterbox) -> dict[str, NDArray]:

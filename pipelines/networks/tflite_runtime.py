@@ -47,7 +47,7 @@ class TfliteRuntime:
         self.metadata: dict[str, str] = {}
 
     def run(self, outputs: Sequence[str], feed: dict[str, NDArray]) -> list[NDArray]:
-        """As `Runtime.run`."""
+        """Run the network; see `Runtime.run`."""
         try:
             return self._run(outputs, feed)
         except ValueError as error:  # of an input that does not fit, or a tensor that a damaged file leaves empty
