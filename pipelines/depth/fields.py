@@ -39,7 +39,7 @@ class Grid:
 
     @property
     def size(self) -> int:
-        """Number of nodes."""
+        """Number of grid nodes, rows x columns."""
         return self.rows * self.columns
 
     def at(self, xy: Array, width: int, height: int) -> Basis:
@@ -88,7 +88,7 @@ class DepthFields:
         return field_scales(self.of_frame[frame_id], height, width)
 
     def in_world(self, frame_id: int, maps: ProxyMaps) -> ProxyMaps:
-        """The same maps, their depth in the unit of the world; unknown for a frame without a field."""
+        """Return the maps with depth in the unit of the world; unknown for a frame without a field."""
         if self.of_frame and frame_id not in self.of_frame:
             return replace(maps, depth=np.zeros_like(maps.depth))
         return replace(maps, depth=maps.depth * self.scales(frame_id, *maps.depth.shape))

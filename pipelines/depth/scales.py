@@ -1,4 +1,4 @@
-"""How proxy depths relate to triangulated points: a scale or a coarse field for each keyframe, one scale for the world.
+"""Scales of proxy depth against triangulated points: a scale or coarse field per keyframe, one scale for the world.
 
 A shift is no part of a field: depth that is known only up to one is given it before (`pipelines.proxy.aligned`).
 """

@@ -19,7 +19,7 @@ _ROWS_AT_ONCE = 200_000
 
 @dataclass(frozen=True)
 class Prior:
-    """How far, relatively, a node strays from where it is expected (node_sd) and from its neighbours (step_sd)."""
+    """Relative standard deviation of a node from its expected value (node_sd) and from its neighbours (step_sd)."""
 
     grid: Grid
     node_sd: float
