@@ -39,7 +39,7 @@ class Similarity:
         return cam_from_target
 
     def inverse(self) -> Similarity:
-        """source_from_target."""
+        """Return the inverse transform, source_from_target."""
         rotation = self.rotation.T
         return Similarity(1 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 

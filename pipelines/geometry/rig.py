@@ -38,7 +38,7 @@ class Rig:
         return len(self.cam_from_rig)
 
     def frames_of(self, stations: Iterable[int]) -> list[int]:
-        """What all cameras took at these places, camera by camera."""
+        """Return the frames of all cameras at these stations, camera by camera."""
         return [c * self.stations + s for c in range(len(self)) for s in stations]
 
     @property
@@ -54,7 +54,7 @@ ONE_CAMERA = Rig(1 << 62, np.eye(3)[None])
 
 
 def rig_of(directions: int, frames: int) -> Rig:
-    """Of so many frames in all, by a camera that looks in 1 or 6 directions."""
+    """Return the rig of `frames` frames in all, taken in 1 or 6 directions."""
     return Rig(frames // len(CUBE), CUBE) if directions == len(CUBE) else ONE_CAMERA
 
 

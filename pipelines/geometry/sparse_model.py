@@ -45,7 +45,7 @@ class SparseModel:
 
     @cached_property
     def tree(self) -> cKDTree:
-        """Of `centers`."""
+        """Search tree over `centers`."""
         return cKDTree(self.centers)
 
     @cached_property

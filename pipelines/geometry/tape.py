@@ -32,13 +32,13 @@ class Touch:
     across_sd: float
 
     def sd(self, direction: Array) -> float:
-        """Of the place along a unit vector (3,)."""
+        """Return the standard deviation of the position along a unit vector (3,)."""
         share = float(self.direction @ direction) ** 2
         return float(np.sqrt(share * self.along_sd**2 + (1 - share) * self.across_sd**2))
 
 
 def touch(cloud: GaussianCloud, origin: Array, direction: Array, pixel: float) -> Touch | None:
-    """What the line from `origin` (3,) along the unit vector `direction` (3,) meets first; None where that is nothing.
+    """Find the first surface on the ray from `origin` (3,) along the unit vector `direction` (3,); None without any.
 
     pixel: radians of a pixel of the screen. The place is the median of the light's way, as the map blends it
     (MSGS-SLAM eqs. 4 to 7); its deviation along the line is half the span of the middle 68 % of what is blended.
