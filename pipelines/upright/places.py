@@ -1,4 +1,4 @@
-"""Where on the Earth the frames of a run were taken, by their pictures' EXIF or a track that the user gives."""
+"""Positions of a run's frames on the Earth, from their images' EXIF or a track that the user gives."""
 
 from __future__ import annotations
 
