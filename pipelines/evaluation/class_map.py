@@ -30,8 +30,8 @@ _SHIPPED = Path(__file__).with_name("class_maps")
 
 @dataclass(frozen=True)
 class Matching:
-    """What a run's and the truth's classes have in common. names: K common classes; of_ours (C,) and of_truth (T,):
-    the common class of each, -1 without; how: in words."""
+    """The classes a run and the truth have in common. names: K common classes; of_ours (C,) and of_truth (T,): the
+    common class of each, -1 without; how: in words."""
 
     names: tuple[str, ...]
     of_ours: NDArray[np.int64]

@@ -1,4 +1,4 @@
-"""How far rendered depth is from the truth."""
+"""Error of rendered depth against the truth."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def evaluate_outcome(
     legacy: bool = False,
     class_map: ClassMap | None = None,
 ) -> tuple[dict[str, Any], Measured | None]:
-    """As `evaluate_run`, with the measured views beside the figures."""
+    """Evaluate like `evaluate_run`; returns the figures and the measured views."""
     matched = match_truth(outcome.frames, outcome.source_is_folder, truth)
     if not matched.has_pose.any() and not (matched.image >= 0).any():
         raise InputError(
@@ -107,7 +107,7 @@ def _without_map(outcome: Outcome) -> dict[str, Any]:
 
 
 def frame_cells(outcome: Outcome, matched: MatchedTruth) -> dict[str, Any]:
-    """How many frames there are of each kind."""
+    """Count the frames of each kind."""
     t = outcome.trajectory
     return {
         "picked": len(t.frame_ids),

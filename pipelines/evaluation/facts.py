@@ -1,4 +1,4 @@
-"""What a run says about its capture, frame by frame, and what to do better next time, in plain words."""
+"""Facts about the capture, frame by frame, and advice for the next one, in plain words."""
 
 from __future__ import annotations
 

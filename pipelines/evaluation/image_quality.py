@@ -1,4 +1,4 @@
-"""How close a rendered image is to a photograph."""
+"""Similarity of a rendered image to a photograph."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ class LabelScore:
 
 
 def score(confusion: Counts) -> LabelScore | None:
-    """Of a square confusion with one more column, as `count_labels` gives it; None without any pixel of truth."""
+    """Score a square confusion with one more column (from `count_labels`); None without any pixel of truth."""
     classes = len(confusion)
     require_shape("confusion", confusion, (classes, classes + 1))
     total = int(confusion.sum())

@@ -1,4 +1,4 @@
-"""How long things are in the exported world, in the words of the viewer's measuring tape."""
+"""Lengths measured in the exported world, described as the viewer's measuring tape does."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def found_lengths(outcome: Outcome) -> list[tuple[str, str]]:
 
 
 def path_length(outcome: Outcome) -> tuple[float, float] | None:
-    """From camera to camera, and its deviation: that of the two ends, by how far places stray from the line between
-    their neighbours. Frames that are lost are passed straight."""
+    """Return the length of the camera path and its standard deviation: that of the two ends, estimated from how far
+    positions stray from the line between their neighbours. Lost frames are bridged by straight lines."""
     t = outcome.trajectory
     directions = rig_of(outcome.calibration.directions, len(outcome.frames))
     centers = t.centers[t.is_posed & (t.frame_ids < directions.stations)]

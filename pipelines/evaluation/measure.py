@@ -42,7 +42,7 @@ class MeasuredView:
     label_accuracy: float
 
     def to_json(self) -> dict[str, Any]:
-        """NaN becomes None."""
+        """Return the figures by name, with None for NaN."""
         return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in asdict(self).items()}
 
 

@@ -28,7 +28,7 @@ _ROWS = 3
 
 @dataclass(frozen=True)
 class RenderedViews:
-    """What rendering the keyframes gave: ids (V,), psnr (V,), pixels of each label (256,), and a sheet as HTML."""
+    """Rendered keyframes: ids (V,), psnr (V,), pixels of each label (256,), and a sheet as HTML."""
 
     ids: list[int]
     psnr: list[float]

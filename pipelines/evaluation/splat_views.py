@@ -27,8 +27,8 @@ _WIDEST = 1.3
 
 @dataclass(frozen=True)
 class SplatScene:
-    """What of a cloud does not depend on the view: covariances (M, 3, 3), opacities (M,), and the middle (3,) and
-    largest side of the box about most of it."""
+    """The view-independent part of a cloud: covariances (M, 3, 3), opacities (M,), and the middle (3,) and largest side
+    of the box around most of it."""
 
     cloud: GaussianCloud
     covariances: NDArray[np.float64]
@@ -38,7 +38,7 @@ class SplatScene:
 
     @staticmethod
     def of(cloud: GaussianCloud) -> SplatScene:
-        """Of a cloud with at least one Gaussian."""
+        """Prepare a cloud of at least one Gaussian."""
         turn = Rotation.from_quat(cloud.quat_wxyz[:, [1, 2, 3, 0]]).as_matrix()
         axes = turn * np.exp(cloud.log_scales.astype(np.float64))[:, None, :]
         low, high = np.quantile(cloud.means, (0.05, 0.95), axis=0)
@@ -49,7 +49,7 @@ class SplatScene:
 
     @property
     def low_pass(self) -> float:
-        """0 for balls."""
+        """Variance that is added on the image, in square pixels; 0 for isotropic Gaussians."""
         return _LOW_PASS if np.ptp(self.cloud.log_scales, axis=1).max() > 1e-4 else 0.0
 
 

@@ -1,4 +1,4 @@
-"""How well a mesh covers the true surface."""
+"""Accuracy and completeness of a mesh against the true surface."""
 
 from __future__ import annotations
 

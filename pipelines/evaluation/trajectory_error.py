@@ -25,7 +25,7 @@ class ErrorStatistics:
 
     @staticmethod
     def of(errors: NDArray) -> ErrorStatistics:
-        """Of (N,) errors, N > 0."""
+        """Summarise (N,) errors. Raises ValueError for N = 0."""
         if len(errors) == 0:
             raise ValueError("no errors to summarise")
         return ErrorStatistics(

@@ -88,7 +88,7 @@ def trajectory_plots(outcome: Outcome, matched: MatchedTruth | None, upright: bo
 
 
 def unit_name(outcome: Outcome) -> str:
-    """That of the world's lengths, with the metres that it is estimated to be."""
+    """Name the unit of length, with the estimated length in metres where the world is not metric."""
     if outcome.metric:
         return "m"
     return "units" if outcome.metres is None else f"units (1 ≈ {outcome.metres.per_unit:.2g} m)"
