@@ -1,1 +1,1 @@
-"""What every folder needs of the process: compiled kernels, identity of the code, memory, signals, progress."""
+"""Process-level services for every folder: compiled kernels, identity of the code, memory, signals, progress."""

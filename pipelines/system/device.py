@@ -1,4 +1,4 @@
-"""Where dense work runs: decided here, by every process for itself."""
+"""Device of dense work: decided here, by every process for itself."""
 
 from __future__ import annotations
 

@@ -38,8 +38,8 @@ def kernel(function: F | None = None, **options: Any) -> Any:
 
 @functools.cache
 def cache_root() -> Path | None:
-    """Where compiled kernels are kept: the first writable of NUMBA_CACHE_DIR, the user's cache folder and a private
-    folder in the system's temporary one; None, said once, if there is no such place."""
+    """Return the folder of compiled kernels: the first writable of NUMBA_CACHE_DIR, the user's cache folder and a
+    private folder in the system's temporary one; None, with a warning, if there is no such place."""
     given = os.environ.get("NUMBA_CACHE_DIR")
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "msgs-slam"
     first = (Path(given) if given else home) / "kernels"

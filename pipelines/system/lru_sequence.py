@@ -58,11 +58,11 @@ class LruSequence(Sequence[T], Generic[T]):
         release_free_memory()
 
     def part(self, numbers: range) -> LruSequence[T]:
-        """Those numbers of the same, counted from 0; keeps its own."""
+        """Return a sequence of the values `numbers`, counted from 0, with a cache of its own."""
         return LruSequence(len(numbers), lambda i: self._make(numbers[i]), self._size_of, self._room)
 
     def changed(self, function: Callable[[int, T], T]) -> LruSequence[T]:
-        """The same with `function` of number and value applied; takes over what is kept here, and the room."""
+        """Return a sequence of `function`(number, value); takes over the cached values and the memory limit."""
         make = self._make
         other = LruSequence(self._count, lambda i: function(i, make(i)), self._size_of, self._room)
         while self._kept:

@@ -1,4 +1,4 @@
-"""How much memory stages need, as far as runs have shown, and in how large parts they work so that it suffices."""
+"""Memory planning: what stages need according to past runs, and the size of the chunks that fit."""
 
 from __future__ import annotations
 

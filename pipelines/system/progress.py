@@ -1,4 +1,4 @@
-"""How a stage tells of its progress, whoever shows it."""
+"""Progress of a stage, independent of who shows it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class StageEvent:
 
     @property
     def title(self) -> str:
-        """[2/6 proxy]"""
+        """Heading such as "[2/6 proxy]"."""
         return f"[{self.index}/{self.of} {self.name}]"
 
     @property
@@ -60,7 +60,7 @@ class Progress(Protocol):
         ...
 
     def stage(self, event: StageEvent) -> None:
-        """What is tracked from now on is part of this stage; or the stage has ended."""
+        """Start a stage, to which tracked items belong from now on, or end it."""
         ...
 
 
@@ -72,7 +72,7 @@ class LineProgress:
         self._said = time.monotonic()
 
     def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
-        """Yield the items."""
+        """Yield the items, and print a line every so often."""
         for done, item in enumerate(items, 1):
             yield item
             if time.monotonic() - self._said > _SECONDS_BETWEEN_LINES:
@@ -92,14 +92,14 @@ class LineProgress:
 
 
 class SilentProgress:
-    """Shows nothing."""
+    """Progress that shows nothing."""
 
     def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
-        """Yield the items."""
+        """Yield the items without showing anything."""
         yield from items
 
     def stage(self, event: StageEvent) -> None:
-        """Nothing."""
+        """Ignore the start and end of stages."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class WithinStage:
     name: str
 
     def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
-        """Yield the items."""
+        """Yield the items with `name` before the label."""
         yield from self.progress.track(items, f"{self.name}: {label}", total)
 
     def stage(self, event: StageEvent) -> None:

@@ -24,8 +24,8 @@ SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP"
 
 @contextmanager
 def soft_stop(tell: Callable[[int], None]) -> Iterator[None]:
-    """In this block the first SIGINT, SIGTERM or SIGHUP calls `tell` and lets the work go on to its next snapshot,
-    which raises `Stopped`; the second one stops at once. A signal that is ignored (nohup) stays ignored.
+    """Handle signals inside this block: the first SIGINT, SIGTERM or SIGHUP calls `tell` and lets the work go on to its
+    next snapshot, which raises `Stopped`; the second stops at once. An ignored signal (nohup) stays ignored.
 
     Does nothing outside the main thread, which alone may set handlers.
     """
