@@ -1,4 +1,4 @@
-"""What all frames saw, gathered in small cubes of the world."""
+"""Voxels of the world that gather what all frames saw."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def touching(sorted_keys: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray
 
 
 def find_near(sorted_keys: NDArray[np.int64], keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """As `find`; where a key is not there, the index of a neighbouring cube that is."""
+    """Return the indices of `find`, with a neighbouring voxel's where a key is missing."""
     at = find(sorted_keys, keys)
     lost = np.flatnonzero((at < 0) & (keys >= 0))
     around = find(sorted_keys, neighbour_keys(keys.ravel()[lost]))
