@@ -1,4 +1,4 @@
-"""What structure from motion has to tell: what is missing, what contradicts itself, what became of what was given."""
+"""Findings of structure from motion for the user: gaps, contradictions, and what became of given poses and cameras."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LEAST_PART = 3
 
 
 def settled_origin(context: StageContext, origin: str, camera: pycolmap.Camera, structure: Structure) -> str:
-    """Where the camera comes from in the end: one that the data set states is given unless the pictures refuted it."""
+    """Return the camera's final origin: a stated one counts as given unless the images refuted it."""
     if origin != "stated":
         return origin
     found = structure.model.cameras[1]
@@ -34,7 +34,7 @@ def settled_origin(context: StageContext, origin: str, camera: pycolmap.Camera, 
 
 
 def warn_of_structure(context: StageContext, structure: Structure, ids: list[int]) -> None:
-    """What is missing in the structure, and where it contradicts the pictures; ids[k] is the frame of keyframe k."""
+    """Warn of gaps in the structure and of contradictions with the images; ids[k] is the frame of keyframe k."""
     report = structure.report
     if report.registered < report.total:
         context.warn(

@@ -73,12 +73,12 @@ class LearnedFeatures:
 
 
 def open_learned(settings: FramesConfig) -> LearnedFeatures | None:
-    """What `frames.features` asks for, None for SIFT. Raises InputError where networks are missing."""
+    """Open the networks that `frames.features` asks for, None for SIFT. Raises InputError where they are missing."""
     return LearnedFeatures(ModelStore.open()) if settings.features == "aliked" else None
 
 
 def learned_inputs(settings: FramesConfig) -> dict[str, str]:
-    """What changes with the networks: their digests; nothing for SIFT. Raises InputError where they are missing."""
+    """Return the digests of the networks, {} for SIFT. Raises InputError where they are missing."""
     if settings.features != "aliked":
         return {}
     store = ModelStore.open()

@@ -1,4 +1,4 @@
-"""What of the frames is not part of the scene, while the stage is at work on them."""
+"""Masks of the frames while the stage is at work: the user's, and people."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from msgs_slam.pipelines.types import Frame, any_of
 
 
 def mask_inputs(source: Path, config: Config) -> dict[str, str] | None:
-    """What changes with the user's masks and with the networks for people; None without any."""
+    """Return digests of the user's masks and of the networks for people; None without any."""
     folder, cards = config.frames.masks, _cards(config)
     found = {"masks": open_masks(Path(folder), open_source(source, config.run.format)).digest()} if folder else {}
     return found | ({"people": cards.identity()} if cards else {}) or None

@@ -64,13 +64,13 @@ def picked(context: StageContext, name: str) -> Path:
 
 
 def grey_of(context: StageContext, masks: FrameMasks, frame: Frame) -> Picture:
-    """In grey, and what is left out of it."""
+    """Load a frame in grey, and its mask of pixels to leave out."""
     gray = to_grey(read_rgb(picked(context, frame.name)))
     return gray, masks.left_out(frame, gray.shape[1], gray.shape[0])
 
 
 def masks_of(context: StageContext, source: AnySource, faces: Faces | None, rig: Rig) -> FrameMasks:
-    """Of all frames; people in those in which they have been looked for."""
+    """Return the masks of all frames; people only in frames that have been searched."""
     places = context.snapshot / "people", context.snapshot / "picked"
     return FrameMasks(context.config, source, *places, context.threads, faces, rig)
 
@@ -85,7 +85,7 @@ def structure_from_motion(
     given: GivenPoses | None,
     divide: Divide = when_asked,
 ) -> StructureFromMotion:
-    """Of these frames; `origin` as of `known_camera`."""
+    """Prepare structure from motion of these frames; `origin` is as in `known_camera`."""
     settings, size = context.config.frames, (camera.width, camera.height)
     learned = open_learned(settings)
 
