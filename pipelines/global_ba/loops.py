@@ -70,7 +70,7 @@ def find_loops(
 
 
 def claimed_drift(loop: Loop, first: KeyframeView, second: KeyframeView) -> tuple[float, float]:
-    """How far (distance, radians) the second camera would have to move to agree with the loop."""
+    """Return the motion (distance, radians) of the second camera that the loop asks for."""
     now = second.cam_from_world @ se3.inverse(first.cam_from_world)
     apart = loop.edge.frame2_from_frame1 @ se3.inverse(now)
     centre_now, centre_then = se3.inverse(now)[:3, 3], se3.inverse(loop.edge.frame2_from_frame1)[:3, 3]
@@ -147,7 +147,7 @@ def save_found(path: Path, found: FoundLoops) -> None:
 
 
 def load_found(path: Path) -> FoundLoops:
-    """Inverse of `save_found`."""
+    """Load what `save_found` wrote."""
     a = load_arrays(path, own=True)
     ends = np.cumsum(a["lengths"])
     sides = [

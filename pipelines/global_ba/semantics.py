@@ -1,4 +1,4 @@
-"""What labels say about keyframes: how much there is to see, and how alike two of them are (MSGS-SLAM eqs. 21-24)."""
+"""Label cues of keyframes: their semantic content, and the similarity of two of them (MSGS-SLAM eqs. 21-24)."""
 
 from __future__ import annotations
 

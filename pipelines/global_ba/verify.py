@@ -28,8 +28,8 @@ ROTATION, TRANSLATION = 2.0, 0.05
 
 @dataclass(frozen=True)
 class KeyframeView:
-    """What verification knows of one keyframe: pose (4, 4), features, which point each feature is (-1 for none), and
-    its position in the camera (Q, 3), NaN where neither a point nor a proxy depth gives one."""
+    """One keyframe as verification sees it: pose (4, 4), features, the point of each feature (-1 for none), and its
+    position in the camera (Q, 3), NaN where neither a point nor a proxy depth gives one."""
 
     frame_id: int
     cam_from_world: Array
