@@ -77,7 +77,7 @@ class AlignedDepth:
         return DepthEstimate(depth, np.where(depth > 0, found.confidence, 0).astype(np.float32), found.invalid)
 
     def figures(self) -> dict[str, Any]:
-        """How well the aligned depths meet the points: the median over frames of the relative error at their points."""
+        """Report the median over frames of the relative error of aligned depth at triangulated points."""
         spread = round(float(np.median(self._spreads)), 5) if self._spreads else None
         return {**self._learned.figures(), "aligned_frames": len(self._fits), "alignment_error": spread}
 

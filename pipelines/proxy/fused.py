@@ -59,14 +59,14 @@ class FusedDepth:
         self._scale = measure_scale(self._sequence, frames, self._learned.estimate)
 
     def estimate(self, frame: Frame) -> DepthEstimate:
-        """The fused depth."""
+        """Fuse the learned depth of a frame with its stereo depth."""
         learned = self._learned.estimate(frame)
         geometry = self._stereo.estimate(frame)
         run_scale = self._scale.value
         return fuse(learned, geometry, run_scale, self._scale.of_frame.get(frame.id, run_scale))
 
     def figures(self) -> dict[str, Any]:
-        """What both say."""
+        """Return the figures of learned and stereo depth together."""
         return {**self._learned.figures(), **self._stereo.figures()}
 
 

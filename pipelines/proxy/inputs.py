@@ -1,4 +1,4 @@
-"""What the stage reads beside the frames: the user's files and networks, looked at before anything slow begins."""
+"""Inputs of the stage beside the frames: the user's files and networks, checked before anything slow starts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the run's metres come from: the depth itself, something that the user knows, or nowhere."""
+"""Source of the run's metres: the depth itself, something that the user knows, or none."""
 
 from __future__ import annotations
 
@@ -79,9 +79,9 @@ def given_scale(run: RunFolder, scale: DepthScale, is_said: bool) -> ReferenceSc
 
 
 def scale_figures(depths: DepthProvider, scale: DepthScale, reference: ReferenceScale | None) -> dict[str, Any]:
-    """Where metres come from, and how long the backbone's unit is in them.
+    """Report the source of the metres, and the backbone's unit in metres.
 
-    independent_depth: whether the depth tells tracking something that the pictures' correspondences do not.
+    independent_depth: whether depth adds to what tracking knows from the correspondences of the images.
     """
     figures: dict[str, Any] = {"independent_depth": depths.metric}
     if reference is not None:

@@ -1,4 +1,4 @@
-"""What a provider of proxy depth or proxy semantics is."""
+"""Interfaces of providers of proxy depth and proxy semantics."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class LabelEstimate:
 
 
 class Provider(Protocol):
-    """What is asked for frames: first all of them together, then one after the other."""
+    """Common part of all providers: a pass over all frames first, then estimates frame by frame."""
 
     @property
     def of_all(self) -> tuple[str, ...]:
@@ -72,13 +72,13 @@ class Provider(Protocol):
 
 
 def prepared(provider: Provider) -> dict[str, Any]:
-    """What `prepare` has found out, to travel to where single frames are estimated."""
+    """Return the state that `prepare` left, to send to the processes that estimate single frames."""
     found = {name: getattr(provider, name) for name in provider.of_all}
     return {name: prepared(v) if hasattr(v, "of_all") else v for name, v in found.items()}
 
 
 def take_prepared(provider: Provider, found: dict[str, Any]) -> None:
-    """As if `prepare` had been called here: `estimate` may be. Inverse of `prepared`."""
+    """Take over the state of `prepared` in place of calling `prepare`; `estimate` may be called afterwards."""
     for name, value in found.items():
         if hasattr(own := getattr(provider, name), "of_all"):
             take_prepared(own, value)
@@ -106,7 +106,7 @@ class DepthProvider(Provider, Protocol):
         """Depth at the size of the proxy maps."""
 
     def figures(self) -> dict[str, Any]:
-        """What the report says of the pass, as plain values."""
+        """Return the figures of the pass for the report, as plain values."""
 
 
 class SemanticsProvider(Provider, Protocol):
@@ -118,19 +118,19 @@ class SemanticsProvider(Provider, Protocol):
         """The frames it will know nothing of."""
 
     def look(self, frames: list[Frame]) -> None:
-        """What `prepare` does of each of these frames by itself; what is done stays."""
+        """Do the part of `prepare` that concerns single frames, for these; results are kept."""
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Slow passes over all frames that `estimate` and `classes` build on."""
 
     def warnings(self) -> list[str]:
-        """What `prepare` found amiss, for the report."""
+        """Return the problems that `prepare` found, for the report."""
 
     def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
         """Labels at the size of the proxy maps."""
 
     def classes(self) -> ClassTable:
-        """Known after `prepare`."""
+        """Return the table of classes; valid after `prepare`."""
 
     def figures(self) -> dict[str, Any]:
-        """What the report says of the pass, as plain values."""
+        """Return the figures of the pass for the report, as plain values."""

@@ -1,4 +1,4 @@
-"""How far the proxy depth of a pixel is to be trusted: MSGS-SLAM eq. (2) and (3)."""
+"""Reliability of proxy depth per pixel: MSGS-SLAM eq. (2) and (3)."""
 
 from __future__ import annotations
 

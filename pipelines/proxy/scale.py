@@ -1,4 +1,4 @@
-"""How long the backbone's unit is in the unit of a depth: metres per unit when the depth is metric."""
+"""Length of the backbone's unit in the unit of a depth: metres per unit when the depth is metric."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class DepthScale:
         return float(np.median(list(self.of_frame.values()))) if self.of_frame else 1.0
 
     def in_backbone_unit(self, estimate: DepthEstimate) -> DepthEstimate:
-        """The same depth in the unit of the backbone's poses."""
+        """Convert a depth to the unit of the backbone's poses."""
         return replace(estimate, depth=(estimate.depth / np.float32(self.value)).astype(np.float32))
 
     @property

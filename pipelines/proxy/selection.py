@@ -1,4 +1,4 @@
-"""From the settings' text to a provider."""
+"""Selection of providers by the text of the settings."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ _FILES_LOOKED_AT = 12
 
 @dataclass(frozen=True)
 class ProviderContext:
-    """What providers are made from. `scratch(name)` is a folder that lives as long as the stage is unfinished;
-    `recording` is the data set that the source is, None for a video or plain images; results of networks are kept over
-    runs in `cache_mb` megabytes."""
+    """Inputs of every provider. `scratch(name)` is a folder that exists as long as the stage is unfinished; `recording`
+    is the source's data set, None for a video or plain images; results of networks are kept over runs in `cache_mb`
+    megabytes."""
 
     source: Path
     sequence: Sequence

@@ -49,7 +49,7 @@ class FilesDepth:
         """Nothing to do."""
 
     def prepare(self, frames: list[Frame]) -> None:
-        """Nothing to do."""
+        """Do nothing: files need no pass over all frames."""
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames without a file."""

@@ -48,7 +48,7 @@ class FilesLabels:
         self._read(next(iter(self._files.values())))
 
     def look(self, frames: list[Frame]) -> None:
-        """Nothing to do."""
+        """Do nothing: files need no pass over single frames."""
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Count the ids of all frames and give labels to those that are classes. InputError for more than 254."""
@@ -72,7 +72,7 @@ class FilesLabels:
         )
 
     def warnings(self) -> list[str]:
-        """What `prepare` found amiss."""
+        """Return a warning of ids that are missing in the table of classes."""
         if not self._outside:
             return []
         ids = ", ".join(map(str, sorted(self._outside)[:8]))

@@ -17,7 +17,7 @@ _LAST_NUMBER = re.compile(r"(\d+)(?!.*\d)")
 
 
 def frame_key(file_name: str) -> str:
-    """What names of one instant share: the stem without words like `.color` or `depth_`."""
+    """Return the key shared by files of one instant: the stem without words like `.color` or `depth_`."""
     return _SUFFIX.sub("", _PREFIX.sub("", Path(file_name).stem)).lower()
 
 

@@ -53,7 +53,7 @@ class RecordingDepth(_RecordingMaps):
         """Nothing to do."""
 
     def prepare(self, frames: list[Frame]) -> None:
-        """Nothing to do."""
+        """Do nothing: files need no pass over all frames."""
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames without depth."""
@@ -74,7 +74,7 @@ class RecordingDepth(_RecordingMaps):
         return [self._recording.root] if self._recording.store else [p for p in self._recording.depth_paths if p]
 
     def figures(self) -> dict[str, Any]:
-        """Nothing to tell."""
+        """Return {}: a data set's depth has no figures."""
         return {}
 
 
@@ -95,7 +95,7 @@ class RecordingLabels(_RecordingMaps):
         self._classes = ClassTable((), ())
 
     def look(self, frames: list[Frame]) -> None:
-        """Nothing to do."""
+        """Do nothing: files need no pass over single frames."""
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Find the classes that occur. Raises InputError where there is none."""
@@ -130,7 +130,7 @@ class RecordingLabels(_RecordingMaps):
         return LabelEstimate(labels, (labels != VOID).astype(np.float32))
 
     def classes(self) -> ClassTable:
-        """Known after `prepare`."""
+        """Return the classes that occur; valid after `prepare`."""
         return self._classes
 
     def files(self) -> list[Path]:
@@ -138,5 +138,5 @@ class RecordingLabels(_RecordingMaps):
         return [p for p in self._recording.label_paths if p]
 
     def figures(self) -> dict[str, Any]:
-        """Nothing to tell."""
+        """Return {}: a data set's labels have no figures."""
         return {}

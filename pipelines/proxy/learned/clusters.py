@@ -20,7 +20,7 @@ _SOFTNESS = 0.1
 
 
 class OnnxClusters(OnnxLabels):
-    """What looks alike to the network is one class, "cluster 1" the most frequent; spherical k-means, fixed seed."""
+    """Classes by clustering features: "cluster 1" is the most frequent; spherical k-means with a fixed seed."""
 
     of_all = (*OnnxLabels.of_all, "_centres")
 

@@ -56,7 +56,7 @@ class OnnxDepth:
         return arrays | ({} if found.focal is None else {"focal": np.array(found.focal)})
 
     def estimate(self, frame: Frame) -> DepthEstimate:
-        """What the network said. Raises InputError when that was nothing at all."""
+        """Return the network's depth of a frame. Raises InputError when no pixel of it is valid."""
         stored = self._pass.load(frame)
         if not (stored["depth"] > 0).any():
             raise InputError(

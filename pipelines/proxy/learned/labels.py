@@ -125,7 +125,7 @@ class OnnxLabels:
         return np.where(halvings.min(-1, keepdims=True) < 255, said, 0).astype(np.float32)
 
     def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
-        """What all frames say of the places that this one shows; what it says itself where there is no world."""
+        """Return labels fused over all frames that see the same places; without a world, this frame's alone."""
         own = self._probabilities(frame)
         if self._scene is not None:
             found = self._scene.estimate(self._sequence, frame, depth, own)

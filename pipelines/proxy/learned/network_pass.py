@@ -92,7 +92,7 @@ class ResultCache:
 
 @dataclass(frozen=True)
 class Workplace:
-    """Where networks run: on which frames, and how; `folder()` keeps this run's results, `cache` those of all runs."""
+    """Frames and resources of a network pass; `folder()` keeps this run's results, `cache` those of all runs."""
 
     sequence: Sequence
     folder: Callable[[], Path]
@@ -131,7 +131,7 @@ class NetworkPass:
         cache.trim()
 
     def load(self, frame: Frame) -> Arrays:
-        """What `run` has left."""
+        """Load the results of `run` for a frame."""
         return load_scratch(self._path(frame))
 
     def _is_whole(self, frame: Frame) -> bool:

@@ -1,4 +1,4 @@
-"""What geometry says of names: floors and ceilings lie, walls stand."""
+"""Orientation cues for class names: floors and ceilings are horizontal, walls vertical."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ class SegmentLabels:
         return [f for f in frames if f.id not in self._world_from_cam]
 
     def look(self, frames: list[Frame]) -> None:
-        """Nothing to do."""
+        """Do nothing: segments need all frames together."""
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Gather all frames and cut the scene."""
