@@ -1,4 +1,4 @@
-"""How much each keyframe counts (MSGS-SLAM eqs. 13, 14)."""
+"""Weights of keyframes from covisibility (MSGS-SLAM eqs. 13, 14)."""
 
 from __future__ import annotations
 

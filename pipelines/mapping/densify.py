@@ -1,4 +1,4 @@
-"""Where the map needs Gaussians (two of the three conditions of MSGS-SLAM 3.4) and which are useless."""
+"""Choice of places that need Gaussians (two of the three conditions of MSGS-SLAM 3.4) and of Gaussians to prune."""
 
 from __future__ import annotations
 

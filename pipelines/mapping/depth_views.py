@@ -1,4 +1,4 @@
-"""What the finished map shows in a view: median depth with a weight, colours and classes."""
+"""Renderings of the finished map in a view: median depth with a weight, colours and classes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class DrawnView:
 
     @property
     def size(self) -> int:
-        """Bytes."""
+        """Memory of the arrays, in bytes."""
         return sum(a.nbytes for a in self.arrays)
 
 

@@ -1,4 +1,4 @@
-"""How the map gets its Gaussians: seeds where a view finds holes, later more where it is wrong, fewer where useless."""
+"""Growth of the map: seeds where a view finds holes, densification where it is wrong, pruning of useless Gaussians."""
 
 from __future__ import annotations
 

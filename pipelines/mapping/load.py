@@ -1,4 +1,4 @@
-"""From the run folder to views: which frames the map is made from, and which only measure it."""
+"""Loading of views from the run folder: the frames that make the map, and those that only measure it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How well the map shows its views: PSNR, SSIM, depth against the proxies, labels against the input's."""
+"""Quality of the map in its views: PSNR, SSIM, depth against the proxies, labels against the input's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the map is optimised for: the loss of one view, MSGS-SLAM eq. (18)."""
+"""Objective of the map: the loss of one view, MSGS-SLAM eq. (18)."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ class MapParameters:
 
     @staticmethod
     def from_tensors(tensors: Mapping[str, Tensor]) -> MapParameters:
-        """Inverse of `to_tensors`."""
+        """Restore the parameters from what `to_tensors` returned."""
         table = AdamTable.from_tensors(tensors, "map", KEYS)
         return MapParameters(table, tensors["anchor_frame_ids"], tensors["trust"])
 

@@ -36,7 +36,7 @@ RELIABILITY_DECAY = 1.0
 
 
 class Seeding(Enum):
-    """What a step seeds before it draws: nothing, the pixels of trusted depth, or whatever is still a hole."""
+    """Pixels that a step seeds before it renders: none, those of trusted depth, or all remaining holes."""
 
     NOTHING = 0
     TRUSTED = 1
@@ -106,11 +106,11 @@ class Schedule:
 
     @property
     def total(self) -> int:
-        """Number of steps."""
+        """Total number of steps."""
         return self.seeding + self.visits
 
     def step(self, iteration: int) -> Step:
-        """What happens at this iteration."""
+        """Return the step of this iteration."""
         return self._seeding_step(iteration) if iteration < self.seeding else self._visit(iteration)
 
     def _seeding_step(self, iteration: int) -> Step:

@@ -25,8 +25,8 @@ _NEIGHBOURS = 12
 
 @dataclass(frozen=True)
 class DensificationError:
-    """Of each Gaussian, the error it answers for in the worst of several views: `error` (M,) in pixels times colour
-    error, and `footprint` (M,) its radius on that image in pixels."""
+    """Error of each Gaussian in the worst of several views: `error` (M,) in pixels times colour error, and `footprint`
+    (M,), its radius on that image in pixels."""
 
     error: Tensor
     footprint: Tensor
@@ -43,7 +43,7 @@ class DensificationError:
 def densification_error(
     gaussian_map: GaussianMap, cam_from_world: Tensor, intrinsics: Intrinsics, error_of: Callable[[Tensor], Tensor]
 ) -> DensificationError:
-    """What each Gaussian answers for in one view: the errors of the pixels, weighed by its part in them, summed.
+    """Compute the error of each Gaussian in one view: the errors of the pixels, weighted by its share in them, summed.
 
     `error_of`: (H, W, 3) colours of the map to (H, W) errors (the error of Rota Bulò, Porzi and Kontschieder, "Revising
     Densification in Gaussian Splatting", ECCV 2024).

@@ -74,7 +74,7 @@ class OptimiserState:
 
     @staticmethod
     def load(snapshot: Path | None, views: Sequence[View]) -> OptimiserState | None:
-        """What `save` has written, None where there is no such file."""
+        """Load what `save` wrote; None where there is no such file."""
         if snapshot is None or not snapshot.exists():
             return None
         loaded = load_tensors(snapshot)

@@ -66,7 +66,7 @@ def divide(frame_ids: Ids, overlap: sparse.csr_matrix, size: int) -> list[Submap
 
 
 def submap_count(keyframes: int, size: int) -> int:
-    """How many submaps so many keyframes are divided into."""
+    """Return the number of submaps for this many keyframes."""
     return max(1, round(keyframes / size)) if size else 1
 
 

@@ -1,4 +1,4 @@
-"""What mapping knows of one keyframe: its picture and proxies as tensors, full size and halved."""
+"""Views of the mapping: a keyframe's image and proxies as tensors, full size and halved."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class View:
 
     @property
     def nbytes(self) -> int:
-        """Memory it takes."""
+        """Memory of its tensors, in bytes."""
         tensors = (self.image, self.depth, self.reliability, self.channels, self.channel_confidence, self.scene)
         return sum(t.nbytes for t in tensors if t is not None)
 
@@ -71,12 +71,12 @@ class View:
         return torch.where(scene, values, elsewhere)
 
     def posed_depth(self) -> PosedDepth:
-        """What other views are compared with, as arrays."""
+        """Return the depth, trust and pose as arrays, to compare other views with."""
         pose = self.cam_from_world.numpy()
         return PosedDepth(self.intrinsics, pose, self.depth.cpu().numpy(), self.trust.cpu().numpy())
 
     def without_depth_at(self, wrong: Tensor) -> View:
-        """The same view, its depth unknown at the marked (H, W) pixels."""
+        """Return the view with unknown depth at the marked (H, W) pixels."""
         return replace(self, depth=torch.where(wrong.to(self.depth.device), 0.0, self.depth))
 
 

@@ -22,7 +22,7 @@ def beside_boundary(channels: Tensor) -> Tensor:
 
 
 def clip_beside_boundary(image: Tensor, channels: Tensor, limit: float) -> None:
-    """From now on the gradient of an (H, W, C) image has, beside boundaries, at most `limit` times the mean norm."""
+    """Clip the gradient of an (H, W, C) image beside boundaries, from now on, to `limit` times the mean norm."""
     if not image.requires_grad:
         return
     near = beside_boundary(channels)
