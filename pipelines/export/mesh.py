@@ -57,7 +57,7 @@ def _view_file(scratch: Path, number: int) -> Path:
 
 
 def make_grid_of(views: Sequence[DrawnView], settings: ExportConfig) -> Grid:
-    """Where the mesh may be."""
+    """Choose the voxel grid of the mesh, around what the views show."""
     shown = Shown(views)
     most = int(settings.max_blocks * max(len(views) / LONG, 1))
     return make_grid(shown, settings.voxel * _median_depth(shown), TRUNCATION, most)

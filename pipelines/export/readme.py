@@ -1,4 +1,4 @@
-"""What the files of an export are for."""
+"""The README of an export: what each file is for."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ _FREE = "The unit of lengths is free: one camera cannot tell metres. Metric dept
 
 
 def lengths(metres: Metres | None, metric: bool) -> str:
-    """What one unit of length is, in a line or two of plain text."""
+    """Describe the unit of length in a line or two of plain text."""
     if metres is None:
         return "Lengths are metres." if metric else _FREE
     if metric:

@@ -26,5 +26,5 @@ def fuse_views(task: Chunk, progress: Progress) -> None:
 
 
 def scratch_of(context: StageContext) -> Path:
-    """Where views and regions lie."""
+    """Return the folder of rendered views and finished regions."""
     return context.snapshot / "mesh"

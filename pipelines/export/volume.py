@@ -30,7 +30,7 @@ _AT_ONCE = 8_000
 
 @dataclass(frozen=True)
 class Frustum:
-    """Where a view can see anything: its camera, and the largest depth that it trusts (0: none)."""
+    """Volume that a view covers: its camera, and the largest depth that it trusts (0: none)."""
 
     camera: Intrinsics
     cam_from_world: NDArray[np.float64]
@@ -38,7 +38,7 @@ class Frustum:
 
     @staticmethod
     def of(view: PosedDepth) -> Frustum:
-        """Of one view."""
+        """Make the frustum of one view."""
         return Frustum(view.intrinsics, view.cam_from_world, float(view.depth[view.trust > 0].max(initial=0)))
 
     def meets(self, centers: NDArray[np.floating], radius: float, beyond: float) -> NDArray[np.bool_]:
@@ -84,7 +84,7 @@ class Grid:
             yield chunks[order[number == n]]
 
     def blocks_of(self, chunks: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Those in the chunks, and the layer after them, without which their last cells would have no corners."""
+        """Return the blocks in the chunks and the layer after them, needed for the corners of the last cells."""
         wanted, home = np.sort(chunk_keys(chunks)), self.blocks // CHUNK
         first = self.blocks % CHUNK == 0
         inside = np.zeros(len(self.blocks), bool)

@@ -48,10 +48,10 @@ def write_web_page(outcome: Outcome, world: World, folder: Path) -> list[Path]:
 
 
 def pack_cloud(cloud: GaussianCloud, upright: NDArray[np.float64]) -> tuple[dict[str, Any], bytes]:
-    """What `cloud.js` unpacks: ranges for reading it, and 12 bytes a Gaussian, a plane a byte, under gzip.
+    """Pack a cloud for `cloud.js`: ranges for reading it, and 12 bytes per Gaussian, one plane per byte, gzipped.
 
-    A place is 16 bits of a logarithm an axis, as a difference to the Gaussian before it on a curve that leaves small
-    cubes last; radius, opacity, colour and class 8 bits each. The same cloud gives the same bytes.
+    A position is 16 bits of a logarithm per axis, as a difference to the Gaussian before it in Morton order; radius,
+    opacity, colour and class take 8 bits each. The same cloud gives the same bytes.
     """
     total, opacity = len(cloud), 1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))
     if total > MOST_GAUSSIANS:
