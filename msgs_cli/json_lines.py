@@ -1,4 +1,4 @@
-"""What happens, as one JSON object a line on stderr and nothing else there, for programs that watch.
+"""Events of a run as one JSON object a line on stderr and nothing else there, for programs that watch.
 
 `--log-format json`. Each has `event` and `time` (seconds since 1970): stage, progress, warning, log, stopping, and one
 of result, stopped, error at the end.
@@ -60,7 +60,7 @@ class JsonProgress:
     these at most five a second and one at each end."""
 
     def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
-        """Yield the items."""
+        """Yield the items, and write a progress line every so often."""
         done, said = 0, 0.0
         self._tell(label, 0, total)
         for done, item in enumerate(items, 1):
@@ -74,7 +74,7 @@ class JsonProgress:
         write_line("progress", **_stage, label=label, done=done, total=total, **more)
 
     def stage(self, event: StageEvent) -> None:
-        """One line."""
+        """Write a line for the start or the end of a stage."""
         _stage.clear()
         if event.state == BEGUN:
             _stage.update(stage=event.name, index=event.index, of=event.of)
@@ -89,7 +89,7 @@ class JsonHandler(logging.Handler):
     """{"event": "warning", "message"}, or {"event": "log", "level", "message"}."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """One line."""
+        """Write a record of the log as one line."""
         if record.levelno == logging.WARNING:
             write_line("warning", **_stage, message=record.getMessage())
         else:
@@ -106,8 +106,8 @@ def is_asked_for(arguments: Iterable[str]) -> bool:
 
 @contextmanager
 def only_json() -> Iterator[None]:
-    """In this block everything on stderr is a JSON line: what libraries, other threads and child processes print there
-    becomes {"event": "log", "level": "print"}, and what ends the program the last line. Ends with SystemExit always."""
+    """Write everything on stderr as JSON lines inside this block: prints of libraries, other threads and child
+    processes become {"event": "log", "level": "print"}, the outcome the last line. Always ends with SystemExit."""
     code = 0
     with _watched():
         try:

@@ -77,7 +77,7 @@ SPLAT_FILES = (".ply", ".spz", ".glb", ".splat", ".safetensors")
 
 
 class Size(click.ParamType):
-    """640x480"""
+    """Parameter type of an image size, written as 640x480."""
 
     name = "size"
 

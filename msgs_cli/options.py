@@ -52,7 +52,7 @@ def verbosity_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def settings_options(command: Callable[..., None]) -> Callable[..., None]:
-    """--config and --set."""
+    """Add the options --config and --set to a command."""
     command = click.option(
         "--set", "overrides", multiple=True, metavar="SECTION.KEY=VALUE",
         help="Change one setting, e.g. --set frames.rate=5; may be repeated.",
@@ -64,7 +64,7 @@ def settings_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def engine_options(help: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """--engine and --address."""
+    """Return a decorator that adds the options --engine and --address."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         command = click.option(
@@ -167,7 +167,7 @@ _SOURCE_OPTIONS = {
 
 
 def source_options(command: Callable[..., None]) -> Callable[..., None]:
-    """What a reconstruction is made from and where; see `source_settings`."""
+    """Add the options that describe the source of a reconstruction; see `source_settings`."""
     for name, (setting, metavar, help) in reversed(_SOURCE_OPTIONS.items()):
         command = click.option(f"--{name}", setting.replace(".", "__"), metavar=metavar, help=help)(command)
     return command
@@ -262,8 +262,8 @@ def tell_result(quiet: bool, **paths: Path | list[Path] | bool) -> None:
 
 
 def worker_setup(quiet: bool, verbose: bool, remote: bool) -> Callable[[str], Progress]:
-    """What sets logging up in a process that works on one recording of many, and makes its progress: bars here, lines
-    from elsewhere. Can be sent there."""
+    """Return a picklable function that sets up logging in a process that works on one recording of many, and returns
+    its progress: bars here, lines from elsewhere."""
     return partial(_worker_progress, quiet, verbose, _as_json(), remote)
 
 
@@ -289,7 +289,7 @@ def open_run(path: Path) -> RunFolder:
 
 @contextmanager
 def like_ctrl_c() -> Iterator[None]:
-    """In this block SIGTERM (docker stop, systemd) raises KeyboardInterrupt."""
+    """Raise KeyboardInterrupt on SIGTERM (docker stop, systemd) inside this block."""
     from msgs_slam.pipelines.system.stopping import let_libraries_take_signals
 
     let_libraries_take_signals()
@@ -302,7 +302,7 @@ def like_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def ending_quietly() -> Iterator[None]:
-    """In this block SIGTERM ends the process at once and without a stack trace of a library."""
+    """End the process on SIGTERM inside this block, at once and without a library's stack trace."""
     from msgs_slam.pipelines.system.stopping import let_libraries_take_signals
 
     let_libraries_take_signals()

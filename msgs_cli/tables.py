@@ -65,7 +65,7 @@ def status_table(stages: Sequence[StageStatus], everything: bool = False) -> str
 
 
 def scale_lines(root: Path, records: dict[str, StageRecord]) -> list[str]:
-    """How long the unit is, once the export has found it."""
+    """Return the line about the scale of the world; none before the export has estimated it."""
     from msgs_slam.pipelines.metres.files import load_metres
     from msgs_slam.pipelines.run.folder import RunFolder
 

@@ -1,4 +1,4 @@
-"""What is printed: nothing that a terminal obeys, and nothing lost without a word."""
+"""Text for the terminal: control characters are escaped, and nothing is dropped silently."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def printable(text: str) -> str:
 
 
 def say(text: Any = "", err: bool = False) -> None:
-    """Print a line."""
+    """Print one line, made safe for the terminal."""
     click.echo(printable(str(text)), err=err)
 
 

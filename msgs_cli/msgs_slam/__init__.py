@@ -1,4 +1,4 @@
-"""What a notebook needs: reconstruct a video, open a finished run, look at it from anywhere.
+"""The Python interface for notebooks: reconstruct a video, open a finished run, render it from anywhere.
 
     import msgs_slam
 
@@ -147,7 +147,7 @@ def _progress(wanted: Progress | bool) -> Progress:
 
 
 def main() -> None:
-    """The command `msgs-slam`."""
+    """Run the command `msgs-slam`."""
     from msgs_slam.msgs_cli.main import main as command
 
     command()
