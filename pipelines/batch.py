@@ -52,9 +52,9 @@ class Recording:
 
 @dataclass(frozen=True)
 class Job:
-    """What travels to wherever a recording is worked on. `settings`: of a file, by section; `prepare` sets logging up
-    there and makes the progress; `code`: identity of the stages' code here; `threads`: how many it takes where the
-    settings leave that open, 0 for all."""
+    """Everything a worker needs to reconstruct one recording. `settings`: of a file, by section; `prepare` sets up
+    logging there and returns the progress; `code`: identity of the stages' code here; `threads`: the number to use
+    where the settings leave that open, 0 for all."""
 
     recording: Recording
     settings: Mapping[str, Any]

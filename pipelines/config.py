@@ -22,7 +22,7 @@ def setting(
 
 @dataclass(frozen=True)
 class RunConfig:
-    """The whole run."""
+    """Settings of the whole run."""
 
     seed: int = setting(0, "seed of every random choice", within=(0, 2**31 - 1))
     threads: int = setting(0, "CPU threads, 0 = all cores; the same count gives the same bytes", within=(0, 1024))
@@ -112,7 +112,7 @@ class ProxyConfig:
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """Camera poses."""
+    """Settings of camera tracking."""
 
     new_segments: bool = setting(True, "begin anew from proxy depth after a loss, and join the parts later")
     render: str = setting(
@@ -123,7 +123,7 @@ class TrackingConfig:
 
 @dataclass(frozen=True)
 class MappingConfig:
-    """The Gaussian map."""
+    """Settings of the Gaussian map."""
 
     max_side: int = setting(
         640,
@@ -259,7 +259,7 @@ class Config:
 
 
 def allowed_values(known: Field[Any]) -> str:
-    """What a setting may be, in words; "" for anything of its type."""
+    """Describe the allowed values of a setting; "" where every value of its type is allowed."""
     return " | ".join(known.metadata["choices"]) or (range_text(known) if known.metadata["within"] else "")
 
 

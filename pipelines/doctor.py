@@ -1,4 +1,4 @@
-"""What this machine has for the program: a line each, and what to do where something is missing."""
+"""Check of this machine: a line for each thing the program needs, and what to do where it is missing."""
 
 from __future__ import annotations
 

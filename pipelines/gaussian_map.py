@@ -50,7 +50,7 @@ class GaussianMap:
 
     @property
     def opacities(self) -> Tensor:
-        """(M,) in 0..1."""
+        """Opacities (M,) in 0..1."""
         return torch.sigmoid(self.opacity_logits)
 
     def only(self, rows: Tensor | slice) -> GaussianMap:
@@ -58,7 +58,7 @@ class GaussianMap:
         return GaussianMap(**{name: tensor[rows] for name, tensor in vars(self).items()})
 
     def moved(self, other_from_world: Similarity) -> GaussianMap:
-        """The same map in another world; radii grow with the scale."""
+        """Transform the map into another world; radii grow with the scale."""
         parts = self.means.detach().cpu().split(_AT_ONCE)
         means = [torch.from_numpy(other_from_world.apply(p.numpy().astype("float64"))).to(p.dtype) for p in parts]
         return replace(

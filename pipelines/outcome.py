@@ -1,4 +1,4 @@
-"""What a run has ended with so far: the latest stage wins."""
+"""Outcome of a run so far: of each result the one of the latest stage."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class Outcome:
         return replace(model, points_in_world=points, cam_from_world=poses)
 
     def moved(self, other_from_run: Similarity) -> Outcome:
-        """The same in another world: cameras, map and points. Raises ValueError where it has been moved before."""
+        """Transform cameras, map and points into another world. Raises ValueError where that has been done before."""
         if self.move is not None:
             raise ValueError("this outcome is no longer in the run's own world")
         poses = other_from_run.apply_to_poses(self.trajectory.cam_from_world)
@@ -121,7 +121,7 @@ class Outcome:
         )
 
     def pieces(self) -> list[Outcome]:
-        """What nothing joins to the rest, each in a world of its own, largest first, as far as it is made."""
+        """Load the disconnected components, each in a world of its own, largest first, as far as they are done."""
         pieces = [RunFolder(self.run.root / name) for name in self.run.pieces("tracking")]
         return [load_outcome(p) for p in pieces if p.manifest_file.exists() and "tracking" in load_records(p)]
 
@@ -131,7 +131,7 @@ class Outcome:
 
 
 def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:
-    """What a run has found, its map on `device`. Raises InputError for a run whose tracking is not done."""
+    """Load the results of a run, its map on `device`. Raises InputError for a run whose tracking is not done."""
     records = load_records(run)
     config = recorded_config(records, load_settings(run))
     pose_stage = next((s for s in _POSE_STAGES if s in records), "")
@@ -163,8 +163,8 @@ def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:
 
 
 def maps_around(outcome: Outcome) -> Callable[[int], GaussianMap]:
-    """What may be seen from a keyframe: of a map made in submaps what its own and those beside it hold. So a view of a
-    long recording takes no longer than one of a short one."""
+    """Return a function from keyframe id to the part of the map it may see: of a map made in submaps its own and those
+    beside it, so that a view of a long recording takes no longer than one of a short one."""
     whole, submaps = outcome.require_map(), outcome.run.load_submaps()
     number_of = {i: n for n, submap in enumerate(submaps) for i in submap["own"].tolist()}
 

@@ -49,7 +49,7 @@ def merge_settings(config: Config, changes: Mapping[str, Any], where: str) -> Co
 
 
 def merge_known_settings(config: Config, changes: Mapping[str, Any]) -> tuple[Config, list[str]]:
-    """As `merge_settings`, but what is no setting, or no value of it, is left out; returns the names of those too."""
+    """Merge as `merge_settings`, but drop unknown names and invalid values; returns the dropped names too."""
     dropped = []
     for section, values in changes.items():
         for key, value in values.items() if isinstance(values, Mapping) else [("", values)]:
@@ -170,7 +170,7 @@ GONE = {
 
 
 def explain_retired(keys: Iterable[str]) -> str:
-    """What has become of the settings among `keys` (section.name) that there were once; "" for none of them."""
+    """Explain what became of the retired settings among `keys` (section.name); "" where there are none."""
     keys = list(keys)
     moved = [f"{k} is {MOVED[k]} now (off unless set)" for k in keys if k in MOVED]
     fixed = [k for k in keys if k in FIXED]

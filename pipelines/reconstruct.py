@@ -1,4 +1,4 @@
-"""From a source to a finished run: what the commands `reconstruct`, `resume` and `status` do."""
+"""The whole pipeline from a source to a finished run, for the commands `reconstruct`, `resume` and `status`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a run stands, for people and for programs."""
+"""Status of a run, for people and for programs."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class RunStatus:
 
     @property
     def memory(self) -> str:
-        """What stages plan with here, and what the ones that are done have needed most."""
+        """Memory that stages plan with here, and the highest peak of the finished ones, in words."""
         peaks = {s.name: s.record.peak_memory_mb for s in self.stages if s.record}
         most = max(peaks, key=lambda name: peaks[name], default="")
         needed = f"peak {peaks[most] / 1000:.1f} GB in {most} " if most else ""
@@ -71,7 +71,7 @@ class RunStatus:
 
     @property
     def warnings(self) -> list[str]:
-        """What is wrong with the run itself, and what to type."""
+        """Faults of the run itself, each with the command that repairs it."""
         again = f"`msgs-slam resume {self.run.root}` makes it and what follows again"
         changed = [
             f"{s.name} was made with other settings than run.toml asks for by now ({', '.join(s.changed)}): {again}"
@@ -91,7 +91,7 @@ class RunStatus:
 
     @property
     def notes(self) -> list[str]:
-        """What is no fault, and good to know."""
+        """Remarks on the run that are no fault."""
         return [
             f"{s.name} keeps what auto chose when it was made ({', '.join(s.newer)}); other networks are there by now: "
             f"to have it chosen anew, delete {self.run.stage(s.name)} and run `msgs-slam resume {self.run.root}`"

@@ -1,4 +1,4 @@
-"""What flows between stages, and the conventions, written once.
+"""Data exchanged between stages, and the conventions, stated once.
 
 Conventions
 - A transform is named target first: `cam_from_world @ points_in_world`. The inner names of a product cancel.
@@ -31,7 +31,7 @@ def require_shape(name: str, array: NDArray, expected: Sequence[int | None]) -> 
 
 
 def any_of(masks: Iterable[NDArray[np.bool_] | None]) -> NDArray[np.bool_] | None:
-    """Where one of the masks (H, W) is; None without any."""
+    """Return the union of the masks (H, W); None without any."""
     found = [m for m in masks if m is not None]
     return np.asarray(np.logical_or.reduce(found)) if found else None
 
@@ -58,7 +58,7 @@ class Features:
 
     @property
     def nbytes(self) -> int:
-        """Memory they take."""
+        """Memory of both arrays, in bytes."""
         return self.keypoints.nbytes + self.descriptors.nbytes
 
     def __len__(self) -> int:
@@ -66,7 +66,7 @@ class Features:
 
     @property
     def xy(self) -> NDArray[np.float64]:
-        """(F, 2) pixels."""
+        """Keypoints (F, 2) in pixels."""
         return self.keypoints[:, :2].astype(np.float64)
 
 
@@ -112,7 +112,7 @@ class Intrinsics:
         return self.resized(max(round(self.width * scale), 1), max(round(self.height * scale), 1))
 
     def resized(self, width: int, height: int) -> Intrinsics:
-        """The same camera after its image is resized to width x height."""
+        """Return the camera after its image is resized to width x height."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
@@ -161,7 +161,7 @@ class Calibration:
 
 @dataclass(frozen=True)
 class ProxyMaps:
-    """What the providers say of one frame, at their own resolution h x w (same field of view as the frame).
+    """Proxy maps of one frame, at their own resolution h x w (same field of view as the frame).
 
     depth (h, w) float32, 0 = unknown; confidence (h, w) float32 in [0, 1]: the reliability U of eq. (2);
     labels (h, w) uint8; label_confidence (h, w) float32 in [0, 1]: probability of that label.
@@ -224,7 +224,7 @@ class Trajectory:
 
     @property
     def is_posed(self) -> NDArray[np.bool_]:
-        """(N,) bool."""
+        """Whether each frame has a pose, (N,)."""
         return np.array([not reason for reason in self.lost_reasons], dtype=bool)
 
     @property
@@ -273,7 +273,7 @@ class SemanticMesh:
 
 @dataclass(frozen=True)
 class MetresSource:
-    """What one source says alone: metres per unit and their relative standard deviation."""
+    """Estimate of one source alone: metres per unit and their relative standard deviation."""
 
     source: str
     per_unit: float
@@ -282,11 +282,11 @@ class MetresSource:
 
 @dataclass(frozen=True)
 class Metres:
-    """How long the unit of a world is, which is never rescaled by it: metres per unit and their relative standard
+    """Length of the unit of a world, which is never rescaled by it: metres per unit and their relative standard
     deviation (that of the logarithm).
 
-    is_guess: whether only what is usual in the world tells it; sources: what it rests on, most telling first; alone:
-    what each says; disagreement: the Birge ratio of the sources, over 1 where they scatter more than they should.
+    is_guess: whether it rests only on what is usual in the world; sources: its evidence, strongest first; alone: the
+    estimate of each; disagreement: the Birge ratio of the sources, over 1 where they scatter more than they should.
     """
 
     per_unit: float

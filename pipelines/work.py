@@ -1,4 +1,4 @@
-"""What the command `work` does: lead or help at a run that several processes work on."""
+"""The command `work`: lead or help at a run that several processes work on."""
 
 from __future__ import annotations
 
