@@ -130,10 +130,10 @@ def load_sequence(context: StageContext) -> Sequence:
     return Sequence(run.load_frames(), calibration, camera, run.load_backbone(), run.image, left_out)
 
 
-def in_frames(work: ProxyWork, task: Callable[[Chunk, Progress], R], frames: list[Frame], **known: Any) -> list[R]:
+def in_frames(opened: ProxyWork, work: Callable[[Chunk, Progress], R], frames: list[Frame], **known: Any) -> list[R]:
     """What a task returns of each range of the frames."""
     ids = np.array([f.id for f in frames], np.int64)
-    return in_chunks(work.context, task, len(frames), work, frame_ids=ids, **known)
+    return in_chunks(opened.context, work, len(frames), opened, frame_ids=ids, **known)
 
 
 def _opened(task: Chunk, progress: Progress) -> tuple[ProxyWork, list[Frame]]:

@@ -102,7 +102,7 @@ def test_names_of_modules_in_strings_are_modules() -> None:
 
 
 def test_every_task_is_defined_where_workers_look_for_it() -> None:
-    """What is handed to `in_chunks` or `each` by name must be found by another process."""
+    """What is handed to `in_chunks`, `in_frames` or `each` by name must be found by another process."""
     defined = {
         node.name
         for name in TASK_MODULES
@@ -111,8 +111,9 @@ def test_every_task_is_defined_where_workers_look_for_it() -> None:
     }
     for path in sources():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("in_chunks", "each"):
-                work = node.args[1] if ast.unparse(node.func).endswith("in_chunks") else node.args[0]
+            called = ast.unparse(node.func).split(".")[-1] if isinstance(node, ast.Call) else ""
+            if isinstance(node, ast.Call) and called in ("in_chunks", "in_frames", "each"):
+                work = node.args[0 if called == "each" else 1]
                 if isinstance(work, ast.Name) and work.id != "work":
                     assert work.id in defined, f"{path}:{node.lineno}"
 
