@@ -93,6 +93,10 @@ _ENTRIES = (
         "removed. OBJ: a group for each class.",
         "texture", f"{_SET.format('texture')}, or {_ONLY.format('texture')}",
     ),
+    Entry(
+        "floorplan.svg", "the walls seen from above, with their lengths, and the camera's path. Browsers, Inkscape.",
+        "floorplan", _ONLY.format("floorplan"),
+    ),
     Entry("classes.json", 'number, name and colour of each class; 255 is "unknown".'),
     Entry("scale.json", "how many metres a unit of the run is, its relative standard deviation, and who says so."),
     Entry(

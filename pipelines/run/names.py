@@ -1,6 +1,6 @@
 """Names of stages and exports, apart from everything heavy so that `--help` is instant."""
 
 STAGES = ("frames", "proxy", "tracking", "mapping", "global_ba", "export")
-EXPORTS = ("colmap", "ply", "spz", "sog", "glb", "tiles", "html", "mesh", "texture", "tum")
+EXPORTS = ("colmap", "ply", "spz", "sog", "glb", "tiles", "html", "mesh", "texture", "floorplan", "tum")
 SOURCE_LIST = "source.videos"
 """The videos of a run of several, in its folder."""

@@ -1,0 +1,116 @@
+"""The walls from above as an SVG, with their lengths."""
+
+from __future__ import annotations
+
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_slam.formats.atomic import write_text
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.pipelines.export.walls import Wall, find_walls
+from msgs_slam.pipelines.outcome import Outcome
+from msgs_slam.pipelines.run.folder import MESH, RunFolder
+from msgs_slam.pipelines.upright.world import load_world
+
+Array = NDArray[np.float64]
+
+FLOOR_PLAN = "floorplan.svg"
+_WIDTH, _MARGIN, _FOOT = 900, 60, 70
+_STYLE = (
+    "text{font:14px system-ui,sans-serif;fill:#111;text-anchor:middle}.n{text-anchor:start;fill:#555;font-size:12px}"
+    ".w{stroke:#111;stroke-width:5;stroke-linecap:round}.o{stroke:#111;stroke-width:2;stroke-dasharray:3 4}"
+    ".p{fill:none;stroke:#ea580c;stroke-width:1.5}.b{stroke:#111;stroke-width:2}"
+)
+
+
+def walls_of_run(run: RunFolder) -> list[Wall]:
+    """Walls in the world of the run's exported files.
+
+    Raises InputError where the run has no mesh, its files do not stand upright, or no wall is found.
+    """
+    if not run.has("export", MESH):
+        raise InputError(
+            f"{run.root} has no mesh yet, and a floor plan is drawn from it: finish the run with msgs-slam resume"
+        )
+    world = load_world(run)
+    if world is None or world.axes != "up":
+        raise InputError(
+            f"{run.root}: a floor plan needs to know which way is up, and the exported files do not say so: film some "
+            "floor and some upright edges, or if export.axes is first, set it to up"
+        )
+    mesh = read_mesh_ply(run.file("export", MESH))
+    if not (walls := find_walls(mesh.vertices, mesh.faces)):
+        raise InputError(f"{run.root}: no wall is seen well enough for a floor plan: film walls from floor to ceiling")
+    return walls
+
+
+def write_floor_plan(outcome: Outcome, folder: Path) -> list[Path]:
+    """floorplan.svg, of an outcome in the run's own world. Raises what `walls_of_run` raises."""
+    walls, world = walls_of_run(outcome.run), load_world(outcome.run)
+    assert world is not None
+    moved = outcome.moved(world.exported_from_run).trajectory
+    per_unit, about = 1.0, ""
+    if world.earth is None and not outcome.metric and outcome.metres is not None:
+        per_unit, about = outcome.metres.per_unit, outcome.metres.text
+    unit = "m" if about or outcome.metric or world.earth is not None else "units"
+    text = floor_plan(walls, moved.centers[moved.is_placed], outcome.run.root.stem, per_unit, unit, about)
+    write_text(folder / FLOOR_PLAN, text)
+    return [folder / FLOOR_PLAN]
+
+
+def floor_plan(walls: list[Wall], path: Array, title: str, per_unit: float, unit: str, about: str) -> str:
+    """An SVG of the walls and of the camera's path (N, 3); lengths are multiplied by `per_unit` and called `unit`."""
+    points = np.concatenate([*(wall.ends for wall in walls), path[:, :2]])
+    low, high = points.min(axis=0), points.max(axis=0)
+    scale = (_WIDTH - 2 * _MARGIN) / float((high - low).max())
+    width, height = ((high - low) * scale + 2 * _MARGIN).tolist()
+
+    def place(at: Array) -> Array:
+        return np.asarray((at - low) * scale * (1, -1) + (_MARGIN, height - _MARGIN))
+
+    way = " ".join(f"{x:.1f},{y:.1f}" for x, y in place(path[:, :2]))
+    notes = enumerate(["≥: an end of this wall was not seen.", f"{about[0].upper()}{about[1:]}." if about else ""])
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {max(width, 420):.0f} {height + _FOOT:.0f}">',
+        f"<title>{escape(title)}: floor plan</title><style>{_STYLE}</style>",
+        '<rect width="100%" height="100%" fill="#fff"/>',
+        f'<polyline class="p" points="{way}"/>',
+        *(_drawn(wall, place(wall.ends), per_unit, unit) for wall in walls),
+        _scale_bar(scale / per_unit, unit, height),
+        *(f'<text class="n" x="{_MARGIN}" y="{height + 36 + 16 * k:.0f}">{escape(n)}</text>' for k, n in notes),
+        "</svg>",
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def _drawn(wall: Wall, ends: Array, per_unit: float, unit: str) -> str:
+    """A line, a stroke across each end that is no corner, and the length outside of the room."""
+    (x1, y1), (x2, y2) = ends
+    outside = np.array([-wall.normal[0], wall.normal[1]])
+    parts = [f'<line class="w" x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"/>']
+    for (x, y), corner in zip(ends, wall.corners, strict=True):
+        if not corner:
+            (ax, ay), (bx, by) = (x, y) + 12 * outside, (x, y) - 12 * outside
+            parts.append(f'<line class="o" x1="{ax:.1f}" y1="{ay:.1f}" x2="{bx:.1f}" y2="{by:.1f}"/>')
+    turn = float(np.degrees(np.arctan2(y2 - y1, x2 - x1)))
+    turn = turn - 180 if turn > 90 else turn + 180 if turn < -90 else turn
+    x, y = ends.mean(axis=0) + 16 * outside
+    told = f"{'' if wall.is_whole else '≥ '}{wall.length * per_unit:.2f} {unit}"
+    parts.append(f'<text transform="translate({x:.1f} {y:.1f}) rotate({turn:.1f})" dy="5">{told}</text>')
+    return "".join(parts)
+
+
+def _scale_bar(pixels: float, unit: str, top: float) -> str:
+    """One unit, or as many as make a bar of some length; `pixels` a unit."""
+    most = 200 / pixels
+    ten = 10.0 ** np.floor(np.log10(most))
+    value = ten * max(n for n in (1, 2, 5) if n * ten <= most)
+    end = _MARGIN + value * pixels
+    return (
+        f'<line class="b" x1="{_MARGIN}" y1="{top:.0f}" x2="{end:.1f}" y2="{top:.0f}"/>'
+        f'<text class="n" x="{_MARGIN}" y="{top + 18:.0f}">{value:g} {unit}</text>'
+    )

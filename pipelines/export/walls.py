@@ -1,0 +1,249 @@
+"""Walls of a mesh that stands upright: planes that reach over much of the room's height, as lines on the floor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_LEANS = np.sin(np.radians(15))
+"""A wall's normal rises less."""
+_APART, _OF_DIRECTION = np.radians(8), np.radians(12)
+"""Directions differ by more; a face's normal differs from its wall's by less."""
+_SAME_WAY, _BESIDE = np.cos(np.radians(30)), 0.08
+"""Walls that look within 30 degrees, and lie so near in heights of the room, may be one."""
+_SQUARE = np.radians(3)
+"""Directions that are so nearly at right angles are."""
+_STEPS = 60
+"""Of the room's height: a wall is one thick, twice that where pictures hang on it."""
+_LAYERS, _LEAST_LAYERS = 20, 8
+"""Of the room's height: a column of a wall shows so many."""
+_FITS = 8
+_LEAST_SHARE, _LEAST_AREA = 0.08, 0.045
+"""A direction's area, of that of the strongest; a plane's, in squared heights of the room."""
+_GAP, _LEAST_LENGTH, _CORNER, _IN_FRONT = 0.7, 0.3, 0.4, 0.35
+"""In heights of the room: openings and furniture that a wall goes on behind, shorter is no wall, ends that meet, and
+how far a cupboard stands before the wall that it hides."""
+
+
+@dataclass(frozen=True)
+class Wall:
+    """ends (2, 2) on the floor; the side that is seen lies to the left of the way from the first to the second.
+    corners: which ends are where another wall meets; the others are where no more was seen."""
+
+    ends: Array
+    corners: tuple[bool, bool] = (False, False)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether both ends are corners, so that its length is that of the wall."""
+        return all(self.corners)
+
+    @property
+    def length(self) -> float:
+        """Between the ends."""
+        return float(np.linalg.norm(self.ends[1] - self.ends[0]))
+
+    @property
+    def along(self) -> Array:
+        """(2,) unit vector from the first to the second."""
+        return np.asarray((self.ends[1] - self.ends[0]) / max(self.length, 1e-12))
+
+    @property
+    def normal(self) -> Array:
+        """(2,) unit vector into the room."""
+        return np.array([-self.along[1], self.along[0]])
+
+
+@dataclass(frozen=True)
+class _Faces:
+    """Upright faces: centers (F, 3), area (F,), angle (F,) of the normal; the room's lowest z, and height."""
+
+    centers: Array
+    area: Array
+    angle: Array
+    low: float
+    height: float
+
+    def only(self, rows: NDArray[np.bool_]) -> _Faces:
+        return _Faces(self.centers[rows], self.area[rows], self.angle[rows], self.low, self.height)
+
+    def facing(self, angle: float) -> NDArray[np.bool_]:
+        """Which of them have about this angle."""
+        return np.asarray(np.abs((self.angle - angle + np.pi) % (2 * np.pi) - np.pi) < _OF_DIRECTION)
+
+    def beside(self, line: _Line) -> tuple[_Faces, _Faces]:
+        """Those on a line, and those that are neither on it nor near it and look another way."""
+        mine = self.facing(line.angle)
+        far = np.abs((self.centers[:, :2] - line.place) @ (-line.along[1], line.along[0])) / self.height * _STEPS
+        return self.only(mine & (far < 2)), self.only(~mine | (far >= 3))
+
+
+@dataclass(frozen=True)
+class _Line:
+    """Through place (2,) along (2,), with the room to its left; the area on it, the angle it was sought at."""
+
+    area: float
+    angle: float
+    place: Array
+    along: Array
+
+
+def find_walls(vertices: NDArray, faces: NDArray) -> list[Wall]:
+    """Of a mesh (V, 3), (F, 3) with z up whose faces look into the room, longest first; corners meet."""
+    upright = _upright_faces(vertices, faces)
+    if len(upright.area) == 0:
+        return []
+    angles = [angle + turn for angle in _directions(upright) for turn in (0.0, np.pi)]
+    walls: list[Wall] = []
+    left = upright
+    while (found := max((_strongest_line(left, angle) for angle in angles), key=lambda line: line.area)).area > 0:
+        here, left = left.beside(found)
+        walls += [
+            Wall(found.place + np.array([[start], [end]]) * found.along) for start, end in _stretches(here, found)
+        ]
+    walls = _without_doubles(walls, upright.height)
+    walls = _without_doubles(_meeting(_without_cupboards(walls, upright.height), upright.height), upright.height)
+    return sorted(walls, key=lambda wall: -wall.length)
+
+
+def _upright_faces(vertices: NDArray, faces: NDArray) -> _Faces:
+    corners = vertices.astype(np.float64)[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    twice = np.linalg.norm(cross, axis=1)
+    centers = corners.mean(axis=1)
+    low, high = np.quantile(centers[:, 2], (0.01, 0.99)) if len(centers) else (0.0, 1.0)
+    rows = (twice > 0) & (np.abs(cross[:, 2]) < _LEANS * twice)
+    return _Faces(
+        centers[rows], twice[rows] / 2, np.arctan2(cross[rows, 1], cross[rows, 0]), float(low), float(high - low)
+    )
+
+
+def _directions(faces: _Faces) -> list[float]:
+    """Angles modulo half a turn that many faces look along; those nearly square to the first are made so."""
+    half, left = faces.angle % np.pi, np.ones(len(faces.area), bool)
+    found: list[float] = []
+    first = 0.0
+    while left.any():
+        weight = np.bincount((np.degrees(half[left])).astype(int) % 180, faces.area[left], minlength=180)
+        smooth = sum(np.roll(weight, k) for k in (-2, -1, 0, 1, 2))
+        peak = np.radians(int(np.argmax(smooth)) + 0.5)
+        near = left & (np.abs(_between(half, peak)) < _APART)
+        strength = float(faces.area[near].sum())
+        first = first or strength
+        if strength < _LEAST_SHARE * first:
+            break
+        angle = peak + float(np.average(_between(half[near], peak), weights=faces.area[near]))
+        if found and abs(_between(angle, found[0] + np.pi / 2)) < _SQUARE:
+            angle = found[0] + np.pi / 2
+        found.append(float(angle))
+        left &= np.abs(_between(half, peak)) >= _APART
+    return found
+
+
+def _between(angle: Array | float, other: float) -> Array:
+    """From the other to the angle, modulo half a turn."""
+    return np.asarray((np.asarray(angle) - other + np.pi / 2) % np.pi - np.pi / 2)
+
+
+def _strongest_line(faces: _Faces, angle: float) -> _Line:
+    """The line that most area with about this angle lies on, as its own faces lie; of no area where that is too
+    little."""
+    step, normal = faces.height / _STEPS, np.array([np.cos(angle), np.sin(angle)])
+    faces = faces.only(faces.facing(angle))
+    if float(faces.area.sum()) < (least := _LEAST_AREA * faces.height**2):
+        return _Line(0.0, angle, np.zeros(2), normal)
+    across = faces.centers[:, :2] @ normal
+    cell = np.floor((across - across.min()) / step).astype(int)
+    weight = np.convolve(np.bincount(cell, faces.area), np.ones(5), "same")
+    near = np.abs(across - across.min() - (np.argmax(weight) + 0.5) * step) < 2.5 * step
+    for _ in range(_FITS):
+        place = np.average(faces.centers[near, :2], axis=0, weights=faces.area[near])
+        away = (faces.centers[near, :2] - place) * np.sqrt(faces.area[near])[:, None]
+        along = np.linalg.eigh(away.T @ away)[1][:, 1]
+        near = np.abs((faces.centers[:, :2] - place) @ (-along[1], along[0])) < 2 * step
+    area = float(faces.area[near].sum())
+    along = along * np.sign(along @ (normal[1], -normal[0]))
+    return _Line(area if area > least else 0.0, angle, place, along)
+
+
+def _stretches(faces: _Faces, line: _Line) -> list[tuple[float, float]]:
+    """Where along a plane its columns reach over enough of the room's height; gaps are closed."""
+    step, t = faces.height / _STEPS, (faces.centers[:, :2] - line.place) @ line.along
+    layer = np.clip((faces.centers[:, 2] - faces.low) / faces.height * _LAYERS, 0, _LAYERS - 1)
+    column = np.floor((t - t.min()) / (2 * step)).astype(int)
+    shown = np.zeros((column.max() + 1, _LAYERS), bool)
+    shown[column, layer.astype(int)] = True
+    full = np.flatnonzero(shown.sum(axis=1) >= _LEAST_LAYERS)
+    if len(full) == 0:
+        return []
+    cuts = np.flatnonzero(np.diff(full) * 2 * step > _GAP * faces.height)
+    starts, ends = full[np.append(0, cuts + 1)], full[np.append(cuts, len(full) - 1)] + 1
+    found = [(t.min() + 2 * step * a, t.min() + 2 * step * b) for a, b in zip(starts, ends, strict=True)]
+    return [(a, b) for a, b in found if b - a > _LEAST_LENGTH * faces.height]
+
+
+def _without_doubles(walls: list[Wall], height: float) -> list[Wall]:
+    """Those of which not most lies on a longer one that looks about the same way."""
+
+    def on(short: Wall, long: Wall) -> bool:
+        if short.length >= long.length or short.normal @ long.normal < _SAME_WAY:
+            return False
+        away = short.ends[0] + np.linspace(0, 1, 21)[:, None] * (short.ends[1] - short.ends[0]) - long.ends[0]
+        beside = np.abs(away @ long.normal) < _BESIDE * height
+        inside = (away @ long.along > -_BESIDE * height) & (away @ long.along < long.length + _BESIDE * height)
+        return bool((beside & inside).mean() > 0.5)
+
+    return [wall for wall in walls if not any(on(wall, other) for other in walls)]
+
+
+def _without_cupboards(walls: list[Wall], height: float) -> list[Wall]:
+    """Those that do not stand close before a longer one that looks the same way."""
+
+    def hides(front: Wall, back: Wall) -> bool:
+        if front.length >= back.length or front.normal @ back.normal < np.cos(_APART):
+            return False
+        depth = (front.ends - back.ends[0]) @ back.normal
+        t = (front.ends - back.ends[0]) @ back.along
+        reach = _CORNER * height
+        close = (depth > 0).all() and (depth < _IN_FRONT * height).all()
+        return bool(close and -reach < t.min() < t.max() < back.length + reach)
+
+    return [wall for wall in walls if not any(hides(wall, other) for other in walls)]
+
+
+def _meeting(walls: list[Wall], height: float) -> list[Wall]:
+    """Ends that lie close to where two walls cross are moved there, the closest first."""
+    options = []
+    for i, first in enumerate(walls):
+        for j in range(i):
+            second = walls[j]
+            if abs(first.along @ second.normal) < np.sin(_APART):
+                continue
+            place = _crossing(first, second)
+            k, m = (int(np.linalg.norm(w.ends - place, axis=1).argmin()) for w in (first, second))
+            far = max(np.linalg.norm(first.ends[k] - place), np.linalg.norm(second.ends[m] - place))
+            if far < _CORNER * height:
+                options.append((float(far), (i, k), (j, m), place))
+    done: set[tuple[int, int]] = set()
+    walls = list(walls)
+    for _, one, other, place in sorted(options, key=lambda option: option[0]):
+        if {one, other} & done:
+            continue
+        done |= {one, other}
+        for number, end in (one, other):
+            ends = walls[number].ends.copy()
+            ends[end] = place
+            met = [end == k or walls[number].corners[k] for k in (0, 1)]
+            walls[number] = replace(walls[number], ends=ends, corners=(met[0], met[1]))
+    return walls
+
+
+def _crossing(first: Wall, second: Wall) -> Array:
+    """(2,) where the lines of two walls that are not parallel cross."""
+    sides = np.stack([first.along, -second.along], axis=1)
+    t = np.linalg.solve(sides, second.ends[0] - first.ends[0])
+    return np.asarray(first.ends[0] + t[0] * first.along)
