@@ -19,7 +19,7 @@ _LEAST_COSINE = 0.7
 
 
 PLAIN_CONFIDENCE = 0.5
-"""Confidence of a network that does not tell its own."""
+"""Confidence of a network that gives none of its own."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class NetworkDepth:
 def network_depth(network: Network, image: NDArray[np.uint8], intrinsics: Intrinsics) -> NetworkDepth:
     """Depth of an RGB image with these intrinsics.
 
-    A canonical depth becomes metres by the focal length of the picture as the network saw it: `z = d · f / f_canonical`
+    A canonical depth becomes metres by the focal length of the image as the network saw it: `z = d · f / f_canonical`
     (Metric3D, Yin et al., ICCV 2023). Values at the network's stops, NaN and negative ones are unknown.
     Raises InputError when the output is no image of depth.
     """
@@ -143,7 +143,7 @@ def points_depth(
 
 
 def solve_shift(points: NDArray[np.float64], rays: NDArray[np.float64]) -> float:
-    """The s for which points (P, 3) with z + s lie on their rays (P, 2), x/z and y/z: robust least squares."""
+    """The s for which points (P, 3) with z + s are on their rays (P, 2), x/z and y/z: robust least squares."""
     weight = np.ones(len(points))
     shift = 0.0
     for _ in range(10):

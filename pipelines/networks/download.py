@@ -224,7 +224,7 @@ def _tag_file(part: Path) -> Path:
 
 
 def _read_tag(part: Path) -> str:
-    """The ETag under which the part was begun. A weak one is of no use for If-Range, and what is none of any."""
+    """The ETag of the partial download. A weak or malformed one is useless for If-Range."""
     try:
         tag = json.loads(_tag_file(part).read_text(encoding="utf-8"))["etag"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):

@@ -15,8 +15,8 @@ from msgs_slam.pipelines.networks.session import Network
 
 
 def network_probabilities(network: Network, output: NDArray, width: int, height: int, side: int = 0) -> NDArray:
-    """(h, w, C) float32 probability of every class from the network's output for a picture of width x height; at the
-    picture's own pixels, or at `side` samples along its longer side. All 0 where the network says nothing.
+    """(h, w, C) float32 probability of every class from the network's output for an image of width x height; at the
+    image's own pixels, or at `side` samples along its longer side. All 0 where the network says nothing.
 
     Raises InputError for an output that is no image of classes, or one without any number.
     """
@@ -85,7 +85,7 @@ def _token_scores(network: Network, output: NDArray, box: Letterbox) -> NDArray[
 
 
 def patch_features(network: Network, output: NDArray, width: int, height: int) -> NDArray[np.float32]:
-    """(rows, columns, F) features of a transformer's patches for a picture of width x height; the tokens before the
+    """(rows, columns, F) features of a transformer's patches for an image of width x height; the tokens before the
     patches (the class token) are left out. Raises InputError for an output that is no such list of tokens."""
     box = network.box(width, height)
     rows, columns = box.box_height // network.card.multiple, box.box_width // network.card.multiple
@@ -96,7 +96,7 @@ def patch_features(network: Network, output: NDArray, width: int, height: int) -
 
 
 def class_token(network: Network, output: NDArray, width: int, height: int) -> NDArray[np.float32] | None:
-    """(F,) unit vector that describes the whole picture: a transformer's first token; None where there is none."""
+    """(F,) unit vector that describes the whole image: a transformer's first token; None where there is none."""
     box = network.box(width, height)
     patches = (box.box_height // network.card.multiple) * (box.box_width // network.card.multiple)
     if network.card.kind != "tokens" or output.ndim != 2 or output.shape[0] <= patches:

@@ -1,4 +1,4 @@
-"""Fitting a picture into a network's input, and reading its output back at the picture's pixels."""
+"""Fitting an image into a network's input, and reading its output back at the image's pixels."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Letterbox:
-    """A picture of width x height, scaled alike in both directions and centred in box_width x box_height."""
+    """An image of width x height, scaled alike in both directions and centred in box_width x box_height."""
 
     width: int
     height: int
@@ -21,7 +21,7 @@ class Letterbox:
 
     @property
     def inner(self) -> tuple[int, int]:
-        """(width, height) of the scaled picture in whole pixels."""
+        """(width, height) of the scaled image in whole pixels."""
         scale = min(self.box_width / self.width, self.box_height / self.height)
         return max(1, round(self.width * scale)), max(1, round(self.height * scale))
 
@@ -33,7 +33,7 @@ class Letterbox:
 
     @property
     def offset(self) -> tuple[int, int]:
-        """(x, y) of the picture's corner in the box."""
+        """(x, y) of the image's corner in the box."""
         inner = self.inner
         return (self.box_width - inner[0]) // 2, (self.box_height - inner[1]) // 2
 
@@ -48,7 +48,7 @@ class Letterbox:
         return box
 
     def take(self, output: NDArray[np.float32], align_corners: bool = False) -> NDArray[np.float32]:
-        """(height, width, ...) the network's output (h', w', ...) at the picture's pixels, bilinear.
+        """(height, width, ...) the network's output (h', w', ...) at the image's pixels, bilinear.
 
         The output shows the same field of view as the box whatever its size (518 pixels in may give 516 out).
         """
@@ -57,7 +57,7 @@ class Letterbox:
         return _interpolate(_interpolate(output, rows, 0), columns, 1)
 
     def indices(self, rows: int, columns: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows and columns of an output of that size that lie nearest to the picture's rows and columns."""
+        """Rows and columns of an output of that size that are nearest to the image's rows and columns."""
         y = np.rint(self._coordinates(self.height, 1, self.box_height, rows, False)).astype(np.int64)
         x = np.rint(self._coordinates(self.width, 0, self.box_width, columns, False)).astype(np.int64)
         return np.clip(y, 0, rows - 1), np.clip(x, 0, columns - 1)
@@ -71,8 +71,8 @@ class Letterbox:
 
 
 def choose_box(width: int, height: int, size: tuple[int, ...], multiple: int, pixels: int) -> Letterbox:
-    """The box for a picture: the fixed `size` (height, width), else sides that are multiples of `multiple` with
-    about the picture's own aspect and `pixels` pixels in all."""
+    """The box for an image: the fixed `size` (height, width), else sides that are multiples of `multiple` with
+    about the image's own aspect and `pixels` pixels in all."""
     if size[0] and size[1]:
         return Letterbox(width, height, size[1], size[0])
     ideal = math.sqrt(pixels / (width * height))

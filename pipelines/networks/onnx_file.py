@@ -23,7 +23,7 @@ _MAX_DEPTH = 32
 
 
 def require_own_weights(path: Path) -> None:
-    """Raise InputError unless `path` is an ONNX file all of whose external weights lie in its own folder."""
+    """Raise InputError unless `path` is an ONNX file all of whose external weights are in its own folder."""
     folder = path.parent.resolve()
     for location in external_locations(path):
         target = folder / location

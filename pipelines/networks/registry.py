@@ -113,7 +113,7 @@ class ModelStore:
         return None
 
     def first_metric(self) -> Model | None:
-        """The best network for depth in the cache that tells metres: by itself, or as its training camera saw them."""
+        """The best network for metric depth in the cache: by itself, or as its training camera saw them."""
         for model in self.models:
             family = self.families[model.family]
             tells = not family.get("relative") or "focal" in family
@@ -122,7 +122,7 @@ class ModelStore:
         return None
 
     def take(self, folder: Path, models: Sequence[Model]) -> list[Model]:
-        """Copy the files of `models` that lie in `folder` into the cache; they are known by their content, whatever
+        """Copy the files of `models` that are in `folder` into the cache; they are known by their content, whatever
         they are called. Returns those that were found. Raises InputError when there is no such folder."""
         of_size: dict[int, list[Path]] = {}
         with reaching(folder):

@@ -14,7 +14,7 @@ def is_tflite(path: Path) -> bool:
 
 
 def open_runtime(path: Path, outputs: Sequence[str], threads: int, device: str) -> Runtime:
-    """Open a network's file, told by its name: .tflite, else ONNX. `outputs` are those that will be asked for.
+    """Open a network's file, by its suffix as TFLite or else ONNX. `outputs` are those that will be asked for.
 
     Raises InputError for a file that is none, or keeps weights outside its own folder.
     """

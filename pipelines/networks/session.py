@@ -137,7 +137,7 @@ def _require_bounded(path: Path, name: str, shape: Sequence[int | str | None]) -
 
 
 def _require_fitting(card: Card, shape: Sequence[int | str | None]) -> None:
-    """What a file of fixed shapes tells of its output before it runs: 1 x channels x rows x columns."""
+    """Shape of the output of a file with fixed shapes, known before it runs: 1 x channels x rows x columns."""
     if card.kind in ("tokens", "points", "features") or len(shape) != 4 or not isinstance(shape[1], int):
         return
     planes = 1 if card.task != "segmentation" or card.kind == "argmax" else len(card.classes)

@@ -32,7 +32,7 @@ class TfliteRuntime:
 
     def __init__(self, path: Path, outputs: Sequence[str], threads: int) -> None:
         """`outputs` may name any tensor inside: the graph then ends there. That is how a network which answers with
-        the best class alone still tells the scores of all of them.
+        the best class alone still gives the scores of all of them.
 
         Raises InputError for a file that is no such network, and for a tensor that it does not have.
         """

@@ -1,6 +1,6 @@
-"""Classes as words, for a network whose features lie in one space with those of texts.
+"""Classes as words, for a network whose features share one space with those of texts.
 
-CLIP (Radford et al., ICML 2021) and its kin compare pictures with texts: a word's probability at a pixel is the softmax
+CLIP (Radford et al., ICML 2021) and its kin compare images with texts: a word's probability at a pixel is the softmax
 of the cosines between the pixel's feature and the words' embeddings, over a temperature. A word must win against the
 card's background phrases too (as in LERF, Kerr et al., ICCV 2023), which together are "other": without them a room in
 which a lamp and a shelf are asked for would consist of lamps and shelves.
@@ -52,7 +52,7 @@ def with_words(card: Card, text: str) -> Card:
     known = [word.casefold() for word in words]
     twice = [word for i, word in enumerate(words) if known[i] in known[:i]]
     if twice or len(words) > MOST_WORDS:
-        problem = f"{twice[0]!r} stands there twice" if twice else f"{len(words)} words, at most {MOST_WORDS}"
+        problem = f"{twice[0]!r} is there twice" if twice else f"{len(words)} words, at most {MOST_WORDS}"
         raise InputError(f"proxy.classes: {problem}. Name every class once")
     background = tuple(phrase for phrase in card.background if phrase.casefold() not in known)
     card = replace(card, classes=(*words, *background), groups=(*words, *(OTHER for _ in background)))

@@ -210,7 +210,7 @@ def refused(card: Path, source: Path, words: str, said: str) -> None:
     [
         ("", "finds what it is asked for: --classes"),
         (" , ,", "finds what it is asked for: --classes"),
-        ("wall, floor, Wall", "'Wall' stands there twice"),
+        ("wall, floor, Wall", "'Wall' is there twice"),
         (", ".join(f"thing {i}" for i in range(MOST_WORDS + 1)), "201 words, at most 200"),
     ],
 )
