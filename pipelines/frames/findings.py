@@ -82,8 +82,8 @@ def warn_of_given(
     figures: dict[str, Any] = {"given_poses": int(given.known.sum()), "given_metric": given.is_metric}
     if structure.mapper == GIVEN_ALONE:
         context.warn(
-            f"structure from motion found nothing in the images: {structure.report.registered} keyframes stand where "
-            f"--poses ({given.what}) says, nothing of them is checked"
+            f"structure from motion found nothing in the images: {structure.report.registered} keyframes have the "
+            f"poses of --poses ({given.what}), unchecked"
         )
         return figures
     if structure.mapper.startswith(GIVEN):

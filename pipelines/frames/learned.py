@@ -21,7 +21,7 @@ from msgs_slam.pipelines.types import Features
 
 EXTRACTOR, MATCHER = "aliked-n16rot", "aliked-lightglue"
 _MULTIPLE = 32
-"""Sides of the network's input; the picture's last row and column go on to fill it."""
+"""Sides of the network's input; the image's last row and column go on to fill it."""
 _LEAST_SCORE, _LEAST_MATCH = 0.2, 0.1
 """Of a feature, and of a match."""
 _INPUTS = {EXTRACTOR: {"image", "max_keypoints", "min_score"},
@@ -38,7 +38,7 @@ class LearnedFeatures:
         self._matcher = _opened(store, store.get(model.needs))
 
     def extract(self, rgb: NDArray[np.uint8], count: int, left_out: NDArray[np.bool_] | None) -> Features:
-        """At most `count` features of an (H, W, 3) picture, none in the mask `left_out` (H, W)."""
+        """At most `count` features of an (H, W, 3) image, none in the mask `left_out` (H, W)."""
         height, width = rgb.shape[:2]
         padded = np.pad(rgb, ((0, -height % _MULTIPLE), (0, -width % _MULTIPLE), (0, 0)), "edge")
         feed = {
@@ -58,7 +58,7 @@ class LearnedFeatures:
         return Features(table[kept], whole[kept])
 
     def match(self, first: Features, second: Features, size: tuple[int, int]) -> NDArray[np.uint32]:
-        """(M, 2) indices of features of two pictures of `size` (width, height) that show the same."""
+        """(M, 2) indices of features of two images of `size` (width, height) that show the same."""
         if not (len(first) and len(second)):
             return np.zeros((0, 2), np.uint32)
         feed: dict[str, NDArray] = {}
@@ -89,7 +89,7 @@ def learned_inputs(settings: FramesConfig) -> dict[str, str]:
 def picture_features(
     rgb: NDArray[np.uint8], left_out: NDArray[np.bool_] | None, settings: FramesConfig, learned: LearnedFeatures | None
 ) -> Features:
-    """Features of an (H, W, 3) picture, of the kind that the settings ask for."""
+    """Features of an (H, W, 3) image, of the kind that the settings ask for."""
     if learned is not None:
         return learned.extract(rgb, settings.max_features, left_out)
     return extract_features(to_grey(rgb), settings.max_features, left_out)
@@ -110,7 +110,7 @@ def _opened(store: ModelStore, model: Model) -> Runtime:
     path: Path = store.path(model)
     if file_sha256(path) != model.sha256:
         raise InputError(f"{path}: is damaged; run: msgs-slam models pull {model.name}")
-    # One thread each: pairs and pictures already go side by side, and results must not depend on how many there are.
+    # One thread each: pairs and images already go side by side, and results must not depend on how many there are.
     runtime = open_runtime(path, [], 1, "cpu")
     if set(runtime.inputs) != _INPUTS[model.name]:
         raise InputError(f"{path}: its inputs are {', '.join(runtime.inputs)}; another kind of file is needed")

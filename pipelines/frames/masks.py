@@ -31,7 +31,7 @@ def mask_inputs(source: Path, config: Config) -> dict[str, str] | None:
 
 
 def check_masks(source: Path, config: Config) -> None:
-    """InputError for masks of another name or size than the pictures, and networks that are not what they should be."""
+    """InputError for masks of another name or size than the images, and networks that are not what they should be."""
     if config.frames.masks:
         open_masks(Path(config.frames.masks), open_source(source, config.run.format))
     if cards := _cards(config):
@@ -45,7 +45,7 @@ def _cards(config: Config) -> PeopleCards | None:
 class FrameMasks:
     """The user's masks of all frames, and people in those in which they were looked for, all before undistortion.
 
-    `folder` keeps what was found; `picked` names the picture of a frame.
+    `folder` keeps what was found; `picked` names the image of a frame.
     """
 
     def __init__(

@@ -59,7 +59,7 @@ def known_camera(context: StageContext, source: AnySource, faces: Faces | None) 
 
 
 def picked(context: StageContext, name: str) -> Path:
-    """The file of a picture."""
+    """The file of an image."""
     return context.snapshot / "picked" / name
 
 
