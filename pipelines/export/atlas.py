@@ -1,4 +1,4 @@
-"""A lighter mesh and a flat picture of its surface: quadric simplification, charts, and who owns which texel."""
+"""A lighter mesh and a flat image of its surface: quadric simplification, charts, and who owns which texel."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FILLED = 0.7
 
 @dataclass(frozen=True)
 class Atlas:
-    """A mesh whose corners lie in a picture too.
+    """A mesh whose corners lie in an image too.
 
     corners (K, 2) float64 texels, the first texel's centre at (0.5, 0.5), and corner_vertex (K,) the vertex of each;
     corner_faces (F, 3) are the faces in corners; width and height in texels.
@@ -59,7 +59,7 @@ def simplified(mesh: SemanticMesh, share: float = SHARE) -> SemanticMesh:
 
 
 def unwrapped(mesh: SemanticMesh, texels_per_unit: float, most: int) -> Atlas:
-    """The mesh cut into charts that lie flat beside each other, in a picture of at most that many texels a side."""
+    """The mesh cut into charts that lie flat beside each other, in an image of at most that many texels a side."""
     import xatlas
 
     area = _areas(mesh.vertices, mesh.faces).sum()

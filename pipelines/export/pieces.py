@@ -1,4 +1,4 @@
-"""Pieces: each stretch that nothing joins to the rest of a run becomes a small run inside it, RUN/piece_2 and so on.
+"""Pieces: each disconnected component of a run becomes a small run inside it, RUN/piece_2 and so on.
 
 A piece has its own frames, world and unit of length. Its first stage takes them out of the run around it, the others
 are those of any run, and so is all that reads it.
@@ -32,7 +32,7 @@ from msgs_slam.pipelines.system.progress import WithinStage
 
 def make_pieces(context: StageContext) -> list[RunFolder]:
     """Bring the pieces that tracking has found up to date, largest first, and remove those it no longer finds; a piece
-    of which no map can be made is told of."""
+    of which no map can be made is reported."""
     run, names = context.run, context.run.pieces("tracking")
     for old in run.root.glob("piece_*"):
         if old.name not in names:
@@ -55,7 +55,7 @@ def make_pieces(context: StageContext) -> list[RunFolder]:
 
 
 def _settings(config: Config) -> Config:
-    """Those of the run around it; a length that is known in one picture tells nothing of another world."""
+    """Those of the run around it; a length that is known in one image says nothing about another world."""
     height = config.proxy.scale_ref.strip().startswith("height")
     return config if height else replace(config, proxy=replace(config.proxy, scale_ref=""))
 

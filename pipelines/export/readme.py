@@ -114,8 +114,8 @@ _ENTRIES = (
 )  # fmt: skip
 
 _UPRIGHT = """\
-Axes: z is up, told by the {told_by}; {height}.
-{heading}. The formats that lay down which way is up follow their own rule: in all GLB files and in point_cloud.spz y is
+Axes: z is up, from the {told_by}; {height}.
+{heading}. The formats that define the up axis follow their own rule: in all GLB files and in point_cloud.spz y is
 up. A viewer that takes y for up shows the PLY files on their back: turn them by -90 degrees about x.
 """
 
@@ -126,7 +126,7 @@ _FIRST = """\
 Axes: the run's own, about those of the first posed camera: x right, y down, z forward{why}.
 """
 
-_FREE = "The unit of lengths is free: one camera cannot tell metres. Metric depth or --scale-ref makes them metres."
+_FREE = "The unit of lengths is free: one camera cannot measure metres. Metric depth or --scale-ref makes them metres."
 
 
 def lengths(metres: Metres | None, metric: bool) -> str:
@@ -148,7 +148,7 @@ def readme(world: World, metres: Metres | None, metric: bool, only: str | None =
         heading = "x is east and y north (GPS, see world.json)" if world.earth else _OWN_HEADING
         axes = _UPRIGHT.format(told_by=world.told_by, height=height, heading=heading)
     else:
-        axes = _FIRST.format(why=", since nothing told which way is up or nobody asked (export.axes)")
+        axes = _FIRST.format(why=", since the gravity direction is unknown or was not asked for (export.axes)")
     entries = [e.lines for e in _ENTRIES if only is None or e.kind in (only, "*")]
     about = [
         textwrap.fill(line, WIDTH, break_on_hyphens=False) for line in (axes + lengths(metres, metric)).splitlines()

@@ -101,7 +101,7 @@ def weld(parts: Sequence[Triangles], chunks: NDArray[np.int32], voxel: float) ->
 
 
 def _border(places: NDArray[np.int64], chunks: NDArray[np.int32]) -> NDArray[np.int64]:
-    """The rows of places that lie on a side of a chunk which is not among these: the others know them too."""
+    """The rows of places on a side of a chunk that is not among these: the others know them too."""
     chunk, inside = np.divmod(places, CHUNK * SIDE * _STEPS)
     rows = np.flatnonzero((inside == 0).any(1))
     chunk, is_side, own = chunk[rows], inside[rows] == 0, chunk_keys(chunks)
@@ -139,6 +139,6 @@ def _firsts(faces, count):  # type: ignore[no-untyped-def]
                 first[b] = a
             else:
                 first[a] = b
-    for v in range(count):  # none stands before its first, so that that is known
+    for v in range(count):  # none is before its first, so that that is known
         first[v] = first[first[v]]
     return first

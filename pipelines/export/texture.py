@@ -24,7 +24,7 @@ POWER = 2.0
 """A view counts with this power of its pixels a length on the surface, times how sharp it is. The mean of many views
 lies nearer to each of them than that of the best: on kitchen 24.4 dB instead of 23.5 with six views and 4."""
 _FEATHER = 0.04
-"""Weights fade over this part of the picture's width beside its rim and beside steps of the depth."""
+"""Weights fade over this part of the image's width beside its rim and beside steps of the depth."""
 _BAND = 64
 
 
@@ -194,8 +194,8 @@ def _finish(total, owner, top, corners, faces, base):  # type: ignore[no-untyped
 
 
 def _filled(total: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W, 4) colours times weights: texels without weight get the mean of those near, by ever coarser pictures
-    (pull and push), so that no viewer's filter or small picture of the texture shows a seam."""
+    """(H, W, 4) colours times weights: texels without weight get the mean of those near, by ever coarser images
+    (pull and push), so that no viewer's filter or small image of the texture shows a seam."""
     height, width = total.shape[:2]
     if min(height, width) < 2:
         return total

@@ -28,7 +28,7 @@ TEXTURE_SIDE = 4096
 def make_textured(
     outcome: Outcome, mesh: SemanticMesh, views: Sequence[PosedDepth], progress: Progress
 ) -> TexturedMesh:
-    """A tenth of the mesh's vertices, and a picture of its surface from the keyframes that `views` are of."""
+    """A tenth of the mesh's vertices, and an image of its surface from the keyframes that `views` are of."""
     shots = _shots(outcome, views)
     light = simplified(mesh)
     atlas = unwrapped(light, texels_wanted(light.vertices, light.faces, shots), TEXTURE_SIDE)
@@ -51,7 +51,7 @@ def _shots(outcome: Outcome, views: Sequence[PosedDepth]) -> Sequence[Shot]:
     frame_of = {f.id: f for f in outcome.frames}
     frames = [frame_of[int(outcome.trajectory.frame_ids[r])] for r in keyframe_rows(outcome)]
     measured = np.array([f.sharpness for f in frames])
-    # Blank walls count as blurred in themselves: neighbours, which see about the same, tell what is sharp there.
+    # Blank walls count as blurred in themselves: neighbours, which see about the same, define what is sharp there.
     usual = median_filter(measured, size=7, mode="nearest")
     sharpness = np.sqrt(np.minimum(measured / np.maximum(usual, 1e-9), 1))
     return LruSequence(

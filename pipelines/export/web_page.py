@@ -36,7 +36,7 @@ _Z_UP_FROM_IMAGE_AXES = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
 def write_web_page(outcome: Outcome, world: World, folder: Path) -> list[Path]:
-    """map.html; nothing where there are no Gaussians. `outcome` stands in `world`."""
+    """map.html; nothing where there are no Gaussians. `outcome` is in `world`."""
     cloud = map_cloud(outcome)
     if len(cloud) == 0:
         return []
@@ -96,7 +96,7 @@ def _classes(cloud: GaussianCloud, outcome: Outcome) -> dict[str, Any]:
 
 
 def _cameras(outcome: Outcome, upright: NDArray[np.float64]) -> dict[str, Any]:
-    """Some cameras in order, all their places, and the frame of a picture: sides over focal length."""
+    """Some cameras in order, all their places, and the frame of an image: sides over focal length."""
     t, k = outcome.trajectory, outcome.calibration.intrinsics
     stations = rig_of(outcome.calibration.directions, len(outcome.frames)).stations
     rows = [int(row) for row in np.flatnonzero(t.is_placed) if t.frame_ids[row] < stations]

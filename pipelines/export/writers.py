@@ -62,7 +62,7 @@ def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
 def write_start(folder: Path, points: NDArray[np.float64], colors: NDArray[np.uint8]) -> str | None:
     """The points (P, 3) that a splat begins with, as a PLY; its name in `folder`, None where there are none.
 
-    It lies where the original trainer looks for it and else writes it; others are told of it by transforms.json.
+    It is where the original trainer looks for it and else writes it; others find it in transforms.json.
     """
     if len(points) == 0:
         return None
@@ -124,7 +124,7 @@ def _in_parts(outcome: Outcome) -> LruSequence[GaussianCloud]:
 def write_spz_file(outcome: Outcome, world: World, version: int, folder: Path) -> list[Path]:
     """The map's colours in a tenth of the space of the PLY, without classes: the format has no room for them.
 
-    SPZ says which way is up, so the scene stands upright in its viewers.
+    SPZ defines the gravity direction, so the scene is upright in its viewers.
     """
     write_spz(folder / "point_cloud.spz", _turned(map_cloud(outcome), world), version)
     return [folder / "point_cloud.spz"]
@@ -165,7 +165,7 @@ def write_trajectory(outcome: Outcome, folder: Path) -> list[Path]:
     """The poses of all posed frames, of panoramas those of their middle; a comment names those that only turned."""
     t, note = outcome.trajectory, lengths(outcome.metres, outcome.metric)
     if t.by_rotation.any():
-        note += f"\nTurned only, so put where their neighbours stand: frames {stretches(t.frame_ids[t.by_rotation])}."
+        note += f"\nTurned only, so put at their neighbours' positions: frames {stretches(t.frame_ids[t.by_rotation])}."
     posed = np.flatnonzero(t.is_posed)
     posed = posed[t.frame_ids[posed] < rig_of(outcome.calibration.directions, len(outcome.frames)).stations]
     write_tum(folder / "trajectory.txt", t.timestamps[posed], t.world_from_cam[posed], note)
