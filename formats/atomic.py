@@ -21,7 +21,7 @@ _LONGEST_NAME = 255
 
 
 class Watcher(Protocol):
-    """Is told of every file that is written atomically, in whatever thread."""
+    """Observer of every file that is written atomically, in whatever thread."""
 
     def writing(self, path: Path, temporary: Path) -> None:
         """`temporary` is whole and takes the name `path` next."""
@@ -159,12 +159,12 @@ def _explained(error: OSError, path: Path) -> Exception:
 
 def is_disk_full(error: OSError, folder: Path) -> bool:
     """Whether a write below `folder` failed for want of room (or of quota, or of the largest file allowed)."""
-    # numpy's tofile reports a short write without an errno; the disk itself tells what happened.
+    # numpy's tofile reports a short write without an errno; the disk itself says what happened.
     return error.errno in _NO_ROOM or (error.errno is None and free_bytes(folder) < _NEARLY_FULL_BYTES)
 
 
 def free_bytes(folder: Path) -> int:
-    """Room on the disk that a folder lies on, or would lie on."""
+    """Free space on the disk of a folder, whether it exists or not."""
     while not folder.exists():
         folder = folder.parent
     return shutil.disk_usage(folder).free

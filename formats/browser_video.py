@@ -19,7 +19,7 @@ H264, VP9, MPEG4 = "H.264", "VP9", "MPEG-4 part 2"
 PLAYED = (H264, VP9)
 """By browsers."""
 _QUALITY = "18"
-"""x264's constant rate factor: hardly to be told from the pictures themselves."""
+"""x264's constant rate factor: hardly distinguishable from the images themselves."""
 
 
 def write_browser_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, codec: str = "") -> str:

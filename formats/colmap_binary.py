@@ -1,4 +1,4 @@
-"""Whether COLMAP's binary files are whole, told before a reader trusts the counts in them."""
+"""Check that COLMAP's binary files are complete, before a reader trusts the counts in them."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ def file_sha256(path: Path) -> str:
 
 
 def files_sha256(named: Iterable[tuple[str, Path]], head: bytes = b"") -> str:
-    """Hex SHA-256 over `head` and the names and contents of files, wherever they lie. Raises as `file_sha256`."""
+    """Hex SHA-256 over `head` and the names and contents of files, wherever they are. Raises as `file_sha256`."""
     digest = hashlib.sha256(head)
     for name, path in named:
         digest.update(f"{name}\0{file_sha256(path)}\n".encode("utf-8", "surrogateescape"))

@@ -10,12 +10,12 @@ class InputError(Exception):
 
 
 class SettingError(InputError):
-    """A setting, or an option that stands for one, cannot be what was asked for: exit code 2, as for an option that
+    """A setting, or an option that sets one, cannot be what was asked for: exit code 2, as for an option that
     does not exist."""
 
 
 class RecoverableError(InputError):
-    """The work done so far is kept, and goes on once what the message names is mended: rights, a vanished source."""
+    """The work done so far is kept, and goes on once what the message names is repaired: rights, a vanished source."""
 
 
 class DiskFullError(RecoverableError):

@@ -61,7 +61,7 @@ def write_primitive(
     picture: bytes = b"",
 ) -> None:
     """A scene of one mesh that is one `primitive` of these parts, class names in the mesh's extras; `name` of mesh and
-    node, `extras` of the document; the bytes of a `picture` lie in the buffer view after the parts. Raises ValueError
+    node, `extras` of the document; the bytes of a `picture` are in the buffer view after the parts. Raises ValueError
     where a part's blocks are not as long as it says, InputError when the disk refuses."""
     starts = np.cumsum([0, *(part.nbytes for part in parts), len(picture)]).tolist()
     views: list[dict[str, Any]] = [{"buffer": 0, "byteOffset": a, "byteLength": b - a} for a, b in pairwise(starts)]

@@ -1,4 +1,4 @@
-"""Places on the Earth: GPS of pictures and tracks, and the local east-north-up frame."""
+"""Places on the Earth: GPS of images and tracks, and the local east-north-up frame."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Track:
 
 
 def photo_places(photos: list[Path | None]) -> Array:
-    """(N, 3) latitude, longitude, altitude that the EXIF of pictures tells; NaN where it does not or cannot be read."""
+    """(N, 3) latitude, longitude, altitude from the EXIF of images; NaN where it does not or cannot be read."""
     out = np.full((len(photos), 3), np.nan)
     for i, photo in enumerate(photos):
         try:

@@ -1,4 +1,4 @@
-"""HDR video (HLG, PQ) brought to the colours of ordinary pictures: OpenCV's decoder cuts it to 8 flat bits."""
+"""HDR video (HLG, PQ) brought to the colours of ordinary images: OpenCV's decoder cuts it to 8 flat bits."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class HdrCapture:
 
 
 def tone_mapped(rgb: NDArray[np.uint16], transfer: str) -> NDArray[np.uint8]:
-    """(H, W, 3) sRGB of BT.2020 pictures with that transfer function, full range.
+    """(H, W, 3) sRGB of BT.2020 images with that transfer function, full range.
 
     Diffuse white (ITU-R BT.2408: 203 cd/m2 in PQ, 75 % in HLG, whose light is taken as the scene's) stays near white;
     above `_KNEE` the largest channel bends towards 1 and takes the others along, so that hues stay.

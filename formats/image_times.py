@@ -17,7 +17,7 @@ _LIST_NAMES = ("timestamps.txt", "times.txt", "rgb.txt")
 
 
 def read_image_times(images: list[Path]) -> NDArray[np.float64] | None:
-    """(N,) seconds at which the images were taken, strictly increasing; None where nothing tells.
+    """(N,) seconds at which the images were taken, strictly increasing; None where they are unknown.
 
     Looks for timestamps.txt, times.txt or rgb.txt in the images' folder, then in the one above: a number a line for
     each image in order, or for each frame number in the images' names; or lines of `seconds name`. Else EXIF.
@@ -70,7 +70,7 @@ def _require_increasing(times: NDArray[np.float64], path: Path) -> NDArray[np.fl
 
 
 def _from_exif(images: list[Path]) -> NDArray[np.float64] | None:
-    """None where an image tells nothing, or times do not increase: cameras that write whole seconds say no order."""
+    """None where an image states no time, or times do not increase: cameras that write whole seconds say no order."""
     stored = np.full(len(images), np.nan)
     readable = np.zeros(len(images), dtype=bool)
     for i, path in enumerate(images):

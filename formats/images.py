@@ -1,4 +1,4 @@
-"""Image files to arrays and back: colour, depth, labels, and what the camera wrote beside the picture."""
+"""Image files to arrays and back: colour, depth, labels, and what the camera wrote beside the image."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from msgs_slam.formats.reading import opened, parsing, reaching
 register_heif_opener()
 
 MAX_IMAGE_PIXELS = 120_000_000
-"""A larger picture is refused by its header, before memory is spent on it (phones go to 108 million)."""
+"""A larger image is refused by its header, before memory is spent on it (phones go to 108 million)."""
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif"})
 _FORMATS = ("JPEG", "PNG", "BMP", "DIB", "TIFF", "WEBP", "GIF", "HEIF")
@@ -40,7 +40,7 @@ _TURNS = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-"""What makes a picture upright, by EXIF's orientation."""
+"""What makes an image upright, by EXIF's orientation."""
 _UNREADABLE_SUFFIXES = frozenset({".dng", ".cr2", ".nef", ".arw", ".raw"})
 _FULL_FRAME_WIDTH_MM = 36.0
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
@@ -129,7 +129,7 @@ def read_depth_png(path: Path) -> NDArray[np.uint16]:
 
 
 def read_label_png(path: Path) -> NDArray[np.uint16]:
-    """(H, W) uint16 label ids as stored; of a palette image the indices. Raises InputError for a colour picture."""
+    """(H, W) uint16 label ids as stored; of a palette image the indices. Raises InputError for a colour image."""
     return _read_one_channel(Path(path), "labels").astype(np.uint16)
 
 
@@ -187,10 +187,10 @@ def decode_rgb(data: bytes, name: str) -> NDArray[np.uint8]:
 
 
 def exif_focal_px(path: Path, width: int, height: int) -> float | None:
-    """Focal length in pixels of an image of width x height, from EXIF; None when EXIF does not tell.
+    """Focal length in pixels of an image of width x height, from EXIF; None when EXIF states none.
 
     From the 35 mm equivalent (over the diagonal, as the makers define it for other aspect ratios than 3:2), else
-    from the focal length and the sensor's pixel pitch. The picture may have been resized since, but not cropped.
+    from the focal length and the sensor's pixel pitch. The image may have been resized since, but not cropped.
     """
     with _opened(Path(path)) as image:
         tags = dict(image.getexif().get_ifd(ExifTags.IFD.Exif))
@@ -206,12 +206,12 @@ def exif_focal_px(path: Path, width: int, height: int) -> float | None:
     sensor_width = _positive(tags.get(ExifTags.Base.ExifImageWidth)) or max(stored)
     sensor_mm = sensor_width * unit / pitch
     if not 1.0 < sensor_mm < 2 * _FULL_FRAME_WIDTH_MM:
-        return None  # some cameras fill the pitch with the picture's print resolution
+        return None  # some cameras fill the pitch with the image's print resolution
     return focal_mm / sensor_mm * max(width, height)
 
 
 def exif_time(path: Path) -> float | None:
-    """Seconds (of the camera's own clock, since 1970) when the picture was taken, from EXIF; None when untold."""
+    """Seconds (of the camera's own clock, since 1970) when the image was taken, from EXIF; None when missing."""
     with _opened(Path(path)) as image:
         tags = dict(image.getexif().get_ifd(ExifTags.IFD.Exif))
     text = tags.get(ExifTags.Base.DateTimeOriginal)
@@ -225,7 +225,7 @@ def exif_time(path: Path) -> float | None:
 
 
 def exif_gps(path: Path) -> tuple[float, float, float] | None:
-    """(latitude, longitude, altitude) in degrees and metres that EXIF tells; altitude NaN, all None where untold."""
+    """(latitude, longitude, altitude) in degrees and metres that EXIF states; altitude NaN, all None where missing."""
     with _opened(Path(path)) as image:
         tags = dict(image.getexif().get_ifd(ExifTags.IFD.GPSInfo))
     angles = []
@@ -246,7 +246,7 @@ def exif_gps(path: Path) -> tuple[float, float, float] | None:
 
 
 def _orientation(image: Image.Image) -> int:
-    """1 to 8 as EXIF defines them; 1 for whatever else stands there: text, lists, other numbers."""
+    """1 to 8 as EXIF defines them; 1 for every other value: text, lists, other numbers."""
     value = image.getexif().get(ExifTags.Base.Orientation, 1)
     return int(value) if value in _TURNS else 1
 

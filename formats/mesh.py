@@ -173,7 +173,7 @@ def read_mesh_glb(path: Path) -> MeshArrays:
 
 
 def _require_own_bytes(data: bytes) -> None:
-    """Raise ValueError unless the GLB's arrays all lie in it: a count alone would be filled with zeros."""
+    """Raise ValueError unless the GLB's arrays are all inside it: a count alone would be filled with zeros."""
     length = int.from_bytes(data[12:16], "little")
     header = json.loads(data[20 : 20 + length])
     accessors = header.get("accessors", [])

@@ -1,11 +1,11 @@
-"""Camera poses as apps on phones write them beside their pictures: Polycam, 3D Scanner App, Record3D, Stray Scanner.
+"""Camera poses as apps on phones write them beside their images: Polycam, 3D Scanner App, Record3D, Stray Scanner.
 
 All are ARKit's, in metres. What each writes, by its published layout:
 
 - Polycam, raw data: `keyframes/cameras/TIME.json` with the rows t_00 to t_23 of world-from-camera; where it has
   adjusted them, `keyframes/corrected_cameras/`.
 - 3D Scanner App, all data: `frame_00000.json` with `cameraPoseARFrame`, sixteen numbers row by row.
-- Record3D, pictures with `metadata.json` (or `metadata`): `poses`, for each picture qx, qy, qz, qw, px, py, pz.
+- Record3D, images with `metadata.json` (or `metadata`): `poses`, for each image qx, qy, qz, qw, px, py, pz.
 - Stray Scanner: `odometry.csv` with the columns timestamp, frame, x, y, z, qx, qy, qz, qw, camera axes as OpenCV's.
 """
 
@@ -29,7 +29,7 @@ _ROWS = [[f"t_{i}{j}" for j in range(4)] for i in range(3)]
 _ODOMETRY = ("frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 Found = tuple[str, list[str], Array]
-"""Of which app, the pictures' names without suffix, and world_from_cam (N, 4, 4)."""
+"""Of which app, the images' names without suffix, and world_from_cam (N, 4, 4)."""
 
 
 def phone_poses(path: Path) -> Found | None:

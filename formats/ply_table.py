@@ -119,7 +119,7 @@ def _property_lines(dtype: np.dtype) -> list[str]:
 
 
 def _packed(array: NDArray[Any]) -> NDArray[Any]:
-    """The rows as they lie in the file: little-endian, without gaps, each list after its length."""
+    """The rows as stored in the file: little-endian, without gaps, each list after its length."""
     fields: list[tuple] = []
     for name in array.dtype.names or ():
         base, shape = array.dtype[name].base.newbyteorder("<"), array.dtype[name].shape

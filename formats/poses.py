@@ -34,8 +34,8 @@ _HOW = (
 
 @dataclass(frozen=True)
 class PoseFile:
-    """N poses: world_from_cam (N, 4, 4), camera axes x right, y down, z forward; names (N) of their pictures without
-    folder and suffix, () where it tells none; times (N,) in seconds, None where it tells none; `is_metric`: whether
+    """N poses: world_from_cam (N, 4, 4), camera axes x right, y down, z forward; names (N) of their images without
+    folder and suffix, () where it has none; times (N,) in seconds, None where it has none; `is_metric`: whether
     files of its kind always are in metres."""
 
     what: str
@@ -69,7 +69,7 @@ def read_poses(path: Path) -> PoseFile:
 
 
 def stem(name: str) -> str:
-    """By which a picture is known: its file's name without folder and suffix."""
+    """By which an image is known: its file's name without folder and suffix."""
     return PurePosixPath(name.replace("\\", "/")).stem
 
 
@@ -79,7 +79,7 @@ def _from_folder(path: Path) -> PoseFile:
             return _from_colmap(folder)
     table = next((path / name for name in _TABLES if (path / name).is_file()), None)
     if table is None:
-        raise InputError(f"--poses {path}: neither a COLMAP model nor a transforms.json lies in it: {_HOW}")
+        raise InputError(f"--poses {path}: it contains neither a COLMAP model nor a transforms.json: {_HOW}")
     return _from_json(table)
 
 

@@ -33,7 +33,7 @@ def parsing(path: Path | str, what: str, advice: str = "copy or export it again"
     """Around code that takes a file's bytes apart, a library's above all: what it raises is the file's fault.
 
     Libraries report damage under every name there is (of zlib, of their own unpacking, AssertionError, MemoryError);
-    a list of them is never whole. So only that call stands in the block. InputErrors pass as they are.
+    a list of them is never whole. So only that call is in the block. InputErrors pass as they are.
     """
     try:
         yield

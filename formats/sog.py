@@ -1,4 +1,4 @@
-"""SOG, PlayCanvas's splat file for the web: pictures in which a pixel is a Gaussian, and what their bytes mean.
+"""SOG, PlayCanvas's splat file for the web: images in which a pixel is a Gaussian, and what their bytes mean.
 
 Version 2 by developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog, all files in one archive. Its axes are
 in practice those of splat PLYs (x right, y down, z forward): so its own converter writes what it reads of SPZ.
@@ -31,7 +31,7 @@ def write_sog(path: Path, cloud: GaussianCloud) -> None:
     """Write a cloud without view-dependent colour; classes are not kept.
 
     Positions are 16 bits of the logarithm between the smallest and the largest; scales and colours the nearest of 256
-    values each; opacity and the parts of a rotation 8 bits. Neighbours lie beside each other (Morton's order), which
+    values each; opacity and the parts of a rotation 8 bits. Neighbours are adjacent (Morton's order), which
     packs. The same cloud gives the same bytes. Raises ValueError for an empty cloud, InputError when the disk refuses.
     """
     if len(cloud) == 0:
@@ -65,7 +65,7 @@ def write_sog(path: Path, cloud: GaussianCloud) -> None:
 
 
 def _codebook(values: Array) -> tuple[Array, NDArray[np.uint8]]:
-    """256 values that stand for all (M, 3), and which of them stands for each: Lloyd's rounds from shares as
+    """256 values that represent all (M, 3), and which of them represents each: Lloyd's rounds from shares as
     even as steps, so that what is rare is met too."""
     flat, even = values.ravel(), np.linspace(0, 1, _LEVELS // 2)
     book = np.sort(np.append(np.quantile(flat, even), flat.min() + np.ptp(flat) * even))

@@ -1,4 +1,4 @@
-"""Whether a video or picture says of itself that it shows the whole sphere."""
+"""Metadata of panoramas: whether a video or image says that it shows the whole sphere."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import torch
 
 MAX_ARRAY_BYTES = 16 * 1024**3
-"""A foreign file of arrays as they lie in memory that is larger is refused."""
+"""A foreign file of arrays in their layout in memory that is larger is refused."""
 
 _DTYPES = {
     "float64": "F64", "float32": "F32", "float16": "F16", "int64": "I64", "int32": "I32", "int16": "I16", "int8": "I8",
@@ -91,7 +91,7 @@ def save_safetensors(path: Path, arrays: Mapping[str, NDArray], meta: Mapping[st
     """
     # The library holds all of it in memory twice before it writes, which were the peak of a mapping.
     contiguous = {name: np.asarray(array, order="C") for name, array in arrays.items()}
-    names = sorted(contiguous, key=lambda name: (-contiguous[name].itemsize, name))  # so that each lies aligned
+    names = sorted(contiguous, key=lambda name: (-contiguous[name].itemsize, name))  # so that each is aligned
     header: dict[str, Any] = {"__metadata__": dict(sorted(meta.items()))} if meta else {}
     end = 0
     for name in names:

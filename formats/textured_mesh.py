@@ -45,7 +45,7 @@ class TexturedMesh:
 
 
 def write_textured_obj(path: Path, mesh: TexturedMesh, class_names: tuple[str, ...] = ()) -> list[Path]:
-    """The OBJ, its material and its picture beside it, of the same stem; a group a class (of each face's first
+    """The OBJ, its material and its image beside it, of the same stem; a group a class (of each face's first
     vertex). The same mesh gives the same bytes. Raises InputError when the disk refuses.
     """
     path = Path(path)

@@ -18,7 +18,7 @@ _ROTATION_TOLERANCE = 0.05
 _LARGEST_ENTRY = 2.0
 
 FARTHEST = 1e9
-"""No camera stands farther from the origin, whatever the unit: beyond, float32 and the squares of lengths break."""
+"""No camera is farther from the origin, whatever the unit: beyond, float32 and the squares of lengths break."""
 
 
 def nearest_rotation(matrices: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -30,7 +30,7 @@ MAX_FRAME_PIXELS = 64_000_000
 """A larger frame is taken for a damaged or hostile header (8K video has 33 million)."""
 
 # The containers of one video each. Left out is what names other files (playlists, scripts, numbered images) or is made
-# into pictures by FFmpeg (text): such a file would show what lies elsewhere on this disk, whatever it is called.
+# into images by FFmpeg (text): such a file would show files from elsewhere on this disk, whatever it is called.
 _CONTAINERS = (
     "mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "mpegts", "mpeg", "mpegvideo", "m4v", "flv", "live_flv", "asf",
     "asf_o", "ogg", "gif", "apng", "h264", "hevc", "av1", "obu", "ivf", "vvc", "vc1", "dv", "mxf", "nut", "wtv", "rm",
@@ -67,9 +67,9 @@ class VideoFrame(NamedTuple):
 
 
 def probe_video(path: Path) -> VideoInfo:
-    """Open a video, decode its first frame and tell what it is.
+    """Open a video, decode its first frame and describe it.
 
-    Raises InputError for a missing, empty or text file, and for one in which no picture can be decoded.
+    Raises InputError for a missing, empty or text file, and for one in which no image can be decoded.
     """
     with VideoReader(path) as reader:
         if next(reader, None) is None:

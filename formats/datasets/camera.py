@@ -11,7 +11,7 @@ from msgs_slam.formats.errors import InputError
 
 _LARGEST_SIDE = 65535
 _FOCAL_SIDES = 100
-"""Focal lengths beyond this many sides of the picture, or below its inverse, are slips of the unit or damage."""
+"""Focal lengths beyond this many sides of the image, or below its inverse, are slips of the unit or damage."""
 _STRONGEST_DISTORTION = 1000.0
 _SAME_SHAPE = 0.01
 
@@ -51,7 +51,7 @@ class Camera:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether an ideal pinhole camera would see another picture."""
+        """Whether an ideal pinhole camera would see another image."""
         return any(self.distortion)
 
     @classmethod

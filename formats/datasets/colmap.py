@@ -20,7 +20,7 @@ _LEVELS_UP = 3
 
 
 def recognises(path: Path) -> bool:
-    """A folder in which a complete model lies, as text or binary, with its images in reach."""
+    """A folder with a complete model, as text or binary, with its images in reach."""
     return _find_model(path) is not None
 
 
@@ -70,7 +70,7 @@ def _find_model(path: Path) -> Path | None:
 
 
 def _find_images(path: Path, model_folder: Path, model: ColmapModel) -> Path:
-    """The folder under which most of the model's images lie."""
+    """The folder that holds most of the model's images."""
     above = [path, *model_folder.resolve().parents[:_LEVELS_UP]]
     places = [base / name for base in above for name in _IMAGE_FOLDERS if (base / name).is_dir()]
     counts = [sum(inside(place, name, model_folder).is_file() for name in model.names) for place in places]

@@ -1,4 +1,4 @@
-"""Plain folders: images, with whatever lies beside them under the usual names."""
+"""Plain folders: images, with companion files under the usual names."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def recognises(path: Path) -> bool:
 def open_folder(path: Path) -> Sequence:
     """A plain folder: only the images must be there.
 
-    Beside or above them may lie depth/ (16 bit PNG, millimetres unless depth_scale in the intrinsics says otherwise),
+    Beside or above them may be depth/ (16 bit PNG, millimetres unless depth_scale in the intrinsics says otherwise),
     labels/ (8 or 16 bit PNG of class ids) with classes.json, intrinsics.json (fx, fy, cx, cy, width, height,
     distortion, depth_scale, pixel_centre), timestamps.txt, and traj.txt: world-from-camera, a 4x4 matrix or a TUM line
     for each image or each frame number. Raises InputError where one of them contradicts the images.

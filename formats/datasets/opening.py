@@ -44,7 +44,7 @@ _READERS = {
 }
 
 _IMAGE_FOLDERS = frozenset({"rgb", "images", "color", "results"})
-# An earlier reconstruction that lies beside images is no part of their recording.
+# An earlier reconstruction beside images is no part of their recording.
 _NOT_FROM_INSIDE = frozenset({"folder", "colmap"})
 
 FORMATS = ("auto", *_READERS)
@@ -52,7 +52,7 @@ FORMATS = ("auto", *_READERS)
 
 
 def recognise(path: Path) -> str | None:
-    """The format of a data set by what lies in it, "folder" for plain images, None for anything else."""
+    """The format of a data set by its files, "folder" for plain images, None for anything else."""
     with reaching(path):
         found = _recognise(Path(path))
     return found[0] if found else None
@@ -62,7 +62,7 @@ def recognise_source(path: Path) -> str | None:
     """The format of a recording to reconstruct; None for a video, and for a folder that holds images directly.
 
     Other than `recognise`, it takes what a user points at literally: a folder of images is no data set because of what
-    lies above it, nor because somebody has left a COLMAP model in it.
+    is above it, nor because somebody has left a COLMAP model in it.
     """
     path = Path(path)
     with reaching(path):
@@ -83,7 +83,7 @@ def _recognise(path: Path) -> tuple[str, Path] | None:
 
 
 def open_sequence(path: Path, format: str = "auto") -> Sequence:
-    """Open a recorded sequence of a known data set, or a folder of images with what lies beside them.
+    """Open a recorded sequence of a known data set, or a folder of images with its companion files.
 
     Images are not read yet, text files are. Raises InputError for an unknown format, a missing path, a path that is
     no such data set, or parts that contradict each other.

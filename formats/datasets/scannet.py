@@ -28,7 +28,7 @@ def recognises(path: Path) -> bool:
 def open_scannet(path: Path) -> Sequence:
     """An exported ScanNet scene: metric poses, of which lost frames have none, depth of its own camera.
 
-    Labels are joined to the NYU40 classes where scannetv2-labels.combined.tsv lies in the folder or above it, else
+    Labels are joined to the NYU40 classes where scannetv2-labels.combined.tsv is in the folder or above it, else
     each raw id is a class of its own. Raises InputError where a part cannot be read.
     """
     images = list_images(path / "color")
@@ -67,7 +67,7 @@ def _camera(path: Path, image: Path | None, recorded_size: tuple[int, int]) -> C
 def scaled_camera(k: NDArray[np.float64], recorded: tuple[int, int], actual: tuple[int, int]) -> Camera:
     """The camera with calibration matrix k (first pixel at (0, 0)) for images of the actual size.
 
-    Images are often passed on smaller than recorded, with the calibration as it was: then the principal point lies
+    Images are often passed on smaller than recorded, with the calibration as it was: then the principal point is
     far from the middle, and the matrix is taken to be that of the recorded size.
     """
     fits = abs(k[0, 2] / actual[0] - 0.5) < 0.15 and abs(k[1, 2] / actual[1] - 0.5) < 0.15

@@ -45,7 +45,7 @@ class _Header:
 
 @dataclass(frozen=True)
 class SensFrames:
-    """Frames of a .sens file: where in the file each one's colour and depth lie (N,) and their lengths."""
+    """Frames of a .sens file: offsets in the file of each one's colour and depth (N,), and their lengths."""
 
     path: Path
     depth_kind: int

@@ -33,7 +33,7 @@ class LabelClass:
 
 
 class FrameStore(Protocol):
-    """Frames that lie in one container file instead of a folder."""
+    """Frames stored in one container file instead of a folder."""
 
     def rgb(self, index: int) -> NDArray[np.uint8]:
         """(H, W, 3) uint8."""
@@ -47,7 +47,7 @@ class Sequence:
     """N frames of one camera.
 
     names: N file names, unique. timestamps (N,) seconds, strictly increasing; `timed` says whether they were measured
-    (or counted at the sensor's known rate), else they only tell the order. image_paths: N paths, or none where
+    (or counted at the sensor's known rate), else they only give the order. image_paths: N paths, or none where
     `store` holds the frames. camera: None where unknown. world_from_cam (N, 4, 4) float64 with exact rotations,
     camera axes x right, y down, z forward; NaN for a frame without a pose; None without any. `metric` says whether
     its lengths are metres. depth_paths, label_paths: N paths, None for a frame without; empty without any.
@@ -128,7 +128,7 @@ class Sequence:
         """(h, w) float32 z-depth in metres with the field of view of the colour image, 0 = unknown; None without.
 
         Depth of another camera is moved to the colour camera's pixels; the few centimetres between the two lenses
-        are left out, as these data sets do not tell them.
+        are left out, as these data sets do not state them.
         """
         raw = self._raw_depth(index)
         if raw is None:

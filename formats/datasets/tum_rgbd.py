@@ -89,6 +89,6 @@ def _camera(path: Path, image: Path) -> tuple[Camera | None, tuple[str, ...]]:
     fx, fy, cx, cy, distortion = _FREIBURG[found[1]] if found else _DEFAULT
     if abs(width / height - 640 / 480) > 0.02:
         return None, ("the images have not the shape of a Kinect's: the camera is taken to be unknown",)
-    notes = () if found else ("the folder's name tells no freiburg camera: a focal length near 525 is expected",)
+    notes = () if found else ("the folder's name states no freiburg camera: a focal length near 525 is expected",)
     camera = Camera.from_integer_centres(640, 480, fx, fy, cx, cy, distortion).resized(width, height)
     return replace(camera, is_nominal=not found), notes
