@@ -83,7 +83,7 @@ class RunFolder(FinishedFiles):
         return load_sparse_model(self.file("frames", BACKBONE)) if self.has("frames", BACKBONE) else None
 
     def image_file(self, frame: Frame) -> Path:
-        """The picture of a frame, undistorted."""
+        """The image of a frame, undistorted."""
         return self.file("frames", frame.name)
 
     def load_features(self, frame_id: int) -> Features | None:
@@ -144,7 +144,7 @@ class RunFolder(FinishedFiles):
         return self.load_proxy(frame_id) if self.has_proxy(frame_id) else None
 
     def load_descriptors(self) -> dict[int, NDArray[np.float32]]:
-        """Frame id → (F,) unit vector by which a network tells how the frame looks; {} where none did."""
+        """Frame id → (F,) global descriptor of a network, a unit vector; {} where none gave one."""
         if not self.has("proxy", DESCRIPTORS):
             return {}
         arrays = load_layout(self.file("proxy", DESCRIPTORS), layouts.DESCRIPTORS)
@@ -153,7 +153,7 @@ class RunFolder(FinishedFiles):
     # tracking, mapping, global_ba -------------------------------------------------------------------------------
 
     def pieces(self, stage: str) -> list[str]:
-        """Folders inside `stage` ("frames", "tracking") of the pieces that nothing joins to the rest, largest first."""
+        """Folders inside `stage` ("frames", "tracking") of the disconnected components, largest first."""
         return list(takewhile(lambda piece: self.has(stage, f"{piece}/{SPARSE}"), (f"piece_{n}" for n in count(2))))
 
     def load_trajectory(self, stage: str, piece: str = "") -> Trajectory:
@@ -330,7 +330,7 @@ def save_depth_fields(folder: Path, fields: DepthFields) -> None:
 def save_exposure(
     folder: Path, frame_ids: NDArray[np.int64], log_gains: NDArray[np.float32], offsets: NDArray[np.float32]
 ) -> None:
-    """picture = colours of the map * exp(log gain) + offset, a keyframe and channel."""
+    """image = colours of the map * exp(log gain) + offset, a keyframe and channel."""
     save_arrays(folder / EXPOSURE, {"frame_ids": frame_ids, "log_gains": log_gains, "offsets": offsets})
 
 

@@ -26,7 +26,7 @@ class RunBusyError(InputError):
 
 @contextmanager
 def locked(run: RunFolder) -> Iterator[None]:
-    """Hold the run's lock; the system lets go of it when the process ends, however it ends. On a disk without locks a
+    """Hold the run's lock, which the OS releases when the process ends, however it ends. On a disk without locks a
     file that only one process can make does the same (`lock_file`).
 
     The folder is made where it is missing, and removed again when the block ends with an error before the work began,

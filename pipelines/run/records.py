@@ -128,7 +128,7 @@ def load_source(run: RunFolder) -> Source:
     """Load the source of a run. Raises InputError for a folder that is not a run."""
     source = read_manifest(run.manifest_file).source
     inside = run.root / SOURCE_LIST
-    # The list of several videos lies in the run, wherever that has been moved to.
+    # The list of several videos is in the run, wherever that has been moved to.
     return replace(source, path=str(inside)) if Path(source.path).name == SOURCE_LIST and inside.is_file() else source
 
 

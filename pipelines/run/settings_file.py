@@ -64,7 +64,7 @@ def _check(run: RunFolder, text: str) -> str:
 
 
 def _known(values: dict[str, Any], run: RunFolder) -> Config:
-    """Settings of an earlier version that are no more, or whose value is none any longer, are told of and left out."""
+    """Settings of an earlier version that are no more, or whose value is none any longer, are reported and left out."""
     config, dropped = merge_known_settings(Config(), values)
     if dropped:
         log.warning(
