@@ -1,6 +1,6 @@
-"""Pictures of 360° and fisheye cameras, brought to what a pinhole camera sees before anything else looks at them.
+"""Images of 360° and fisheye cameras, brought to what a pinhole camera sees before anything else looks at them.
 
-A panorama becomes six pictures, the sides of a cube; a fisheye of known lens one, of the width that fits.
+A panorama becomes six images, the sides of a cube; a fisheye of known lens one, of the width that fits.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Faces:
     def _remapped(self, small: NDArray[Any], camera: int, how: int) -> NDArray[np.uint8]:
         border = cv2.BORDER_REPLICATE
         if self.fisheye is None:
-            # Over a pole the picture goes on half-way round.
+            # Over a pole the image goes on half-way round.
             half = small.shape[1] // 2
             ends = (np.roll(rows, half, axis=1) for rows in (small[_ROWS - 1 :: -1], small[: -_ROWS - 1 : -1]))
             small, border = np.concatenate([next(ends), small, next(ends)]), cv2.BORDER_WRAP
@@ -72,7 +72,7 @@ class Faces:
 
 
 def find_faces(source: VideoSource | FolderSource | RecordingSource, config: FramesConfig) -> Faces | None:
-    """None for pictures that are a plain camera's already.
+    """None for images that are a plain camera's already.
 
     Raises InputError for a panorama that is not whole, and a fisheye whose lens is not known where `frames.camera` says
     that it is one.
@@ -95,7 +95,7 @@ def find_faces(source: VideoSource | FolderSource | RecordingSource, config: Fra
 
 
 def looks_like_panoramas(source: VideoSource | FolderSource | RecordingSource, config: FramesConfig) -> bool:
-    """Whether the pictures have the shape of panoramas, and nothing says what they are."""
+    """Whether the images have the shape of panoramas, and nothing says what they are."""
     unsaid = config.camera == "auto" and not config.intrinsics and not isinstance(source, RecordingSource)
     return unsaid and source.width == 2 * source.height
 
@@ -137,14 +137,14 @@ def panorama_faces(width: int, height: int, max_side: int) -> Faces:
 
 
 def _on_panorama(rays: NDArray[np.float64], width: int, height: int) -> Map:
-    """Where directions (H, W, 3) in the rig lie; OpenCV's first pixel has its centre at (0, 0)."""
+    """Pixels of directions (H, W, 3) in the rig; OpenCV's first pixel has its centre at (0, 0)."""
     x, y, z = np.moveaxis(rays / np.linalg.norm(rays, axis=-1, keepdims=True), -1, 0)
     across, down = np.arctan2(x, z) / (2 * np.pi) + 0.5, np.arcsin(y) / np.pi + 0.5
     return (across * width - 0.5).astype(np.float32), (down * height - 0.5 + _ROWS).astype(np.float32)
 
 
 def fisheye_face(camera: Camera, max_side: int) -> Faces:
-    """The middle of a fisheye picture as a pinhole of the same focal length sees it."""
+    """The middle of a fisheye image as a pinhole of the same focal length sees it."""
     size = reduced_size(camera.width, camera.height, max_side)
     small = camera.resized(*size)
     lens = make_lens(to_pycolmap(small))
@@ -152,6 +152,6 @@ def fisheye_face(camera: Camera, max_side: int) -> Faces:
 
 
 def level_mosaic(faces: list[NDArray[Pixel]]) -> NDArray[Pixel]:
-    """The pictures (H, W) of the level directions as one of twice the side, by which panoramas are compared."""
+    """The images (H, W) of the level directions as one of twice the side, by which panoramas are compared."""
     front, right, back, left = faces[:LEVEL]
     return np.vstack([np.hstack([front, right]), np.hstack([back, left])])

@@ -22,14 +22,14 @@ from msgs_slam.pipelines.types import Frame
 
 AnySource = VideoSource | FolderSource | RecordingSource
 LEAST = 3
-"""Poses that belong to a picture, below which a file is taken for one of another recording."""
+"""Poses that belong to an image, below which a file is taken for one of another recording."""
 
 
 def given_poses(config: FramesConfig, source: AnySource, frames: Sequence[Frame]) -> GivenPoses | None:
     """The poses of `frames.poses` frame by frame; None where none are given.
 
-    A picture's pose is known by the picture's name; of a file of times by the nearest within 20 ms; of one that tells
-    neither, or times of pictures without, by the order, where there are as many as pictures. Raises InputError where
+    An image's pose is known by its name; of a file of times by the nearest within 20 ms; of one that states
+    neither, or times of images without, by the order, where there are as many as images. Raises InputError where
     fewer than three belong to a frame.
     """
     if not config.poses:
@@ -58,7 +58,7 @@ def load_given(run: RunFolder) -> GivenPoses | None:
 
 
 def check_poses(config: FramesConfig, source: AnySource) -> None:
-    """Raise InputError for poses that cannot belong to the source, as far as its names and their number tell."""
+    """Raise InputError for poses that cannot belong to the source, as far as its names and their number show."""
     if not config.poses:
         return
     file = read_poses(Path(config.poses))

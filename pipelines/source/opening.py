@@ -29,7 +29,7 @@ _PAUSE = 10.0
 
 
 class Source(Protocol):
-    """Pictures in the order of time, all of one size.
+    """Images in the order of time, all of one size.
 
     `expected_frames` is an estimate before reading, 0 = unknown; `has_times` says whether the timestamps are real.
     """
@@ -44,11 +44,11 @@ class Source(Protocol):
         ...
 
     def name(self, frame_id: int, index: int) -> str:
-        """File name of picked frame `frame_id`, which is picture `index` of the source."""
+        """File name of picked frame `frame_id`, which is image `index` of the source."""
         ...
 
     def original(self, index: int) -> Path | None:
-        """The file of picture `index` when it can serve as a frame as it is, else None."""
+        """The file of image `index` when it can serve as a frame as it is, else None."""
         ...
 
     def exif_focal(self) -> float | None:
@@ -75,7 +75,7 @@ class VideoSource:
         self.expected_frames = sum(i.frame_count_claimed for i in found.values())
 
     def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
-        """See `Source.read`; a truncated or damaged file is told to `warn` at the end."""
+        """See `Source.read`; a truncated or damaged file is reported to `warn` at the end."""
         first, start = 0, 0.0
         for file in self.files:
             with VideoReader(file, None if wanted is None else lambda i, n=first: n + i in wanted) as reader:  # type: ignore[misc]
@@ -149,7 +149,7 @@ class FolderSource:
         return sizes
 
     def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
-        """See `Source.read`; images that cannot be read are left out and told to `warn`."""
+        """See `Source.read`; images that cannot be read are left out and reported to `warn`."""
         for index, path in enumerate(self._images):
             if wanted is not None and index not in wanted:
                 continue
@@ -218,9 +218,9 @@ def require_source(path: Path) -> None:
 
 
 def source_digest(source: Path, format: str) -> str:
-    """Identity of a source: a video's bytes; names and bytes of the pictures of a folder or data set, and their times.
+    """Identity of a source: a video's bytes; names and bytes of the images of a folder or data set, and their times.
 
-    What else lies in the folder does not count. Raises InputError where there is nothing to read.
+    Other files in the folder do not count. Raises InputError where there is nothing to read.
     """
     require_source(source)
     recording = open_recording(source, format)

@@ -1,4 +1,4 @@
-"""Which pictures of the source become frames."""
+"""Which images of the source become frames."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def sharpest_of_windows(
     rate: float,
     measure: Callable[[NDArray[np.uint8]], float] = sharpness,
 ) -> Iterator[tuple[VideoFrame, float]]:
-    """The sharpest picture of every 1/rate seconds, with its sharpness; rate 0 keeps all.
+    """The sharpest image of every 1/rate seconds, with its sharpness; rate 0 keeps all.
 
-    One pass that holds one picture. Windows lie on the source's clock from its first picture, so a variable frame
+    One pass that holds one image. Windows lie on the source's clock from its first image, so a variable frame
     rate gives an even rate of frames.
     """
     best: tuple[VideoFrame, float] | None = None

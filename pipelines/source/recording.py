@@ -47,7 +47,7 @@ class RecordingSource:
             self.height, self.width = s.rgb(0).shape[:2]
 
     def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
-        """See `Source.read`; what the reader notes of the data set, and images that cannot be read, are told."""
+        """See `Source.read`; what the reader notes of the data set, and images that cannot be read, are reported."""
         if warn is not None:
             for note in self.sequence.notes:
                 warn(f"{self.sequence.format}: {note}")

@@ -25,15 +25,15 @@ class FramePixels:
         self._xy = camera.img_from_cam(rays).reshape(k.height, k.width, 2)
 
     def sample(self, image: NDArray) -> NDArray:
-        """(H, W) the nearest pixels of `image` (h, w), which covers the source's whole picture."""
+        """(H, W) the nearest pixels of `image` (h, w), which covers the source's whole image."""
         scale = (image.shape[1] / self._size[0], image.shape[0] / self._size[1])
-        # A hair to the right: at an even reduction the centre lies exactly between two pixels, but for rounding.
+        # A hair to the right: at an even reduction the centre is exactly between two pixels, but for rounding.
         column, row = (np.floor(self._xy[..., i] * scale[i] + 1e-6).astype(np.int64) for i in (0, 1))
         return image[row.clip(0, image.shape[0] - 1), column.clip(0, image.shape[1] - 1)]
 
 
 def _distorted_camera(calibration: Calibration) -> Camera:
-    """The lens before undistortion, which may have enlarged the picture to fill the frame."""
+    """The lens before undistortion, which may have enlarged the image to fill the frame."""
     k, zoom = calibration.intrinsics, 1.0
     for _ in range(6):
         camera = Camera(
