@@ -25,7 +25,7 @@ def adjust(model: pycolmap.Reconstruction, refine_camera: bool, narrowly: bool =
     those that are a pixel off must not have a say.
 
     A camera to be calibrated gets a second radial coefficient here: one is enough to find the structure, and too few
-    to tell the focal length of a real lens.
+    to determine the focal length of a real lens.
 
     Returns the standard deviation of the focal length in pixels, 0 for a camera that is not refined. Three things add
     up in it: the noise of the observations, how far the focal length moves when the lens has one coefficient less,

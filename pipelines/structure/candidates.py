@@ -1,6 +1,6 @@
 """Models of matched keyframes that could be the structure, and which of them is.
 
-A mapper's model is judged by all matches; where it is doubtful the next one is asked, and where neighbouring pictures
+A mapper's model is judged by all matches; where it is doubtful the next one is asked, and where neighbouring images
 contradict it, it is made again from what these share.
 """
 
@@ -94,7 +94,7 @@ class Candidates:
     cam_from_rig: NDArray[np.float64] = field(default_factory=lambda: ONE_CAMERA.cam_from_rig)
 
     def _calibrated(self, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
-        """The best model; of a stated camera the model of one that is found anew, where that explains the pictures
+        """The best model; of a stated camera the model of one that is found anew, where that explains the images
         much better, or where the stated one gives none."""
         held = self._self_calibrated(views, pairs)
         if not self.is_stated:
@@ -125,7 +125,7 @@ class Candidates:
         """The best model; of two where the first is not sure of its camera."""
         found = self._adjusted(views, pairs, ("global", "incremental", GIVEN))
         if found is not None and found.focal_sd > _UNSURE_FOCAL * found.model.cameras[1].mean_focal_length():
-            # A lens that is bent before the poses stand can run away with the focal length.
+            # A lens that is bent before the poses are stable can run away with the focal length.
             again = self._adjusted(views, pairs, (LENS_HELD,))
             if again is not None and again.focal_sd < found.focal_sd and again.score >= _AS_GOOD * found.score:
                 return again
@@ -170,7 +170,7 @@ class Candidates:
 
     def _unfolded(self, views: Views, pairs: Sequence[VerifiedPair]) -> _Tried | None:
         """The model of a path that things which repeat have folded: made of what neighbours share, for little repeats
-        within so few pictures, its loops closed by the other pairs that lie nearly right with that."""
+        within so few images, its loops closed by the other pairs that nearly agree with that."""
         total, reach = self._places(views.xy), self.config.overlap
         near = [p for p in pairs if abs(p.first % total - p.second % total) <= reach]
         straight = self._tried(NEIGHBOURS, views, near, pairs)
@@ -181,7 +181,7 @@ class Candidates:
         return closed if grown is closed else self._closed(grown, views, pairs)
 
     def _closed(self, found: _Tried, views: Views, pairs: Sequence[VerifiedPair]) -> _Tried:
-        """The model with those points made one that are one by matched pairs which lie nearly right, and all adjusted
+        """The model with those points made one that are one by matched pairs which nearly agree, and all adjusted
         by a wide loss and a narrow one, again and again as long as that makes it better."""
         while True:
             model = pycolmap.Reconstruction(found[0])
@@ -222,7 +222,7 @@ class Candidates:
         return None if model is None else self._judged(name, model, views, every)
 
     def _judged(self, name: str, model: pycolmap.Reconstruction, views: Views, every: Sequence[VerifiedPair]) -> _Tried:
-        """The model without what its neighbours contradict, mended, and how good it is."""
+        """The model without what its neighbours contradict, repaired, and how good it is."""
         seen = every, views.xy, self._places(views.xy), self.config.overlap
         model = without_misplaced(model, *seen)
         report = judge(model, *seen)

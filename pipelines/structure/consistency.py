@@ -31,7 +31,7 @@ _MOST_MISPLACED = 0.2
 class ModelReport:
     """registered of total keyframes; median reprojection error in pixels; points.
 
-    `agreement`: share of the verified matches between registered keyframes that lie within 4 px of the epipolar line
+    `agreement`: share of the verified matches between registered keyframes that are within 4 px of the epipolar line
     of the final poses; `pairs_agreeing`: share of the pairs of which more than half of the matches do. A folded
     trajectory leaves whole pairs that disagree, however small its reprojection error is. `seams` and `parts`: see
     `find_seams` and `find_parts`; they see one bad place among many good ones.
@@ -65,7 +65,7 @@ class ModelReport:
 
     @property
     def is_consistent(self) -> bool:
-        """Whether what is placed agrees with the pictures."""
+        """Whether what is placed agrees with the images."""
         return self.pairs_agreeing >= 0.9 and not self.contradicted
 
 
@@ -78,7 +78,7 @@ def judge(
 ) -> ModelReport:
     """Report on a model; `pairs` are indices i of keyframes whose image id is i + 1, `xy` their features' pixels.
 
-    total: places where the camera stood; keyframes i, i + total and so on are views from one place in several
+    total: number of stations; keyframes i, i + total and so on are views from one place in several
     directions, and the report is about places. `reach`: places at most so many apart are neighbours.
     """
     checks = check_pairs(model, pairs, xy, total)

@@ -1,7 +1,7 @@
-"""A stated camera that the pictures contradict.
+"""A stated camera that the images contradict.
 
 What a data set's file says of its camera may be true of the kind of camera only, or of another one. Such numbers are a
-start: they are held as long as freeing them explains the pictures hardly better.
+start: they are held as long as freeing them explains the images hardly better.
 """
 
 from __future__ import annotations

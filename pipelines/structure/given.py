@@ -74,7 +74,7 @@ def agreement(found: Array, given: Array) -> Agreement | None:
     if len(found) < 3:
         return None
     ours, theirs = se3.inverse(found), se3.inverse(given)
-    # Begun without what is far from everything: a pose in another town would turn the first fit round.
+    # Started without far outliers: a pose in another town would turn the first fit round.
     apart = np.linalg.norm(theirs[:, :3, 3] - np.median(theirs[:, :3, 3], axis=0), axis=1)
     weight = 1 / (1 + (apart / max(3 * float(np.median(apart)), _LEAST_SD)) ** 2)
     for _ in range(_ROUNDS):
@@ -111,7 +111,7 @@ def posed_model(
     refine_camera: bool,
     seed: int,
 ) -> pycolmap.Reconstruction | None:
-    """Points of the verified matches (of pictures with pixels xy), triangulated with given poses (K, 4, 4) and adjusted
+    """Points of the verified matches (of images with pixels xy), triangulated with given poses (K, 4, 4) and adjusted
     together with them, in rounds that ask for more and more; None where the poses make none."""
     model = bare_model(camera, xy, cam_from_world)
     images = sorted(model.reg_image_ids())
@@ -131,7 +131,7 @@ def posed_model(
 
 
 def bare_model(camera: pycolmap.Camera, xy: Sequence[Array], cam_from_world: Array) -> pycolmap.Reconstruction:
-    """Pictures i + 1 with pixels xy[i] at their poses, those of NaN left out, and no points."""
+    """Images i + 1 with pixels xy[i] at their poses, those of NaN left out, and no points."""
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera)
     for i, (pixels, pose) in enumerate(zip(xy, cam_from_world, strict=True)):

@@ -15,7 +15,7 @@ from msgs_slam.pipelines.types import Intrinsics
 
 _BORDER_POINTS = 65
 FOCAL_GUESS = 1.2
-"""Longer sides of a picture that a focal length is where nothing tells it."""
+"""Focal length in longer sides of the image where it is unknown."""
 
 
 def to_pycolmap(camera: Camera) -> pycolmap.Camera:
@@ -71,7 +71,7 @@ class Lens:
     """A distorted camera and the pinhole of the same image size that takes its place.
 
     The pinhole keeps the principal point, and the focal length too unless the frame's border would then look past the
-    source's: it is enlarged just enough that every pixel of the undistorted frame has a picture (what falls outside is
+    source's: it is enlarged just enough that every pixel of the undistorted frame has an image (what falls outside is
     cropped). `shift_px` is the largest distance by which a pixel moves.
     """
 

@@ -11,7 +11,7 @@ import pycolmap
 _ANY_DISTORTION = 1e9
 """COLMAP takes a camera with a coefficient above 1 for one that ran away, and places no view of it. One that is held
 cannot run away, and real ones have such: the third radial one of a Kinect is 1.16."""
-# pycolmap tells of each step on stderr, through the progress bars; what fails is told by whoever called it.
+# pycolmap reports each step on stderr, through the progress bars; failures are reported by the caller.
 pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
 # Its import makes a process that is asked to end print a stack trace first: back to what there was before.
 if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is not None:

@@ -24,7 +24,7 @@ _FINE_FACTORS = np.geomspace(0.85, 1.18, 9)
 
 
 def require_motion(largest_displacement: float) -> None:
-    """Raise InputError for a camera that stands still; displacement as a fraction of the image width."""
+    """Raise InputError for a camera that does not move; displacement as a fraction of the image width."""
     if largest_displacement < _MOVING_FRACTION:
         raise InputError(
             f"there is no parallax: over the whole source the image moves by at most {largest_displacement:.2%} of "

@@ -1,7 +1,7 @@
 """Rolling shutter: a sensor reads its rows one after the other, and the camera moves on meanwhile.
 
-A frame's pose is that of its middle row. What is seen `late` seconds after it lies, to first order, `late` times its
-velocity in the picture farther on; the camera's velocity comes from the poses of the frames beside it (as in Hedborg
+A frame's pose is that of its middle row. What is seen `late` seconds after it appears, to first order, `late` times its
+velocity in the image farther on; the camera's velocity comes from the poses of the frames beside it (as in Hedborg
 et al., Rolling Shutter Bundle Adjustment, CVPR 2012, whose poses between frames are interpolated). Pixels from which
 that displacement is taken away are adjusted as if they had been seen at once. How long the readout takes is one number
 of the camera, found in closed form beside all poses and points.
@@ -32,7 +32,7 @@ read row by row; of a video that was filmed upright and turned these are columns
 NO_READOUT = (0.0, 0.0)
 
 LONGEST_STEP = 1.0
-"""Seconds: frames farther apart tell nothing of how fast the camera moved at either."""
+"""Seconds: frames farther apart say nothing about the camera's velocity at either."""
 LEAST_GAIN = 0.01
 """Share of the robust cost that a readout must explain. Of three cameras that take all rows at once it was less than
 0.00002, of a phone that holds still 0.001; of a Kinect 0.03 at first and 0.054 in the end."""

@@ -1,8 +1,8 @@
-"""A path that has lost its size, mended by what the matches say.
+"""Repair of scale breaks in a path by its matches.
 
 Two structures that share one keyframe may be of any size beside each other. A mapper that has given one of them a wrong
 size throws away what contradicts it, the features matched on both sides, though their depths in the shared keyframe,
-once from the cameras before and once from those behind it, tell how large one side is against the other.
+once from the cameras before and once from those behind it, give the scale of one side against the other.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from msgs_slam.pipelines.structure.seams import LEAST_POINTS, tracks_of
 from msgs_slam.pipelines.structure.tracks import complete_tracks
 
 _LEAST_ANGLE = 0.01
-"""Radians between the rays of two cameras below which they tell no depth."""
+"""Radians between the rays of two cameras below which they give no depth."""
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ def mended(
     model: pycolmap.Reconstruction, report: ModelReport, pairs: Sequence[VerifiedPair], xy: Sequence[Array],
     total: int, reach: int, seed: int,
 ) -> tuple[pycolmap.Reconstruction, ModelReport]:  # fmt: skip
-    """The model with the two sides of its loose seams in one size, where enough matched features tell it and the result
+    """The model with both sides of its weak links at one scale, where enough matched features give it and the result
     falls into fewer parts without agreeing less; else as it is. Arguments as of `judge`, image i + 1 is keyframe i."""
     for seam in [s for s in report.seams if s.is_weak_link]:
         owner = {k: n for n, part in enumerate(report.parts) for k in part}
@@ -105,8 +105,8 @@ def _depths(second_from_first: Array, first: Array, second: Array) -> tuple[Arra
 
 
 def resize_behind(model: pycolmap.Reconstruction, keyframe: int, ratio: float) -> None:
-    """Make all that lies behind a keyframe, and the points that are seen mostly from there, larger by `ratio`, about
-    where the keyframe stood, in place."""
+    """Make everything after a keyframe, and the points that are seen mostly from there, larger by `ratio`, about
+    the keyframe's position, in place."""
     image = keyframe + 1
     centre = model.images[image].projection_center()
     for i in model.reg_image_ids():

@@ -60,14 +60,14 @@ class Seam:
 
     @property
     def is_contradicted(self) -> bool:
-        """The pictures on the two sides match, and say that they lie otherwise."""
+        """The images on the two sides match, and contradict their poses."""
         return self.pairs >= _LEAST_PAIRS and self.agreement < _PAIR_AGREES
 
 
 def find_seams(
     placed: Sequence[int], checks: Iterable[PairCheck], tracks: Iterable[Sequence[int]], reach: int
 ) -> list[Seam]:
-    """All seams of the placed keyframes (sorted indices); what lies more than `reach` places apart is no neighbour.
+    """All seams of the placed keyframes (sorted indices); keyframes more than `reach` places apart are no neighbours.
 
     `tracks` are the keyframes (sorted indices) that see a point, for every point.
     """

@@ -61,7 +61,7 @@ def when_asked(name: str, count: int, known: dict[str, NDArray]) -> None:
 class Structure:
     """An adjusted reconstruction (image i + 1 is keyframe i, all cameras are as camera 1) and how good it is.
 
-    No point is seen from two of the report's parts: nothing tells how these lie to each other. `tried` are the pairs
+    No point is seen from two of the report's parts: the transform between them is unknown. `tried` are the pairs
     of keyframes that were matched, `pairs` those of them that obey one geometry. `pieces` are further models, in the
     same camera, of keyframes that the ones before could not place, each with a world and a unit of its own.
     """

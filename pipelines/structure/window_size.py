@@ -15,7 +15,7 @@ _LEAST_SIZE = 100
 
 
 def window_size(memory_mb: int, pixels: int) -> int:
-    """Keyframes of a window for `run.memory_mb` and pictures of so many pixels; where that is not given (0) always as
+    """Keyframes of a window for `run.memory_mb` and images of so many pixels; where that is not given (0) always as
     many: what comes out does not depend on the machine."""
     if memory_mb == 0:
         return SIZE

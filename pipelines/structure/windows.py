@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 _LEAST_SHARED = 30
 _LEAST_MATCHES, _NEAR, _OUTLIER = 12, 0.05, 3.0
-"""A loop between windows: its least matches, their median error as a share of the picture's width, from where it is
+"""A loop between windows: its least matches, their median error as a share of the image's width, from where it is
 left to `global_ba`, and how many medians a match may be off. On made-up walks only."""
 WIDE = 40.0
 """Of the loss of the adjustment that pulls loops together: standard deviations."""
@@ -101,7 +101,7 @@ def align_views(source: Array, target: Array, source_points: Array, target_point
 def close_loops(
     model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair], windows: Sequence[range], xy: Sequence[Array]
 ) -> int:  # fmt: skip
-    """Make one of points that verified matches between windows say are one, where the windows lie nearly right, in
+    """Make one of points that verified matches between windows say are one, where the windows nearly agree, in
     place; how many."""
     camera, merged = model.cameras[1], 0
     for pair in pairs:
