@@ -2,7 +2,7 @@
 
 A keyframe whose neighbours see nothing in common, at a door or in a quick turn, has features that match before and
 behind it, but hardly one that does both: then how long the steps on both sides are, one against the other, hangs on a
-few points or on none. Corners followed by optical flow need less of a picture than descriptors that are alike do.
+few points or on none. Corners followed by optical flow need less of an image than descriptors that are alike do.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ LEAST = 100
 """Features matched on both sides below which a keyframe is a weak one. On a made-up walk, steps beyond keyframes with
 15 to 45 of them change by 1 to 8 %; the weakest of six recordings have 330 and more, of two others next to none."""
 _MOST, _DISTANCE = 1000, 3.0
-"""Corners of a picture, and pixels between them."""
+"""Corners of an image, and pixels between them."""
 _LEAST_GUESS, _GUESS_ERROR = 8, 0.03
-"""Matches for a first guess of where corners go, a homography, and their error, as a share of the picture's width."""
+"""Matches for a first guess of where corners go, a homography, and their error, as a share of the image's width."""
 
 Array = NDArray[np.float64]
 Picture = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
@@ -105,7 +105,7 @@ def bridged(
 def _followed(
     pictures: Sequence[Picture], features: Sequence[Features], before: VerifiedPair, behind: VerifiedPair
 ) -> list[Array]:
-    """Pixels (Q, 2) of corners of the middle picture that are found in both others, in each of the three."""
+    """Pixels (Q, 2) of corners of the middle image that are found in both others, in each of the three."""
     (first, hidden_first), (middle, hidden), (last, hidden_last) = pictures
     xy = corners(middle, np.zeros((0, 2)), _MOST, _DISTANCE, hidden)
     there, seen = [], np.ones(len(xy), np.bool_)

@@ -1,4 +1,4 @@
-"""SIFT features of a picture: the only extractor there is.
+"""SIFT features of an image: the only extractor there is.
 
 COLMAP's: OpenCV's takes a third of its time, but of a rendered office its features made poses a seventh worse.
 """
@@ -20,7 +20,7 @@ _of_thread = threading.local()
 PEAK_THRESHOLD = 0.004
 """Contrast of the weakest feature; lower finds more on plain walls."""
 _SUPPORT = 2.0
-"""Of a feature's scale: nearer to a mask than this, what moves there has a part in where it lies."""
+"""Of a feature's scale: nearer to a mask than this, what moves there affects its position."""
 
 
 def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -34,10 +34,10 @@ def extract_features(
     left_out: NDArray[np.bool_] | None = None,
     threshold: float = PEAK_THRESHOLD,
 ) -> Features:
-    """SIFT features (Lowe 2004) of an (H, W) picture, at most about `count`, as RootSIFT (Arandjelović and Zisserman,
+    """SIFT features (Lowe 2004) of an (H, W) image, at most about `count`, as RootSIFT (Arandjelović and Zisserman,
     CVPR 2012).
 
-    `threshold` is the least contrast, as a share of the range of grey. None lies in the mask `left_out` (H, W), nor
+    `threshold` is the least contrast, as a share of the range of grey. None is in the mask `left_out` (H, W), nor
     reaches into it.
     """
     require_shape("grey", grey, (None, None))
@@ -54,7 +54,7 @@ def extract_features(
 
 
 def _extractor(count: int, threshold: float) -> pycolmap.FeatureExtractor:
-    """One on each thread: the same picture gives the same bytes."""
+    """One on each thread: the same image gives the same bytes."""
     if getattr(_of_thread, "made", None) != (count, threshold):
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu = False

@@ -1,7 +1,7 @@
 """Which keyframes may show the same place, by a compact descriptor of their features.
 
 VLAD (Jégou et al., PAMI 2012) with intra-normalisation (Arandjelović and Zisserman, All about VLAD, CVPR 2013) over a
-vocabulary learnt from the run itself. It stands where the paper has DINOv2 features, which need weights, and beside
+vocabulary learnt from the run itself. It replaces the paper's DINOv2 features, which need weights, and adds to
 them where there are any.
 """
 
@@ -108,7 +108,7 @@ def loop_pairs(
     """For each frame the `per_frame` most alike ones of those `allowed` (rows of (N, N)) that are more alike than
     `least`, as sorted unique (i, j), i < j.
 
-    Of neighbouring candidates only the best is taken: five views of one place tell less than five places.
+    Of neighbouring candidates only the best is taken: five views of one place say less than five places.
     """
     pairs: set[tuple[int, int]] = set()
     for first in range(0, len(looks), _BLOCK):
@@ -125,8 +125,8 @@ def loop_pairs(
 
 
 def far_apart(count: int, gap: int, places: int = 0) -> Callable[[slice], NDArray[np.bool_]]:
-    """Rows of (N, N): which of `count` frames lie at least `gap` places apart; of those that look in another direction,
-    each direction with `places` frames, which stand at another place."""
+    """Rows of (N, N): which of `count` frames are at least `gap` places apart; of those that look in another direction,
+    each direction with `places` frames, which are at another place."""
     index = np.arange(count)
     places = places or count
 

@@ -79,7 +79,7 @@ class Snapshots:
     def _require_room(self) -> None:
         """COLMAP ends the whole process where its database cannot grow, so there must be room for it before.
 
-        It is taken for a moment: how much is free tells nothing of a quota, or of the largest file allowed.
+        It is taken for a moment: the free space says nothing about a quota or the largest file allowed.
         """
         needed = _DATABASE_SHARE * sum(p.stat().st_size for p in self.folder.glob("*/*.npz")) + _LEAST_ROOM
         place = self.folder / "room.tmp"
