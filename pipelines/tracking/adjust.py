@@ -62,7 +62,7 @@ class Report:
 
 
 def without_dependent_depth(settings: TrackingConfig, proxy_report: Mapping[str, Any]) -> TrackingConfig:
-    """The settings, `use_depth` off where the proxies were made from the same pictures: nothing new about the poses."""
+    """The settings, `use_depth` off where the proxies were made from the same images: nothing new about the poses."""
     independent = proxy_report.get("independent_depth", proxy_report.get("metric", False))
     return settings if independent else replace(settings, use_depth=False)
 
@@ -198,7 +198,7 @@ def set_scale(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics) -> Bundle
 def with_depths(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics, settings: TrackingConfig) -> Bundle:
     """The bundle with the rescaled proxy depths as its depth observations.
 
-    Proxies that were made from the same pictures say nothing new about the poses: without metres, or with
+    Proxies that were made from the same images say nothing new about the poses: without metres, or with
     `use_depth` off, they are left out.
     """
     if not (settings.use_depth and ties.metric):

@@ -20,7 +20,7 @@ from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, TrackState
 Array = NDArray[np.float64]
 
 _MOST_SCALE_SD = 0.1
-"""Relative: a stretch shorter than the given poses are exact tells nothing of its size among them."""
+"""Relative: over a stretch about as short as their own errors, given poses do not determine the scale."""
 
 
 def carry_given(context: StageContext, state: TrackState) -> dict[str, Any]:
@@ -53,7 +53,7 @@ def join_by_given(state: TrackState, given: GivenPoses) -> int:
 
 
 def _to_given(state: TrackState, given: GivenPoses, segment: int) -> Similarity | None:
-    """given_from_state by the posed frames of a segment that have a given pose; None where they tell no size."""
+    """given_from_state by the posed frames of a segment that have a given pose; None where they determine no scale."""
     ids = [i for i in sorted(state.poses) if state.segment[i] == segment and given.known[i]]
     found = np.array([state.poses[i] for i in ids]).reshape(-1, 4, 4)
     agreed = agreement(found, given.cam_from_world[ids])

@@ -85,7 +85,7 @@ def _triangulate(first: int, second: int, state: TrackState, pictures: Pictures)
 
 
 def _nearby_depth(frame_id: int, xy: Array, state: TrackState) -> Array:
-    """(Q,) depth of the nearest known point in the picture: a fair first guess."""
+    """(Q,) depth of the nearest known point in the image: a fair first guess."""
     seen, motion = state.sightings[frame_id], state.poses[frame_id]
     z = state.points[seen.point] @ motion[2, :3] + motion[2, 3]
     ahead = z > 0
@@ -99,7 +99,7 @@ def triangulate(
     xy1: Array, xy2: Array, cam2_from_cam1: Array, intrinsics: Intrinsics, max_error: float
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Points in the first camera (Q, 3) nearest to both rays, and which (Q,) are good: in front of both cameras, rays
-    at an angle of at least 1.5 degrees, and within `max_error` pixels in both pictures."""
+    at an angle of at least 1.5 degrees, and within `max_error` pixels in both images."""
     ones = np.ones(len(xy1))
     ray1 = unproject(xy1, ones, intrinsics)
     centre2 = se3.inverse(cam2_from_cam1)[:3, 3]

@@ -76,7 +76,7 @@ class FrontEnd:
         return seen, self.solve(frame_id, seen, start), start
 
     def _by_rendering(self, frame_id: int) -> bool:
-        """Pose the frame by comparing it with Gaussians, where a neighbour is posed and the picture agrees well."""
+        """Pose the frame by comparing it with Gaussians, where a neighbour is posed and the image agrees well."""
         neighbours = [i for i in (frame_id - 1, frame_id + 1) if i in self.state.poses]
         if not neighbours or self.settings.render == "never":
             return False
@@ -93,7 +93,7 @@ class FrontEnd:
         return True
 
     def is_inside(self, frame_id: int) -> bool:
-        """Whether keyframes of one segment lie on both sides: then there is no need for new ones."""
+        """Whether keyframes of one segment are on both sides: then there is no need for new ones."""
         nearest = self.state.nearest_keyframes(frame_id, 1)
         if len(nearest) < 2 or abs(nearest[0] - nearest[1]) >= REACH:
             return False

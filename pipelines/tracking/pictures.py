@@ -1,4 +1,4 @@
-"""Grey pictures and features of frames, the last few kept in memory."""
+"""Grey images and features of frames, the last few kept in memory."""
 
 from __future__ import annotations
 

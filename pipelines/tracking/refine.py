@@ -29,7 +29,7 @@ SILHOUETTE = 0.95
 
 @dataclass(frozen=True)
 class RenderWeights:
-    """λ_C, λ_D and λ_S of eq. (16), depths in units of the picture's median depth."""
+    """λ_C, λ_D and λ_S of eq. (16), depths in units of the image's median depth."""
 
     color: float = 1.0
     depth: float = 0.0
@@ -45,8 +45,8 @@ class RenderWeights:
 class Comparison:
     """cam_from_world (4, 4) after the comparison, and eq. (16) per pixel before and after.
 
-    unexplained: share of the picture's contrast that is left in the colours, 1 being what a map would leave that knows
-    nothing but the mean; 1 and more for a picture of something else, or of nothing.
+    unexplained: share of the image's contrast that is left in the colours, 1 being what a map would leave that knows
+    nothing but the mean; 1 and more for an image of something else, or of nothing.
     """
 
     cam_from_world: Array
@@ -81,7 +81,7 @@ def compare_frame(
     """The pose near `start` (4, 4) from which the working map looks most like the frame.
 
     None where the keyframes have no depth, too little of the map is seen, or the search does not converge. The
-    keyframes lie in one segment. The terms of depth and labels need proxies of the frame itself (`proxy.frames`).
+    keyframes are in one segment. The terms of depth and labels need proxies of the frame itself (`proxy.frames`).
     """
     small = pictures.intrinsics.at_most(WORKING_SIDE)
     drawn = seed_map(keyframes, state, pictures)
@@ -107,9 +107,9 @@ def compare_frame(
 def tracking_loss(
     drawn: WorkingMap, cam_from_world: Tensor, intrinsics: Intrinsics, view: View, weights: RenderWeights
 ) -> Loss:
-    """Eq. (16) over the pixels with Sil > T_sil, depths in units of the picture's median depth.
+    """Eq. (16) over the pixels with Sil > T_sil, depths in units of the image's median depth.
 
-    The colours are compared after the exposure that fits best. Infinite when less than a fifth of the picture shows the
+    The colours are compared after the exposure that fits best. Infinite when less than a fifth of the image shows the
     map.
     """
     features = torch.cat([drawn.colors, drawn.labels], 1)

@@ -23,14 +23,14 @@ RIVAL_SHARE = 0.5
 COMMON_POINTS = 8
 """Keyframes with so many points in common show one place."""
 SNAP = 2.0
-"""A SIFT feature within so many pixels of a keyframe's sighting stands for the same point."""
+"""A SIFT feature within so many pixels of a keyframe's sighting is the same point."""
 
 
 def relocalise(frame_id: int, state: TrackState, pictures: Pictures, seed: int) -> tuple[Sightings, FramePose | None]:
     """Sightings from the keyframes that look most like the frame, and the pose they agree on, if any.
 
-    None, too, where two places explain the frame about as well and lie apart: things that repeat, such as the doors of
-    a corridor, tell nothing of which of them is seen.
+    None, too, where two places explain the frame about as well and are apart: things that repeat, such as the doors of
+    a corridor, do not show which of them is seen.
     """
     groups = _candidate_groups(frame_id, state, pictures, CANDIDATES)
     return recognise(frame_id, groups, state, pictures, seed)

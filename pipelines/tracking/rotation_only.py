@@ -1,4 +1,4 @@
-"""Frames that only turn: what a posed frame and the next have in common tells a rotation where it tells no depth."""
+"""Frames that only turn: matches with a posed frame determine a rotation where they determine no depth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from msgs_slam.pipelines.types import Intrinsics
 Array = NDArray[np.float64]
 
 TOLERANCE = 0.01
-"""Of the picture's long side: within so much a rotation explains a match. A hand that turns a camera moves it, too.
+"""Of the image's long side: within so much a rotation explains a match. A hand that turns a camera moves it, too.
 This and the two below were chosen on the turn of a phone past a blank wall and on a rendered one."""
 _LEAST_MATCHES, _LEAST_SHARE = 8, 0.6
 """Features that agree on a rotation before flow is asked; the share of all matches that must agree in the end."""
@@ -28,7 +28,7 @@ _TRIALS, _CORNERS = 200, 300
 
 
 def set_rotation_only_poses(state: TrackState, pictures: Pictures, seed: int) -> None:
-    """Pose lost frames next to posed ones by rotation alone, in place: each stands where the nearer of the posed frames
+    """Pose lost frames next to posed ones by rotation alone, in place: each is put where the nearer of the posed frames
     beside its stretch does, and has no sightings. They are noted in `state.turned`, no other frame is changed. A turn
     leads panoramas away from nothing."""
     if len(state.rig) > 1:
@@ -48,8 +48,8 @@ def set_rotation_only_poses(state: TrackState, pictures: Pictures, seed: int) ->
 def _turns(anchor: int, ids: list[int], cam_from_world: Array, pictures: Pictures, seed: int) -> dict[int, Array]:
     """Poses of the frames `ids`, which lead away from the posed frame `anchor`, as far as rotations reach.
 
-    Each is compared with the frame that lies farthest back and still shows the same: that way a slow walk, which no two
-    neighbours tell from a turn, comes to an end.
+    Each is compared with the farthest frame back that still shows the same: that way a slow walk, which no two
+    neighbours distinguish from a turn, comes to an end.
     """
     poses, reference, last = {anchor: cam_from_world}, anchor, anchor
     for i in ids:

@@ -25,7 +25,7 @@ TRIES = 12
 def join_segments(state: TrackState, pictures: Pictures, seed: int) -> int:
     """Bring every segment that can be recognised into the largest one's world; returns how many were joined.
 
-    One keyframe is not believed: two must be recognised, and say the same of how the worlds lie to each other.
+    One keyframe is not believed: two must be recognised, and agree on the transform between the worlds.
     """
     joined, again = 0, True
     while again:

@@ -20,7 +20,7 @@ from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 
 Array = NDArray[np.float64]
 WORKING_SIDE = 320
-"""Long side of the pictures that are compared: smaller ones have a wider basin, and colours there are averages."""
+"""Long side of the images that are compared: smaller ones have a wider basin, and colours there are averages."""
 STRIDE = 2
 MIN_POINTS = 8
 """Fewer points say nothing of the scale of a proxy depth."""
