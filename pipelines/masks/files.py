@@ -1,4 +1,4 @@
-"""The user's masks: one PNG a picture, black is left out (the convention of COLMAP's image reader)."""
+"""The user's masks: one PNG an image, black is left out (the convention of COLMAP's image reader)."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _LAST_NUMBER = re.compile(r"(\d+)(?!.*\d)")
 
 @dataclass(frozen=True)
 class MaskFiles:
-    """paths: index of a picture in the source → its mask."""
+    """paths: index of an image in the source → its mask."""
 
     paths: dict[int, Path]
 
     def left_out(self, index: int, width: int, height: int) -> NDArray[np.bool_] | None:
-        """(height, width) of the source's picture `index`; None where it has no mask. What is black in half of a pixel
+        """(height, width) of the source's image `index`; None where it has no mask. What is black in half of a pixel
         is left out."""
         path = self.paths.get(index)
         if path is None:
@@ -39,10 +39,10 @@ class MaskFiles:
 
 
 def open_masks(folder: Path, source: Source) -> MaskFiles:
-    """The masks of a source's pictures: NAME.jpg.png or NAME.png for the image NAME.jpg, or the number of the frame in
-    the video (from 0). Not every picture needs one.
+    """The masks of a source's images: NAME.jpg.png or NAME.png for the image NAME.jpg, or the number of the frame in
+    the video (from 0). Not every image needs one.
 
-    Raises InputError for a folder without any, a mask that belongs to no picture, and one of another size.
+    Raises InputError for a folder without any, a mask that belongs to no image, and one of another size.
     """
     if not folder.is_dir():
         raise InputError(f"--masks {folder}: there is no such folder")

@@ -1,7 +1,7 @@
 """Detection of moving things without any network: the other keyframes see the background behind them.
 
 Depth and poses carry the surfaces of other keyframes into each one. Where several of them say what should be seen and
-the picture shows another colour, something stood there that was gone for them. A thing of the scene is there for the
+the image shows another colour, something was there that was gone for them. A thing of the scene is there for the
 others too and explains itself, and over a surface of one colour nobody accuses anybody. RobustNeRF (Sabour et al., CVPR
 2023) too leaves out what the rest of the views does not agree on, there while a map is fitted.
 """
@@ -32,7 +32,7 @@ _UNLIKE, _LIKE = 12.0, 7.2
 _LEAST = 3
 """Witnesses against a pixel."""
 _SURE_COUNT = 200
-"""Pixels that tell how much brighter one picture is than another."""
+"""Pixels needed to estimate how much brighter one image is than another."""
 _KEPT = 128
 """Views that are kept in memory."""
 
@@ -46,10 +46,10 @@ class Rules:
 
 
 _FIRST, _AGAIN = Rules(0.2, 0.03), Rules(0.1, 0.04)
-"""Once something is found in a picture, less will do for the rest of it."""
+"""Once something is found in an image, less will do for the rest of it."""
 _ROUNDS = 3
 _LEAST_SHARE = 0.006
-"""Of the picture: the evidence in a thing; and of the thing itself:"""
+"""Of the image: the evidence in a thing; and of the thing itself:"""
 _DENSE = 0.5
 _RIM = 5
 
@@ -183,7 +183,7 @@ def _judge(
 
 
 def _things(evidence: NDArray[np.bool_], gap: float, before: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
-    """(h, w) pieces of evidence that lie close together, as things with a rim; with `before` those that touch it."""
+    """(h, w) pieces of evidence that are close together, as things with a rim; with `before` those that touch it."""
     reach = max(1, round(gap * evidence.shape[1]))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     around = cv2.copyMakeBorder(evidence.astype(np.uint8), *(reach,) * 4, cv2.BORDER_CONSTANT, value=0)

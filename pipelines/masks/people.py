@@ -1,7 +1,7 @@
 """People, by two small networks that have to agree.
 
-Either alone takes things for people: on eleven pictures in twelve of empty rooms one of them finds some. What both are
-sure of was a person, but for one rucksack in 70 pictures of 7 recordings.
+Either alone takes things for people: on eleven images in twelve of empty rooms one of them finds some. What both are
+sure of was a person, but for one rucksack in 70 images of 7 recordings.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from msgs_slam.pipelines.networks.session import Network
 _MAYBE = 0.3
 """Probability of the class from which pixels form a candidate."""
 _SURE = 0.75
-"""Both networks' mean over a candidate. Chosen on 70 pictures of 7 recordings: people had 0.82 and more, other things
+"""Both networks' mean over a candidate. Chosen on 70 images of 7 recordings: people had 0.82 and more, other things
 0.67 and less, but for one rucksack."""
 _LEAST_SHARE = 0.001
 _REACH = 0.12
-"""Of the picture's long side: what the person network sees so near a candidate belongs to it (feet, hair, hands)."""
+"""Of the image's long side: what the person network sees so near a candidate belongs to it (feet, hair, hands)."""
 _HARDLY = 0.1
 """Where the person network sees this little, the vague rim of the class is no person."""
 _MARGIN = 0.012
 """Of the long side: the rim that is left out around people, whose borders are soft in both networks. With these
-numbers 99.4 % of a woman pasted into 45 pictures of a room were found, 96.8 % in the worst of them, and 3.3 % of the
-picture beside her; with half the reach 98.6, 87.4 and 3.0 %."""
+numbers 99.4 % of a woman pasted into 45 images of a room were found, 96.8 % in the worst of them, and 3.3 % of the
+image beside her; with half the reach 98.6, 87.4 and 3.0 %."""
 
 
 @dataclass(frozen=True)
