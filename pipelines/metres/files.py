@@ -46,7 +46,7 @@ def load_metres(run: RunFolder) -> Metres | None:
 
 
 def save_metres(folder: Path, metres: Metres | None) -> Path:
-    """scale.json: the value, its sentence, and what each source says; null where nothing tells metres."""
+    """scale.json: the value, its sentence, and what each source says; null where metres are unknown."""
     path = folder / SCALE
     write_json(path, None if metres is None else {"text": metres.text, **asdict(metres), "about_alone": _ALONE})
     return path

@@ -48,7 +48,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class Found:
-    """metres: None where nothing tells them, or only a guess could and may not; warning: what speaks against them."""
+    """metres: None where they are unknown, or only guessed although guesses are off; warning: evidence against them."""
 
     metres: Metres | None
     warning: str | None = None

@@ -26,10 +26,10 @@ _RISE = 0.6
 """A camera whose height changes by more than this part of itself (80 % of the views) does not stay on one floor."""
 _LEVEL = np.cos(np.radians(25))
 _GROUND_REACH, _GROUND_SD, _LEAST_UNDER, _LEAST_OVER_GROUND = 0.3, 0.15, 20, 0.3
-"""Ground lies within this part of the usual depth around the camera; the height over it is so exact; so many voxels,
+"""Ground is within this part of the usual depth around the camera; the height over it is so exact; so many voxels,
 and so large a share of the cameras with some under them, are needed."""
 _LEAST_HEIGHT = 0.05
-"""A camera nearer to its floor than this part of the usual depth lies on it: that tells nothing."""
+"""A camera nearer to its floor than this part of the usual depth was put on it: its height says nothing."""
 
 
 def floor_trust(scene: Scene) -> float | None:
@@ -77,7 +77,7 @@ def stays_on_floor(heights: Array) -> bool:
 
 
 def over_ground(scene: Scene) -> Array:
-    """(K,) heights of cameras over what lies level under them: the way that they went, seen from before or behind."""
+    """(K,) heights of cameras over level ground under them: the way that they went, seen from before or behind."""
     up = scene.gravity.up
     level = scene.voxels.normal @ up > _LEVEL
     ground, reach = scene.voxels.position[level], _GROUND_REACH * scene.median_depth

@@ -20,12 +20,12 @@ Array = NDArray[np.float64]
 
 SMALL_SD = 0.25
 """FastDepth puts 77.1 % of the pixels of NYU Depth v2 within 25 % of the truth (Wofk et al., ICRA 2019): a Gaussian of
-0.186 in log depth, most of it alike over a picture. On rooms of another kind it errs more; four recordings, none of
+0.186 in log depth, most of it alike over an image. On rooms of another kind it errs more; four recordings, none of
 them used to choose anything else here, gave log errors of 0.10, -0.05, -0.15 and -0.43: 0.24 root mean square."""
 LARGE_SD = 0.10
 """Metric3D-V2 and MoGe-2: zero-shot AbsRel of 6 to 10 % on indoor sets (their papers), of which much is the scale."""
 _ZOOMS = (1.0, 1.25, 1.5)
-"""FastDepth was trained on pictures enlarged by 1 to 1.5, depth divided by as much: each is as good an answer."""
+"""FastDepth was trained on images enlarged by 1 to 1.5, depth divided by as much: each is as good an answer."""
 _LEAST_PIXELS = 1500
 _INDEPENDENT = 6
 """Neighbouring views err alike: the median of many counts as that of so few at most."""
@@ -61,12 +61,12 @@ def log_ratio(network: Network, frame: SeenFrame, camera: Intrinsics, zoom: floa
     """log(metres by the network / depth in the world), the median over the reliable pixels that it saw.
 
     A network without a canonical focal length knows the size of things only through the camera it was trained with: it
-    gets the picture as that camera, `zoom` times as long, would have taken it. What a lens of k times the focal length
+    gets the image as that camera, `zoom` times as long, would have taken it. What a lens of k times the focal length
     shows looks k times nearer, so its depth counts k times.
     """
     fx, fy = network.card.focal
     rows, columns = network.card.size
-    # The view must lie in the picture: what is beyond its border would be made up.
+    # The view must lie in the image: what is beyond its border would be made up.
     zoom *= max(1.0, columns / fx * camera.fx / camera.width, rows / fy * camera.fy / camera.height)
     own = Intrinsics(columns, rows, fx * zoom, fy * zoom, columns / 2, rows / 2)
     image = retake(frame.image, camera, own)
@@ -93,7 +93,7 @@ def _median_log(metres: Array, depth: Array) -> float | None:
 
 
 def retake(image: NDArray[np.uint8], camera: Intrinsics, other: Intrinsics) -> NDArray[np.uint8]:
-    """The picture that a camera at the same place with other intrinsics would have taken; edges repeat beyond it."""
+    """The image that a camera at the same place with other intrinsics would have taken; edges repeat beyond it."""
     sx, sy = other.fx / camera.fx, other.fy / camera.fy
     if min(sx, sy) < 0.75:  # linear interpolation alone would alias
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigmaX=0.4 / sx, sigmaY=0.4 / sy), np.uint8)

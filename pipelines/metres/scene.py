@@ -37,7 +37,7 @@ _LEAST_PLANE = 30
 
 @dataclass(frozen=True)
 class SeenFrame:
-    """One keyframe: its picture (H, W, 3), its maps with depth in the unit of the world, world_from_cam (4, 4)."""
+    """One keyframe: its image (H, W, 3), its maps with depth in the unit of the world, world_from_cam (4, 4)."""
 
     image: NDArray[np.uint8]
     maps: ProxyMaps

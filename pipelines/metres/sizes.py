@@ -9,7 +9,7 @@ from __future__ import annotations
 Sizes = tuple[tuple[float, float, float], ...]
 
 CAMERA_OVER_FLOOR: Sizes = ((1.45, 0.12, 0.75), (1.30, 0.35, 0.25))
-"""Held by somebody who stands: between elbow and eye. DIN 33402-2 (adults of 18 to 65, 5th percentile of women to 95th
+"""Held by somebody standing: between elbow and eye. DIN 33402-2 (adults of 18 to 65, 5th percentile of women to 95th
 of men): elbow 0.96 to 1.18 m, shoulder 1.26 to 1.55 m, eye 1.44 to 1.74 m, shoes 2.5 cm more (EN ISO 3411). So mostly
 1.2 to 1.7 m; the second mode is for who sits or kneels, reaches up, or is a robot."""
 CAMERA_OVER_TABLE = 0.70, 0.35
@@ -21,14 +21,14 @@ Offices (ASR A1.2): at least 2.50 m, 2.75 m from 50 m² on, 3.00 m from 100 m² 
 
 DOOR: Sizes = ((2.02, 0.05, 0.7), (1.75, 0.2, 0.3))
 """Leaf of 1.985 m (DIN 18101), 1.981 m (United Kingdom), 80 inches = 2.032 m (United States), the frame a little more;
-the second mode is for doors of which the picture has cut some off."""
+the second mode is for doors of which the image has cut some off."""
 
 TABLE: Sizes = ((0.74, 0.05, 0.55), (0.43, 0.15, 0.35), (0.90, 0.05, 0.1))
 """Desks 0.74 m (EN 527-1, type C), school tables 0.76 m (EN 1729-1, size 6), dining tables 0.71 to 0.76 m; coffee
 tables 0.35 to 0.50 m, which networks call tables too; worktops."""
 SEAT: Sizes = ((0.45, 0.08, 0.75), (0.60, 0.3, 0.25))
 """0.46 m (EN 1729-1, size 6), 0.40 to 0.51 m (EN 1335-1), sofas 0.38 to 0.45 m; the second mode is for arm rests,
-stools and what lies on seats."""
+stools and things on seats."""
 BED: Sizes = ((0.52, 0.18, 1.0),)
 """Upper side of the mattress: 0.43 to 0.58 m where wheelchairs shall reach it (ADA guidance), 0.40 to 0.65 m sold."""
 WORKTOP: Sizes = ((0.90, 0.04, 0.8), (0.74, 0.1, 0.2))
@@ -54,7 +54,7 @@ TOPS = {
     "sofa": ("sofa", SEAT),
     "seating": ("seat", SEAT),
 }
-"""Class names of networks and data sets whose upper side has a usual height: what people are told, and the heights."""
+"""Class names of networks and data sets whose upper side has a usual height: the name for people, and the heights."""
 THINGS = ("door", "level surface", *dict.fromkeys(told for told, _ in TOPS.values()))
 """Sources that are counted: 2 doors, 3 chairs."""
 DOORS = ("door", "double door")

@@ -21,18 +21,18 @@ Array = NDArray[np.float64]
 _LEVEL = np.cos(np.radians(25))
 _UPRIGHT = np.sin(np.radians(20))
 _CELL = 3.0
-"""Voxels on a side of the cells in which things are told apart, seen from above."""
+"""Voxels on a side of the cells in which things are separated, seen from above."""
 _LEAST_TOP, _LEAST_DOOR = 60, 100
 """Voxels of a thing's upper side, and of a door: about 0.1 and 0.16 m² at the usual distance."""
 _MOST_OF_A_KIND = 4
 _OVER_FLOOR = 0.08
-"""What is lower than this part of the usual depth is the floor, or lies on it."""
+"""Whatever is lower than this part of the usual depth is the floor, or on it."""
 _LEAST_LEVEL = 0.2
 """Share of a thing's upper side that makes a level."""
 _LENGTH_SD = 0.04
 _WRONG_NAME, _WRONG_SURFACE = 0.3, 0.4
 """Chance that a thing is none, or that its level is another part of it. The small network of the default pull
-reaches a mean IoU of 55 % on ADE20K's validation pictures (MLPerf Mobile)."""
+reaches a mean IoU of 55 % on ADE20K's validation images (MLPerf Mobile)."""
 
 
 def sizes_of_things(scene: Scene) -> list[Evidence]:
@@ -87,7 +87,7 @@ def _surfaces(scene: Scene, heights: Array) -> list[Evidence]:
 
 
 def _levels(scene: Scene, heights: Array, members: NDArray) -> list[float]:
-    """Heights at which much of these voxels lies, most first."""
+    """Heights with many of these voxels, most first."""
     weight = scene.voxels.weight[members]
     return levels(heights[members], weight / weight.sum(), scene.voxels.size, _LEAST_LEVEL)
 
