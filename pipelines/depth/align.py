@@ -1,6 +1,6 @@
 """The depths of all keyframes brought into one world: a field each, chosen so that views and triangulated points agree.
 
-The error of a depth is smooth over a picture and changes from picture to picture; where many pictures see the same
+The error of a depth is smooth over an image and changes from image to image; where many images see the same
 surface its true place is near the middle of what they say.
 """
 
@@ -33,7 +33,7 @@ PAIR_SD, POINT_SD = 0.03, 0.01
 GROSS = 0.15
 """A larger disagreement is another surface."""
 SHARE = 0.25
-"""Neighbouring samples err alike: a picture's worth of them counts as a few per node."""
+"""Neighbouring samples err alike: an image's worth of them counts as a few per node."""
 ROUNDS = 4
 _ROOM = 60_000_000
 """Bytes of depths, and of samples of them, that are kept; what has no room is read again."""
@@ -100,7 +100,7 @@ def _anchors(model: SparseModel, k: int, full: Intrinsics, small: Intrinsics) ->
 
 def fit_fields(views: Sequence[PosedDepth], anchors: Mapping[int, Anchors], expected: Array | None = None) -> Array:
     """(N, nodes) log scales by robust least squares, re-linearised at every round; `anchors` by index of the view. Of a
-    long recording a window of views at a time, the others as they stand."""
+    long recording a window of views at a time, the others unchanged."""
     start = np.zeros((len(views), FINE.size)) if expected is None else expected
     fields = start.copy()
     samples = LruSequence(len(views), lambda n: _Samples.of(views[n]), lambda s: s.nbytes, _ROOM)

@@ -1,4 +1,4 @@
-"""Scale fields: how many times as far as its provider says each pixel of a keyframe lies in the world."""
+"""Scale fields: factor from a provider's depth to depth in the world, for each pixel of a keyframe."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Basis:
 
 @dataclass(frozen=True)
 class Grid:
-    """rows x columns nodes that span a picture from corner to corner; between them the log scale is bilinear."""
+    """rows x columns nodes that span an image from corner to corner; between them the log scale is bilinear."""
 
     rows: int
     columns: int
@@ -43,7 +43,7 @@ class Grid:
         return self.rows * self.columns
 
     def at(self, xy: Array, width: int, height: int) -> Basis:
-        """The nodes around pixels xy (Q, 2) of a picture of that size."""
+        """The nodes around pixels xy (Q, 2) of an image of that size."""
         gx = np.clip(xy[:, 0] / width, 0, 1) * (self.columns - 1)
         gy = np.clip(xy[:, 1] / height, 0, 1) * (self.rows - 1)
         left, top = np.minimum(gx.astype(int), self.columns - 2), np.minimum(gy.astype(int), self.rows - 2)

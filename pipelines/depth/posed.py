@@ -21,7 +21,7 @@ _LEAST_OVERLAP = 0.2
 _OVERLAP_SAMPLES = 16
 CANDIDATES = 256
 _REACH = 1.5
-"""What lies farther from a camera than this times what it shows is hidden behind that."""
+"""A point farther from a camera than this times the depth shown there is occluded."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class PosedDepth:
         return unproject(xy, depth, self.intrinsics) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
 
     def seen(self, points: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """xy (Q, 2), z (Q,) of points (Q, 3) of the world, and which lie inside the picture, before the camera."""
+        """xy (Q, 2), z (Q,) of points (Q, 3) of the world, and which lie inside the image, before the camera."""
         xy, z = project(points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3], self.intrinsics)
         # Pixels of points behind the camera are NaN, which compares false.
         inside = np.all((xy >= 0) & (xy < (self.intrinsics.width, self.intrinsics.height)), axis=1)
@@ -58,7 +58,7 @@ class PosedDepth:
 def overlaps(views: Iterable[PosedDepth]) -> sparse.csr_matrix:
     """(N, N) η[i, j], MSGS-SLAM eq. (10): the fraction of view i's back-projected samples inside view j's image.
 
-    Only where view j may see what i shows: where that lies no farther from j than what j itself shows, and in the
+    Only where view j may see what i shows: where that is no farther from j than what j itself shows, and in the
     spread over near and far ones of at most CANDIDATES views. So the cost grows with the number of views, not with its
     square.
     """
@@ -115,7 +115,7 @@ class _Candidates:
 
 
 def _inside(points: Array, matrices: Array, sizes: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """(C, Q) whether points (Q, 3) lie inside the pictures of cameras with projections (C, 3, 4)."""
+    """(C, Q) whether points (Q, 3) lie inside the images of cameras with projections (C, 3, 4)."""
     u, v, z = np.moveaxis(matrices[:, :, :3] @ points.T + matrices[:, :, 3:], 1, 0)
     width, height = sizes[:, :1], sizes[:, 1:]
     return np.asarray((z > 0) & (u >= 0) & (u < width * z) & (v >= 0) & (v < height * z))

@@ -20,10 +20,10 @@ def resample_nearest(array: NDArray, height: int, width: int) -> NDArray:
 
 
 def resize_depth(depth: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
-    """(H, W) → (height, width): of a smaller picture the mean of what each pixel covers, where that is one surface and
+    """(H, W) → (height, width): of a smaller image the mean of what each pixel covers, where that is one surface and
     known whole; else the value under its centre.
 
-    The mean of the inverse, which is linear on a plane. Under the centre of two by two pixels lies their corner: one of
+    The mean of the inverse, which is linear on a plane. Under the centre of two by two pixels is their corner: one of
     them is half a pixel aside, which is per cents of the depth where a floor recedes.
     """
     nearest = resample_nearest(depth, height, width)

@@ -17,7 +17,7 @@ from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 Array = NDArray[np.float64]
 
 COARSE = Grid(3, 4)
-"""Of the fields that points alone can tell."""
+"""Of the fields that points alone can determine."""
 PRIOR = Prior(COARSE, node_sd=0.06, step_sd=0.05)
 """Around the keyframe's scale."""
 DEPTH_SD = 0.05
@@ -71,7 +71,7 @@ def world_scale(log_scales: Array) -> WorldScale:
     """The factor on the world that makes the keyframes' proxies right on average, from their log scales (N,).
 
     The mean without those beyond three robust sigmas. The uncertainty counts only independent keyframes: errors of
-    neighbours are alike, which the correlation of successive ones tells.
+    neighbours are alike, which the correlation of successive ones shows.
     """
     deviation = log_scales - np.median(log_scales)
     sigma = 1.4826 * float(np.median(np.abs(deviation)))

@@ -1,4 +1,4 @@
-"""Depth that stands in front of what other views see there is wrong, and would become a floater."""
+"""Removal of depth in front of what other views see there: it is wrong, and would become a floater."""
 
 from __future__ import annotations
 
