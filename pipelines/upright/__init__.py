@@ -1,1 +1,1 @@
-"""Which way is up, and the world that the exported files stand in."""
+"""The gravity direction, and the world of the exported files."""

@@ -1,4 +1,4 @@
-"""Up and the floor of a finished run: by what stands upright in its pictures and lies level in its map."""
+"""Up and the floor of a finished run: by vertical lines in its images and level surfaces in its map."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _AGREE = 3.0
 
 @dataclass(frozen=True)
 class Upright:
-    """`up` (3,) unit vector in the run's world and what told it, "" where nothing did; `floor` (3,) a point of the
+    """`up` (3,) unit vector in the run's world and its source, "" where none; `floor` (3,) a point of the
     floor, None without one; `against`: degrees between up and what each witness says alone."""
 
     up: Array
@@ -75,7 +75,7 @@ def find_upright(outcome: Outcome) -> Upright:
 
 
 def _verdict(witnesses: dict[str, Array]) -> tuple[Array, str]:
-    """Up and what told it. Floor and lines err for different reasons, depth and poses: the middle of both is better."""
+    """Up and its source. Floor and lines err for different reasons, depth and poses: the middle of both is better."""
     floor, lines = witnesses.get("floor"), witnesses.get("upright lines")
     if floor is not None and lines is not None and _degrees(floor, lines) < _AGREE:
         return (floor + lines) / float(np.linalg.norm(floor + lines)), "floor and upright lines"

@@ -1,8 +1,8 @@
-"""The vertical by the straight lines of the pictures: edges of walls, doors, windows and furniture stand upright.
+"""The vertical by the straight lines of the images: edges of walls, doors, windows and furniture are vertical.
 
-A line in a picture and the camera's centre span a plane. The direction of the line in the world lies in that plane, so
+A line in an image and the camera's centre span a plane. The direction of the line in the world lies in that plane, so
 the plane's normal n is across it: n . up = 0 for every upright line, whatever its place. With the cameras' rotations
-known, the lines of all pictures vote together (the vanishing point of all cameras at once).
+known, the lines of all images vote together (the vanishing point of all cameras at once).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from msgs_slam.pipelines.types import Intrinsics
 Array = NDArray[np.float64]
 
 _LEAST_LENGTH = 0.05
-"""Shorter segments, as a share of the picture's long side, do not tell their direction."""
+"""Shorter segments, as a share of the image's long side, have no reliable direction."""
 _REACH = 35.0
 _PRIOR_SD = 15.0
 """Degrees by which the cameras' own up is wrong: phones are held at a slant, and one direction of view leaves its tilt
@@ -42,14 +42,14 @@ class Vertical:
 
     @property
     def is_sure(self) -> bool:
-        """Far more lines stand upright than chance would have it."""
+        """Far more lines are vertical than chance would have it."""
         return self.lines >= _LEAST_LINES and self.contrast >= _LEAST_CONTRAST
 
 
 def line_planes(picture: NDArray[np.uint8], intrinsics: Intrinsics) -> tuple[Array, Array]:
-    """normals (L, 3) in the camera of the planes through its straight segments, and lengths (L,) in picture sides.
+    """normals (L, 3) in the camera of the planes through its straight segments, and lengths (L,) in image sides.
 
-    picture (H, W, 3) RGB without lens distortion. Segments by LSD (von Gioi et al., PAMI 2010).
+    `picture`: (H, W, 3) RGB without lens distortion. Segments by LSD (von Gioi et al., PAMI 2010).
     """
     side = max(picture.shape[:2])
     grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
@@ -69,7 +69,7 @@ def line_planes(picture: NDArray[np.uint8], intrinsics: Intrinsics) -> tuple[Arr
 def up_of_lines(
     pictures: Iterable[NDArray[np.uint8]], cam_from_world: Array, intrinsics: Intrinsics, prior: Array
 ) -> Vertical:
-    """Up by the lines of pictures at poses cam_from_world (N, 4, 4), near the unit vector `prior` (3,)."""
+    """Up by the lines of images at poses cam_from_world (N, 4, 4), near the unit vector `prior` (3,)."""
     found = [line_planes(picture, intrinsics) for picture in pictures]
     normals = np.concatenate(
         [np.zeros((0, 3)), *(n @ p[:3, :3] for (n, _), p in zip(found, cam_from_world, strict=True))]

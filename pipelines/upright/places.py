@@ -20,14 +20,14 @@ from msgs_slam.pipelines.upright.world import World
 Array = NDArray[np.float64]
 OFF, AUTO = "off", "auto"
 _LEAST_GAP = 2.0
-"""Seconds from a fix at which a track still tells a place; slower tracks tell it within their own step."""
+"""Seconds from a fix at which a track still gives a position; slower tracks give it within their own step."""
 
 
 def world_on_earth(outcome: Outcome, world: World, gps: str) -> tuple[World, str]:
     """The upright world turned to x east, y north in metres, and "" or why it is not.
 
-    gps: "auto" for the pictures' EXIF, "off", or the name of a track. The reason is "" too where nobody asked: of EXIF
-    that does not suffice, only the log tells.
+    gps: "auto" for the images' EXIF, "off", or the name of a track. The reason is "" too where nobody asked: of EXIF
+    that does not suffice, only the log reports it.
     """
     if gps == OFF:
         return world, ""
@@ -41,7 +41,7 @@ def world_on_earth(outcome: Outcome, world: World, gps: str) -> tuple[World, str
 
 def _laid_out(outcome: Outcome, world: World, places: Array) -> World | str:
     if world.axes != "up":
-        return "which way is up is not known"
+        return "the gravity direction is not known"
     posed = outcome.trajectory.is_placed
     centers = world.exported_from_run.apply(outcome.trajectory.centers[posed])
     found = georeference(centers, places[posed], outcome.metric)
@@ -55,7 +55,7 @@ def _exif_places(outcome: Outcome) -> Array:
     try:
         source = open_source(Path(load_source(outcome.run).path), outcome.config.run.format)
     except InputError:
-        return none  # moved away since: what it told is lost, and nothing else
+        return none  # moved away since: its contribution is lost, and nothing else
     if not isinstance(source, FolderSource):
         return none
     return photo_places([source.file(frame.source_index) for frame in outcome.frames])

@@ -1,4 +1,4 @@
-"""The world of the exported files, and how it lies to the run's own."""
+"""The world of the exported files, and the transform from the run's own to it."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _Y_DOWN_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 @dataclass(frozen=True)
 class World:
-    """axes "up" (z up) or "first" (the run's own); what told up ("" where nothing did), whether z = 0 is a floor, and
-    by how many degrees each other witness of up differs; `earth`: where it lies, if x is east and y is north."""
+    """axes "up" (z up) or "first" (the run's own); the source of up ("" without any), whether z = 0 is a floor, and
+    by how many degrees each other witness of up differs; `earth`: its place, if x is east and y is north."""
 
     axes: str
     told_by: str
@@ -39,7 +39,7 @@ class World:
 
     @property
     def gltf_from_exported(self) -> Array:
-        """(3, 3) rotation into glTF's y up; identity where the world does not stand upright."""
+        """(3, 3) rotation into glTF's y up; identity where the world is not upright."""
         return Y_UP_FROM_Z_UP if self.axes == "up" else np.eye(3)
 
     @property
@@ -54,7 +54,7 @@ FIRST = World("first", "", False, SAME)
 def upright_world(outcome: Outcome, found: Upright) -> World:
     """z up, the floor at 0, x and y counted from the middle of the camera's path; y is where the first camera looked.
 
-    Without a floor z counts from the middle of the path too. `FIRST` where nothing told up.
+    Without a floor z counts from the middle of the path too. `FIRST` where up is unknown.
     """
     if not found.told_by:
         return FIRST
