@@ -1,4 +1,4 @@
-"""Camera paths for pictures of a finished map: the run's own, the same smoothed, or a circle round the scene."""
+"""Camera paths for images of a finished map: the run's own, the same smoothed, or a circle round the scene."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 Array = NDArray[np.float64]
 
 _FROM_OUTSIDE = 1.4
-"""Sizes of a scene that one stands away from its middle: then it fills most of a picture of 50 degrees."""
+"""Sizes of a scene that one stands away from its middle: then it fills most of an image of 50 degrees."""
 
 
 def resampled(world_from_cam: Array, count: int) -> Array:

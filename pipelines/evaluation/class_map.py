@@ -52,7 +52,7 @@ class Matching:
 
 @dataclass(frozen=True)
 class ClassMap:
-    """pairs: our name, its names in the truth, all lower case; truth: every class of the truth, () where not told."""
+    """pairs: our name, its names in the truth, all lower case; truth: every class of the truth, () where unknown."""
 
     name: str
     pairs: tuple[tuple[str, tuple[str, ...]], ...]

@@ -15,7 +15,7 @@ from msgs_slam.pipelines.upright.world import load_world
 Array = NDArray[np.float64]
 
 _ENDS = (0.01, 0.99)
-"""Between which shares of the solid Gaussians something lies: beyond are floaters, and views through windows."""
+"""Quantiles of the solid Gaussians between which something is: beyond are floaters, and views through windows."""
 _UNSHARP = 0.005
 """The end is as unsharp as it moves when the share does by so much, either way."""
 _LEAST_GAUSSIANS, _LEAST_FRAMES = 1000, 5

@@ -1,4 +1,4 @@
-"""Rendering the map at a run's views and collecting what the comparison with pictures and truth gives."""
+"""Rendering the map at a run's views and collecting what the comparison with images and truth gives."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def _jobs(
 
 
 def refined_pose(outcome: Outcome, frame_id: int, cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4, 4) the pose from which the map looks most like the frame's picture, found without any truth.
+    """(4, 4) the pose from which the map looks most like the frame's image, found without any truth.
 
     The pose as it was where the fit does not converge. Raises InputError for a run without a map.
     """
@@ -170,7 +170,7 @@ def _measure(
     if left_out is not None:  # what is no part of the scene is not judged
         photo = np.where(left_out[..., None], picture, photo)
     depth_l1 = accuracy = float("nan")
-    # At other poses only the picture is compared: depth and labels count once a frame.
+    # At other poses only the image is compared: depth and labels count once a frame.
     if matched.image[row] >= 0 and not kind.endswith((AT_TRUE_POSES, AT_REFINED_POSES)):
         index = int(matched.image[row])
         if (depth := matched.sequence.depth(index)) is not None:

@@ -28,7 +28,7 @@ class Lpips:
         self._distance = distance
 
     def __call__(self, image: Image, truth: Image) -> float:
-        """Of two (H, W, 3) pictures in 0..255. Raises ValueError for different shapes."""
+        """Of two (H, W, 3) images in 0..255. Raises ValueError for different shapes."""
         require_shape("image", image, truth.shape)
         return self._distance(_scaled(image), _scaled(truth))
 

@@ -106,7 +106,7 @@ def _advice_section(
 ) -> str:
     lines = advice(outcome, capture, sparse, loops, float(np.mean(views.psnr)) if views and views.psnr else None)
     if not lines:
-        return section("What would improve it", "<p>Nothing stands out in this capture.</p>", kind="fine")
+        return section("What would improve it", "<p>No problem found in this capture.</p>", kind="fine")
     return section("What would improve it", bullets(lines), kind="advice")
 
 
@@ -148,7 +148,7 @@ def _scale_text(outcome: Outcome) -> str:
 
 
 def _piece_section(piece: Outcome, progress: Progress) -> str:
-    """What nothing joins to the rest: a run of its own inside the run, in short."""
+    """A disconnected component: a run of its own inside the run, in short."""
     views = None if piece.gaussian_map is None else render_views(piece, progress)
     t = piece.trajectory
     seconds = f"{t.timestamps[0]:.1f} to {t.timestamps[-1]:.1f}"
@@ -213,7 +213,7 @@ def _export_section(outcome: Outcome) -> str:
 
 
 def files_of_export(run: RunFolder) -> list[tuple[str, int]]:
-    """Name and bytes of what lies there: of the stage, and what `msgs-slam export --only` has added since."""
+    """Name and bytes of the files there: of the stage, and what `msgs-slam export --only` has added since."""
     root = run.stage("export")
     return [(p.relative_to(root).as_posix(), p.stat().st_size) for p in sorted(root.rglob("*")) if p.is_file()]
 

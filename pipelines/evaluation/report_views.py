@@ -1,4 +1,4 @@
-"""The rendered keyframes of a report, and what they tell."""
+"""The rendered keyframes of a report, and their figures."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ def depth_points(depth: NDArray, camera: Intrinsics, world_from_cam: NDArray[np.
 def seen_in_depth(
     points: Points, depth: NDArray, camera: Intrinsics, cam_from_world: NDArray[np.float64], slack: float
 ) -> NDArray[np.bool_]:
-    """(N,) whether a point lies in the picture and no further than `slack` metres behind the depth seen there."""
+    """(N,) whether a point lies in the image and no further than `slack` metres behind the depth seen there."""
     xy, z = project(se3.transform(cam_from_world, points), camera)
     # Pixels of points behind the camera are NaN, which compares false.
     seen = np.asarray(((xy >= 0) & (xy < (camera.width, camera.height))).all(axis=1))

@@ -28,7 +28,7 @@ class MapView:
     coverage: NDArray[np.float32]
 
     def exposed(self, exposure: Exposure | None, time: float) -> NDArray[np.uint8]:
-        """(H, W, 3) picture of the moment, with the exposure that the run found for it."""
+        """(H, W, 3) image of the moment, with the exposure that the run found for it."""
         color = self.color if exposure is None else exposure.apply(self.color, time)
         return np.round(np.clip(color, 0, 1) * 255).astype(np.uint8)
 

@@ -66,7 +66,7 @@ def trajectory_plots(outcome: Outcome, matched: MatchedTruth | None, upright: bo
     """SVGs of the camera path from above and from the side, with the truth where there is one.
 
     The axes are the path's own: its plane of largest extent is looked at from above; those of the world, where it
-    stands `upright`.
+    is `upright`.
     """
     t = outcome.trajectory
     centers = np.where(t.is_posed[:, None], t.centers, np.nan)
