@@ -81,7 +81,7 @@ def stage_sources(file: Path, root: Path = ROOT) -> set[Path]:
 
 @functools.cache
 def _imported_files(path: Path, root: Path) -> tuple[Path, ...]:
-    """Files of the modules that a file imports anywhere in it, and of the packages they lie in."""
+    """Files of the modules that a file imports anywhere in it, and of the packages they are in."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_bytes())):
         if isinstance(node, ast.Import):

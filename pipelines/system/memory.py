@@ -43,7 +43,7 @@ def submap_size(config: Config, camera: Intrinsics) -> int:
 
 
 def release_free_memory() -> None:
-    """Hand what is free back to the system, where the C library has a call for that: glibc keeps what lies between
+    """Hand what is free back to the system, where the C library has a call for that: glibc keeps what is between
     pieces still in use, after a window of structure from motion 40 to 190 MB."""
     if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
         trim(0)
@@ -55,7 +55,7 @@ def memory_room(memory_mb: int) -> float:
 
 
 def room_on(device: object, host: float) -> float:
-    """Bytes to plan with for what lies on a device: on a GPU what is free there now, whatever the `host` has."""
+    """Bytes to plan with for data on a device: on a GPU what is free there now, whatever the `host` has."""
     if not str(device).startswith("cuda"):
         return host
     import torch
@@ -64,7 +64,7 @@ def room_on(device: object, host: float) -> float:
 
 
 def machine_memory() -> float:
-    """Bytes of memory of the machine, or of the container where that has less; 8 GB where nobody tells."""
+    """Bytes of memory of the machine, or of the container where that has less; 8 GB where neither is known."""
     return min([_physical_memory(), *_container_limits()])
 
 

@@ -114,4 +114,4 @@ class WithinStage:
         yield from self.progress.track(items, f"{self.name}: {label}", total)
 
     def stage(self, event: StageEvent) -> None:
-        """Nothing: the stage around it is the one to tell of."""
+        """Nothing: the stage around it is reported."""
