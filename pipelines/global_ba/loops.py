@@ -41,7 +41,7 @@ def find_loops(
     intrinsics: Intrinsics,
     seed: int,
 ) -> FoundLoops:
-    """Verify candidate pairs of keyframe indices; `views`, which may be made as they are asked for, stand at
+    """Verify candidate pairs of keyframe indices; `views`, which may be made on demand, are at
     cam_from_world (N, 4, 4).
 
     A verified pair is still refused when the drift it claims is more than the path between its keyframes can have

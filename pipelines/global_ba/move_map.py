@@ -23,7 +23,7 @@ def move_map(
 ) -> GaussianMap:
     """The map after its keyframes (N,) moved from old to new poses (N, 4, 4), their depths times `depth_ratio` (N,).
 
-    A Gaussian keeps its place in its anchor's picture; its distance and radius change by the ratio. Gaussians whose
+    A Gaussian keeps its place in its anchor's image; its distance and radius change by the ratio. Gaussians whose
     anchor is not among the keyframes follow the one next to it in the sequence.
     """
     anchors = gaussian_map.anchor_frame_ids.cpu().numpy()

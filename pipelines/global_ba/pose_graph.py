@@ -1,7 +1,7 @@
 """A pose graph over similarities: consecutive and loop edges, by Gauss-Newton (first term of MSGS-SLAM eq. 26).
 
 An own solver, because pycolmap's pose graph averages rotations and knows no Sim(3) edges. A node is
-cam_from_world with a scale: x_cam = scale * R x_world + t. Loop edges stand under Cauchy's loss, so that one that
+cam_from_world with a scale: x_cam = scale * R x_world + t. Loop edges have Cauchy's loss, so that one that
 contradicts all others loses its pull.
 """
 

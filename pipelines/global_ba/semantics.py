@@ -18,7 +18,7 @@ GRID = (40, 30)
 
 @dataclass(frozen=True)
 class LabelSummary:
-    """labels (30, 40) uint8: the picture's labels, sampled; entropy in nats; boundary: share of pixels on a boundary;
+    """labels (30, 40) uint8: the image's labels, sampled; entropy in nats; boundary: share of pixels on a boundary;
     graph (C, C): how much border each pair of classes shares (off the diagonal) and each class's area (on it)."""
 
     labels: NDArray[np.uint8]
