@@ -33,10 +33,10 @@ class AlignedDepth:
     of_all = ("_learned", "_fits")
 
     def __init__(self, learned: OnnxDepth, sequence: Sequence, relative: str) -> None:
-        """Raises InputError without a backbone: nothing else tells the frames' scales."""
+        """Raises InputError without a backbone: nothing else gives the frames' scales."""
         if sequence.backbone is None:
             raise InputError(
-                f"{learned.name} knows depth only up to scale, and structure from motion found no points to tell it. "
+                f"{learned.name} knows depth only up to scale, and structure from motion found no points to fix it. "
                 "Move the camera sideways, or choose a metric network"
             )
         self._learned, self._sequence, self._relative = learned, sequence, relative
@@ -45,7 +45,7 @@ class AlignedDepth:
         self._spreads: list[float] = []
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
-        """The frames that have no pose, so that nothing tells their scale."""
+        """The frames without a pose, whose scale is therefore unknown."""
         return [f for f in frames if f.id not in self._sequence.cam_from_world]
 
     def look(self, frames: list[Frame]) -> None:
@@ -99,7 +99,7 @@ def fit_relative(values: Array, z: Array, relative: str) -> tuple[float, float]:
 
 
 def to_depth(values: Array, fit: tuple[float, float], relative: str) -> Array:
-    """Depth of values; 0 where the fit makes them lie behind the camera or beyond every distance."""
+    """Depth of values; 0 where the fit puts them behind the camera or beyond every distance."""
     linear = fit[0] * values + fit[1]
     known = linear > 1e-6 * max(abs(fit[1]), abs(fit[0]), 1e-12)
     safe = np.where(known, linear, 1)

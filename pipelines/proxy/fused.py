@@ -25,7 +25,7 @@ _FAR_OFF, _PROVEN = 0.2, 0.7
 _GUESS_SHARE, _GUESS_SPREAD, _GUESS_GAP = 0.9, 0.02, 0.15
 """Where the views do not agree, the geometry guesses from its surroundings, and is as good as a network: two guesses
 that miss differently are better together. Its share grows with how much the network strays around the scale field, and
-fades as the two lie farther apart (all in log depth)."""
+fades as the two differ more (all in log depth)."""
 
 
 class FusedDepth:
@@ -86,7 +86,7 @@ def fuse(learned: DepthEstimate, geometry: DepthEstimate, scale: float, frame_sc
     field, spread = _smooth_field(ratio, weight)
     for _ in range(2):
         field, spread = _smooth_field(ratio, weight / (1 + ((ratio - field) / _OUTLIER) ** 2))
-    # A wrong match agrees with a view or two by chance, but then stands far off the learned surface as well.
+    # A wrong match agrees with a view or two by chance, but then is far off the learned surface as well.
     lead &= ~both | (np.abs(ratio - field) < _FAR_OFF) | (geometry.confidence > _PROVEN)
     guessed = known & (geometry.confidence < SURE)
     doubt = spread**2 / (spread**2 + _GUESS_SPREAD**2)

@@ -53,7 +53,7 @@ def left_to_auto(config: Config) -> tuple[str, ...]:
 
 
 def check_proxy(source: Path, config: Config) -> None:
-    """InputError for a network that is not what its card says, a map of another shape than the pictures, and a scale
+    """InputError for a network that is not what its card says, a map of another shape than the images, and a scale
     reference that makes no sense."""
     if config.proxy.scale_ref.strip() == POSES and not config.frames.poses:
         raise InputError("--scale-ref poses needs poses: give them with --poses FILE|FOLDER")
@@ -80,7 +80,7 @@ def _digest_of(files: list[Path]) -> str:
 
 
 def _before_frames(source: Path, config: Config) -> ProviderContext:
-    """As if every picture of the source were a frame; none of them is decoded."""
+    """As if every image of the source were a frame; none of them is decoded."""
     pictures = open_source(source, config.run.format)
     width, height = pictures.width, pictures.height
     camera = Intrinsics(width, height, width, width, width / 2, height / 2)

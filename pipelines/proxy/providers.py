@@ -44,7 +44,7 @@ class DepthEstimate:
 class LabelEstimate:
     """labels (h, w) uint8 indices into the provider's class table or VOID; confidence (h, w) float32 in [0, 1].
 
-    descriptor (F,) is a unit vector that says how the picture looks, where a network gives one.
+    descriptor (F,) is a unit vector that says how the image looks, where a network gives one.
     """
 
     labels: NDArray[np.uint8]

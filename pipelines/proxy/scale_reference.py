@@ -1,4 +1,4 @@
-"""Metres from one thing that the user knows: a distance in one picture, or how high the camera was held."""
+"""Metres from one thing that the user knows: a distance in one image, or how high the camera was held."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _PIXEL_SD = 1.0
 
 @dataclass(frozen=True)
 class Reference:
-    """metres between `points` (2, 2), pixels of `picture` of the source; the camera's height where picture is ""."""
+    """metres between `points` (2, 2), pixels of `picture` of the source; the camera's height where that is ""."""
 
     metres: float
     picture: str = ""
@@ -72,7 +72,7 @@ def parse_reference(text: str) -> Reference | None:
 
 
 def require_reference_in(source: Source, text: str) -> None:
-    """Raise InputError for a reference that is malformed, to a picture the source does not have, or outside it."""
+    """Raise InputError for a reference that is malformed, to an image the source does not have, or outside it."""
     reference = parse_reference(text)
     if reference is None or not reference.picture:
         return
@@ -88,7 +88,7 @@ def distance_scale(
     """The scale that makes the two points as far apart as they are known to be.
 
     They are followed into the nearest keyframes and measured in each by its depth; the median counts. Raises
-    InputError when no keyframe near the picture sees both with reliable depth.
+    InputError when no keyframe near the image sees both with reliable depth.
     """
     index = _picture_index(source, reference.picture)
     picture = next(iter(source.read({index})), None)
@@ -123,7 +123,7 @@ def height_scale(reference: Reference, heights: Array) -> ReferenceScale:
 
 
 def _picture_index(source: Source, picture: str) -> int:
-    """Index in the source of a picture: the image's name, or the number of the video's frame."""
+    """Index in the source of an image: by its name, or the number of the video's frame."""
     if isinstance(source, VideoSource):
         # Headers of videos may promise no frames at all.
         if not picture.isdecimal() or 0 < source.expected_frames <= int(picture):
@@ -138,9 +138,9 @@ def _picture_index(source: Source, picture: str) -> int:
 
 
 def _follow(first: NDArray[np.uint8], second: NDArray[np.uint8], points: Array) -> Array | None:
-    """(2, 2) the points of one picture in another, by optical flow there and back; None where one is lost.
+    """(2, 2) the points of one image in another, by optical flow there and back; None where one is lost.
 
-    The first is a picture of the source, the second a frame without lens distortion: also between equal instants
+    The first is an image of the source, the second a frame without lens distortion: also between equal instants
     points move a little.
     """
     a, b = to_grey(first), to_grey(second)

@@ -124,7 +124,7 @@ def open_depth(around: ProviderContext) -> DepthProvider:
 
 def _wants_fusion(around: ProviderContext, choice: Choice, learned: DepthProvider) -> bool:
     """Whether the depth gains from multi-view depth: a network's does; that of files may come from a sensor, or from a
-    network that somebody ran before, and the points of structure from motion tell which."""
+    network that somebody ran before, and the points of structure from motion decide which."""
     if around.config.fuse != "learned" or choice.card is not None:
         return around.config.fuse != "never"
     posed = [f for f in around.sequence.frames if f.id in around.sequence.cam_from_world]
@@ -158,14 +158,14 @@ def open_learned_semantics(around: ProviderContext, choice: Choice) -> FilesLabe
 
 
 def open_depth_files(around: ProviderContext, folder: str) -> FilesDepth | RecordingDepth:
-    """The depth of a folder; without one, that of the data set itself, or what lies beside the source."""
+    """The depth of a folder; without one, that of the data set itself, or files beside the source."""
     if not folder and around.recording is not None:
         return RecordingDepth(around.recording, around.sequence)
     return FilesDepth(folder, around.source, around.sequence, around.config.depth_scale)
 
 
 def open_label_files(around: ProviderContext, folder: str) -> FilesLabels | RecordingLabels:
-    """The labels of a folder; without one, those of the data set itself, or what lies beside the source."""
+    """The labels of a folder; without one, those of the data set itself, or files beside the source."""
     if not folder and around.recording is not None:
         return RecordingLabels(around.recording, around.sequence, around.progress)
     return FilesLabels(folder, around.source, around.sequence, around.progress)
@@ -190,7 +190,7 @@ def _cached(task: str) -> Card | None:
 
 
 def metric_card() -> Card | None:
-    """The card of the best network in the cache that tells metres, be it good for nothing else; None without one."""
+    """The card of the best network in the cache for metric depth, be it good for nothing else; None without one."""
     model = ModelStore.open().first_metric()
     return None if model is None else ModelStore.open().card(model)
 

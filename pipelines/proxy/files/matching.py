@@ -69,7 +69,7 @@ def match_files(
 
 
 def _list(folder: Path, suffixes: tuple[str, ...], names: tuple[str, ...]) -> list[Path]:
-    """The map files of a folder; where several kinds lie together, those that carry one of `names`."""
+    """The map files of a folder; where several kinds are mixed, those that carry one of `names`."""
     files = sorted(
         (p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith(".")),
         key=lambda p: natural_key(p.name),

@@ -22,7 +22,7 @@ from msgs_slam.pipelines.types import VOID, ClassTable, Frame
 
 
 class _RecordingMaps:
-    """What depth and labels share: frames are pictures of the recording, its maps cover its pictures."""
+    """What depth and labels share: frames are images of the recording, its maps cover its images."""
 
     def __init__(self, recording: Recording, sequence: Sequence) -> None:
         self._recording, self._sequence = recording, sequence
@@ -30,7 +30,7 @@ class _RecordingMaps:
 
     @cached_property
     def _pixels(self) -> FramePixels:
-        """The map's pixels in the recording's pictures, which may be distorted."""
+        """The map's pixels in the recording's images, which may be distorted."""
         return FramePixels(replace(self._sequence.calibration, intrinsics=self._sequence.intrinsics))
 
     def _nothing(self) -> NDArray[np.float32]:

@@ -25,7 +25,7 @@ from msgs_slam.pipelines.types import VOID, ClassTable, Frame
 _LEAST_SHARE = 0.001
 """A class on a smaller share of all pixels is noise of the network and becomes void."""
 _SIDE = 160
-"""Samples of the probabilities that are kept along the longer side of a picture: networks give 33 to 128."""
+"""Samples of the probabilities that are kept along the longer side of an image: networks give 33 to 128."""
 _STEPS = 16
 """Steps of the stored probabilities in each halving: 4 %; 255 of them reach down to 2e-5."""
 
@@ -53,7 +53,7 @@ class OnnxLabels:
         self._scene: NamedScene | None = None
         identity = f"{card_identity(card)} {place.sequence.intrinsics.width}x{place.sequence.intrinsics.height}"
         self._pass = NetworkPass(self.name, identity, place, self._compute)
-        if card.text is not None:  # no file says whether a picture's features are as long as a word's
+        if card.text is not None:  # no file says whether an image's features are as long as a word's
             camera = place.sequence.intrinsics
             self._compute(np.full((camera.height, camera.width, 3), 128, np.uint8))
 
@@ -119,7 +119,7 @@ class OnnxLabels:
         """What has to be known of all frames before `_probabilities`: nothing, the network knows its classes."""
 
     def _probabilities(self, frame: Frame) -> NDArray[np.float32]:
-        """(rows, columns, C) over the whole picture; 0 where the network says nothing."""
+        """(rows, columns, C) over the whole image; 0 where the network says nothing."""
         halvings = self._pass.load(frame)["halvings"]
         said = np.exp2(-halvings.astype(np.float32) / np.float32(_STEPS))
         return np.where(halvings.min(-1, keepdims=True) < 255, said, 0).astype(np.float32)

@@ -103,7 +103,7 @@ class Workplace:
 
 
 class NetworkPass:
-    """`compute` turns a picture (h, w, 3) into named arrays; `identity` says what else they depend on."""
+    """`compute` turns an image (h, w, 3) into named arrays; `identity` says what else they depend on."""
 
     def __init__(
         self, name: str, identity: str, place: Workplace, compute: Callable[[NDArray[np.uint8]], Arrays]

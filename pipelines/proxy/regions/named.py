@@ -61,7 +61,7 @@ class NamedScene:
         probabilities_of: Callable[[Frame], NDArray[np.float32]],
         vocabulary: Vocabulary,
     ) -> NamedScene:
-        """All frames vote; `probabilities_of` gives (rows, columns, C) over the frame's picture, 0 for nothing said."""
+        """All frames vote; `probabilities_of` gives (rows, columns, C) over the frame's image, 0 for nothing said."""
         sequence = segments.sequence
         voxels, gravity, kind = segments.structure(frames, depth_of)
         votes = np.zeros((len(voxels), len(vocabulary.names) + 1), np.float32)

@@ -16,7 +16,7 @@ _STANDING = frozenset(
 )
 _LIES, _STANDS = np.cos(np.radians(45)), np.cos(np.radians(35))
 _ON_FLOOR = 0.25
-"""Up to this share of the cameras' height over the floor a thing may lie on it."""
+"""Up to this share of the cameras' height over the floor a thing may be above it and still count as lying on it."""
 _AGAINST = float(np.exp(-2.0))
 """Probability left to a name that the geometry contradicts: normals of stereo depth err too. Factors e^-2 and e^-4 did
 equally well on two recordings."""

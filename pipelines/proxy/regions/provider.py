@@ -86,7 +86,7 @@ class SegmentLabels:
     def structure(
         self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]
     ) -> tuple[Voxels, Gravity, NDArray[np.int64]]:
-        """All frames' surface in voxels (V,), which way is up, and floor, ceiling, wall, surface or other (V,)."""
+        """All frames' surface in voxels (V,), gravity, and floor, ceiling, wall, surface or other (V,)."""
         posed = [f for f in frames if f.id in self._world_from_cam]
         self._size = _scene_depth([depth_of(f) for f in posed[:: max(1, len(posed) // 12)]]) / _VOXELS_PER_DEPTH
         release_free_memory()  # what depths and moving things have needed
