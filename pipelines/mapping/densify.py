@@ -16,7 +16,7 @@ def holes(silhouette: Tensor, least: float) -> Tensor:
 def hidden_surfaces(rendered: Tensor, proxy: Tensor, trust: Tensor, tolerance: float) -> Tensor:
     """(H, W) bool: condition (b), a trusted proxy is nearer than the map by more than `tolerance` of its depth.
 
-    The less the proxy is trusted, the farther it has to stand out.
+    The less the proxy is trusted, the larger the difference has to be.
     """
     allowed = tolerance * proxy / trust.clamp(min=0.1)
     return (proxy > 0) & (rendered - proxy > allowed)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 STRIDE = 4
-"""Every so many-th pixel of every so many-th row tells."""
+"""Stride of the pixels that are used, in both directions."""
 SOLID = 0.9
 """Of what the map covers less, its colours say nothing yet."""
 LEAST = 100
@@ -28,10 +28,10 @@ def fit_exposure(shown: Tensor, photo: Tensor, known: Tensor, exposure: Tensor) 
     """(2, 3) log gain and offset by which the map's colours `shown` (H, W, 3) are nearest to `photo` (H, W, 3).
 
     One step of iteratively reweighted least squares towards the least absolute difference, in closed form, from
-    `exposure` (2, 3); `known` (H, W) are the pixels that tell. Taken whole at every visit: Adam moves an exposure by a
-    few per cent in all the visits of a view together, and a camera that adapts to a window does more from one picture
+    `exposure` (2, 3); `known` (H, W) are the pixels to use. Taken whole at every visit: Adam moves an exposure by a
+    few per cent in all the visits of a view together, and a camera that adapts to a window does more from one image
     to the next. Chosen on five whole recordings, two by cameras, all of which gain; a made room of 13 views, whose map
-    stays far from its pictures, loses by it, and gains where only a third of each step is taken.
+    stays far from its images, loses by it, and gains where only a third of each step is taken.
     """
     part = (slice(None, None, STRIDE),) * 2
     use = known[part].reshape(-1, 1).double()

@@ -41,8 +41,8 @@ def load_views(
 ) -> MappingInput:
     """The keyframes of `trajectory` with images and proxies, in order.
 
-    Of `memory`, bytes, or of what a GPU has free where the views lie on one, a quarter is for views; what has no room
-    there is read again when it is visited. Depths are in the unit of the world by `fields`, those of tracking unless
+    A quarter of `memory`, bytes, or of the GPU's free memory where the views are on one, is for views; the rest is
+    read again when it is visited. Depths are in the unit of the world by `fields`, those of tracking unless
     others are given; what other views see through is unknown. Without `class_ids` the channels are the classes that
     occur.
     """

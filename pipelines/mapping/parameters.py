@@ -31,7 +31,7 @@ class MapParameters:
         return MapParameters(AdamTable(values), gaussian_map.anchor_frame_ids, torch.ones_like(gaussian_map.log_radii))
 
     def to_map(self) -> GaussianMap:
-        """The map as it stands."""
+        """Return a copy of the current map."""
         return GaussianMap(**{k: self[k].detach().clone() for k in KEYS}, anchor_frame_ids=self.anchor_frame_ids)
 
     def __getitem__(self, key: str) -> Tensor:

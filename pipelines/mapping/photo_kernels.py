@@ -1,6 +1,6 @@
 """Triton kernels of the photo loss and the exposure: what `photo_loss` compiles for a CPU, on a card.
 
-Pictures are flat: number i is a colour of pixel i // 3. The sums are atomic additions: their last bits may differ from
+Images are flat: number i is a colour of pixel i // 3. The sums are atomic additions: their last bits may differ from
 run to run. The interpreter of Triton (environment variable TRITON_INTERPRET=1) runs these kernels on CPU tensors.
 """
 
@@ -51,7 +51,7 @@ def blur_planes(
     numbers: tl.tensor, TAPS: tl.constexpr, BLOCK: tl.constexpr,
 ) -> None:  # fmt: skip
     """The window's mean of `numbers` numbers of planes of `size`, along rows of `row` numbers with step 3, or along
-    columns, whose `row` is the whole plane, with the step of a picture's row; zeros outside the picture."""
+    columns, whose `row` is the whole plane, with the step of an image's row; zeros outside the image."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < numbers
     place = (i % size) % row

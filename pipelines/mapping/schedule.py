@@ -26,8 +26,8 @@ RATE_DECAY = 0.03
 """Learning rates at the end, as a share of those at the start. 0.06 shows more on two stretches of eight keyframes, and
 0.9 dB less on the whole of replica, where 77 views pull in turn at each Gaussian."""
 LEAST_SHOWN = 0.5
-"""What is left out of the pictures is made up for by more visits, but by no more than twice as many: a place is visited
-as often as if nobody had stood before it. A walk of 45 frames with somebody on a fifth of it comes 0.20 dB nearer to
+"""What is left out of the images is made up for by more visits, but by no more than twice as many: a place is visited
+as often as if nobody had covered it. A walk of 45 frames with somebody on a fifth of it comes 0.20 dB nearer to
 the same walk without her with her outline given, 0.41 dB with that of the networks."""
 TIME_DECAY = 0.1
 """τ of eq. (13), a keyframe, while the map is seeded."""
@@ -87,7 +87,7 @@ class Schedule:
         """The schedule for these views; `passes` overrides that of the settings, which also have a least count;
         `keyframe_miou` is T_sem of eq. (12), 0 leaves it away; `first_rate`: learning rates of the first visit; below 1
         the map only settles, and keeps its Gaussians."""
-        # Read once: views may lie on disk.
+        # Read once: views may be on disk.
         reliability, shares = np.array([(float(v.trust.mean()), v.shown) for v in views]).T
         shown = max(float(shares.mean()), LEAST_SHOWN)
         visits = round((settings.passes if passes is None else passes) * len(views) / shown)

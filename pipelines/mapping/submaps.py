@@ -15,13 +15,13 @@ from msgs_slam.pipelines.depth.posed import PosedDepth
 BORDER = 16
 """Keyframes of other submaps that a submap is made with beside its own."""
 _SLACK, _UNEVEN = 0.3, 0.5
-"""A cut may lie this share of a submap away from where all become even; there it has to share this much less."""
+"""A cut may be this share of a submap away from where all become even; there it has to share this much less."""
 _IN_ORDER = 1e-3
 """Overlap that keyframes beside each other in time have at least: what shows nothing known belongs to somewhere."""
 _SHARES = 0.05
-"""Submaps lie beside each other where a keyframe of one has in its picture this much of what one of the other shows."""
+"""Submaps are neighbours where a keyframe of one has in its image this share of what one of the other shows."""
 _SEEN_THROUGH = 0.05
-"""Relative: a view does not tell about what lies farther behind its surface."""
+"""Relative: a view says nothing about points farther behind its surface."""
 
 Ids = NDArray[np.int64]
 

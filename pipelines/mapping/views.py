@@ -18,12 +18,12 @@ from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 
 @dataclass(frozen=True)
 class View:
-    """A posed picture with its proxies.
+    """A posed image with its proxies.
 
-    cam_from_world (4, 4) float64, on the host wherever the others lie; image (H, W, 3) uint8; depth (H, W) float32 in
+    cam_from_world (4, 4) float64, on the host wherever the others are; image (H, W, 3) uint8; depth (H, W) float32 in
     the world's unit, 0 = unknown; reliability U (H, W) uint8 0..255; channels (H, W) uint8: the class *channel* of each
     pixel, VOID where unknown; channel_confidence (H, W) uint8; scene (H, W) bool:
-    False where the picture shows what is no part of the scene, None where all of it is. Kept in bytes: a run has
+    False where the image shows what is no part of the scene, None where all of it is. Kept in bytes: a run has
     hundreds of views.
     """
 
@@ -60,11 +60,11 @@ class View:
 
     @property
     def shown(self) -> float:
-        """Share of the picture that shows the scene; above 0."""
+        """Share of the image that shows the scene; above 0."""
         return 1.0 if self.scene is None else max(float(self.scene.float().mean()), 1e-6)
 
     def of_scene(self, values: Tensor, elsewhere: Tensor | float = 0.0) -> Tensor:
-        """(H, W) or (H, W, channels) `values` where the picture shows the scene."""
+        """(H, W) or (H, W, channels) `values` where the image shows the scene."""
         if self.scene is None:
             return values
         scene = self.scene if values.ndim == 2 else self.scene[..., None]
@@ -90,7 +90,7 @@ def make_view(
     device: torch.device | str = "cpu",
     left_out: NDArray[np.bool_] | None = None,
 ) -> View:
-    """A view of the size of `intrinsics`; `maps` None stands for a frame of which no provider said anything, `left_out`
+    """A view of the size of `intrinsics`; `maps` None is a frame without proxies, `left_out`
     (any size) is what of it is no part of the scene."""
     width, height = intrinsics.width, intrinsics.height
     if image.shape[:2] != (height, width):

@@ -1,4 +1,4 @@
-"""Keyframes by what they show, MSGS-SLAM eq. (12): beside a new one stand those whose labels differ from its own."""
+"""Keyframes by what they show, MSGS-SLAM eq. (12): a new one is paired with those whose labels differ from its own."""
 
 from __future__ import annotations
 

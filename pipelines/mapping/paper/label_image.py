@@ -1,6 +1,6 @@
-"""The semantic image compared like a picture, MSGS-SLAM eq. (20), instead of cross-entropy.
+"""The semantic image compared like a colour image, MSGS-SLAM eq. (20), instead of cross-entropy.
 
-Off: on 8 keyframes of replica with noisy labels mIoU 94.0 % with it, 94.6 % with cross-entropy; pictures and depth
+Off: on 8 keyframes of replica with noisy labels mIoU 94.0 % with it, 94.6 % with cross-entropy; images and depth
 alike.
 """
 
