@@ -97,7 +97,7 @@ class JsonHandler(logging.Handler):
 
 
 def is_asked_for(arguments: Iterable[str]) -> bool:
-    """Whether a command line asks for JSON lines; seen before it is parsed, for what is wrong with it is told so."""
+    """Whether a command line asks for JSON lines; seen before it is parsed, for errors in it are reported so."""
     words = list(arguments)
     given = [b for a, b in pairwise(words) if a == "--log-format"]
     given += [w.partition("=")[2] for w in words if w.startswith("--log-format=")]

@@ -121,7 +121,7 @@ def verify() -> None:
 @models.command()
 @click.argument("name")
 def path(name: str) -> None:
-    """Print where a model's file lies."""
+    """Print the path of a model's file."""
     from msgs_slam.formats.errors import InputError
     from msgs_slam.pipelines.networks.registry import ModelStore
 

@@ -163,7 +163,7 @@ _SOURCE_OPTIONS = {
         "lat, lon, alt (a video counts from its start). Default: auto, the images' EXIF; off for neither.",
     ),
 }  # fmt: skip
-"""Option → the setting it stands for, what is given, help."""
+"""Option → its setting, metavar, help."""
 
 
 def source_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -217,11 +217,11 @@ def set_up_logging(quiet: bool, verbose: bool, as_json: bool | None = None) -> N
 
 
 _said: set[str] = set()
-"""The warnings that have been told since logging was set up."""
+"""The warnings shown since logging was set up."""
 
 
 class SaidOnce(logging.Filter):
-    """A warning is told once, however often it comes."""
+    """Shows a warning once, however often it comes."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -237,7 +237,7 @@ class SaidOnce(logging.Filter):
 
 
 def is_said(warning: str) -> bool:
-    """Whether it has been told already."""
+    """Whether it has been shown already."""
     return warning in _said
 
 

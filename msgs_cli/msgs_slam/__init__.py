@@ -7,7 +7,7 @@
     view = run.draw(run.world_from_cam[0])
     view.color, view.depth, view.labels
 
-Everything else of the program lies beside it under this name: `msgs_slam.formats`, `msgs_slam.pipelines`.
+Everything else of the program is importable under this name: `msgs_slam.formats`, `msgs_slam.pipelines`.
 """
 
 from __future__ import annotations
