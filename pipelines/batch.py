@@ -144,7 +144,7 @@ def work_on(job: Job) -> str:
 
 
 def table_rows(recordings: Iterable[Recording]) -> list[dict[str, Any]]:
-    """One row a recording, from what lies in its run folder: whoever worked on it, and whenever."""
+    """One row a recording, from the files of its run folder: whoever worked on it, and whenever."""
     return [_row(r) for r in recordings]
 
 

@@ -175,7 +175,7 @@ class ExportConfig:
 
     axes: str = setting(
         "up",
-        "up: z up where up can be told, the floor at 0 where one is found; first: those of the first posed camera",
+        "up: z up where gravity is found, the floor at 0 where one is found; first: those of the first posed camera",
         ("up", "first"),
     )
     gps: str = setting(
@@ -190,7 +190,7 @@ class ExportConfig:
     mesh_side: int = setting(640, "pixels on the long side of their depth images", within=(16, 8192))
     scale: str = setting(
         "auto",
-        "where nothing tells metres, auto says how long a unit is about, by a network and usual sizes; free does not",
+        "where metres are unknown, auto estimates how long a unit is, by a network and usual sizes; free does not",
         ("auto", "free"),
     )
     spz: bool = setting(False, "write the map as point_cloud.spz too")

@@ -20,7 +20,7 @@ from msgs_slam.pipelines.system.progress import Progress
 
 VIDEO, TRUTH, RUN = "room.mp4", "room_truth", "room.msgs"
 CLIP = Path(__file__).with_name("demo_clip")
-"""The video, and its truth without the pictures as a zip: 36 frames of a made-up room (tests/world/demo_clip.py)."""
+"""The video, and its truth without the images as a zip: 36 frames of a made-up room (tests/world/demo_clip.py)."""
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ class GaussianMap:
 
 
 def decided_channels(logits: Tensor) -> Tensor:
-    """(..., C) class logits → (...) int64 channels; -1 where no class stands out: what was void in every view.
+    """(..., C) class logits → (...) int64 channels; -1 where no class dominates: what was void in every view.
 
     Seeds of void pixels have logits of zero, and what no label has spoken for stays near that.
     """

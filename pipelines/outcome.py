@@ -111,7 +111,7 @@ class Outcome:
         if self.move is not None:
             raise ValueError("this outcome is no longer in the run's own world")
         poses = other_from_run.apply_to_poses(self.trajectory.cam_from_world)
-        # A lost frame keeps its identity: it stands nowhere.
+        # A lost frame keeps its identity: it has no position.
         poses = np.where(self.trajectory.is_posed[:, None, None], poses, self.trajectory.cam_from_world)
         return replace(
             self,

@@ -160,7 +160,7 @@ def _run(
             raise RecoverableError(f"{error}. {kept}") from error
         if not same:
             raise RecoverableError(
-                f"{source} has changed since {run.root} was begun. {kept}. Or reconstruct what it is now into another "
+                f"{source} has changed since {run.root} was made. {kept}. Or reconstruct what it is now into another "
                 "folder: --out NEW"
             )
 

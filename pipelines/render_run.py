@@ -1,4 +1,4 @@
-"""The finished map as a video or as pictures, along the run's own path or another."""
+"""The finished map as a video or as images, along the run's own path or another."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ KINDS = ("color", "depth", "labels", "side-by-side")
 PATHS = ("own", "smooth", "orbit")
 _SMOOTHING_SECONDS = 0.5
 _FILE_SIZE, _FIELD_OF_VIEW = (960, 540), np.radians(50)
-"""Of pictures of a splat file, which tells nothing of cameras: the field of view is from top to bottom."""
+"""Of images of a splat file, which stores no cameras: the field of view is from top to bottom."""
 
 
 def render_run(
@@ -44,8 +44,8 @@ def render_run(
 ) -> Path:
     """Draw the map along a path into a video (.mp4, .avi, .mkv) or, for any other name, a folder of PNG files.
 
-    kind: one of `KINDS`; path: one of `PATHS`; frames: how many pictures, 0 = as long as the walk took (an orbit: ten
-    seconds); size: (width, height) of a picture, by default the run's. Returns `target`; where browsers will not play
+    kind: one of `KINDS`; path: one of `PATHS`; frames: how many images, 0 = as long as the walk took (an orbit: ten
+    seconds); size: (width, height) of an image, by default the run's. Returns `target`; where browsers will not play
     the video, a warning says so. Raises InputError for an unknown kind or path, or a run without a map.
     """
     _require_choice("kind", kind, KINDS)

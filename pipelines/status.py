@@ -28,7 +28,7 @@ OUTDATED, NOT_YET = "outdated", "not yet"
 @dataclass(frozen=True)
 class StageStatus:
     """state: done; running (a process makes it now); damaged (done, but some of its files are gone or not as it left
-    them); interrupted (begun and not ended); outdated (its files are there, but were made with other settings or from
+    them); interrupted (started and not ended); outdated (its files are there, but were made with other settings or from
     other inputs than the stages before it have by now); not yet. record: of a stage that is done; changed: settings of
     run.toml, as `section.key=value`, with which `resume` would make it again; damaged: names of those files;
     expected_mb: the peak of memory that other recordings of that size have had, None before the keyframes are known;
@@ -120,7 +120,7 @@ class RunStatus:
 
 
 def run_status(run: RunFolder, program: Sequence[Stage] = ()) -> RunStatus:
-    """Reads every file of the run once, to tell which are damaged; with the stages of the `program`, tells too what it
+    """Reads every file of the run once, to find damaged ones; with the stages of the `program`, reports too what it
     would make again, and why.
 
     Raises InputError where the manifest or the settings are damaged.
@@ -169,7 +169,7 @@ def expected_mb(stage: str, run: RunFolder, config: Config) -> float | None:
 
     try:
         camera, found = run.load_calibration().intrinsics, load_records(run)["frames"].figures
-    except InputError:  # damaged, which is told elsewhere
+    except InputError:  # damaged, which is reported elsewhere
         return None
     keyframes, small = int(found.get("keyframes", found["frames"])), camera.at_most(config.mapping.max_side)
     parts = submap_count(keyframes, submap_size(config, camera))

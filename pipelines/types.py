@@ -121,7 +121,7 @@ class Intrinsics:
     def every(self, stride: int) -> Intrinsics:
         """The camera of an image's pixels [stride // 2 :: stride] along both sides.
 
-        Of an even stride these are not the middles of the squares that a smaller picture of the same view would have.
+        Of an even stride these are not the middles of the squares that a smaller image of the same view would have.
         """
         off = stride // 2 - (stride - 1) / 2
         width, height = (len(range(stride // 2, side, stride)) for side in (self.width, self.height))
@@ -199,7 +199,7 @@ class Trajectory:
 
     frame_ids (N,) int, timestamps (N,) seconds, cam_from_world (N, 4, 4) float64 (identity where lost),
     is_keyframe (N,) bool, lost_reasons: N strings, "" where the frame is posed. by_rotation (N,) bool: of the pose only
-    the rotation is known, the frame was put where its neighbour stands; by default of none.
+    the rotation is known, the frame was put at its neighbour's position; by default of none.
     """
 
     frame_ids: NDArray[np.int64]
