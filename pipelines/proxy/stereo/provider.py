@@ -24,7 +24,8 @@ from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
 from msgs_slam.pipelines.proxy.stereo.borrow import agreed_depth, borrow_depth, carry_depth
 from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
-from msgs_slam.pipelines.proxy.stereo.fill import fill_unsure, judge_by_company
+from msgs_slam.pipelines.proxy.stereo.evidence import evidence_of, prefer_matches, surface_contrast
+from msgs_slam.pipelines.proxy.stereo.fill import SURE, fill_unsure, judge_by_company
 from msgs_slam.pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
 from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth
 from msgs_slam.pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
@@ -35,13 +36,17 @@ from msgs_slam.pipelines.types import Frame, Intrinsics
 from msgs_slam.pipelines.voxels.voxels import to_lab
 
 _CACHED_FRAMES = 48
-_VIEWS, _BEST, _FUSE_VIEWS, _LENDERS = 6, 3, 8, 16
-"""Keyframes that one is matched with, those of them that count at a pixel, those whose depths are compared, and those
-that lend theirs."""
+_VIEWS, _FUSE_VIEWS, _LENDERS = 12, 8, 16
+"""Keyframes that one is matched with, those whose depths are compared, and those that lend theirs. What lies beside a
+near thing is hidden from half of the views."""
+_LEAST_BEST, _MOST_BEST = 3, 5
+"""Of the views that one is matched with, the better half counts at a pixel, but not fewer or more than these."""
+_RANGE_VIEWS = 6
+"""Their points say how near and far to look."""
 _CACHED_LENDERS = _LENDERS + 4
 _BEST_ANGLE = 8.0
 """Degrees between the views of a pair."""
-_SMALL_STEP, _JUMP, _EDGE = 0.05, 0.4, 0.05
+_SMALL_STEP, _JUMP, _EDGE = 0.1, 1.2, 0.05
 """Of the smoothing: a plane more or less, any other step, and the intensity step that makes it cheap."""
 _STIFFNESS = 0.01
 _STOP = 0.02
@@ -101,19 +106,19 @@ class MultiviewDepth:
         """(H, W) inverse depth of one keyframe from its neighbours alone; 0 where nothing matches."""
         camera = self._camera
         companions = self._neighbours(index, _VIEWS)
-        limits = depth_range(self._model, index, companions)
+        limits = depth_range(self._model, index, companions[:_RANGE_VIEWS])
         if len(companions) == 0 or limits is None:
             return np.zeros((camera.height, camera.width), np.float32)
         image, left_out = self._grey(int(self._model.frame_ids[index]))
         others = np.stack([_blanked(*self._grey(int(self._model.frame_ids[j]))) for j in companions])
         warps = self._warps(index, companions)
         planes = np.linspace(1 / limits[1], 1 / limits[0], self._planes)
-        step = planes[1] - planes[0]
-        cost = sweep_cost(image, others, warps, planes, _BEST, self._bands)
+        step, best = planes[1] - planes[0], best_count(len(companions))
+        cost = sweep_cost(image, others, warps, planes, best, self._bands)
         total = smooth_cost(cost, image, _SMALL_STEP, _JUMP, _EDGE, self._bands)
         inverse = (planes[0] + pick_planes(total) * step).astype(np.float32)
         inverse = cv2.bilateralFilter(inverse, 7, step, 2.0)
-        inverse = refine_inverse_depth(image, others, warps, inverse, step / 3, 2, _STIFFNESS, _BEST, self._bands)
+        inverse = refine_inverse_depth(image, others, warps, inverse, step / 3, 2, _STIFFNESS, best, self._bands)
         inverse = cv2.bilateralFilter(inverse, 7, 0.7 * step, 2.0)
         inverse = np.clip(inverse, planes[0], planes[-1]).astype(np.float32)
         unknown = at_stops(inverse, planes)
@@ -128,9 +133,24 @@ class MultiviewDepth:
             empty = np.zeros((target.height, target.width), np.float32)
             return DepthEstimate(empty, empty)
         index = self._index[frame.id]
-        depth, confidence = self._borrow(index)
-        depth, confidence = fill_unsure(depth, confidence, self._small(index))
+        borrowed, sure = self._borrow(index)
+        filled, confidence = fill_unsure(borrowed, sure, self._small(index))
+        depth = np.where(sure < SURE, self._prefer_matches(index, filled), filled)
         return upsample_depth(depth, confidence, self._sequence.image(frame))
+
+    def _prefer_matches(self, index: int, filled: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The keyframe's own matches where the depths of others bear them out better than what was filled in."""
+        companions = self._present(self._neighbours(index, _VIEWS))
+        if len(companions) == 0:
+            return filled
+        others = np.stack([self._fused(j)[0] for j in companions.tolist()])
+        warps, back = self._warps(index, companions), self._rows_back(index, companions)
+
+        def borne_out(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+            _, support, conflict = fuse_depths(depth, others, warps, back, 2 * _TOLERANCE, self._bands)
+            return np.asarray(support - conflict)
+
+        return prefer_matches(filled, self._fused(index)[0], borne_out, self._contrast(index))
 
     def _borrow(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth and confidence of one keyframe, with sure depths of others where its own is unsure."""
@@ -148,11 +168,10 @@ class MultiviewDepth:
         if len(companions) == 0:
             return depth, np.where(depth > 0, 0.2, 0).astype(np.float32)
         others = np.stack([self._raw(int(j)) for j in companions])
-        back = np.array([self._warps(int(j), np.array([index]))[0][2] for j in companions])
-        fused, support, conflict = fuse_depths(
-            depth, others, self._warps(index, companions), back, _TOLERANCE, self._bands
-        )
-        return fused, judge_by_company(agreement(support, conflict), self._small(index))
+        warps, back = self._warps(index, companions), self._rows_back(index, companions)
+        fused, support, conflict = fuse_depths(depth, others, warps, back, _TOLERANCE, self._bands)
+        confidence = agreement(support, conflict) * evidence_of(self._contrast(index))
+        return fused, judge_by_company(confidence, self._small(index))
 
     def figures(self) -> dict[str, Any]:
         """The size that the images were matched at."""
@@ -178,6 +197,13 @@ class MultiviewDepth:
         matrix, poses = self._camera.matrix, self._model.cam_from_world
         return warps_to(matrix, poses[index], [matrix] * len(others), [poses[j] for j in others])
 
+    def _rows_back(self, index: int, others: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(N, 4) what gives this keyframe's z of the others' pixels, as `fuse_depths` wants it."""
+        return np.array([self._warps(int(j), np.array([index]))[0][2] for j in others])
+
+    def _contrast(self, index: int) -> NDArray[np.float32]:
+        return surface_contrast(self._grey(int(self._model.frame_ids[index]))[0])
+
     def _read_grey(self, frame_id: int) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
         rgb = self._sequence.read_image(self._frame[frame_id])
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
@@ -193,6 +219,11 @@ class MultiviewDepth:
     def _load_raw(self, index: int) -> NDArray[np.float32]:
         inverse = load_scratch(self._path(int(self._model.frame_ids[index])))["inverse_depth"]
         return invert(inverse)
+
+
+def best_count(views: int) -> int:
+    """How many of so many views count at a pixel: the others may not see it."""
+    return min(_MOST_BEST, max(_LEAST_BEST, views // 2))
 
 
 def _blanked(grey: NDArray[np.float32], left_out: NDArray[np.bool_] | None) -> NDArray[np.float32]:

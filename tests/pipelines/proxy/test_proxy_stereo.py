@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
 from msgs_slam.pipelines.proxy.stereo.borrow import agreed_depth, borrow_depth, carry_depth
 from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
+from msgs_slam.pipelines.proxy.stereo.evidence import evidence_of, prefer_matches, surface_contrast
 from msgs_slam.pipelines.proxy.stereo.fill import SURE, fill_unsure, judge_by_company
-from msgs_slam.pipelines.proxy.stereo.provider import at_stops
+from msgs_slam.pipelines.proxy.stereo.provider import at_stops, best_count
 from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth
 from msgs_slam.pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
 from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost, warps_to
@@ -254,13 +255,44 @@ def test_a_chance_match_in_a_blank_wall_is_not_sure_for_it_stands_alone() -> Non
     assert judged[20, 10] < SURE / 2
     assert judged[:, 36:].min() > 0.6
     one_surface = judge_by_company(np.full((HEIGHT, WIDTH), 0.8, np.float32), image)
-    np.testing.assert_allclose(one_surface, 0.64**0.75, rtol=1e-4)
+    np.testing.assert_allclose(one_surface, 0.64**0.9, rtol=1e-4)
 
 
 def test_the_ends_of_the_sweep_are_no_matches() -> None:
     planes = np.linspace(0.2, 1.2, 51)
     found = at_stops(np.array([0.2, 0.215, 0.23, 0.7, 1.17, 1.19, 1.2], np.float32), planes)
     np.testing.assert_array_equal(found, [True, True, False, False, False, True, True])
+
+
+def test_the_better_half_of_many_views_counts() -> None:
+    assert [best_count(n) for n in (2, 6, 8, 10, 12)] == [3, 3, 4, 5, 5]
+
+
+def test_agreement_on_a_blank_surface_is_little_evidence_also_beside_its_border() -> None:
+    image = view_of_plane(np.eye(4), 0.0)[0]
+    image[:, :30] = 0.05 + 0.001 * np.random.default_rng(4).standard_normal((HEIGHT, 30)).astype(np.float32)
+    evidence = evidence_of(surface_contrast(image))
+    assert np.quantile(evidence[:, 27:30], 0.9) < 0.5  # the windows of these columns reach into the texture
+    assert evidence[:, 30:].mean() > 0.9
+    assert evidence[:, 30:].max() < 1
+
+
+def test_a_match_that_other_views_bear_out_is_preferred_to_a_plane_in_front_of_it() -> None:
+    truth = view_of_plane(np.eye(4), 0.3)[1].astype(np.float32)
+    others = np.stack([view_of_plane(c, 0.3)[1] for c in CAMERAS]).astype(np.float32)
+    back = np.array([warps_to(MATRIX, c, [MATRIX], [np.eye(4)])[0][2] for c in CAMERAS])
+    warps = warps_to(MATRIX, np.eye(4), [MATRIX] * 4, CAMERAS)
+
+    def borne_out(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        _, support, conflict = fuse_depths(depth, others, warps, back, 0.02, Bands(1))
+        return np.asarray(support - conflict)
+
+    in_front, inner = (0.6 * truth).astype(np.float32), (slice(8, -8), slice(10, -10))
+    clear, blank = np.full(truth.shape, 1e-3, np.float32), np.full(truth.shape, 1e-5, np.float32)
+    np.testing.assert_array_equal(prefer_matches(in_front, truth, borne_out, clear)[inner], truth[inner])
+    np.testing.assert_array_equal(prefer_matches(truth, in_front, borne_out, clear)[inner], truth[inner])
+    np.testing.assert_array_equal(prefer_matches(in_front, truth, borne_out, blank), in_front)
+    np.testing.assert_array_equal(prefer_matches(in_front, np.zeros_like(truth), borne_out, clear), in_front)
 
 
 def lend(truth: NDArray, color: float, confidence: float = 0.9) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
