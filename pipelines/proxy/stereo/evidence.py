@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.proxy.stereo.window import LIKENESS, weigh_windows
+from msgs_slam.pipelines.proxy.stereo.window import LIKENESS, row_length, weigh_windows
 
 _FAINT, _POWER = 5e-5, 0.25
 """Variance (intensities 0..1; two grey levels) and power by which agreement on a blank surface counts less."""
@@ -18,7 +18,9 @@ _CLEAR = 2e-4
 def surface_contrast(image: NDArray[np.float32]) -> NDArray[np.float32]:
     """(h, w) variance of the intensities (0..1) of each pixel's window, which count by how like the pixel they are: of
     a blank surface it is small also beside its border."""
-    return np.asarray(weigh_windows(image, 0, image.shape[0], LIKENESS)[2][:, 1])
+    height, width = image.shape
+    moments = weigh_windows(image, 0, height, LIKENESS)[2].reshape(height, 2, row_length(width))
+    return moments[:, 1, :width].copy()
 
 
 def evidence_of(contrast: NDArray[np.float32]) -> NDArray[np.float32]:
