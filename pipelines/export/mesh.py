@@ -38,7 +38,7 @@ def keyframe_rows(outcome: Outcome) -> list[int]:
 
 
 def draw(outcome: Outcome, settings: ExportConfig, scratch: Path, progress: Progress, numbers: range) -> None:
-    """What the map shows in the `keyframe_rows` with these numbers, into `scratch`; what is there stays."""
+    """Render the map in the `keyframe_rows` with these numbers into `scratch`; existing files are kept."""
     rows, t, near = keyframe_rows(outcome), outcome.trajectory, maps_around(outcome)
     camera = outcome.calibration.intrinsics.at_most(settings.mesh_side)
     for number in progress.track(numbers, "drawing", len(numbers)):
@@ -48,7 +48,7 @@ def draw(outcome: Outcome, settings: ExportConfig, scratch: Path, progress: Prog
 
 
 def drawn_views(scratch: Path, count: int) -> Sequence[DrawnView]:
-    """What `draw` has left of so many keyframes; those used last are in memory."""
+    """Load the renderings of `draw` on demand; the last ones used stay in memory."""
     return LruSequence(count, lambda n: load_value(_view_file(scratch, n)), lambda view: view.size, _KEPT_BYTES)
 
 
@@ -81,7 +81,7 @@ def fuse_regions(
 
 
 def fused_regions(scratch: Path, count: int) -> Callable[[], Iterable[Region]]:
-    """What `fuse_regions` has left of so many regions, one in memory at a time."""
+    """Return a function that loads the regions of `fuse_regions`, one in memory at a time."""
     return lambda: (load_value(_region_file(scratch, number)) for number in range(count))
 
 
@@ -97,7 +97,7 @@ def make_region(
     progress: Progress,
     of: str = "",
 ) -> Region:
-    """One of the regions of the grid, from the views that see it; `of` tells progress which."""
+    """One of the regions of the grid, from the views that see it; `of` names it for the progress."""
     near, least = grid.views_of(chunks), LEAST_WEIGHT if len(views) >= 4 else 0.5
     fusing = (views[n].shown for n in progress.track(near, "fusing" + of, len(near)))
     triangles = chunk_surfaces(fuse(grid, chunks, fusing, get_threads()), chunks, least)

@@ -12,7 +12,7 @@ from msgs_slam.pipelines.system.progress import Progress
 
 
 def draw_keyframes(task: Chunk, progress: Progress) -> None:
-    """What the map shows in some of the keyframes."""
+    """Render the map in the keyframes of a chunk."""
     context = task.context(progress)
     outcome = load_outcome(task.run, context.device).moved(task.known["move"])
     draw(outcome, task.config.export, scratch_of(context), progress, task.numbers)

@@ -135,7 +135,7 @@ def _proposed(task: Chunk) -> list[tuple[int, int]]:
 
 
 def extract_features(task: Chunk, progress: Progress) -> None:
-    """Of some keyframes."""
+    """Extract the features of the keyframes of a chunk."""
     _opened(task, progress).features_of(task.known["keyframes"], task.numbers)
 
 
@@ -146,7 +146,7 @@ def match_pairs(task: Chunk, progress: Progress) -> None:
 
 
 def map_windows(task: Chunk, progress: Progress) -> None:
-    """Some windows."""
+    """Reconstruct the windows of a chunk."""
     _opened(task, progress).map_windows(task.numbers, task.known["keyframes"], _proposed(task))
 
 

@@ -161,7 +161,7 @@ def _depths(
 
 
 def rows_of(trajectory: Trajectory, frame_ids: NDArray[np.int64]) -> Trajectory:
-    """The same with these frames alone."""
+    """Select these frames of a trajectory."""
     rows = np.flatnonzero(np.isin(trajectory.frame_ids, frame_ids))
     t, reasons = trajectory, tuple(trajectory.lost_reasons[r] for r in rows)
     return Trajectory(

@@ -27,7 +27,7 @@ _BLOCK = 512
 
 @dataclass(frozen=True)
 class TermWeights:
-    """What silhouette, depth and labels count beside the photo; `unit`: the scene's median depth."""
+    """Weights of silhouette, depth and labels beside the photo; `unit`: the scene's median depth."""
 
     silhouette: float
     depth: float

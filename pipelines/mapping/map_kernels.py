@@ -20,7 +20,7 @@ def compare_maps(
     by_silhouette: tl.tensor, by_depth: tl.tensor, by_label: tl.tensor, NU: tl.constexpr,
     LABELS: tl.constexpr, PADDED: tl.constexpr, MASKED: tl.constexpr, BLOCK: tl.constexpr,
 ) -> None:  # fmt: skip
-    """Of a block of pixels the silhouette's, the depth's and with LABELS the classes' terms, each times its weight and
+    """Add up the terms of silhouette, depth and, with LABELS, classes over a block of pixels, each times its weight and
     a mean over all pixels; features (pixels, 3 + classes)."""
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = pixel < pixels

@@ -49,7 +49,7 @@ class PoseStep:
 class OptimiserState:
     """The map's parameters, each view's twist, the exposures (N, 2, 3) of all views, and the number of steps done.
 
-    Twists and poses stay on the host, wherever the map lies: six numbers at a time are no work for a card. Gradients
+    Twists and poses stay on the host, wherever the map is: six numbers at a time are no work for a GPU. Gradients
     found on a card wait there until somebody asks for a pose of theirs: all views' come in one copy, where one a visit
     would make the host wait for each.
     """

@@ -49,7 +49,7 @@ class AlignedDepth:
         return [f for f in frames if f.id not in self._sequence.cam_from_world]
 
     def look(self, frames: list[Frame]) -> None:
-        """The network's pass."""
+        """Run the network on these frames."""
         self._learned.look(frames)
 
     def prepare(self, frames: list[Frame]) -> None:

@@ -48,7 +48,7 @@ class FusedDepth:
         return [f for f in self._learned.missing(frames) if f in self._stereo.missing(frames)]
 
     def look(self, frames: list[Frame]) -> None:
-        """Both providers' passes."""
+        """Run the passes of both providers on these frames."""
         self._learned.look(frames)
         self._stereo.look(frames)
 

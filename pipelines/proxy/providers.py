@@ -97,7 +97,7 @@ class DepthProvider(Provider, Protocol):
         """The frames it will know nothing of."""
 
     def look(self, frames: list[Frame]) -> None:
-        """What `prepare` does of each of these frames by itself; what is done stays."""
+        """Do the part of `prepare` that concerns single frames, for these; results are kept."""
 
     def prepare(self, frames: list[Frame]) -> None:
         """Slow passes over all frames that `estimate` builds on; goes on where it was interrupted."""

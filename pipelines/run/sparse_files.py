@@ -12,12 +12,12 @@ from msgs_slam.pipelines.run.layouts import load_layout, reading
 
 
 def save_sparse_model(path: Path, model: SparseModel) -> None:
-    """One npz."""
+    """Write a sparse model as one npz."""
     save_arrays(path, {field.name: getattr(model, field.name) for field in fields(model)})
 
 
 def load_sparse_model(path: Path) -> SparseModel:
-    """Inverse of `save_sparse_model`."""
+    """Load what `save_sparse_model` wrote. Raises InputError for a damaged file."""
     arrays = load_layout(path, layouts.SPARSE_MODEL)
     with reading(path, "sparse model"):
         layouts.require_increasing("frame_ids", arrays["frame_ids"])

@@ -46,7 +46,7 @@ class FilesDepth:
         self.estimate(next(f for f in sequence.frames if f.id in self._files))
 
     def look(self, frames: list[Frame]) -> None:
-        """Nothing to do."""
+        """Do nothing: files need no pass over single frames."""
 
     def prepare(self, frames: list[Frame]) -> None:
         """Do nothing: files need no pass over all frames."""

@@ -50,7 +50,7 @@ class RecordingDepth(_RecordingMaps):
         super().__init__(recording, sequence)
 
     def look(self, frames: list[Frame]) -> None:
-        """Nothing to do."""
+        """Do nothing: files need no pass over single frames."""
 
     def prepare(self, frames: list[Frame]) -> None:
         """Do nothing: files need no pass over all frames."""

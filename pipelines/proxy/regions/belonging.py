@@ -1,4 +1,4 @@
-"""What the parts of a thing say of each other's names: it has one where most of them agree."""
+"""Class names over the parts of a thing: it has one name where most of its parts agree."""
 
 from __future__ import annotations
 
