@@ -44,7 +44,7 @@ class Wall:
 
     @property
     def length(self) -> float:
-        """Between the ends."""
+        """Distance between the ends."""
         return float(np.linalg.norm(self.ends[1] - self.ends[0]))
 
     @property
@@ -93,7 +93,7 @@ class _Line:
 
 
 def find_walls(vertices: NDArray, faces: NDArray) -> list[Wall]:
-    """Of a mesh (V, 3), (F, 3) with z up whose faces look into the room, longest first; corners meet."""
+    """Find the walls of a mesh (V, 3), (F, 3) with z up whose faces look into the room, longest first; corners meet."""
     upright = _upright_faces(vertices, faces)
     if len(upright.area) == 0:
         return []
