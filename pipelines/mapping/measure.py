@@ -38,8 +38,8 @@ def measure_view(
     """Compare the map, seen from `cam_from_world` (4, 4) with the given exposure (3,), with what the view shows of the
     scene."""
     rendering = draw_map(gaussian_map, view, cam_from_world)
-    colors = rendering.features[..., :3] * torch.exp(torch.as_tensor(log_gain)).to(view.image.device)
-    colors = (colors + torch.as_tensor(offset).to(view.image.device)).clamp(0, 1)
+    colors = rendering.features[..., :3] * torch.exp(torch.tensor(log_gain)).to(view.image.device)
+    colors = (colors + torch.tensor(offset).to(view.image.device)).clamp(0, 1)
     photo = view.of_scene(view.colors, colors)
     error = ((colors - photo).square().mean() / view.shown).clamp(min=1e-10)
     known = view.depth > 0
@@ -61,7 +61,7 @@ def _label_agreement(rendering: Rendering, view: View) -> float:
 
 def draw_map(gaussian_map: GaussianMap, view: View, cam_from_world: NDArray[np.float64]) -> Rendering:
     """Colours ++ class logits, depth and silhouette from a camera."""
-    pose = torch.as_tensor(cam_from_world, dtype=torch.float64)
+    pose = torch.tensor(cam_from_world, dtype=torch.float64)  # a copy: workers get arrays to read only
     features = torch.cat([gaussian_map.colors, gaussian_map.class_logits], dim=1)
     m = gaussian_map
     return render(m.means, m.radii, m.opacities, features, pose, view.intrinsics)
