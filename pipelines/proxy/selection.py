@@ -213,7 +213,7 @@ def missing_networks() -> str | None:
 def _multiview(around: ProviderContext) -> MultiviewDepth:
     side, planes = around.config.stereo_side, around.config.stereo_planes
     return MultiviewDepth(
-        around.sequence, side, planes, lambda: around.scratch("stereo"), around.threads, around.progress
+        around.sequence, side, planes, lambda: around.scratch("stereo"), around.threads, around.progress, around.device
     )
 
 

@@ -1,4 +1,4 @@
-"""Counts what a card is asked to do in steady mapping: operations, reads by the host, bytes copied to and fro.
+"""Counts what a card is asked to do in steady mapping and stereo: operations, reads by the host, bytes copied.
 
     python tests/benchmarks/launches.py                   the table
     python tests/benchmarks/launches.py --causes          also by the function that asks for them
@@ -43,6 +43,7 @@ from msgs_slam.pipelines.mapping.optimise import MapOptimiser
 from msgs_slam.pipelines.mapping.schedule import Seeding, Step
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View, make_view
+from msgs_slam.pipelines.proxy.stereo import card
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 from tests import pretend_device
 from tests.pretend_device import DEVICE, PretendTensor
@@ -199,6 +200,15 @@ def optimiser() -> MapOptimiser:
     return out
 
 
+def stereo_of_a_keyframe() -> None:
+    """Matched with six others, its depth compared with those of eight."""
+    pictures = np.random.default_rng(0).random((9, 6, 10)).astype(np.float32)
+    warps = np.repeat(np.eye(3, 4)[None], 8, 0)
+    warps[:, 0, 3] = 5 * np.arange(8)
+    card.match_planes(pictures[0], pictures[1:7], warps[:6], np.linspace(0.2, 1.0, 4), DEVICE)
+    card.fuse_depths(pictures[0], pictures[1:], warps, warps[:, 2], 0.01, DEVICE)
+
+
 def step(iteration: int, view: int) -> Step:
     """A visit; labels count in every second iteration."""
     return Step(iteration, view, 1.0, 0.5, False, Seeding.NOTHING, False, False, False, True)
@@ -216,6 +226,7 @@ def measure() -> dict[str, Counting]:
             "poses, once a pass": counted(mapper.state.settle_poses),
             f"weights for pruning, {VIEWS} views": counted(mapper._blending_weights),
             f"blame for splitting, {VIEWS} views": counted(mapper._blame),
+            "stereo of a keyframe": counted(stereo_of_a_keyframe),
         }
 
 

@@ -8,8 +8,9 @@ and hold only a few frames at a time.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import cv2
@@ -27,9 +28,7 @@ from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
 from msgs_slam.pipelines.proxy.stereo.evidence import evidence_of, prefer_matches, surface_contrast
 from msgs_slam.pipelines.proxy.stereo.fill import SURE, fill_unsure, judge_by_company
 from msgs_slam.pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
-from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth
-from msgs_slam.pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
-from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost, warps_to
+from msgs_slam.pipelines.proxy.stereo.sweep import warps_to
 from msgs_slam.pipelines.proxy.stereo.upsample import upsample_depth
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Frame, Intrinsics
@@ -63,10 +62,18 @@ class MultiviewDepth:
     of_all = ()
 
     def __init__(
-        self, sequence: Sequence, side: int, planes: int, folder: Callable[[], Path], threads: int, progress: Progress
+        self,
+        sequence: Sequence,
+        side: int,
+        planes: int,
+        folder: Callable[[], Path],
+        threads: int,
+        progress: Progress,
+        device: str = "cpu",
     ) -> None:
         """side: of the images that are matched, pixels; planes: depths that are tried; `folder` gives a place for the
-        maps between the passes. InputError without a backbone of two keyframes."""
+        maps between the passes; what compares pictures and depths runs on the `device`. InputError without a backbone
+        of two keyframes."""
         if sequence.backbone is None or len(sequence.backbone.frame_ids) < 2:
             raise InputError(
                 "depth from several views needs parallax, and structure from motion found none: the camera stands "
@@ -76,7 +83,7 @@ class MultiviewDepth:
         self._model: SparseModel = sequence.backbone
         self._index = {int(f): i for i, f in enumerate(self._model.frame_ids)}
         self._frame = {f.id: f for f in sequence.frames}
-        self._bands = Bands(threads)
+        self._bands, self._device = Bands(threads), device
         self._camera: Intrinsics = sequence.calibration.intrinsics.at_most(side)
         self._grey = lru_cache(_CACHED_FRAMES)(self._read_grey)
         self._raw = lru_cache(_CACHED_FRAMES)(self._load_raw)
@@ -178,6 +185,15 @@ class MultiviewDepth:
         return {"stereo_size": [self._camera.width, self._camera.height]}
 
     # what both use ----------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _card(self) -> ModuleType | None:
+        """The same by kernels where the device takes them."""
+        if self._device == "cpu":
+            return None
+        import msgs_slam.pipelines.proxy.stereo.card as card  # imports torch
+
+        return card if card.takes_kernels_on(self._device) else None
 
     def _path(self, frame_id: int) -> Path:
         return self._folder() / f"{frame_id:06d}.npz"

@@ -21,7 +21,7 @@ from msgs_slam.pipelines.proxy.stereo.window import (
     weigh_windows,
 )
 
-_ALIKE = 1e3
+ALIKE = 1e3
 """Likeness by which all pixels of a window count alike: it lies on the surface itself, and needs all of its texture."""
 
 
@@ -69,7 +69,7 @@ def _refine_band(
     samples = np.zeros(views * SAMPLED_ROWS * length, np.float32)
     seen = np.zeros(views * SAMPLED_ROWS * length, np.float32)
     surface, top = np.zeros(length, np.float32), np.empty(16 * best, np.float32)
-    weights, weighted, moments = weigh_windows(image, first, last, _ALIKE)
+    weights, weighted, moments = weigh_windows(image, first, last, ALIKE)
     total = np.empty((2 * reach + 1, last - first, length), np.float32)
     for d in range(2 * reach + 1):
         for k in range(last - first + 2 * RADIUS):

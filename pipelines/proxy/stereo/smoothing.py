@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
 from msgs_slam.pipelines.system.jit import kernel
 
-_DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
+DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 
 
 def smooth_cost(
@@ -21,8 +21,8 @@ def smooth_cost(
     """
     height, width, _ = cost.shape
     total = np.zeros_like(cost)
-    for dy, dx in _DIRECTIONS:
-        starts = _path_starts(height, width, dy, dx)
+    for dy, dx in DIRECTIONS:
+        starts = path_starts(height, width, dy, dx)
 
         def work(first: int, last: int, dy: int = dy, dx: int = dx, starts: NDArray[np.int64] = starts) -> None:
             _scan_paths(cost, image, starts[first:last], dy, dx, small, large, edge, total)
@@ -31,7 +31,7 @@ def smooth_cost(
     return total
 
 
-def _path_starts(height: int, width: int, dy: int, dx: int) -> NDArray[np.int64]:
+def path_starts(height: int, width: int, dy: int, dx: int) -> NDArray[np.int64]:
     """(S, 2) row and column of the first pixel of every path of a direction; each pixel lies on exactly one path."""
     y, x = np.mgrid[:height, :width]
     before_y, before_x = y - dy, x - dx

@@ -16,7 +16,7 @@ from tests.benchmarks.launches import VIEWS, measure
 def test_a_card_is_asked_for_little_and_seldom_waited_for() -> None:
     """The limits are a little above what is done: an operation that slips in by the view or by the Gaussian is seen."""
     rows = {name: found.counts for name, found in measure().items()}
-    colors, labels, poses, weights, blame = rows.values()
+    colors, labels, poses, weights, blame, stereo = rows.values()
     assert 30 < colors["launches"] < labels["launches"] <= 52
     for visit in (colors, labels):
         assert (visit["reads"], visit["bytes from it"]) == (1, 0)
@@ -25,3 +25,5 @@ def test_a_card_is_asked_for_little_and_seldom_waited_for() -> None:
     assert blame["launches"] <= 18 * VIEWS
     assert weights["reads"] == blame["reads"] == VIEWS
     assert weights["bytes from it"] == blame["bytes from it"] == 0
+    assert stereo["launches"] <= 20
+    assert stereo["reads"] == 2

@@ -1,0 +1,137 @@
+"""Stereo on a card: `match_planes` and `fuse_depths` by kernels of Triton. Arrays come from the host and go back; what
+lies between stays there."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+import msgs_slam.pipelines.gaussians.render.cards as cards
+import msgs_slam.pipelines.proxy.stereo.matching as rules
+from msgs_slam.pipelines.proxy.stereo.refine import ALIKE
+from msgs_slam.pipelines.proxy.stereo.smoothing import DIRECTIONS, path_starts
+from msgs_slam.pipelines.proxy.stereo.window import LIKENESS, OUTSIDE, RADIUS, SIDE, STEP, VARIANCE_FLOOR
+
+Array = NDArray[np.float32]
+_BLOCK = 64
+"""Pixels of a program; windows multiply them by sixteen."""
+
+
+def takes_kernels_on(device: str) -> bool:
+    """Whether there is a card that runs them."""
+    return cards.takes_kernels(torch.empty(0, device=device))
+
+
+def match_planes(
+    image: Array, others: Array, warps: NDArray[np.float64], planes: NDArray[np.float64], device: str
+) -> Array:
+    """As `matching.match_planes`, but for rounding."""
+    on_card = Matching(*(_there(x, device) for x in (image, others, warps.reshape(-1, 12))))
+    inverse = on_card.soften(on_card.found_by(planes), rules.SOFT_VALUES[0] * (planes[1] - planes[0]))
+    inverse = on_card.refined(inverse, rules.MOVE * (planes[1] - planes[0]))
+    return on_card.soften(inverse, rules.SOFT_VALUES[1] * (planes[1] - planes[0])).cpu().numpy()
+
+
+def fuse_depths(
+    depth: Array,
+    others: Array,
+    warps: NDArray[np.float64],
+    back_rows: NDArray[np.float64],
+    tolerance: float,
+    device: str,
+) -> tuple[Array, Array, Array]:
+    """As `consistency.fuse_depths`."""
+    from msgs_slam.pipelines.proxy.stereo.card_kernels import fuse_pixels  # imports triton
+
+    pictures = (_there(depth, device), _there(others, device))
+    places = (torch.from_numpy(np.ascontiguousarray(x)).to(device) for x in (warps.reshape(-1, 12), back_rows))
+    out = torch.empty(3, *depth.shape, device=device)
+    _run(fuse_pixels, depth.size, *pictures, *places, *out.unbind(0), len(others), *depth.shape[::-1],
+         TOLERANCE=tolerance)  # fmt: skip
+    fused, support, conflict = out.cpu().numpy()
+    return fused, support, conflict
+
+
+class Matching:
+    """The steps of the match: a picture (H, W), others (N, H, W) and their warps (N, 12), float32 on a card."""
+
+    def __init__(self, image: Tensor, others: Tensor, warps: Tensor) -> None:
+        self._image, self._given = image, (image, others, warps)
+        self._size = (image.shape[1], image.shape[0])
+        self._window = {
+            "BEST": rules.BEST, "VIEWS": _power_of_two(len(others)), "FLOOR": VARIANCE_FLOOR, "OUTSIDE": OUTSIDE,
+            "SIDE": SIDE, "STEP": STEP, "RADIUS": RADIUS,
+        }  # fmt: skip
+
+    def found_by(self, planes: NDArray[np.float64]) -> Tensor:
+        """(H, W) inverse depth after sweep and smoothing."""
+        from msgs_slam.pipelines.proxy.stereo.card_kernels import pick_pixels
+
+        total, inverse = self.smoothed(self.cost(planes)), torch.empty_like(self._image)
+        numbers = (inverse.numel(), len(planes), float(planes[0]), float(planes[1] - planes[0]))
+        _run(pick_pixels, inverse.numel(), total, inverse, *numbers, PLANES=_power_of_two(len(planes)))
+        return inverse
+
+    def cost(self, planes: NDArray[np.float64]) -> Tensor:
+        """(H, W, D) as of `sweep_cost`."""
+        from msgs_slam.pipelines.proxy.stereo.card_kernels import sweep_pixels
+
+        cost = self._image.new_empty(*self._image.shape, len(planes))
+        numbers = (len(self._given[1]), len(planes), *self._size, -0.5 / LIKENESS**2)
+        depths = _there(planes, self._image.device)
+        _run(sweep_pixels, self._image.numel(), *self._given, depths, cost, *numbers, **self._window)
+        return cost
+
+    def smoothed(self, cost: Tensor) -> Tensor:
+        """(H, W, D) as of `smooth_cost`; a launch for each direction, a program for each path."""
+        from msgs_slam.pipelines.proxy.stereo.card_kernels import scan_paths
+
+        total, count = torch.zeros_like(cost), cost.shape[2]
+        numbers = (count, rules.SMALL_STEP, rules.JUMP, rules.EDGE)
+        for direction in DIRECTIONS:
+            starts = _starts(*self._size, *direction, cost.device)
+            given = (cost, self._image, starts, total, *self._size, *direction, *numbers)
+            cards.launch(scan_paths, len(starts), *given, PLANES=_power_of_two(count))
+        return total
+
+    def soften(self, values: Tensor, spread: float) -> Tensor:
+        """(H, W) after the bilateral filter, `spread` the sd of its values."""
+        from msgs_slam.pipelines.proxy.stereo.card_kernels import soften_pixels
+
+        out, numbers = torch.empty_like(values), (-0.5 / spread**2, -0.5 / rules.SOFT_PLACE**2)
+        _run(soften_pixels, out.numel(), values, out, *self._size, *numbers, REACH=rules.SOFT_SIZE // 2)
+        return out
+
+    def refined(self, inverse: Tensor, step: float) -> Tensor:
+        """(H, W) as of `refine_inverse_depth`."""
+        from msgs_slam.pipelines.proxy.stereo.card_kernels import refine_pixels
+
+        refined = torch.empty_like(inverse)
+        numbers = (len(self._given[1]), *self._size, -0.5 / ALIKE**2, float(step), rules.STIFFNESS)
+        moves = {"REACH": rules.REACH, "MOVES": _power_of_two(2 * rules.REACH + 1)}
+        _run(refine_pixels, inverse.numel(), *self._given, inverse, refined, *numbers, **moves, **self._window)
+        return refined
+
+
+def _there(array: NDArray, device: Any) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array, np.float32)).to(device)
+
+
+def _power_of_two(count: int) -> int:
+    return max(2, 1 << (count - 1).bit_length())
+
+
+def _run(kernel: Any, count: int, *arguments: Any, **settings: Any) -> None:
+    cards.launch(kernel, -(-count // _BLOCK), *arguments, BLOCK=_BLOCK, **settings)
+
+
+@lru_cache(maxsize=16)
+def _starts(width: int, height: int, down: int, across: int, device: torch.device) -> Tensor:
+    """(S,) int32: number of each path's first pixel."""
+    starts = path_starts(height, width, down, across)
+    return torch.from_numpy((starts[:, 0] * width + starts[:, 1]).astype(np.int32)).to(device)
