@@ -30,7 +30,7 @@ def takes_kernels_on(device: str) -> bool:
 def match_planes(
     image: Array, others: Array, warps: NDArray[np.float64], planes: NDArray[np.float64], device: str
 ) -> Array:
-    """As `matching.match_planes`, but for rounding."""
+    """Return what `matching.match_planes` does, but for rounding."""
     on_card = Matching(*(_there(x, device) for x in (image, others, warps.reshape(-1, 12))))
     inverse = on_card.soften(on_card.found_by(planes), rules.SOFT_VALUES[0] * (planes[1] - planes[0]))
     inverse = on_card.refined(inverse, rules.MOVE * (planes[1] - planes[0]))
@@ -45,7 +45,7 @@ def fuse_depths(
     tolerance: float,
     device: str,
 ) -> tuple[Array, Array, Array]:
-    """As `consistency.fuse_depths`."""
+    """Return what `consistency.fuse_depths` does."""
     from msgs_slam.pipelines.proxy.stereo.card_kernels import fuse_pixels  # imports triton
 
     pictures = (_there(depth, device), _there(others, device))
@@ -64,8 +64,8 @@ class Matching:
         self._image, self._given = image, (image, others, warps)
         self._size = (image.shape[1], image.shape[0])
         self._window = {
-            "BEST": rules.BEST, "VIEWS": _power_of_two(len(others)), "FLOOR": VARIANCE_FLOOR, "OUTSIDE": OUTSIDE,
-            "SIDE": SIDE, "STEP": STEP, "RADIUS": RADIUS,
+            "BEST": rules.best_count(len(others)), "VIEWS": _power_of_two(len(others)), "FLOOR": VARIANCE_FLOOR,
+            "OUTSIDE": OUTSIDE, "SIDE": SIDE, "STEP": STEP, "RADIUS": RADIUS,
         }  # fmt: skip
 
     def found_by(self, planes: NDArray[np.float64]) -> Tensor:

@@ -1,4 +1,4 @@
-"""What a match is worth: views of a blank surface agree on anything, and views that do not see a place say nothing."""
+"""The worth of a match: views of a blank surface agree on anything, and views that do not see a place say nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stereo asks of `lanes` beyond the renderer: choices, and samples of an image between its pixels."""
+"""Operations on `lanes` that stereo alone needs: choices, and samples of an image between its pixels."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def choose(typing_context: Any, condition: Any, value: Any, other: Any) -> Any:
 
 @intrinsic
 def square_root(typing_context: Any, value: Any) -> Any:
-    """Of each lane."""
+    """Return the square root of each lane."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         return call_llvm(builder, f"llvm.sqrt.v{WIDTH}f32", vector_type(), args[0])

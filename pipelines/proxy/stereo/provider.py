@@ -27,6 +27,7 @@ from msgs_slam.pipelines.proxy.stereo.borrow import agreed_depth, borrow_depth, 
 from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
 from msgs_slam.pipelines.proxy.stereo.evidence import evidence_of, prefer_matches, surface_contrast
 from msgs_slam.pipelines.proxy.stereo.fill import SURE, fill_unsure, judge_by_company
+from msgs_slam.pipelines.proxy.stereo.matching import match_planes
 from msgs_slam.pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
 from msgs_slam.pipelines.proxy.stereo.sweep import warps_to
 from msgs_slam.pipelines.proxy.stereo.upsample import upsample_depth
@@ -38,16 +39,11 @@ _CACHED_FRAMES = 48
 _VIEWS, _FUSE_VIEWS, _LENDERS = 12, 8, 16
 """Keyframes that one is matched with, those whose depths are compared, and those that lend theirs. What lies beside a
 near thing is hidden from half of the views."""
-_LEAST_BEST, _MOST_BEST = 3, 5
-"""Of the views that one is matched with, the better half counts at a pixel, but not fewer or more than these."""
 _RANGE_VIEWS = 6
 """Their points say how near and far to look."""
 _CACHED_LENDERS = _LENDERS + 4
 _BEST_ANGLE = 8.0
 """Degrees between the views of a pair."""
-_SMALL_STEP, _JUMP, _EDGE = 0.1, 1.2, 0.05
-"""Of the smoothing: a plane more or less, any other step, and the intensity step that makes it cheap."""
-_STIFFNESS = 0.01
 _STOP = 0.02
 """As a part of the range of inverse depths: so near to its ends nothing is a match."""
 _TOLERANCE = 0.01
@@ -120,13 +116,8 @@ class MultiviewDepth:
         others = np.stack([_blanked(*self._grey(int(self._model.frame_ids[j]))) for j in companions])
         warps = self._warps(index, companions)
         planes = np.linspace(1 / limits[1], 1 / limits[0], self._planes)
-        step, best = planes[1] - planes[0], best_count(len(companions))
-        cost = sweep_cost(image, others, warps, planes, best, self._bands)
-        total = smooth_cost(cost, image, _SMALL_STEP, _JUMP, _EDGE, self._bands)
-        inverse = (planes[0] + pick_planes(total) * step).astype(np.float32)
-        inverse = cv2.bilateralFilter(inverse, 7, step, 2.0)
-        inverse = refine_inverse_depth(image, others, warps, inverse, step / 3, 2, _STIFFNESS, best, self._bands)
-        inverse = cv2.bilateralFilter(inverse, 7, 0.7 * step, 2.0)
+        given, card = (image, others, warps, planes), self._card
+        inverse = match_planes(*given, self._bands) if card is None else card.match_planes(*given, self._device)
         inverse = np.clip(inverse, planes[0], planes[-1]).astype(np.float32)
         unknown = at_stops(inverse, planes)
         return np.where(unknown if left_out is None else unknown | left_out, np.float32(0), inverse)
@@ -154,7 +145,7 @@ class MultiviewDepth:
         warps, back = self._warps(index, companions), self._rows_back(index, companions)
 
         def borne_out(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-            _, support, conflict = fuse_depths(depth, others, warps, back, 2 * _TOLERANCE, self._bands)
+            _, support, conflict = self._compare(depth, others, warps, back, 2 * _TOLERANCE)
             return np.asarray(support - conflict)
 
         return prefer_matches(filled, self._fused(index)[0], borne_out, self._contrast(index))
@@ -176,9 +167,21 @@ class MultiviewDepth:
             return depth, np.where(depth > 0, 0.2, 0).astype(np.float32)
         others = np.stack([self._raw(int(j)) for j in companions])
         warps, back = self._warps(index, companions), self._rows_back(index, companions)
-        fused, support, conflict = fuse_depths(depth, others, warps, back, _TOLERANCE, self._bands)
+        fused, support, conflict = self._compare(depth, others, warps, back, _TOLERANCE)
         confidence = agreement(support, conflict) * evidence_of(self._contrast(index))
         return fused, judge_by_company(confidence, self._small(index))
+
+    def _compare(
+        self,
+        depth: NDArray[np.float32],
+        others: NDArray[np.float32],
+        warps: NDArray[np.float64],
+        back: NDArray[np.float64],
+        tolerance: float,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Compare as `fuse_depths` does, on the device."""
+        given, card = (depth, others, warps, back, tolerance), self._card
+        return fuse_depths(*given, self._bands) if card is None else card.fuse_depths(*given, self._device)
 
     def figures(self) -> dict[str, Any]:
         """The size that the images were matched at."""
@@ -235,11 +238,6 @@ class MultiviewDepth:
     def _load_raw(self, index: int) -> NDArray[np.float32]:
         inverse = load_scratch(self._path(int(self._model.frame_ids[index])))["inverse_depth"]
         return invert(inverse)
-
-
-def best_count(views: int) -> int:
-    """How many of so many views count at a pixel: the others may not see it."""
-    return min(_MOST_BEST, max(_LEAST_BEST, views // 2))
 
 
 def _blanked(grey: NDArray[np.float32], left_out: NDArray[np.bool_] | None) -> NDArray[np.float32]:

@@ -9,7 +9,8 @@ from msgs_slam.pipelines.proxy.stereo.borrow import agreed_depth, borrow_depth, 
 from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
 from msgs_slam.pipelines.proxy.stereo.evidence import evidence_of, prefer_matches, surface_contrast
 from msgs_slam.pipelines.proxy.stereo.fill import SURE, fill_unsure, judge_by_company
-from msgs_slam.pipelines.proxy.stereo.provider import at_stops, best_count
+from msgs_slam.pipelines.proxy.stereo.matching import best_count
+from msgs_slam.pipelines.proxy.stereo.provider import at_stops
 from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth
 from msgs_slam.pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
 from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost, warps_to

@@ -46,7 +46,7 @@ def on_card(pictures: tuple[np.ndarray, np.ndarray, np.ndarray]) -> card.Matchin
 
 def test_the_sweep_has_the_costs_of_the_cpu(pictures: tuple, on_card: card.Matching) -> None:
     found = on_card.cost(PLANES).cpu().numpy()
-    expected = sweep_cost(*pictures, PLANES, matching.BEST, BANDS)
+    expected = sweep_cost(*pictures, PLANES, matching.best_count(len(pictures[1])), BANDS)
     assert found.shape == expected.shape
     assert expected.std() > 0.1
     # Where the rim of a view, or of what is no scene, runs through a pixel, rounding decides whether it is seen.
@@ -63,7 +63,9 @@ def test_paths_are_smoothed_as_on_the_cpu(pictures: tuple, on_card: card.Matchin
 def test_the_refinement_and_the_filter_are_those_of_the_cpu(pictures: tuple, on_card: card.Matching) -> None:
     inverse = (0.45 + 0.05 * np.random.default_rng(2).random(pictures[0].shape)).astype(np.float32)
     there = torch.from_numpy(inverse).to(DEVICE)
-    expected = refine_inverse_depth(*pictures, inverse, 0.01, matching.REACH, matching.STIFFNESS, matching.BEST, BANDS)
+    expected = refine_inverse_depth(
+        *pictures, inverse, 0.01, matching.REACH, matching.STIFFNESS, matching.best_count(len(pictures[1])), BANDS
+    )
     found = on_card.refined(there, 0.01).cpu().numpy()
     assert np.abs(expected - inverse).max() > 0.005
     assert (np.abs(found - expected) > 1e-4).mean() < 0.01
