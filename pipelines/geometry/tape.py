@@ -81,6 +81,24 @@ def tape(first: Touch, second: Touch) -> tuple[float, float]:
     return length, float(np.hypot(first.sd(way / length), second.sd(way / length)))
 
 
+def area(places: Array) -> float:
+    """Of the polygon with these corners (N, 3) in order, seen from where it looks largest; 0 of fewer than three."""
+    if len(places) < 3:
+        return 0.0
+    ways = places[1:] - places[0]
+    return float(np.linalg.norm(np.cross(ways[:-1], ways[1:]).sum(axis=0)) / 2)
+
+
+def area_text(area: float, is_metric: bool, metres: Metres | None) -> str:
+    """An area in words, as `tape_text` says a length."""
+    if is_metric:
+        return f"{area:.3g} m²"
+    text = f"{area:.3g} square units"
+    if metres is None:
+        return text
+    return f"{text} ≈ {area * metres.per_unit**2:.2g} m² ± {200 * metres.relative_sd:.0f} %"
+
+
 def tape_text(length: float, sd: float, is_metric: bool, metres: Metres | None) -> str:
     """A distance in words: metres where the world has them, else units with the metres that they are guessed to be."""
     unit_sd = metres.relative_sd if metres is not None else 0.0

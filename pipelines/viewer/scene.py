@@ -44,7 +44,8 @@ class ViewerCamera:
 class ViewerScene:
     """cloud: the M Gaussians in the world of the exported files; labels (M,) uint8 indices into `class_names`, VOID for
     none, or None without classes; `scale` multiplies the world's lengths for show; up (3,); path (N, 3) camera centres
-    as shown; mesh_file of the run, if there is one; is_metric, metres: what a unit of the world is."""
+    as shown; mesh_file of the run, if there is one; whether the floor is at 0; is_metric, metres: what a unit of the
+    world is."""
 
     title: str
     cloud: GaussianCloud
@@ -57,6 +58,7 @@ class ViewerScene:
     path: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
     mesh_file: Path | None = None
     run: RunFolder | None = None
+    has_floor: bool = False
     is_metric: bool = False
     metres: Metres | None = None
 
@@ -140,6 +142,7 @@ def _from_run(outcome: Outcome) -> ViewerScene:
         path=centers * scale,
         mesh_file=outcome.run.file("export", MESH) if outcome.run.has("export", MESH) else None,
         run=outcome.run,
+        has_floor=world is not None and world.has_floor,
         is_metric=outcome.metric,
         metres=outcome.metres,
     )

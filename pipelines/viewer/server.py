@@ -16,14 +16,15 @@ from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.pipelines.export.floor_plan import walls_of_run
 from msgs_slam.pipelines.viewer.door import guarding
 from msgs_slam.pipelines.viewer.scene import MODES, ViewerCamera, ViewerScene, load_scenes
-from msgs_slam.pipelines.viewer.tools import Selection, Tape, class_name, unit_text
+from msgs_slam.pipelines.viewer.tools import Selection, Tape, class_name, length_text, unit_text
 
 _FRUSTUM = 0.09
 _PREVIEW_WIDTH = 480
 _HELP = "Drag: turn. Right drag: move. Wheel: zoom. W A S D, Q E: fly. Two fingers: move and zoom."
-_GREY = "gray"
+_GREY, _RED = "gray", (220, 38, 38)
 """Buttons of equal weight: none of them is what the page is for."""
 
 
@@ -77,7 +78,7 @@ class Viewer:
         self._add_tools()
         self.mode.value = MODES[0]
         for name, box in self.boxes.items():
-            box.value = name != "Mesh"
+            box.value = name not in ("Mesh", "Floor plan")
         for client in self.server.get_clients().values():
             self._place(client)
 
@@ -143,11 +144,13 @@ class Viewer:
         depth_here = gui.add_button("Colour by depth from this view", color=_GREY)
         depth_here.on_click(self._show_depth)
         gui.add_button("Reset view", color=_GREY).on_click(lambda event: self._place(event.client))
+        gui.add_button("From above", color=_GREY).on_click(lambda event: self._look_down(event.client))
         self._checkbox("Show Gaussians", True, lambda on: setattr(self._splats, "visible", on))
         if self._cameras:
             self._checkbox("Cameras", True, self._show_cameras)
         if any(scene.mesh_file for scene in self.scenes):
             self._checkbox("Mesh", False, self._show_mesh)
+            self._checkbox("Floor plan", False, self._show_floor_plan)
         if self.scene.cameras:
             blank = np.full((30, 40, 3), 235, np.uint8)
             self.preview = gui.add_image(blank, label="Camera image", format="jpeg", visible=False)
@@ -182,6 +185,25 @@ class Viewer:
     def _show_mesh(self, on: bool) -> None:
         if self._mesh is not None:
             self._mesh.visible = on
+
+    def _show_floor_plan(self, on: bool) -> None:
+        """Walls as lines over the map, with their lengths; the box goes off where there are none to show."""
+        self.server.scene.remove_by_name("/walls")
+        if not on:
+            return
+        try:
+            walls = walls_of_run(self.scene.run) if self.scene.run is not None else []
+        except InputError as error:
+            self.server.gui.add_markdown(plain(str(error)))
+            self.boxes["Floor plan"].value = False
+            return
+        top = float(np.quantile(self.scene.cloud.means[:, 2], 0.99))
+        ends = np.stack([np.column_stack([wall.ends, (top, top)]) for wall in walls]) * self.scene.scale
+        lines = ends.astype(np.float32)
+        self.server.scene.add_line_segments("/walls/lines", lines, _RED, thickness=4.0, thickness_units="screen")
+        for number, wall in enumerate(walls):
+            told = f"{'' if wall.is_whole else '≥ '}{length_text(wall.length, self.scene)}"
+            self.server.scene.add_label(f"/walls/{number}", told, position=ends[number].mean(axis=0))
 
     def _add_camera(self, number: int, camera: ViewerCamera) -> Any:
         wxyz, position = self._pose(camera)
@@ -228,6 +250,16 @@ class Viewer:
                 client.camera.look_at = position + 1.5 * forward
             return
         client.camera.position, client.camera.look_at = self._outside()
+
+    def _look_down(self, client: Any) -> None:
+        """From so high that the whole scene is seen, what the first camera saw ahead at the top."""
+        middle, up = np.median(self.scene.centers, axis=0).astype(np.float64), self.scene.up
+        ahead = self.scene.cameras[0].world_from_cam[:3, 2] if self.scene.cameras else np.array([0.0, 1, 0])
+        ahead = ahead - (ahead @ up) * up
+        with client.atomic():
+            # Not quite straight down: there the page would not know what is up in its picture.
+            client.camera.position = middle + 8 * up - 0.02 * ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+            client.camera.look_at = middle
 
     def _add_path(self) -> Any:
         if len(self.scene.path) < 2:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.gaussian_ply import write_gaussian_ply
-from msgs_slam.pipelines.geometry.tape import Touch, tape, tape_text, touch
+from msgs_slam.pipelines.geometry.tape import Touch, area, area_text, tape, tape_text, touch
 from msgs_slam.pipelines.types import VOID
 from msgs_slam.pipelines.viewer.scene import ViewerScene
 
@@ -30,12 +30,17 @@ class Selection:
     def __init__(self, server: Any, scene: ViewerScene, changed: Callable[[], None]) -> None:
         self._server, self._scene, self._changed = server, scene, changed
         self.classes: dict[int, Any] = {}
+        self._deleted: list[NDArray[np.bool_]] = []
         self._pending: threading.Timer | None = None
         if scene.labels is not None:
             with server.gui.add_folder("Classes", expand_by_default=False):
                 self._add_classes(scene.labels)
         with server.gui.add_folder("Crop", expand_by_default=False):
             self._add_box()
+        hide = server.gui.add_button("Delete visible Gaussians", hint="Until undone; no file changes", color="gray")
+        hide.on_click(lambda _: self.delete())
+        self.undo_button = server.gui.add_button("Undo delete", color="gray", visible=False)
+        self.undo_button.on_click(lambda _: self.undo())
         save = server.gui.add_button(
             "Save visible Gaussians (.ply)", hint="In the coordinates of the exported files", color="gray"
         )
@@ -53,7 +58,23 @@ class Selection:
         if self.crop.value:
             low, high = np.array([s.value for s in self.box]).T
             shown &= ((self._scene.cloud.means >= low) & (self._scene.cloud.means <= high)).all(axis=1)
+        for rows in self._deleted:
+            shown &= ~rows
         return shown
+
+    def delete(self) -> None:
+        """What is shown is shown no more, whatever the switches and the box say."""
+        if (rows := self.rows).any():
+            self._deleted.append(rows)
+            self.undo_button.visible = True
+            self._soon()
+
+    def undo(self) -> None:
+        """What was deleted last is back."""
+        if self._deleted:
+            self._deleted.pop()
+            self.undo_button.visible = bool(self._deleted)
+            self._soon()
 
     def ply(self) -> bytes:
         """What is shown as the bytes of a splat PLY, in the world of the exported files."""
@@ -126,6 +147,13 @@ def class_name(scene: ViewerScene, label: int) -> str:
     return "unknown" if label == VOID or label >= len(scene.class_names) else scene.class_names[label]
 
 
+def length_text(length: float, scene: ViewerScene) -> str:
+    """A length without its uncertainty."""
+    if scene.is_metric or scene.metres is None:
+        return f"{length:.2f} {'m' if scene.is_metric else 'units'}"
+    return f"{length:.2f} units ≈ {length * scene.metres.per_unit:.2g} m"
+
+
 def unit_text(scene: ViewerScene) -> str:
     """What lengths are given in, in a line."""
     if scene.is_metric:
@@ -136,7 +164,8 @@ def unit_text(scene: ViewerScene) -> str:
 
 
 class Tape:
-    """Two clicks on the map: a line with the distance and its standard deviation.
+    """Two clicks on the map: a line with the distance and its standard deviation; or more, for the area between them.
+    Each place tells its height over the floor, where there is one.
 
     viser 1.1 takes no finger's tap on the scene for a click (a touched canvas holds its pointer from the start), so a
     button marks what is in the middle of the view.
@@ -144,14 +173,16 @@ class Tape:
 
     def __init__(self, server: Any, scene: ViewerScene, selection: Selection) -> None:
         self._server, self._scene, self._selection = server, scene, selection
-        self._first: Touch | None = None
+        self._places: list[Touch] = []
         self.result = ""
         with server.gui.add_folder("Measure"):
             self.switch = server.gui.add_checkbox("Measuring tape", False, hint="Click two places of the map")
+            self.kind = server.gui.add_dropdown("Measure", ("length", "area"), visible=False)
             self._middle = server.gui.add_button(
                 "Mark the middle", hint="Instead of a click; for fingers", visible=False
             )
             self.told = server.gui.add_markdown("")
+        self.kind.on_update(lambda _: self._turn(bool(self.switch.value)))
         self._middle.on_click(lambda event: self.mark_middle(event.client))
         self.switch.on_update(lambda _: self._turn(bool(self.switch.value)))
 
@@ -165,40 +196,51 @@ class Tape:
         self._place(np.asarray(client.camera.position, np.float64), turn[:, 2], client)
 
     def _place(self, origin: NDArray[np.float64], direction: NDArray[np.float64], client: Any) -> None:
-        """The first end of the tape, or the second."""
+        """One end of the tape more, or one corner of an area."""
         pixel = float(client.camera.fov) / max(int(client.camera.image_height), 1)
         cloud = self._scene.cloud.only(self._selection.rows)
         found = touch(cloud, origin / self._scene.scale, direction / np.linalg.norm(direction), pixel)
         if found is None:
             self.told.content = "No surface there: click on the map."
-        elif self._first is None:
-            self._first = found
-            self._mark("/tape/first", found)
-            self.told.content = "Click the second place."
-        else:
-            self._mark("/tape/second", found)
-            self._tell(self._first, found)
-            self._first = None
+            return
+        if self.kind.value == "length" and len(self._places) == 2:
+            self._places = []
+            self._server.scene.remove_by_name("/tape")
+        self._places.append(found)
+        place = found.point * self._scene.scale
+        self._server.scene.add_icosphere(f"/tape/{len(self._places)}", 0.03, _RED, position=place)
+        self._tell()
 
     def _turn(self, on: bool) -> None:
         self._server.scene.remove_click_callback()
         self._server.scene.remove_by_name("/tape")
-        self._middle.visible = on
-        self._first, self.result, self.told.content = None, "", "Click two places of the map." if on else ""
+        self._middle.visible = self.kind.visible = on
+        asked = "Click two places of the map." if self.kind.value == "length" else "Click the corners of an area."
+        self._places, self.result, self.told.content = [], "", asked if on else ""
         if on:
             self._server.scene.on_click()(self.click)
 
-    def _tell(self, first: Touch, second: Touch) -> None:
-        length, sd = tape(first, second)
-        self.result = tape_text(length, sd, self._scene.is_metric, self._scene.metres)
-        self.told.content = f"**{self.result}**"
-        # A little towards the eye, else what it is stretched over covers it.
-        ends = np.stack([t.point * self._scene.scale - _LIFT * t.direction for t in (first, second)]).astype(np.float32)
-        scene = self._server.scene
-        scene.add_line_segments("/tape/line", ends[None], _RED, thickness=3.0, thickness_units="screen")
-        scene.add_label("/tape/text", self.result, position=ends.mean(axis=0))
+    def _tell(self) -> None:
+        """In words, and as a line on the map, what the places come to."""
+        places, scene = np.stack([t.point for t in self._places]), self._scene
+        self.result = ""
+        if self.kind.value == "length" and len(places) == 2:
+            self.result = tape_text(*tape(*self._places), scene.is_metric, scene.metres)
+        elif self.kind.value == "area" and len(places) > 2:
+            self.result = area_text(area(places), scene.is_metric, scene.metres)
+        last = self._places[-1]
+        height = tape_text(float(last.point[2]), last.sd(np.array([0.0, 0, 1])), scene.is_metric, scene.metres)
+        more = "Click the second place." if self.kind.value == "length" else "Click the next corner."
+        told = [f"**{self.result}**" if self.result else more, f"{height} over the floor" if scene.has_floor else ""]
+        self.told.content = "\n\n".join(line for line in told if line)
+        if len(places) > 1:
+            self._stretch()
 
-    def _mark(self, name: str, found: Touch) -> None:
-        self._server.scene.remove_by_name("/tape" if name.endswith("first") else name)
-        place = found.point * self._scene.scale
-        self._server.scene.add_icosphere(name, 0.03, _RED, position=place)
+    def _stretch(self) -> None:
+        # A little towards the eye, else what it is stretched over covers it.
+        ends = np.stack([t.point * self._scene.scale - _LIFT * t.direction for t in self._places]).astype(np.float32)
+        ways = np.stack([ends, np.roll(ends, -1, axis=0)], axis=1)[: 1 if len(ends) == 2 else None]
+        scene = self._server.scene
+        scene.add_line_segments("/tape/line", ways, _RED, thickness=3.0, thickness_units="screen")
+        if self.result:
+            scene.add_label("/tape/text", self.result, position=ends.mean(axis=0))

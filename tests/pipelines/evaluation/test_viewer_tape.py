@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.gaussian_ply import read_gaussian_ply
 from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
-from msgs_slam.pipelines.geometry.tape import Touch, tape, tape_text, touch
+from msgs_slam.pipelines.geometry.tape import Touch, area, area_text, tape, tape_text, touch
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Metres
 from msgs_slam.pipelines.viewer.scene import ViewerScene, load_scenes
@@ -132,3 +132,14 @@ def test_classes_and_box_choose_what_is_shown_and_saved(viewer: Any, tmp_path: P
     chosen.crop.value = False
     chosen.classes[floor].value = True
     assert chosen.rows.all()
+
+
+def test_area_of_a_polygon_that_may_be_hollow_and_lean() -> None:
+    hollow = np.array([[0.0, 0, 0], [4, 0, 0], [4, 3, 0], [2, 1, 0], [0, 3, 0]])  # 12 less a triangle of 4
+    turned = hollow @ np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0].T + (1, 2, 3)
+    assert area(hollow) == pytest.approx(8.0)
+    assert area(turned) == pytest.approx(8.0)
+    assert area(hollow[:2]) == 0
+    assert area_text(8.0, True, None) == "8 m²"
+    assert area_text(8.0, False, None) == "8 square units"
+    assert area_text(8.0, False, Metres(2.0, 0.09, True, ("a door",))) == "8 square units ≈ 32 m² ± 18 %"
