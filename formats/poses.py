@@ -132,7 +132,7 @@ def _matrix(value: Any, path: Path, number: int) -> NDArray[np.float64]:
 
 def _number(value: Any, path: Path) -> float:
     if not isinstance(value, int | float) or isinstance(value, bool):
-        raise InputError(f"--poses {path}: {str(value)[:40]!r} is no time: give every frame its seconds as a number")
+        raise InputError(f"--poses {path}: {str(value)[:40]!r} is not a time: give every frame its seconds as a number")
     return float(value)
 
 

@@ -263,7 +263,7 @@ def export(
     """
     set_up_logging(quiet, verbose)
     if (config_file or overrides) and to is None:
-        raise click.UsageError("with --set or --config, say where to write with --to")
+        raise click.UsageError("add --to DIR: files of other settings (--set, --config) do not go into the run")
     from msgs_slam.pipelines.export.stage import export_run
     from msgs_slam.pipelines.read_config import load_config
     from msgs_slam.pipelines.reconstruct import made_with

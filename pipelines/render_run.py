@@ -76,7 +76,7 @@ def render_file(
     _require_target(target, fps)
     cloud = read_gaussians(path)
     if len(cloud) == 0:
-        raise InputError(f"{path}: contains no Gaussians")
+        raise InputError(f"{path}: contains no Gaussians: nothing can be drawn. Export it again")
     scene, (width, height) = SplatScene.of(cloud), size or _FILE_SIZE
     focal = height / 2 / np.tan(_FIELD_OF_VIEW / 2)
     camera = Intrinsics(width, height, focal, focal, width / 2, height / 2)

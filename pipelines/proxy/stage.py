@@ -67,7 +67,8 @@ def _warn_of_missing(work: ProxyWork, frames: list[Frame]) -> None:
     for kind, provider in (("depth", work.depths), ("label", work.semantics)):
         missing = provider.missing(frames)
         if len(missing) == len(frames):
-            raise InputError(f"{provider.name}: no {kind} map belongs to any keyframe. Check the names of the files")
+            name = missing[0].name
+            raise InputError(f"{provider.name}: no {kind} map is named like any keyframe, for example {name}")
         if missing:
             work.context.warn(
                 f"{len(missing)} of {len(frames)} frames have no {kind} map, the first is {missing[0].name}"

@@ -42,7 +42,7 @@ MadeMaps = tuple[list[float], dict[int, NDArray[np.float32]]]
 
 
 class ProxyWork:
-    """The common ground of the stage and its tasks: the frames and their cameras, the providers, and the depths that are
+    """The common ground of the stage and its tasks: the frames and their cameras, the providers, and the depths
     computed so far."""
 
     def __init__(self, context: StageContext) -> None:

@@ -63,7 +63,7 @@ class RecordingSource:
             if rgb.shape[:2] != (self.height, self.width):
                 raise InputError(
                     f"{self.sequence.names[index]} of {self.path} is {rgb.shape[1]}x{rgb.shape[0]}, the first image is "
-                    f"{self.width}x{self.height}: a recording has images of one size"
+                    f"{self.width}x{self.height}: a recording has images of one size; resize or remove it"
                 )
             yield VideoFrame(index, float(self.sequence.timestamps[index]), rgb)
 

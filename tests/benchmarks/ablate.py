@@ -128,7 +128,7 @@ def _claim(folder: Path, source: Path, truth: Sequence, config: Config) -> None:
             )
         return
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder} exists and is no ablation. Choose another folder with --out")
+        raise InputError(f"{folder} exists and is not an ablation's folder. Choose another with --out")
     write_json(file, stamp)
 
 

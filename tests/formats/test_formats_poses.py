@@ -159,7 +159,7 @@ def test_all_layouts_say_the_same(
         ("a.json", "[]", "lists no frames"),
         ("a.json", '[{"transform": [1, 2, 3], "name": "a"}]', "no 4x4 matrix"),
         ("a.json", '[{"transform": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]', "lists no frames"),
-        ("a.json", '[{"timestamp": "now", "transform": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]', "is no time"),
+        ("a.json", '[{"timestamp": "now", "transform": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]', "is not a time"),
         ("a.json", '[{"name": "a", "transform": [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}]', "no rigid transform"),
         ("a.txt", "1 2 3\n", "no 4x4 matrices"),
         ("a.txt", "nan " * 16 + "\n", "holds no pose"),

@@ -106,7 +106,7 @@ def test_another_ablation_in_the_folder_is_refused(folder: Path, truth: Sequence
 
 def test_mistakes_are_explained(truth: Sequence, config: Config, tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("x")
-    with pytest.raises(InputError, match="is no ablation"):
+    with pytest.raises(InputError, match="is not an ablation's folder"):
         run(truth, tmp_path, config)
     for seeds in ((), (1, 1)):
         with pytest.raises(InputError, match="different numbers"):

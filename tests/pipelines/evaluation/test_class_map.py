@@ -50,7 +50,7 @@ def test_a_class_that_the_run_knows_and_did_not_find_counts(tmp_path: Path) -> N
         ('sofa = "couch"\n', r"\[classes\]"),
         ("[classes]\nsofa = 3\n", "a name or a list of names"),
         ("[classes]\nsofa = []\n", "a name or a list of names"),
-        ("[classes]\n[others]\n", "is no class map"),
+        ("[classes]\n[others]\n", "is not a class map"),
         ("[classes\n", "mine.toml"),
     ],
 )
