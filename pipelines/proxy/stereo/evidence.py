@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs_slam.pipelines.gaussians.render.jit import kernel
 from msgs_slam.pipelines.proxy.stereo.window import LIKENESS, row_length, weigh_windows
 
 _FAINT, _POWER = 5e-5, 0.25
@@ -15,11 +16,12 @@ _CLEAR = 2e-4
 """Variance from which a match can be preferred to a guess."""
 
 
+@kernel
 def surface_contrast(image: NDArray[np.float32]) -> NDArray[np.float32]:
     """(h, w) variance of the intensities (0..1) of each pixel's window, which count by how like the pixel they are: of
     a blank surface it is small also beside its border."""
     height, width = image.shape
-    moments = weigh_windows(image, 0, height, LIKENESS)[2].reshape(height, 2, row_length(width))
+    moments = weigh_windows(image, 0, height, LIKENESS)[2].reshape((height, 2, row_length(width)))
     return moments[:, 1, :width].copy()
 
 
