@@ -98,20 +98,22 @@ class Size(click.ParamType):
     help="What is drawn; side-by-side: all three, three times as wide.",
 )  # fmt: skip
 @click.option(
-    "--path", "camera_path", default="smooth", show_default=True, type=click.Choice(["own", "smooth", "orbit"]),
-    help="The run's own camera path, the same smoothed, or a circle about the scene.",
+    "--path", "camera_path", default="smooth", show_default=True, metavar="own|smooth|orbit|FILE",
+    help="The run's own camera path, the same smoothed, a circle about the scene, or a path saved in `view`.",
 )  # fmt: skip
-@click.option("--fps", default=30.0, type=click.FloatRange(0.1, 240), help="Frames a second.", show_default=True)
+@click.option(
+    "--fps", type=click.FloatRange(0.1, 240), help="Images per second. Default: 30, or as the path's FILE says."
+)
 @click.option(
     "--size", type=Size(), metavar="WIDTHxHEIGHT", help="Pixels of the images. Default: those of the run's frames."
 )
 @verbosity_options
 def render(
-    source: Path, target: Path, kind: str, camera_path: str, fps: float, size: tuple[int, int] | None, quiet: bool,
-    verbose: bool,
+    source: Path, target: Path, kind: str, camera_path: str, fps: float | None, size: tuple[int, int] | None,
+    quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
-    """Draw the map of RUN along a camera path, or any splat FILE (.ply, .spz, .glb, .splat) along an orbit, into a
-    video or a folder of images.
+    """Draw the map of RUN along a camera path, or any splat FILE (.ply, .spz, .glb, .splat) along an orbit or a
+    recorded path, into a video or a folder of images.
 
     An .mp4 is H.264 where PyAV is installed (pip install 'msgs-slam[hdr]'), else VP9: browsers play both. An .avi or
     .mkv loses nothing (FFV1).
@@ -121,10 +123,10 @@ def render(
 
     is_file = source.is_file() and source.suffix.lower() in SPLAT_FILES
     if is_file and (kind != "color" or camera_path == "own"):
-        raise click.UsageError("a splat file has colours and no cameras: --kind color, --path orbit")
+        raise click.UsageError("a splat file has colours and no cameras: --kind color, --path orbit or FILE")
     with ending_quietly():
         if is_file:
-            made = render_file(source, target, fps, 0, make_progress(quiet), size)
+            made = render_file(source, target, fps, 0, make_progress(quiet), size, camera_path)
         else:
             made = render_run(open_run(source), target, kind, camera_path, fps, 0, make_progress(quiet), size)
     say(made)

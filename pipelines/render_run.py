@@ -22,67 +22,130 @@ from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress, log
 from msgs_slam.pipelines.types import Intrinsics
-from msgs_slam.pipelines.upright.world import up_in_run
+from msgs_slam.pipelines.upright.world import load_world, up_in_run
+from msgs_slam.pipelines.viewer.camera_path import EXPORTED, CameraPath, read_camera_path
 from msgs_slam.pipelines.viewer.scene import up_of_file
 
 KINDS = ("color", "depth", "labels", "side-by-side")
 PATHS = ("own", "smooth", "orbit")
 _SMOOTHING_SECONDS = 0.5
-_FILE_SIZE, _FIELD_OF_VIEW = (960, 540), np.radians(50)
-"""Of images of a splat file, which stores no cameras: the field of view is from top to bottom."""
+_FILE_SIZE, _FIELD_OF_VIEW = (960, 540), 50.0
+"""Of images of a splat file, which stores no cameras: the field of view is from top to bottom, in degrees."""
 
 
 def render_run(
     run: RunFolder,
     target: Path,
     kind: str = "color",
-    path: str = "smooth",
-    fps: float = 30.0,
+    path: str | Path = "smooth",
+    fps: float | None = None,
     frames: int = 0,
     progress: Progress | None = None,
     size: tuple[int, int] | None = None,
 ) -> Path:
     """Draw the map along a path into a video (.mp4, .avi, .mkv) or, for any other name, a folder of PNG files.
 
-    kind: one of `KINDS`; path: one of `PATHS`; frames: how many images, 0 = as long as the walk took (an orbit: ten
-    seconds); size: (width, height) of an image, by default the run's. Returns `target`; where browsers will not play
-    the video, a warning says so. Raises InputError for an unknown kind or path, or a run without a map.
+    kind: one of `KINDS`; path: one of `PATHS`, or the file of a camera path; fps: None = 30, or as the file says;
+    frames: how many images, 0 = as long as the walk took (an orbit: ten seconds; a file: as long as it says); size:
+    (width, height) of an image, by default the run's. Returns `target`; where browsers will not play the video, a
+    warning says so. Raises InputError for an unknown kind or path, a bad file, or a run without a map.
     """
     _require_choice("kind", kind, KINDS)
-    _require_choice("path", path, PATHS)
-    _require_target(target, fps)
+    rate = 30.0 if fps is None else fps
+    _require_target(target, rate)
+    given = _given_path(path, fps)
+    flown = None if given is None else _in_world_of_run(given, run)
     outcome = load_outcome(run)
     outcome.require_map()
     outcome = outcome if size is None else _of_size(outcome, size)
     near, far = _depth_range(outcome)
-    world_from_cam = _path(outcome, path, fps, frames, (near * far) ** 0.5)
-    steps = (progress or SilentProgress()).track(range(len(world_from_cam)), "rendering", len(world_from_cam))
-    pictures = (_draw(outcome, world_from_cam[i], kind, near, far) for i in steps)
-    return _write(target, pictures, fps)
+    if flown is None:
+        poses = _path(outcome, str(path), rate, frames, (near * far) ** 0.5)
+        views = [(outcome, pose) for pose in poses]
+    else:
+        views = [(_seeing(outcome, fov), pose) for pose, fov in zip(*flown, strict=True)]
+    steps = (progress or SilentProgress()).track(views, "rendering", len(views))
+    pictures = (_draw(seen, pose, kind, near, far) for seen, pose in steps)
+    return _write(target, pictures, rate if given is None else given.fps)
 
 
 def render_file(
-    path: Path,
+    source: Path,
     target: Path,
-    fps: float = 30.0,
+    fps: float | None = None,
     frames: int = 0,
     progress: Progress | None = None,
     size: tuple[int, int] | None = None,
+    path: str | Path = "orbit",
 ) -> Path:
-    """Draw a splat file by any program along a circle round it, otherwise as `render_run`; by default 960x540.
+    """Draw a splat file by any program along a circle round it, or the camera path in the file `path`, otherwise as
+    `render_run`; by default 960x540.
 
-    Raises InputError for a file that cannot be read or is empty.
+    Raises InputError for a file that cannot be read or is empty, or a camera path in the world of a run.
     """
-    _require_target(target, fps)
-    cloud = read_gaussians(path)
+    rate = 30.0 if fps is None else fps
+    _require_target(target, rate)
+    given = _of_file(_given_path(path, fps), path)
+    cloud = read_gaussians(source)
     if len(cloud) == 0:
-        raise InputError(f"{path}: contains no Gaussians: nothing can be drawn. Export it again")
+        raise InputError(f"{source}: contains no Gaussians: nothing can be drawn. Export it again")
     scene, (width, height) = SplatScene.of(cloud), size or _FILE_SIZE
-    focal = height / 2 / np.tan(_FIELD_OF_VIEW / 2)
-    camera = Intrinsics(width, height, focal, focal, width / 2, height / 2)
-    poses = around(scene.middle, scene.size, up_of_file(path), frames or round(10 * fps))
+    if given is None:
+        poses = around(scene.middle, scene.size, up_of_file(source), frames or round(10 * rate))
+        fovs = np.full(len(poses), _FIELD_OF_VIEW)
+    else:
+        (poses, fovs), rate = given.flight(), given.fps
+    cameras = [_camera(width, height, fov) for fov in fovs]
     steps = (progress or SilentProgress()).track(range(len(poses)), "rendering", len(poses))
-    return _write(target, (draw_splats(scene, camera, np.linalg.inv(poses[i])) for i in steps), fps)
+    return _write(target, (draw_splats(scene, cameras[i], np.linalg.inv(poses[i])) for i in steps), rate)
+
+
+def _camera(width: int, height: int, fov: float) -> Intrinsics:
+    focal = height / 2 / np.tan(np.radians(fov) / 2)
+    return Intrinsics(width, height, focal, focal, width / 2, height / 2)
+
+
+def _of_file(path: CameraPath | None, file: str | Path) -> CameraPath | None:
+    if path is not None and path.world != EXPORTED:
+        raise InputError(
+            f"{file} was recorded in a run before its export, in other coordinates than a splat file has: give the run "
+            "instead of the splat file, or record the path again"
+        )
+    return path
+
+
+def _given_path(path: str | Path, fps: float | None) -> CameraPath | None:
+    """The camera path in a file; None for a name of `PATHS`."""
+    if path in PATHS:
+        return None
+    if not Path(path).is_file():
+        raise InputError(
+            f"path is one of {', '.join(PATHS)}, or a camera path that `msgs-slam view` has saved; there is no file "
+            f"{str(path)!r}"
+        )
+    return read_camera_path(Path(path), fps)
+
+
+def _in_world_of_run(path: CameraPath, run: RunFolder) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The flight in the run's own world: (N, 4, 4) world_from_cam, (N,) fields of view in degrees."""
+    poses, fovs = path.flight()
+    if path.world == EXPORTED:
+        if (world := load_world(run)) is None:
+            raise InputError(
+                f"the camera path is in the coordinates of exported files, and {run.root} has none: "
+                f"run `msgs-slam resume {run.root}` first"
+            )
+        cam_from_run = world.exported_from_run.inverse().apply_to_poses(np.linalg.inv(poses))
+        return np.asarray(np.linalg.inv(cam_from_run), np.float64), fovs
+    return poses, fovs
+
+
+def _seeing(outcome: Outcome, fov: float) -> Outcome:
+    """The same seen by a camera with this field of view from top to bottom, in degrees."""
+    k = outcome.calibration.intrinsics
+    fy = k.height / 2 / float(np.tan(np.radians(fov) / 2))
+    zoomed = replace(k, fx=k.fx * fy / k.fy, fy=fy)
+    return replace(outcome, calibration=replace(outcome.calibration, intrinsics=zoomed))
 
 
 def _require_target(target: Path, fps: float) -> None:

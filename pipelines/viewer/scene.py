@@ -1,4 +1,4 @@
-"""What the viewer shows, as plain arrays: from a run, or from a splat file by any program."""
+"""The content of the viewer, as plain arrays: from a run, or from a splat file by any program."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from msgs_slam.pipelines.proxy.palette import class_colors
 from msgs_slam.pipelines.run.folder import MESH, WORLD, RunFolder
 from msgs_slam.pipelines.types import Frame, Metres
 from msgs_slam.pipelines.upright.world import load_world, read_world, up_in_run
+from msgs_slam.pipelines.viewer.camera_path import EXPORTED, RUN
 
 MODES = ("colour", "classes", "depth")
 MOST_CAMERAS = 60
@@ -44,8 +45,8 @@ class ViewerCamera:
 class ViewerScene:
     """cloud: the M Gaussians in the world of the exported files; labels (M,) uint8 indices into `class_names`, VOID for
     none, or None without classes; `scale` multiplies the world's lengths for show; up (3,); path (N, 3) camera centres
-    as shown; mesh_file of the run, if there is one; whether the floor is at 0; is_metric, metres: what a unit of the
-    world is."""
+    as shown; mesh_file of the run, if there is one; world: which one, as camera paths name it; whether the floor is at
+    0; is_metric, metres: what a unit of the world is."""
 
     title: str
     cloud: GaussianCloud
@@ -58,6 +59,7 @@ class ViewerScene:
     path: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
     mesh_file: Path | None = None
     run: RunFolder | None = None
+    world: str = EXPORTED
     has_floor: bool = False
     is_metric: bool = False
     metres: Metres | None = None
@@ -104,7 +106,7 @@ class ViewerScene:
 
 
 def load_scenes(path: Path) -> list[ViewerScene]:
-    """Of a run folder and its pieces, largest first, or of a file of Gaussians. Raises InputError for anything else, or
+    """Load a run folder and its pieces, largest first, or a file of Gaussians. Raises InputError for anything else, or
     a run without a map."""
     with reaching(path):
         is_file, is_folder = path.is_file(), path.is_dir()
@@ -142,6 +144,7 @@ def _from_run(outcome: Outcome) -> ViewerScene:
         path=centers * scale,
         mesh_file=outcome.run.file("export", MESH) if outcome.run.has("export", MESH) else None,
         run=outcome.run,
+        world=RUN if world is None else EXPORTED,
         has_floor=world is not None and world.has_floor,
         is_metric=outcome.metric,
         metres=outcome.metres,

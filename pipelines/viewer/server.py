@@ -12,14 +12,15 @@ import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.pipelines.export.floor_plan import walls_of_run
 from msgs_slam.pipelines.viewer.door import guarding
+from msgs_slam.pipelines.viewer.flight import Flight
 from msgs_slam.pipelines.viewer.scene import MODES, ViewerCamera, ViewerScene, load_scenes
 from msgs_slam.pipelines.viewer.tools import Selection, Tape, class_name, length_text, unit_text
+from msgs_slam.pipelines.viewer.views import client_view, move_client, shown_pose
 
 _FRUSTUM = 0.09
 _PREVIEW_WIDTH = 480
@@ -84,7 +85,7 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """Where to look."""
+        """The address to open in a browser."""
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
     def show(self, mode: str, client: Any = None) -> None:
@@ -106,8 +107,8 @@ class Viewer:
     def _eye(self, client: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(position, direction of view) as shown."""
         if client is not None:
-            turn = Rotation.from_quat(np.asarray(client.camera.wxyz)[[1, 2, 3, 0]]).as_matrix()
-            return np.asarray(client.camera.position), turn[:, 2]
+            pose = client_view(client)
+            return pose[:3, 3], pose[:3, 2]
         if self.scene.cameras:
             world_from_cam = self.scene.cameras[0].world_from_cam
             return world_from_cam[:3, 3] * self.scene.scale, world_from_cam[:3, 2]
@@ -125,7 +126,7 @@ class Viewer:
         self.server.sleep_forever()
 
     def stop(self) -> None:
-        """End the server."""
+        """End the server and its timers."""
         self._remove_tools()
         self.server.stop()
 
@@ -162,11 +163,13 @@ class Viewer:
         with self._tools:
             self.selection = Selection(self.server, self.scene, lambda: self.show(self.mode.value))
             self.tape = Tape(self.server, self.scene, self.selection)
+            self.flight = Flight(self.server, self.scene)
 
     def _remove_tools(self) -> None:
         if self.selection is not None:
             self.tape.switch.value = False
             self.selection.rest()
+            self.flight.rest()
             self._tools.remove()
             self.selection = None
 
@@ -206,7 +209,7 @@ class Viewer:
             self.server.scene.add_label(f"/walls/{number}", told, position=ends[number].mean(axis=0))
 
     def _add_camera(self, number: int, camera: ViewerCamera) -> Any:
-        wxyz, position = self._pose(camera)
+        wxyz, position = shown_pose(camera.world_from_cam, self.scene.scale)
         handle = self.server.scene.add_camera_frustum(
             f"/cameras/{number:05d}", camera.fov, camera.aspect, scale=_FRUSTUM, color=(37, 99, 235),
             thickness=1.5, thickness_units="screen", wxyz=wxyz, position=position,
@@ -214,15 +217,10 @@ class Viewer:
         handle.on_click(lambda event: None if self.tape.switch.value else self.visit(camera, event.client))
         return handle
 
-    def _pose(self, camera: ViewerCamera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(wxyz, position) in the scene's size; viser's cameras look along +z with y down, as ours do."""
-        quat_xyzw = Rotation.from_matrix(camera.world_from_cam[:3, :3]).as_quat()
-        return quat_xyzw[[3, 0, 1, 2]], camera.world_from_cam[:3, 3] * self.scene.scale
-
     def visit(self, camera: ViewerCamera, client: Any) -> None:
         """Look from a camera, as after a click on it, and show its frame."""
         if client is not None:
-            self._move(client, camera)
+            move_client(client, camera.world_from_cam, self.scene.scale, camera.fov)
             if self.mode.value == "depth":
                 self.show("depth", client)
         if self.scene.run is not None:
@@ -234,16 +232,10 @@ class Viewer:
                 label = plain(str(error))
             self.preview.label = label
 
-    def _move(self, client: Any, camera: ViewerCamera) -> None:
-        wxyz, position = self._pose(camera)
-        with client.atomic():
-            client.camera.wxyz, client.camera.position = wxyz, position
-            client.camera.fov = camera.fov
-
     def _place(self, client: Any) -> None:
         """Behind and above the first camera, or outside a scene without cameras."""
         if self.scene.cameras:
-            _, position = self._pose(self.scene.cameras[0])
+            _, position = shown_pose(self.scene.cameras[0].world_from_cam, self.scene.scale)
             forward = self.scene.cameras[0].world_from_cam[:3, 2]
             with client.atomic():
                 client.camera.position = position - 0.9 * forward + 0.5 * self.scene.up

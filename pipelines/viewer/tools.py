@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.gaussian_ply import write_gaussian_ply
 from msgs_slam.pipelines.geometry.tape import Touch, area, area_text, tape, tape_text, touch
 from msgs_slam.pipelines.types import VOID
 from msgs_slam.pipelines.viewer.scene import ViewerScene
+from msgs_slam.pipelines.viewer.views import client_view
 
 _SETTLE_SECONDS = 0.25
 """A slider is dragged through many values; the map is sent again once it rests."""
@@ -63,21 +63,21 @@ class Selection:
         return shown
 
     def delete(self) -> None:
-        """What is shown is shown no more, whatever the switches and the box say."""
+        """Hide what is shown, whatever the switches and the box say."""
         if (rows := self.rows).any():
             self._deleted.append(rows)
             self.undo_button.visible = True
             self._soon()
 
     def undo(self) -> None:
-        """What was deleted last is back."""
+        """Bring back what was deleted last."""
         if self._deleted:
             self._deleted.pop()
             self.undo_button.visible = bool(self._deleted)
             self._soon()
 
     def ply(self) -> bytes:
-        """What is shown as the bytes of a splat PLY, in the world of the exported files."""
+        """Return what is shown as the bytes of a splat PLY, in the world of the exported files."""
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "seen.ply"
             write_gaussian_ply(path, self._scene.cloud.only(self.rows), self._scene.class_names)
@@ -143,7 +143,7 @@ def round_range(low: float, high: float) -> tuple[float, float, float]:
 
 
 def class_name(scene: ViewerScene, label: int) -> str:
-    """That of a label of the scene's Gaussians."""
+    """The name of a label of the scene's Gaussians."""
     return "unknown" if label == VOID or label >= len(scene.class_names) else scene.class_names[label]
 
 
@@ -155,7 +155,7 @@ def length_text(length: float, scene: ViewerScene) -> str:
 
 
 def unit_text(scene: ViewerScene) -> str:
-    """What lengths are given in, in a line."""
+    """Say in a line what lengths are given in."""
     if scene.is_metric:
         return "Lengths are metres."
     if scene.metres is None:
@@ -191,9 +191,9 @@ class Tape:
         self._place(np.asarray(event.ray_origin, np.float64), np.asarray(event.ray_direction, np.float64), event.client)
 
     def mark_middle(self, client: Any) -> None:
-        """What is in the middle of the client's view."""
-        turn = Rotation.from_quat(np.asarray(client.camera.wxyz)[[1, 2, 3, 0]]).as_matrix()
-        self._place(np.asarray(client.camera.position, np.float64), turn[:, 2], client)
+        """Take the place in the middle of the client's view."""
+        pose = client_view(client)
+        self._place(pose[:3, 3], pose[:3, 2], client)
 
     def _place(self, origin: NDArray[np.float64], direction: NDArray[np.float64], client: Any) -> None:
         """One end of the tape more, or one corner of an area."""
