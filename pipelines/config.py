@@ -188,6 +188,9 @@ class ExportConfig:
         within=(10, 10_000_000),
     )  # fmt: skip
     mesh_side: int = setting(640, "pixels on the long side of their depth images", within=(16, 8192))
+    planes: bool = setting(
+        True, "the mesh's floors, walls and fronts straight: what no match confirms moves onto the planes beside it"
+    )
     scale: str = setting(
         "auto",
         "where metres are unknown, auto estimates how long a unit is, by a network and usual sizes; free does not",

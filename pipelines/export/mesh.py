@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,12 @@ from numpy.typing import NDArray
 from msgs_slam.formats.mesh import MeshBlocks
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.depth.posed import PosedDepth
+from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.export.joined import Region
 from msgs_slam.pipelines.export.paint import paint
+from msgs_slam.pipelines.export.planes import Planes
+from msgs_slam.pipelines.export.straighten import planes_of, straightened
 from msgs_slam.pipelines.export.surface import chunk_surfaces, weld
 from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid
 from msgs_slam.pipelines.gaussians.render import get_threads
@@ -21,7 +25,7 @@ from msgs_slam.pipelines.mapping.depth_views import DrawnView, Shown, drawn_view
 from msgs_slam.pipelines.outcome import Outcome, maps_around
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.types import VOID
+from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 
 TRUNCATION = 4.0
 """Voxels on either side of a surface that a depth speaks for."""
@@ -29,6 +33,8 @@ LEAST_WEIGHT = 1.5
 """A voxel seen with less weight, in views at the median depth, has no surface."""
 LONG = 200
 """Keyframes of a recording for which `export.max_blocks` is meant; a longer one may have more by its length."""
+SURE = 0.5
+"""Confidence of a proxy's depth from which the depth drawn there stays where it is."""
 _KEPT_BYTES = 100e6
 
 
@@ -44,7 +50,30 @@ def draw(outcome: Outcome, settings: ExportConfig, scratch: Path, progress: Prog
     for number in progress.track(numbers, "drawing", len(numbers)):
         if not (file := _view_file(scratch, number)).exists():
             row = rows[number]
-            save_value(file, drawn_view(near(int(t.frame_ids[row])), t.cam_from_world[row], camera))
+            frame_id = int(t.frame_ids[row])
+            view = drawn_view(near(frame_id), t.cam_from_world[row], camera)
+            maps = outcome.run.find_proxy(frame_id) if settings.planes else None
+            save_value(file, view if maps is None else replace(view, unsure=_unsure(maps, camera)))
+
+
+def _unsure(maps: ProxyMaps, camera: Intrinsics) -> NDArray[np.bool_]:
+    return resample_nearest(maps.confidence, camera.height, camera.width) < SURE
+
+
+def straighten(scratch: Path, planes: Planes, progress: Progress, numbers: range) -> None:
+    """Move unsure depths of the views of `draw` onto the planes; a view that is done stays."""
+    for number in progress.track(numbers, "straightening", len(numbers)):
+        view: DrawnView = load_value(file := _view_file(scratch, number))
+        if view.unsure is not None:
+            save_value(file, straightened(view, planes))
+
+
+def planes_in(scratch: Path, count: int) -> Planes:
+    """The planes of what `draw` has left, found once: views that are straight would give others."""
+    if not (file := scratch / "planes.npz").exists():
+        save_value(file, planes_of(drawn_views(scratch, count)))
+    planes: Planes = load_value(file)
+    return planes
 
 
 def drawn_views(scratch: Path, count: int) -> Sequence[DrawnView]:

@@ -17,9 +17,16 @@ from msgs_slam.pipelines.engine.chunks import in_chunks
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.export.floor_plan import write_floor_plan
 from msgs_slam.pipelines.export.joined import joined
-from msgs_slam.pipelines.export.mesh import drawn_views, fused_regions, keyframe_rows, make_grid_of, mesh_figures
+from msgs_slam.pipelines.export.mesh import (
+    drawn_views,
+    fused_regions,
+    keyframe_rows,
+    make_grid_of,
+    mesh_figures,
+    planes_in,
+)
 from msgs_slam.pipelines.export.pieces import make_pieces
-from msgs_slam.pipelines.export.tasks import draw_keyframes, fuse_views, scratch_of
+from msgs_slam.pipelines.export.tasks import draw_keyframes, fuse_views, scratch_of, straighten_views
 from msgs_slam.pipelines.export.textured import make_textured, write_textured
 from msgs_slam.pipelines.export.tiles import write_tiles
 from msgs_slam.pipelines.export.web_page import write_web_page
@@ -115,6 +122,8 @@ def write_meshes(job: MeshJob, outcome: Outcome, world: World) -> list[Path]:
     views = drawn_views(job.scratch, count)
     if not job.is_made or "texture" in job.kinds:
         in_chunks(job.context, draw_keyframes, count, move=outcome.move)
+        if job.context.config.export.planes:
+            in_chunks(job.context, straighten_views, count, planes=planes_in(job.scratch, count))
     if not job.is_made:
         grid = make_grid_of(views, job.context.config.export)
         regions, class_ids = len(list(grid.regions())), tuple(outcome.label_of_channel.tolist())

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from msgs_slam.pipelines.engine.chunks import Chunk
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.export.mesh import draw, drawn_views, fuse_regions
+from msgs_slam.pipelines.export.mesh import draw, drawn_views, fuse_regions, straighten
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.system.progress import Progress
 
@@ -16,6 +16,11 @@ def draw_keyframes(task: Chunk, progress: Progress) -> None:
     context = task.context(progress)
     outcome = load_outcome(task.run, context.device).moved(task.known["move"])
     draw(outcome, task.config.export, scratch_of(context), progress, task.numbers)
+
+
+def straighten_views(task: Chunk, progress: Progress) -> None:
+    """Move the unsure depths of a chunk's views onto the planes of all."""
+    straighten(scratch_of(task.context(progress)), task.known["planes"], progress, task.numbers)
 
 
 def fuse_views(task: Chunk, progress: Progress) -> None:

@@ -17,16 +17,20 @@ from msgs_slam.pipelines.types import Intrinsics
 
 @dataclass(frozen=True)
 class DrawnView:
-    """Depth and trust, colors (H, W, 3) uint8 and class channels (H, W) int16, -1 = none; None for a map without."""
+    """Depth and trust, colors (H, W, 3) uint8 and class channels (H, W) int16, -1 = none; None for a map without.
+
+    unsure (H, W): where a depth may move onto a plane beside it, None for nowhere."""
 
     shown: PosedDepth
     colors: NDArray[np.uint8]
     channels: NDArray[np.int16] | None
+    unsure: NDArray[np.bool_] | None = None
 
     @property
     def arrays(self) -> list[NDArray]:
-        """Depth, trust, colors, and channels where there are any."""
-        return [self.shown.depth, self.shown.trust, self.colors, *([] if self.channels is None else [self.channels])]
+        """Depth, trust, colors, and channels and unsure where there are any."""
+        some = (self.channels, self.unsure)
+        return [self.shown.depth, self.shown.trust, self.colors, *(a for a in some if a is not None)]
 
     @property
     def size(self) -> int:

@@ -12,7 +12,7 @@ from msgs_slam.pipelines.mapping.depth_views import depth_view
 from msgs_slam.pipelines.outcome import Outcome, evenly, maps_around
 from msgs_slam.pipelines.upright.lines import up_of_lines
 from msgs_slam.pipelines.voxels.layout import Gravity, find_gravity, floor_plane, name_structure
-from msgs_slam.pipelines.voxels.voxels import Voxels, gather_frame, merge, select
+from msgs_slam.pipelines.voxels.voxels import Voxels, gather_depths, select
 
 Array = NDArray[np.float64]
 
@@ -89,12 +89,7 @@ def surface_voxels(outcome: Outcome, rows: Sequence[int]) -> Voxels:
     views = [depth_view(near(int(t.frame_ids[row])), t.cam_from_world[row], camera) for row in rows]
     seen = np.concatenate([np.zeros(0), *(v.depth[v.trust > 0] for v in views)])
     size = float(np.median(seen)) / _VOXELS_PER_DEPTH if len(seen) else 1.0
-    black = np.zeros((camera.height, camera.width, 3), np.uint8)
-    gathered = (
-        gather_frame(v.depth, v.trust, black, camera, np.linalg.inv(v.cam_from_world).astype(np.float64), size)
-        for v in views
-    )
-    voxels = merge(size, gathered)
+    voxels = gather_depths(views, size)
     return select(voxels, voxels.weight > _LEAST_WEIGHT)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -11,6 +12,9 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.geometry.camera import unproject_depth
 from msgs_slam.pipelines.types import Intrinsics
+
+if TYPE_CHECKING:
+    from msgs_slam.pipelines.depth.posed import PosedDepth
 
 _BITS = 21
 _HALF = 1 << (_BITS - 1)
@@ -138,6 +142,17 @@ def gather_frame(
     w = weight[use].astype(np.float64)
     values = np.concatenate([np.ones((len(w), 1)), points[use], normals[use], lab[use]], axis=1) * w[:, None]
     return _sum_by_key(keys[use], values)
+
+
+def gather_depths(views: Iterable[PosedDepth], size: float) -> Voxels:
+    """The surface that depth images show, by their trust; without colours."""
+
+    def gathered(view: PosedDepth) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        black = np.zeros((*view.depth.shape, 3), np.uint8)
+        world_from_cam = np.linalg.inv(view.cam_from_world).astype(np.float64)
+        return gather_frame(view.depth, view.trust, black, view.intrinsics, world_from_cam, size)
+
+    return merge(size, (gathered(view) for view in views))
 
 
 def merge(size: float, frames: Iterable[tuple[NDArray[np.int64], NDArray[np.float64]]], most: int = MOST) -> Voxels:

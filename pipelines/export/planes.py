@@ -1,0 +1,105 @@
+"""Planes of a room: floor, walls, fronts, found among the voxels of its surface.
+
+They are found by random hypotheses, largest first, and fitted again to what lies on them (RANSAC, Fischler and Bolles
+1981).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_slam.pipelines.voxels.voxels import Voxels, neighbour_keys, voxel_keys
+
+Array = NDArray[np.float64]
+
+_MOST, _LEAST_SHARE, _LEAST_VOXELS = 20, 0.01, 30
+"""Planes, and the share of the sure surface and the voxels that each has at least."""
+_HYPOTHESES, _COUNTED = 200, 20_000
+"""Planes through a voxel that are tried for each that is found, and voxels by which they are compared."""
+_THICK, _TAKEN = 0.7, 2.0
+"""Voxels from a plane: up to the first a voxel lies on it, up to the second it is in no further plane."""
+_ALONG, ROUGHLY_ALONG = 0.94, 0.8
+"""Cosine between the normals of a plane and of a voxel that lies on it, and of a pixel that moves onto it."""
+REACH = 3.0
+"""Voxels that a depth moves at most, across the plane."""
+NEAR, _AGREE = 8, 0.25
+"""A plane is believed in cubes of so many voxels where it has this share of all that lies within reach and along it,
+and in those without any that touch them: not where a sure surface bends away from it or has a step."""
+
+
+@dataclass(frozen=True)
+class Planes:
+    """normal (P, 3) unit vectors towards the cameras; offset (P,) = normal @ point; `cubes`, of each the sorted keys of
+    the cubes of side `NEAR * voxel` where it is believed."""
+
+    voxel: float
+    normal: Array
+    offset: Array
+    cubes: Sequence[NDArray[np.int64]]
+
+
+def find_planes(voxels: Voxels) -> Planes:
+    """The largest planes of a surface; the same ones every time."""
+    rng, left, total = np.random.default_rng(0), np.ones(len(voxels), bool), voxels.weight.sum()
+    normals, offsets, cubes = [], [], []
+    for _ in range(_MOST):
+        if left.sum() < _LEAST_VOXELS:
+            break
+        on = _largest(voxels, np.flatnonzero(left), rng)
+        if voxels.weight[on].sum() < _LEAST_SHARE * total or len(on) < _LEAST_VOXELS:
+            break
+        normal, offset, on = _fitted(voxels, left, on)
+        left &= ~_on(voxels, normal, offset, _TAKEN, ROUGHLY_ALONG)
+        left[on] = False
+        if len(on) >= _LEAST_VOXELS:
+            normals.append(normal)
+            offsets.append(offset)
+            cubes.append(_believed(voxels, normal, offset, on))
+    return Planes(float(voxels.size), np.array(normals).reshape(-1, 3), np.array(offsets), cubes)
+
+
+def _largest(voxels: Voxels, left: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
+    """The voxels on the best of some planes through a voxel; voxels are drawn by their weight."""
+    share = voxels.weight[left] / voxels.weight[left].sum()
+    tried = rng.choice(left, min(_HYPOTHESES, len(left)), replace=False, p=share)
+    seen = left if len(left) <= _COUNTED else rng.choice(left, _COUNTED, replace=False)
+    normal = voxels.normal[tried]
+    offset = (voxels.position[tried] * normal).sum(1)
+    on = np.abs(voxels.position[seen] @ normal.T - offset) < _THICK * voxels.size
+    on &= voxels.normal[seen] @ normal.T > _ALONG
+    best = int((voxels.weight[seen] @ on).argmax())
+    return left[_on(voxels, normal[best], offset[best], _THICK, _ALONG)[left]]
+
+
+def _fitted(voxels: Voxels, left: NDArray[np.bool_], on: NDArray[np.int64]) -> tuple[Array, float, NDArray[np.int64]]:
+    """Normal, offset and voxels of the plane through the middle of the voxels `on`, and of those that it then has."""
+    for _ in range(3):
+        weight = voxels.weight[on]
+        middle = np.average(voxels.position[on], 0, weight)
+        apart = voxels.position[on] - middle
+        normal = np.linalg.eigh((apart * weight[:, None]).T @ apart)[1][:, 0]
+        normal = normal * (1 if (voxels.normal[on] @ normal).sum() > 0 else -1)
+        offset = float(middle @ normal)
+        on = np.flatnonzero(left & _on(voxels, normal, offset, _THICK, _ALONG))
+        if len(on) < _LEAST_VOXELS:
+            break
+    return normal, offset, on
+
+
+def _believed(voxels: Voxels, normal: Array, offset: float, on: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Sorted keys of the cubes where what lies `on` the plane is not outweighed."""
+    near = _on(voxels, normal, offset, REACH, ROUGHLY_ALONG)
+    near[on] = True
+    keys, place = np.unique(voxel_keys(voxels.position[near], NEAR * voxels.size), return_inverse=True)
+    weight = voxels.weight[near]
+    agrees = np.bincount(place, weight * np.isin(np.flatnonzero(near), on)) >= _AGREE * np.bincount(place, weight)
+    return np.setdiff1d(neighbour_keys(keys[agrees]), keys[~agrees])
+
+
+def _on(voxels: Voxels, normal: Array, offset: float, within: float, along: float) -> NDArray[np.bool_]:
+    close = np.abs(voxels.position @ normal - offset) < within * voxels.size
+    return np.asarray(close & (voxels.normal @ normal > along))

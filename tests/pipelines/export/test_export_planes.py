@@ -1,0 +1,139 @@
+"""Depths that are not sure, beside planes, steps and curves that are: a made room, 60 voxels deep."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from msgs_slam.pipelines.config import ExportConfig
+from msgs_slam.pipelines.depth.posed import PosedDepth
+from msgs_slam.pipelines.engine.task_files import load_value, save_value
+from msgs_slam.pipelines.export.mesh import draw, drawn_views, keyframe_rows, planes_in, straighten
+from msgs_slam.pipelines.export.planes import Planes, find_planes
+from msgs_slam.pipelines.export.straighten import planes_of, straightened
+from msgs_slam.pipelines.mapping.depth_views import DrawnView
+from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.types import Intrinsics
+from msgs_slam.pipelines.voxels.voxels import Voxels
+
+Image = NDArray[np.float64]
+OracleRun = Callable[..., RunFolder]
+CAMERA = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
+WALL, FLOOR = 3.0, 1.0
+VOXEL = WALL / 60
+ROWS, COLUMNS = np.mgrid[:120, :160] + 0.5
+RAYS = np.stack([(COLUMNS - 80) / 150, (ROWS - 60) / 150, np.ones_like(ROWS)], -1)
+MIDDLE = (np.abs(COLUMNS - 80) < 35) & (np.abs(ROWS - 50) < 25)
+WAVES = np.sin(COLUMNS / 12) * np.sin(ROWS / 12)
+
+
+def room() -> Image:
+    """Depth of a wall 3 away and a floor 1 below the camera."""
+    return np.minimum(WALL, FLOOR / np.maximum(RAYS[..., 1], 1e-9))
+
+
+def view(depth: Image, unsure: NDArray[np.bool_], aside: float) -> DrawnView:
+    """From a camera `aside` to the right; what is seen moves with it."""
+    pose = np.eye(4)
+    pose[0, 3] = -aside
+    shown = PosedDepth(CAMERA, pose, depth.astype(np.float32), np.ones(depth.shape, np.float32))
+    return DrawnView(shown, np.zeros((*depth.shape, 3), np.uint8), None, unsure)
+
+
+def views(depth: Image, unsure: NDArray[np.bool_]) -> list[DrawnView]:
+    return [view(depth, unsure, aside) for aside in (-0.1, 0.0, 0.1)]
+
+
+def test_an_unsure_wall_becomes_straight() -> None:
+    truth = room()
+    seen = views(truth + 1.8 * VOXEL * WAVES * MIDDLE, MIDDLE)
+    planes = planes_of(seen)
+    assert sorted(np.round(planes.normal, 2).tolist()) == [[0, -1, 0], [0, 0, -1]]
+    before, after = (np.abs(v.shown.depth - truth)[MIDDLE] for v in (seen[0], straightened(seen[0], planes)))
+    assert np.percentile(before, 90) > VOXEL
+    assert np.percentile(after, 90) < 0.1 * VOXEL
+
+
+def test_sure_depths_stay() -> None:
+    seen = views(room() + 0.3 * VOXEL * WAVES, MIDDLE)
+    planes, first = planes_of(seen), seen[0]
+    changed = straightened(first, planes).shown.depth != first.shown.depth
+    assert changed[MIDDLE].mean() > 0.9
+    assert not changed[~MIDDLE].any()
+    sure = replace(first, unsure=np.zeros_like(MIDDLE))
+    np.testing.assert_array_equal(straightened(sure, planes).shown.depth, first.shown.depth)
+
+
+def test_a_step_of_four_voxels_stays() -> None:
+    depth = room() - 4 * VOXEL * MIDDLE
+    seen = views(depth, MIDDLE)
+    planes = planes_of(seen)
+    assert len(planes.offset) == 2
+    np.testing.assert_array_equal(straightened(seen[1], planes).shown.depth, seen[1].shown.depth)
+
+
+def test_a_plane_ends_where_others_are_sure_of_something_else() -> None:
+    """One view in three does not know of a panel two voxels before the wall, on which no plane was found."""
+    depth = room() - 2 * VOXEL * MIDDLE
+    seen = views(depth, np.zeros_like(MIDDLE))
+    seen[0] = replace(seen[0], unsure=MIDDLE)
+    moved = np.abs(straightened(seen[0], planes_of(seen)).shown.depth - depth)
+    inner = (np.abs(COLUMNS - 80) < 14) & (np.abs(ROWS - 50) < 8)
+    assert moved[inner].max() < 0.1 * VOXEL
+
+
+def test_a_ball_stays() -> None:
+    """Of eight voxels radius, before the wall."""
+    center = np.array([0.0, -0.1, 2.0])
+    a, b, c = (RAYS**2).sum(-1), RAYS @ center, center @ center - (8 * VOXEL) ** 2
+    ball = b**2 > a * c
+    depth = np.where(ball, (b - np.sqrt(np.maximum(b**2 - a * c, 0))) / a, room())
+    seen = [view(depth, ball, 0.0)] * 3
+    np.testing.assert_array_equal(straightened(seen[0], planes_of(seen)).shown.depth, seen[0].shown.depth)
+
+
+def test_a_round_hall_gets_facets_of_less_than_two_voxels() -> None:
+    """A sphere of forty voxels radius from inside, every other four columns unsure."""
+    depth = 40 * VOXEL / np.sqrt((RAYS**2).sum(-1))
+    seen = [view(depth, COLUMNS.astype(int) % 8 < 4, 0.0)] * 3
+    off = np.abs(straightened(seen[1], planes_of(seen)).shown.depth - depth)
+    assert off.max() < 2 * VOXEL
+
+
+def test_planes_are_the_same_every_time_and_travel(tmp_path: Path) -> None:
+    seen = views(room(), MIDDLE)
+    first = planes_of(seen)
+    save_value(tmp_path / "planes.npz", first)
+    for other in (planes_of(seen), load_value(tmp_path / "planes.npz")):
+        np.testing.assert_array_equal(other.normal, first.normal)
+        np.testing.assert_array_equal(other.offset, first.offset)
+        assert [c.tolist() for c in other.cubes] == [c.tolist() for c in first.cubes]
+
+
+@pytest.mark.parametrize("count", [0, 20])
+def test_no_surface_has_no_planes(count: int) -> None:
+    some = np.ones((count, 3))
+    found = find_planes(Voxels(1.0, np.arange(count), np.ones(count), some, some / 3**0.5, some))
+    assert found.normal.shape == (0, 3)
+    assert isinstance(planes_of([]), Planes)
+
+
+def test_views_of_a_run_are_made_straight_once(oracle_run: OracleRun, tmp_path: Path) -> None:
+    run = oracle_run(video=True)
+    outcome = load_outcome(run)
+    count = len(keyframe_rows(outcome))
+    draw(outcome, ExportConfig(mesh_side=80, planes=False), tmp_path / "off", SilentProgress(), range(count))
+    assert drawn_views(tmp_path / "off", count)[0].unsure is None
+    draw(outcome, ExportConfig(mesh_side=80), tmp_path, SilentProgress(), range(count))
+    assert drawn_views(tmp_path, count)[0].unsure is not None
+    planes = planes_in(tmp_path, count)
+    straighten(tmp_path, planes, SilentProgress(), range(count))
+    done = {path: path.read_bytes() for path in tmp_path.glob("*.npz")}
+    assert all(v.unsure is None for v in drawn_views(tmp_path, count))
+    straighten(tmp_path, planes_in(tmp_path, count), SilentProgress(), range(count))
+    assert done == {path: path.read_bytes() for path in tmp_path.glob("*.npz")}
