@@ -140,6 +140,8 @@ def render(
 def view(path: Path, port: int, host: str) -> None:
     """Look at a run, or at any Gaussians (.ply, .spz, .glb, .splat), in the browser.
 
+    A run that is not finished shows what its stages have made by now, and more as soon as another one ends.
+
     Needs the extra: pip install 'msgs-slam[viewer]'.
     """
     from msgs_slam.pipelines.viewer.server import open_viewer

@@ -60,6 +60,11 @@ class Flight:
         self.keyframes.insert(at, Keyframe(pose, float(np.degrees(client.camera.fov))))
         self._changed(at)
 
+    def take(self, keyframes: list[Keyframe]) -> None:
+        """Go on with keyframes that were recorded in the same world."""
+        self.keyframes = keyframes
+        self._changed(max(len(keyframes) - 1, 0))
+
     def delete(self) -> None:
         """Without the chosen keyframe."""
         if self.keyframes:

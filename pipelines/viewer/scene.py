@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -13,20 +13,26 @@ from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gaussian_files import read_gaussians
-from msgs_slam.formats.gaussians import GaussianCloud
+from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
 from msgs_slam.formats.reading import reaching
 from msgs_slam.pipelines.export.stage import on_earth
 from msgs_slam.pipelines.export.writers import map_cloud
 from msgs_slam.pipelines.gaussian_map import decided_channels
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.outcome import Outcome, evenly, labels_of_channels, load_outcome
 from msgs_slam.pipelines.proxy.palette import class_colors
 from msgs_slam.pipelines.run.folder import MESH, WORLD, RunFolder
+from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.types import Frame, Metres
+from msgs_slam.pipelines.upright.find import cameras_up
 from msgs_slam.pipelines.upright.world import load_world, read_world, up_in_run
 from msgs_slam.pipelines.viewer.camera_path import EXPORTED, RUN
 
 MODES = ("colour", "classes", "depth")
 MOST_CAMERAS = 60
+GAUSSIANS, POINTS = "Gaussians", "points"
+_POINT_RADIUS = 0.012
+"""Of a scene as shown."""
 _USUAL_SIZE = 5.0
 """The scene is shown this large: covariances travel in half precision, which has few digits for small numbers."""
 
@@ -46,7 +52,8 @@ class ViewerScene:
     """cloud: the M Gaussians in the world of the exported files; labels (M,) uint8 indices into `class_names`, VOID for
     none, or None without classes; `scale` multiplies the world's lengths for show; up (3,); path (N, 3) camera centres
     as shown; mesh_file of the run, if there is one; world: which one, as camera paths name it; whether the floor is at
-    0; is_metric, metres: what a unit of the world is."""
+    0; is_metric, metres: what a unit of the world is; what: the cloud's elements, GAUSSIANS or, before there is a map,
+    POINTS; is_empty: nothing is there yet, and the cloud holds an invisible one."""
 
     title: str
     cloud: GaussianCloud
@@ -63,6 +70,8 @@ class ViewerScene:
     has_floor: bool = False
     is_metric: bool = False
     metres: Metres | None = None
+    what: str = GAUSSIANS
+    is_empty: bool = False
 
     @cached_property
     def centers(self) -> NDArray[np.float32]:
@@ -106,15 +115,22 @@ class ViewerScene:
 
 
 def load_scenes(path: Path) -> list[ViewerScene]:
-    """Load a run folder and its pieces, largest first, or a file of Gaussians. Raises InputError for anything else, or
-    a run without a map."""
+    """Load a run folder and its pieces, largest first, or a file of Gaussians; of a run without a map its cameras and
+    points, as far as they are done. Raises InputError for anything else."""
     with reaching(path):
         is_file, is_folder = path.is_file(), path.is_dir()
     if is_file:
         return [_from_file(path)]
     if not is_folder:
         raise InputError(f"{path}: there is no such run folder or splat file")
-    outcome = load_outcome(RunFolder(path))
+    if not (run := RunFolder(path)).manifest_file.exists():
+        raise InputError(
+            f"{path} is no run folder: it has no manifest.json. Give the folder of `msgs-slam reconstruct`"
+        )
+    records = load_records(run)
+    if "mapping" not in records:
+        return [_from_tracking(load_outcome(run)) if "tracking" in records else _from_frames(run, "frames" in records)]
+    outcome = load_outcome(run)
     return [_from_run(outcome), *(_from_run(piece) for piece in outcome.pieces() if piece.gaussian_map is not None)]
 
 
@@ -149,6 +165,51 @@ def _from_run(outcome: Outcome) -> ViewerScene:
         is_metric=outcome.metric,
         metres=outcome.metres,
     )
+
+
+def _from_tracking(outcome: Outcome) -> ViewerScene:
+    """Cameras and points, in the run's world."""
+    t, run = outcome.trajectory, outcome.run
+    posed = t.world_from_cam[t.is_posed]
+    rows = np.flatnonzero(t.is_keyframe)
+    cameras = list(zip(t.frame_ids[rows].tolist(), t.world_from_cam[rows], strict=True))
+    scene = _of_points(run, outcome.load_sparse(), cameras, up_in_run(outcome))
+    return replace(scene, path=posed[:, :3, 3] * scene.scale, is_metric=outcome.metric)
+
+
+def _from_frames(run: RunFolder, is_done: bool) -> ViewerScene:
+    """Keyframes and points of structure from motion, or nothing before they are found."""
+    model = run.load_backbone() if is_done else None
+    if model is None or not len(model.frame_ids):
+        return _of_points(run, None, [], np.array([0.0, -1, 0]))
+    world_from_cam = np.asarray(np.linalg.inv(model.cam_from_world), np.float64)
+    cameras = list(zip(model.frame_ids.tolist(), world_from_cam, strict=True))
+    scene = _of_points(run, model, cameras, cameras_up(world_from_cam))
+    return replace(scene, path=model.centers * scene.scale)
+
+
+def _of_points(
+    run: RunFolder, model: SparseModel | None, cameras: list[tuple[int, NDArray[np.float64]]], up: NDArray[np.float64]
+) -> ViewerScene:
+    """Small balls for points; cameras: (frame id, world_from_cam (4, 4)) of keyframes."""
+    points, colors = np.zeros((1, 3)), np.zeros((1, 3), np.uint8)
+    if is_empty := model is None or not len(model.points_in_world):
+        opacity = -20.0
+    else:
+        points, colors, opacity = model.points_in_world, model.colors, 4.0
+    centers = np.array([pose[:3, 3] for _, pose in cameras]).reshape(-1, 3)
+    scale, ones = _scale(points, centers), np.ones(len(points), np.float32)
+    cloud = isotropic_cloud(
+        points.astype(np.float32), np.float32(np.log(_POINT_RADIUS / scale)) * ones, np.float32(opacity) * ones,
+        (colors / 255).astype(np.float32),
+    )  # fmt: skip
+    shown = ViewerScene(run.root.name, cloud, scale, up, run=run, world=RUN, what=POINTS, is_empty=is_empty)
+    if not cameras:
+        return shown
+    frames, k = run.load_frames(), run.load_calibration().intrinsics
+    fov, aspect = 2 * float(np.arctan(k.height / 2 / k.fy)), k.width / k.height
+    seen = [ViewerCamera(frames[i], pose, fov, aspect) for i, pose in evenly(cameras, MOST_CAMERAS)]
+    return replace(shown, cameras=seen)
 
 
 def _from_file(path: Path) -> ViewerScene:

@@ -18,6 +18,7 @@ from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.pipelines.export.floor_plan import walls_of_run
 from msgs_slam.pipelines.viewer.door import guarding
 from msgs_slam.pipelines.viewer.flight import Flight
+from msgs_slam.pipelines.viewer.live import Watch
 from msgs_slam.pipelines.viewer.scene import MODES, ViewerCamera, ViewerScene, load_scenes
 from msgs_slam.pipelines.viewer.tools import Selection, Tape, class_name, length_text, unit_text
 from msgs_slam.pipelines.viewer.views import client_view, move_client, shown_pose
@@ -53,6 +54,8 @@ class Viewer:
 
     def __init__(self, server: Any, scenes: list[ViewerScene]) -> None:
         self.server, self.scenes = server, scenes
+        self.watch: Watch | None = None
+        self._told = ""
         server.gui.configure_theme(show_logo=False)
         self.boxes: dict[str, Any] = {}
         self._sending = threading.Lock()
@@ -61,6 +64,8 @@ class Viewer:
         self._add_controls()
         self._add_tools()
         server.on_client_connect(self._place)
+        if (run := scenes[0].run) is not None:
+            self.watch = Watch(run, self.tell, self.replace)
 
     def _load(self, scene: ViewerScene) -> None:
         """Everything of the scene, and nothing else."""
@@ -83,6 +88,33 @@ class Viewer:
         for client in self.server.get_clients().values():
             self._place(client)
 
+    def replace(self, scenes: list[ViewerScene]) -> None:
+        """Show other scenes, as after another stage of the run: all controls are made anew. Whoever looks at the same
+        world keeps the view, and the camera path its keyframes."""
+        old, keyframes = self.scene, self.flight.keyframes
+        self._remove_tools()
+        self.server.gui.reset()
+        self.boxes.clear()
+        vars(self).pop("legend", None)
+        self.scenes = scenes
+        self._load(scenes[0])
+        self._add_controls()
+        self._add_tools()
+        stays = old.world == self.scene.world and not old.is_empty
+        if stays:
+            self.flight.take(keyframes)
+        for client in self.server.get_clients().values():
+            if stays:
+                client.camera.position = np.asarray(client.camera.position) * self.scene.scale / old.scale
+            else:
+                self._place(client)
+
+    def tell(self, text: str) -> None:
+        """Put a line above the controls: what is shown of an unfinished run, and what is to come."""
+        self._told = re.sub(r"[<>{}\[\]\\]", "?", text)  # of a folder's name, which the page could take for its own
+        if self.standing.content != self._told:
+            self.standing.content, self.standing.visible = self._told, bool(self._told)
+
     @property
     def url(self) -> str:
         """The address to open in a browser."""
@@ -96,7 +128,7 @@ class Viewer:
         colors = s.depth_colors(*self._eye(client)) if mode == "depth" else s.colors[mode]
         with self._sending:
             rows = np.arange(len(s.cloud)) if self.selection is None else np.flatnonzero(self.selection.rows)
-            box = self.boxes.get("Show Gaussians")
+            box = self.boxes.get(f"Show {s.what}")
             visible = len(rows) > 0 and (box is None or bool(box.value))
             rows = rows if len(rows) else np.zeros(1, np.int64)  # a page cannot be sent none
             self._splats = self.server.scene.add_gaussian_splats(
@@ -127,26 +159,29 @@ class Viewer:
 
     def stop(self) -> None:
         """End the server and its timers."""
+        if self.watch is not None:
+            self.watch.stop()
         self._remove_tools()
         self.server.stop()
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        titles = [f"{plain(s.title)}: {len(s.centers):,} Gaussians" for s in self.scenes]
+        titles = [f"{plain(s.title)}: {0 if s.is_empty else len(s.centers):,} {s.what}" for s in self.scenes]
         if len(titles) == 1:
             gui.add_markdown("**{}**: {}".format(*titles[0].rsplit(": ", 1)))
         else:
             self.pieces = gui.add_dropdown("Piece", titles)
             self.pieces.on_update(lambda _: self.choose(titles.index(self.pieces.value)))
+        self.standing = gui.add_markdown(self._told, visible=bool(self._told))
         modes = tuple(m for m in MODES if m in self.scene.colors or m == "depth")
-        self.mode = gui.add_dropdown("Gaussians", modes)
+        self.mode = gui.add_dropdown(self.scene.what.capitalize(), modes)
         self.mode.on_update(lambda event: self.show(self.mode.value, event.client))
         self.legend = gui.add_html("", visible=False)
         depth_here = gui.add_button("Colour by depth from this view", color=_GREY)
         depth_here.on_click(self._show_depth)
         gui.add_button("Reset view", color=_GREY).on_click(lambda event: self._place(event.client))
         gui.add_button("From above", color=_GREY).on_click(lambda event: self._look_down(event.client))
-        self._checkbox("Show Gaussians", True, lambda on: setattr(self._splats, "visible", on))
+        self._checkbox(f"Show {self.scene.what}", True, lambda on: setattr(self._splats, "visible", on))
         if self._cameras:
             self._checkbox("Cameras", True, self._show_cameras)
         if any(scene.mesh_file for scene in self.scenes):

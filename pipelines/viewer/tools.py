@@ -37,12 +37,12 @@ class Selection:
                 self._add_classes(scene.labels)
         with server.gui.add_folder("Crop", expand_by_default=False):
             self._add_box()
-        hide = server.gui.add_button("Delete visible Gaussians", hint="Until undone; no file changes", color="gray")
+        hide = server.gui.add_button(f"Delete visible {scene.what}", hint="Until undone; no file changes", color="gray")
         hide.on_click(lambda _: self.delete())
         self.undo_button = server.gui.add_button("Undo delete", color="gray", visible=False)
         self.undo_button.on_click(lambda _: self.undo())
         save = server.gui.add_button(
-            "Save visible Gaussians (.ply)", hint="In the coordinates of the exported files", color="gray"
+            f"Save visible {scene.what} (.ply)", hint="In the coordinates of the exported files", color="gray"
         )
         save.on_click(lambda event: self.save(event.client))
 

@@ -1,0 +1,72 @@
+"""Watching a run that is not finished: what the viewer shows of it, what is still to come, and when there is more."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.names import STAGES
+from msgs_slam.pipelines.run.records import load_records
+from msgs_slam.pipelines.run.running import load_running
+from msgs_slam.pipelines.viewer.scene import ViewerScene, load_scenes
+
+_BETWEEN_LOOKS = 2.0
+"""Seconds."""
+_SHOWING = {
+    "frames": "cameras and points after frames", "tracking": "cameras and points after tracking",
+    "mapping": "the map after mapping", "global_ba": "the map after global_ba",
+}  # fmt: skip
+
+
+def standing(run: RunFolder) -> str:
+    """Say in a line what is shown of a run and what is still to come; "" for a finished one."""
+    records = load_records(run)
+    left = [name for name in STAGES if name not in records]
+    if not left:
+        return ""
+    shown = next((text for name, text in reversed(_SHOWING.items()) if name in records), "nothing yet")
+    running = load_running(run)
+    if running is None:
+        what = f"{', '.join(left)}. No job is running: `msgs-slam resume {run.root.name}` goes on"
+    else:
+        what = ", ".join(f"{name} ({running.text})" if name == running.stage else name for name in left)
+    return f"Shown: {shown} ({len(STAGES) - len(left)} of {len(STAGES)} stages done). Still to come: {what}."
+
+
+class Watch:
+    """Looks at a run every other second until it is finished: `tell` gets its standing, `show` its scenes when a stage
+    has ended that changes them."""
+
+    def __init__(self, run: RunFolder, tell: Callable[[str], None], show: Callable[[list[ViewerScene]], None]) -> None:
+        self._run, self._tell, self._show = run, tell, show
+        self._seen = self._shown_stages()
+        self._stop = threading.Event()
+        self._tell(standing(run))
+        if len(load_records(run)) < len(STAGES):
+            threading.Thread(target=self._watch, daemon=True).start()
+
+    def stop(self) -> None:
+        """End the watch after the look that is on."""
+        self._stop.set()
+
+    def _watch(self) -> None:
+        while not self._stop.wait(_BETWEEN_LOOKS):
+            try:
+                self._look()
+                if len(load_records(self._run)) == len(STAGES):
+                    return
+            except InputError as error:  # a stage that is made again just now: the next look finds it whole
+                self._tell(str(error))
+
+    def _look(self) -> None:
+        stages = self._shown_stages()
+        if stages != self._seen:
+            self._show(load_scenes(self._run.root))
+            self._seen = stages
+        self._tell(standing(self._run))
+
+    def _shown_stages(self) -> dict[str, str]:
+        """Stage → digest of its files, of all whose results are shown."""
+        return {name: record.content for name, record in load_records(self._run).items() if name != "proxy"}
