@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import sys
 from collections.abc import Sequence
@@ -212,32 +211,6 @@ def resume(
 
 @main.command()
 @RUN_ARGUMENT
-@click.option("-v", "--verbose", is_flag=True, help="Every figure of every stage.")
-@click.option("--json", "as_json", is_flag=True, help="The same for programs, with every figure.")
-def status(run_path: Path, verbose: bool, as_json: bool) -> None:
-    """Say which stages of RUN are done, what they found, what was degraded, and which files are damaged."""
-    from msgs_slam.msgs_cli.tables import scale_lines, status_table, warning_lines
-    from msgs_slam.pipelines.reconstruct import all_stages
-    from msgs_slam.pipelines.status import run_status
-
-    run = open_run(run_path)
-    found = run_status(run, all_stages())
-    if as_json:
-        click.echo(json.dumps(found.to_json(), indent=1))
-        return
-    say(f"{run.root}: made from {found.source}\n")
-    say(status_table(found.stages, verbose))
-    say(found.memory)
-    records = {s.name: s.record for s in found.stages if s.record}
-    whole = {s.name: s.record for s in found.stages if s.record and not s.damaged}
-    for line in scale_lines(run.root, whole):
-        say(line)
-    for line in [*(f"warning: {w}" for w in found.warnings), *warning_lines(records), *found.notes]:
-        say(line)
-
-
-@main.command()
-@RUN_ARGUMENT
 @click.option(
     "--only", type=click.Choice([*EXPORTS, *_COMES_WITH]),
     help="Write one kind of file only; nerfstudio's comes with colmap. Default: all.",
@@ -362,7 +335,7 @@ def _results(root: Path, records: dict[str, Any]) -> dict[str, Path]:
     return {"run": root} | ({"export": root / "export"} if "export" in records else {})
 
 
-for command in (looking.evaluate, looking.report, looking.render, looking.view):
+for command in (looking.status, looking.evaluate, looking.report, looking.render, looking.view):
     main.add_command(command)
 main.add_command(models)
 main.add_command(batch)
