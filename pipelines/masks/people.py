@@ -48,7 +48,8 @@ class PeopleCards:
 
 def people_cards(store: ModelStore) -> PeopleCards | None:
     """The networks in the cache, the smallest of each kind; None unless both are there."""
-    here = sorted((m for m in store.models if m.family != "head" and store.is_here(m)), key=lambda m: m.bytes)
+    with_card = (m for m in store.models if "input" in store.families[m.family])
+    here = sorted((m for m in with_card if store.is_here(m)), key=lambda m: m.bytes)
     cards = [store.card(m) for m in here]
     person = next((c for c in cards if c.task == "person"), None)
     classes = next((c for c in cards if c.kind in ("logits", "probabilities") and "person" in c.classes), None)

@@ -217,6 +217,16 @@ def test_frames_between_are_searched_where_a_keyframe_shows_people(
     masks.find_people(frames, [0, 3, 6, 9], SilentProgress())
 
 
+def test_networks_of_other_kinds_in_the_cache_are_passed_by(stand_ins: ModelStore) -> None:
+    for model in stand_ins.models:
+        if model.family in ("lpips", "aliked", "lightglue"):  # their contracts are no cards
+            stand_ins.path(model).parent.mkdir(parents=True, exist_ok=True)
+            with stand_ins.path(model).open("wb") as file:
+                file.truncate(model.bytes)
+    assert stand_ins.is_here(stand_ins.get("lpips-alex"))
+    assert people_cards(stand_ins) is not None
+
+
 def test_the_real_networks_find_the_woman_and_leave_rooms_alone(shared_data: Path, tmp_path: Path) -> None:
     store = ModelStore.open(tmp_path / "cache")
     store.take(shared_data / "models", store.with_needed([]))
