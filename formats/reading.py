@@ -42,7 +42,7 @@ def parsing(path: Path | str, what: str, advice: str = "copy or export it again"
     except Exception as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         reason = lines[-1][:_MOST_OF_A_REASON]
-        raise InputError(f"{path} is damaged or not a valid {what} ({reason}): {advice}") from error
+        raise InputError(f"{path} is damaged or no {what} ({reason}): {advice}") from error
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from torch.utils._pytree import tree_flatten, tree_map
 from msgs_slam.pipelines import outcome
 from msgs_slam.pipelines.engine import stages
 from msgs_slam.pipelines.gaussians.render import compositing, cpu, inspection
+from msgs_slam.pipelines.mapping import submap_tasks
 
 DEVICE = "meta"
 _COPIES = {torch.ops.aten.copy_.default, torch.ops.aten._to_copy.default}
@@ -176,7 +177,7 @@ def pretended(patch: pytest.MonkeyPatch) -> Iterator[str]:
 
     patch.setattr(compositing, "choose_backend", choose)
     patch.setattr(inspection, "choose_backend", choose)
-    for user in (outcome, stages):
+    for user in (outcome, stages, submap_tasks):
         patch.setattr(user, "resolve_device", lambda wanted="auto": DEVICE)
     patch.setattr(torch.autograd, "_engine_run_backward", _backwards(torch.autograd._engine_run_backward))
     with _Mode():
