@@ -138,7 +138,7 @@ def test_signals_end_other_commands_without_a_stack_trace(
         time.sleep(0.01)
     process.send_signal(number)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == code
+    assert process.returncode == code, errors
     assert "stack trace" not in errors
     assert "Traceback" not in errors
     assert ("stopped by Ctrl-C" in errors) == (number == signal.SIGINT)
