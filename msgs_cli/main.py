@@ -66,6 +66,10 @@ class FriendlyGroup(click.Group):
             raise _refused(error) from error
         except KeyboardInterrupt as error:
             raise Interrupted("stopped by Ctrl-C") from error
+        except SystemError as error:
+            if "with an exception set" not in str(error):  # so numba says where Ctrl-C met a kernel
+                raise
+            raise Interrupted("stopped by Ctrl-C") from error
         except OSError as error:
             if error.errno not in _SYSTEM_REFUSES:
                 raise
