@@ -14,13 +14,11 @@ from msgs_slam.pipelines.export.planes import NEAR, REACH, ROUGHLY_ALONG, Planes
 from msgs_slam.pipelines.geometry.camera import unproject_depth
 from msgs_slam.pipelines.mapping.depth_views import DrawnView
 from msgs_slam.pipelines.outcome import evenly
-from msgs_slam.pipelines.voxels.voxels import find, gather_depths, normals_in_cam, select, voxel_keys
+from msgs_slam.pipelines.voxels.voxels import VOXELS_PER_DEPTH, find, gather_depths, normals_in_cam, voxel_keys
 
 _SIDE = 200
-_VOXELS_PER_DEPTH = 60
 _COMPARED = 24
 """Views whose median depth sets the size of a voxel."""
-_LEAST_WEIGHT = 1.0
 _STRETCH = 1.4
 """A depth changes by no larger factor: a plane seen from the side is far away a little beside."""
 
@@ -29,9 +27,8 @@ def planes_of(views: Sequence[DrawnView]) -> Planes:
     """The planes of what the views surely show."""
     some = (views[n].shown for n in evenly(range(len(views)), _COMPARED))
     seen = [float(np.median(v.depth[v.trust > 0])) for v in some if (v.trust > 0).any()]
-    size = float(np.median(seen)) / _VOXELS_PER_DEPTH if seen else 1.0
-    voxels = gather_depths((_sure_part(view) for view in views), size)
-    return find_planes(select(voxels, voxels.weight > _LEAST_WEIGHT))
+    size = float(np.median(seen)) / VOXELS_PER_DEPTH if seen else 1.0
+    return find_planes(gather_depths((_sure_part(view) for view in views), size))
 
 
 def _sure_part(view: DrawnView) -> PosedDepth:

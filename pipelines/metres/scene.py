@@ -22,12 +22,10 @@ from msgs_slam.pipelines.voxels.layout import (
     floor_plane,
     name_structure,
 )
-from msgs_slam.pipelines.voxels.voxels import Voxels, find, gather_frame, merge, select, voxel_keys
+from msgs_slam.pipelines.voxels.voxels import VOXELS_PER_DEPTH, Voxels, find, gather_frame, merge, select, voxel_keys
 
 Array = NDArray[np.float64]
 
-VOXELS_PER_DEPTH = 60
-"""A voxel is this fraction of the median depth: 4 cm at 2.4 m."""
 LEAST_CONFIDENCE = 0.3
 _SIDE = 200
 _LEAST_WEIGHT = 1.5

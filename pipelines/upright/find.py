@@ -12,14 +12,12 @@ from msgs_slam.pipelines.mapping.depth_views import depth_view
 from msgs_slam.pipelines.outcome import Outcome, evenly, maps_around
 from msgs_slam.pipelines.upright.lines import up_of_lines
 from msgs_slam.pipelines.voxels.layout import Gravity, find_gravity, floor_plane, name_structure
-from msgs_slam.pipelines.voxels.voxels import Voxels, gather_depths, select
+from msgs_slam.pipelines.voxels.voxels import VOXELS_PER_DEPTH, Voxels, gather_depths
 
 Array = NDArray[np.float64]
 
 _PICTURES, _VIEWS = 40, 24
 _SIDE = 200
-_VOXELS_PER_DEPTH = 60
-_LEAST_WEIGHT = 1.0
 _AGREE = 3.0
 """Degrees: a floor that leans more against sure upright lines is a ramp, or badly seen; the lines are believed."""
 
@@ -88,9 +86,8 @@ def surface_voxels(outcome: Outcome, rows: Sequence[int]) -> Voxels:
     t, camera, near = outcome.trajectory, outcome.calibration.intrinsics.at_most(_SIDE), maps_around(outcome)
     views = [depth_view(near(int(t.frame_ids[row])), t.cam_from_world[row], camera) for row in rows]
     seen = np.concatenate([np.zeros(0), *(v.depth[v.trust > 0] for v in views)])
-    size = float(np.median(seen)) / _VOXELS_PER_DEPTH if len(seen) else 1.0
-    voxels = gather_depths(views, size)
-    return select(voxels, voxels.weight > _LEAST_WEIGHT)
+    size = float(np.median(seen)) / VOXELS_PER_DEPTH if len(seen) else 1.0
+    return gather_depths(views, size)
 
 
 def _degrees(a: Array, b: Array) -> float:

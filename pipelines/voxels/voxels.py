@@ -16,6 +16,10 @@ from msgs_slam.pipelines.types import Intrinsics
 if TYPE_CHECKING:
     from msgs_slam.pipelines.depth.posed import PosedDepth
 
+VOXELS_PER_DEPTH = 60
+"""A voxel is this fraction of the scene's median depth: 5 cm at 3 m."""
+_LEAST_WEIGHT = 1.0
+"""Of a voxel that depth images show."""
 _BITS = 21
 _HALF = 1 << (_BITS - 1)
 _WAITING = 500_000
@@ -145,14 +149,15 @@ def gather_frame(
 
 
 def gather_depths(views: Iterable[PosedDepth], size: float) -> Voxels:
-    """The surface that depth images show, by their trust; without colours."""
+    """Gather the surface that depth images show, by their trust, where they show it well enough; without colours."""
 
     def gathered(view: PosedDepth) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         black = np.zeros((*view.depth.shape, 3), np.uint8)
         world_from_cam = np.linalg.inv(view.cam_from_world).astype(np.float64)
         return gather_frame(view.depth, view.trust, black, view.intrinsics, world_from_cam, size)
 
-    return merge(size, (gathered(view) for view in views))
+    voxels = merge(size, (gathered(view) for view in views))
+    return select(voxels, voxels.weight > _LEAST_WEIGHT)
 
 
 def merge(size: float, frames: Iterable[tuple[NDArray[np.int64], NDArray[np.float64]]], most: int = MOST) -> Voxels:

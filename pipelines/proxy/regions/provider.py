@@ -26,6 +26,7 @@ from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import VOID, ClassTable, Frame
 from msgs_slam.pipelines.voxels.layout import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
 from msgs_slam.pipelines.voxels.voxels import (
+    VOXELS_PER_DEPTH,
     Voxels,
     find_near,
     gather_frame,
@@ -34,8 +35,6 @@ from msgs_slam.pipelines.voxels.voxels import (
     voxel_keys,
 )
 
-_VOXELS_PER_DEPTH = 60
-"""A voxel is this fraction of the scene's median depth: 5 cm at 3 m."""
 _GATHER_SIDE = 200
 _LEAST_CONFIDENCE = 0.3
 _REACH = 40.0
@@ -88,7 +87,7 @@ class SegmentLabels:
     ) -> tuple[Voxels, Gravity, NDArray[np.int64]]:
         """All frames' surface in voxels (V,), gravity, and floor, ceiling, wall, surface or other (V,)."""
         posed = [f for f in frames if f.id in self._world_from_cam]
-        self._size = _scene_depth([depth_of(f) for f in posed[:: max(1, len(posed) // 12)]]) / _VOXELS_PER_DEPTH
+        self._size = _scene_depth([depth_of(f) for f in posed[:: max(1, len(posed) // 12)]]) / VOXELS_PER_DEPTH
         release_free_memory()  # what depths and moving things have needed
         tracked = self._progress.track(posed, "regions", len(posed))
         voxels = merge(self._size, (self._gather(f, depth_of(f)) for f in tracked))

@@ -85,6 +85,7 @@ class MultiviewDepth:
         self._raw = lru_cache(_CACHED_FRAMES)(self._load_raw)
         self._fused = lru_cache(_CACHED_LENDERS)(self._fuse)
         self._small = lru_cache(_CACHED_LENDERS)(self._read_small)
+        self._contrast = lru_cache(_CACHED_LENDERS)(self._measure_contrast)
         self._lab = lru_cache(_CACHED_LENDERS)(lambda index: to_lab(self._small(index)))
         self._nearest = lru_cache(_CACHED_FRAMES)(self._choose_nearest)
 
@@ -220,7 +221,7 @@ class MultiviewDepth:
         """(N, 4) what gives this keyframe's z of the others' pixels, as `fuse_depths` wants it."""
         return np.array([self._warps(int(j), np.array([index]))[0][2] for j in others])
 
-    def _contrast(self, index: int) -> NDArray[np.float32]:
+    def _measure_contrast(self, index: int) -> NDArray[np.float32]:
         return surface_contrast(self._grey(int(self._model.frame_ids[index]))[0])
 
     def _read_grey(self, frame_id: int) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
