@@ -18,6 +18,7 @@ from msgs_slam.formats.errors import InputError, SettingError
 from msgs_slam.msgs_cli import looking
 from msgs_slam.msgs_cli.batch import batch
 from msgs_slam.msgs_cli.doctor import doctor
+from msgs_slam.msgs_cli.extending import extend
 from msgs_slam.msgs_cli.json_lines import Interrupted, is_asked_for, only_json
 from msgs_slam.msgs_cli.models import models
 from msgs_slam.msgs_cli.options import (
@@ -28,7 +29,6 @@ from msgs_slam.msgs_cli.options import (
     device_option,
     ending_quietly,
     engine_options,
-    is_said,
     make_progress,
     open_run,
     set_up_logging,
@@ -39,6 +39,7 @@ from msgs_slam.msgs_cli.options import (
     tell_result,
     verbosity_options,
 )
+from msgs_slam.msgs_cli.summary import print_summary, result_paths
 from msgs_slam.msgs_cli.text import flush_output, prepare_streams, printable, say
 from msgs_slam.msgs_cli.work import work
 from msgs_slam.pipelines.run.names import EXPORTS
@@ -105,6 +106,7 @@ def main() -> None:
     msgs-slam demo                      try it on a small synthetic room (about 4 minutes on two cores)
     msgs-slam reconstruct video.mp4     the whole job; writes video.msgs/
     msgs-slam resume video.msgs         resume an interrupted run
+    msgs-slam extend RUN more.mp4       add a video to a finished run; its map is kept and grown
     msgs-slam batch FOLDER --out RUNS   many recordings, on one machine or many
     msgs-slam work RUN --shard K/N      one of many processes at one long run
     msgs-slam status video.msgs         what is done, what was found
@@ -170,8 +172,8 @@ def reconstruct(
     ):
         records = run_reconstruct(one_source(sources, run), run, config, make_progress(quiet), until, workers)
     if not quiet:
-        _print_summary(run.root, records)
-    tell_result(quiet, **_results(run.root, records))
+        print_summary(run.root, records)
+    tell_result(quiet, **result_paths(run.root, records))
 
 
 @main.command()
@@ -209,8 +211,8 @@ def resume(
     ):
         records = run_resume(run, make_progress(quiet), config, until, workers)
     if not quiet:
-        _print_summary(run.root, records)
-    tell_result(quiet, **_results(run.root, records))
+        print_summary(run.root, records)
+    tell_result(quiet, **result_paths(run.root, records))
 
 
 @main.command()
@@ -290,7 +292,7 @@ def demo(
         with stopping_softly(f"Resume with: msgs-slam resume {run.root}"):
             records = run_reconstruct(video, run, config, make_progress(quiet))
         if not quiet:
-            _print_summary(run.root, records)
+            print_summary(run.root, records)
 
     result = run_demo(out, reconstruct_clip, make_progress(quiet))
     say("\nAgainst the known truth:")
@@ -320,27 +322,9 @@ def show_config(config_file: Path | None, overrides: tuple[str, ...]) -> None:
     click.echo(config_to_toml(load_config(config_file, overrides)), nl=False)
 
 
-def _print_summary(root: Path, records: dict[str, Any]) -> None:
-    """The table, what is not said yet, and where the results are."""
-    from msgs_slam.msgs_cli.tables import scale_lines, status_table, warning_lines
-    from msgs_slam.pipelines.status import DONE, StageStatus
-
-    say(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
-    for line in warning_lines(records, is_said):
-        say(line, err=True)
-    for line in scale_lines(root, records):
-        say(line)
-    if "export" in records:
-        say(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")
-
-
-def _results(root: Path, records: dict[str, Any]) -> dict[str, Path]:
-    """Where they are."""
-    return {"run": root} | ({"export": root / "export"} if "export" in records else {})
-
-
 for command in (looking.status, looking.evaluate, looking.report, looking.render, looking.view):
     main.add_command(command)
+main.add_command(extend)
 main.add_command(models)
 main.add_command(batch)
 main.add_command(work)

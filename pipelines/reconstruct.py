@@ -125,6 +125,26 @@ def resume(
         return _run(run, source, origin.digest, config, progress, until, workers)
 
 
+def extend(run: RunFolder, videos: Sequence[Path], progress: Progress) -> dict[str, StageRecord]:
+    """Add videos by the same camera to a finished run: see `docs/adding.md`. Stopped once it has begun, the same
+    call or `resume` goes on.
+
+    Raises InputError, with nothing changed, for a run that is not finished, another camera, and a video in which
+    nothing of the run is recognised.
+    """
+    from msgs_slam.pipelines.tracking.extend_run import add_videos, is_added, require_extendable
+
+    require_run(run)
+    if run.is_piece or is_added(run, videos):
+        return resume(run, progress)
+    with locked(run):
+        config = load_settings(run)
+        resolve_device(config.run.device)
+        require_extendable(run, videos, config, progress)
+        source = add_videos(run, videos, config)
+        return _run(run, Path(source.path), source.digest, config, progress, STAGES[-1], None)
+
+
 def require_run(run: RunFolder) -> None:
     """Raise InputError unless the folder holds a run."""
     if run.manifest_file.exists():

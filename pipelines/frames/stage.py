@@ -21,6 +21,7 @@ from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.correspondence.bridges import Picture
 from msgs_slam.pipelines.engine.chunks import in_chunks
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
+from msgs_slam.pipelines.frames.extending import in_world_of
 from msgs_slam.pipelines.frames.findings import settled_origin, warn_of_given, warn_of_structure
 from msgs_slam.pipelines.frames.keyframes import KeyframeChoice, choose_keyframes
 from msgs_slam.pipelines.frames.learned import learned_inputs, open_learned
@@ -36,6 +37,7 @@ from msgs_slam.pipelines.frames.tasks import (
     structure_from_motion,
 )
 from msgs_slam.pipelines.geometry.rig import Rig, rig_of
+from msgs_slam.pipelines.run.before import before_inputs, before_of
 from msgs_slam.pipelines.run.folder import (
     RunFolder,
     save_backbone,
@@ -149,7 +151,10 @@ def _keyframes(context: StageContext, frames: list[Frame], masks: FrameMasks, ri
     panoramas all sides are keyframes."""
     table = context.snapshot / "keyframes.json"
     if not table.exists():
-        chosen = _choose(context, frames, masks, rig).keyframes
+        before = before_of(context.source)
+        chosen, first = ([], 0) if before is None else before.keyframes_of(frames)
+        added = _choose(context, frames[first:], masks, rig).keyframes
+        chosen += [first + k for k in added]
         if context.config.frames.poses and len(chosen) < _FEW_KEYFRAMES:  # blank pictures whose poses are known
             even = np.linspace(0, len(frames) - 1, min(_FEW_KEYFRAMES, len(frames))).round().astype(int)
             chosen = sorted({*chosen, *even.tolist()})
@@ -174,7 +179,7 @@ def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks, rig: 
     parallax = context.config.frames.parallax
     while True:
         choice = choose_keyframes(pictures(), parallax / across)
-        if not context.config.frames.poses:
+        if not (context.config.frames.poses or before_of(context.source)):
             require_motion(choice.largest_displacement * across)
         if len(choice.keyframes) >= min(_FEW_KEYFRAMES, len(places)) or parallax < context.config.frames.parallax / 3:
             return choice
@@ -223,7 +228,8 @@ def _write_backbone(
         return read_rgb(picked(context, frames[frame_id].name))
 
     model = to_sparse_model(structure.model, keyframes, lens, load_rgb)
-    save_backbone(context.folder, model)
+    before = before_of(context.source)
+    save_backbone(context.folder, model if before is None else in_world_of(before, model, frames))
     for number, piece in enumerate(structure.pieces, 2):
         save_sparse(context.folder / f"piece_{number}", to_sparse_model(piece, keyframes, lens, load_rgb))
 
@@ -294,7 +300,8 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
 
 
 def _inputs(source: Path, config: Config) -> dict[str, str] | None:
-    return (mask_inputs(source, config) or {}) | learned_inputs(config.frames) | pose_inputs(config.frames) or None
+    more = learned_inputs(config.frames) | pose_inputs(config.frames) | before_inputs(source)
+    return (mask_inputs(source, config) or {}) | more or None
 
 
 def _division(run: RunFolder, config: Config) -> list[range]:

@@ -20,6 +20,7 @@ from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.learned import open_learned, picture_features
 from msgs_slam.pipelines.frames.masks import FrameMasks
 from msgs_slam.pipelines.geometry.rig import Rig, rig_of
+from msgs_slam.pipelines.run.before import before_of
 from msgs_slam.pipelines.source.faces import Faces, find_faces
 from msgs_slam.pipelines.source.known_poses import given_poses
 from msgs_slam.pipelines.source.opening import FolderSource, VideoSource, open_source
@@ -27,7 +28,7 @@ from msgs_slam.pipelines.source.recording import RecordingSource
 from msgs_slam.pipelines.source.sharpness import reduced_size
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
 from msgs_slam.pipelines.structure.given import GivenPoses
-from msgs_slam.pipelines.structure.lens import FOCAL_GUESS, to_pycolmap, unknown_camera
+from msgs_slam.pipelines.structure.lens import FOCAL_GUESS, calibrated_camera, to_pycolmap, unknown_camera
 from msgs_slam.pipelines.structure.sfm import Divide, StructureFromMotion, when_asked
 from msgs_slam.pipelines.structure.window_size import window_size
 from msgs_slam.pipelines.system.progress import Progress
@@ -44,6 +45,9 @@ def known_camera(context: StageContext, source: AnySource, faces: Faces | None) 
         pinhole = Camera(**asdict(faces.pinhole))
         return to_pycolmap(pinhole), "given"
     width, height = reduced_size(source.width, source.height, config.max_side)
+    before = before_of(context.source)
+    if before is not None and before.camera.origin != "given":
+        return calibrated_camera(before.camera), before.camera.origin
     if config.intrinsics:
         given = read_intrinsics(config.intrinsics, source.width, source.height)
         return to_pycolmap(given.resized(width, height)), "given"
@@ -87,7 +91,8 @@ def structure_from_motion(
 ) -> StructureFromMotion:
     """Prepare structure from motion of these frames; `origin` is as in `known_camera`."""
     settings, size = context.config.frames, (camera.width, camera.height)
-    learned = open_learned(settings)
+    learned, before = open_learned(settings), before_of(context.source)
+    start = given.cam_from_world if given is not None else None
 
     def extract(frame_id: int) -> Features:
         rgb = read_rgb(picked(context, frames[frame_id].name))
@@ -98,7 +103,8 @@ def structure_from_motion(
         camera=camera,
         is_fixed=origin in ("given", "stated"),
         is_stated=origin == "stated",
-        given=None if given is None else given.cam_from_world,
+        given=start if before is None else before.poses_of(frames),
+        is_extension=before is not None,
         extract=extract,
         picture=lambda frame_id: grey_of(context, masks, frames[frame_id]),
         time=lambda frame_id: frames[frame_id].timestamp,

@@ -20,12 +20,12 @@ from msgs_slam.pipelines.global_ba.candidates import loop_candidates
 from msgs_slam.pipelines.global_ba.close import Closed, close_loops
 from msgs_slam.pipelines.global_ba.local import adjusted_poses, loop_keyframes
 from msgs_slam.pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_found
-from msgs_slam.pipelines.global_ba.move_map import follow_keyframes, move_map
 from msgs_slam.pipelines.global_ba.semantics import LabelSummary, summarise_labels
 from msgs_slam.pipelines.global_ba.verify import KeyframeView, Loop, make_view
-from msgs_slam.pipelines.mapping.build import Refined, refine_map, rows_of
+from msgs_slam.pipelines.mapping.build import Refined, refine_map
 from msgs_slam.pipelines.mapping.load import load_views, with_rigid_panoramas
-from msgs_slam.pipelines.mapping.poses import move_trajectory
+from msgs_slam.pipelines.mapping.move_map import follow_keyframes, move_map
+from msgs_slam.pipelines.mapping.poses import move_trajectory, rows_of
 from msgs_slam.pipelines.run.folder import (
     MAP,
     RunFolder,

@@ -14,9 +14,10 @@ from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.depth.posed import PosedDepth, overlaps
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.mapping.extending import GROWN, grow_submap
 from msgs_slam.pipelines.mapping.load import split_frames
 from msgs_slam.pipelines.mapping.measure import ViewFigures
-from msgs_slam.pipelines.mapping.poses import interpolate_rows, move_trajectory
+from msgs_slam.pipelines.mapping.poses import interpolate_rows, move_trajectory, rows_of
 from msgs_slam.pipelines.mapping.state import Exposures, OptimisedMap
 from msgs_slam.pipelines.mapping.submap_tasks import (
     AGREED,
@@ -31,6 +32,7 @@ from msgs_slam.pipelines.mapping.submap_tasks import (
     measure_submap,
 )
 from msgs_slam.pipelines.mapping.submaps import Submap, divide, submap_count
+from msgs_slam.pipelines.run.before import Before
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.memory import submap_size
 from msgs_slam.pipelines.types import Trajectory
@@ -64,13 +66,20 @@ class Refined:
         return self.psnr_after >= self.psnr_before
 
 
-def build_map(context: StageContext, trajectory: Trajectory, class_ids: tuple[int, ...]) -> Mapped:
-    """The map of the keyframes; channel c of its classes is label class_ids[c]."""
+def build_map(
+    context: StageContext, trajectory: Trajectory, class_ids: tuple[int, ...], before: Before | None = None
+) -> Mapped:
+    """The map of the keyframes; channel c of its classes is label class_ids[c]. `before`: the run that this one
+    extends, whose map is kept and grown where one submap is all there is."""
     kept, _ = split_frames(trajectory, context.config.mapping.hold_out)
     fields = context.run.load_depth_fields("tracking")
     submaps = _submaps(context, trajectory, fields, kept)
     tasks = submap_tasks(context, submaps, trajectory, fields, class_ids)
-    kind = _each(context, tasks, MADE, JOINED, REFINED, AGREED)
+    if before is not None and len(tasks) > 1:
+        context.warn("the map of the extended run is made anew: it is made in parts, which begin without one")
+        before = None
+    tasks = [replace(task, before=before) for task in tasks]
+    kind = _each(context, tasks, *((MADE, JOINED, REFINED, AGREED) if before is None else (GROWN,)))
     made = _survey(tasks, kind)
     moved = move_trajectory(trajectory, made.ids, made.cam_from_world)
     keyframes, held_out = measure(context, tasks, moved, made.ids, made.exposure, kind, fields)
@@ -107,7 +116,7 @@ def _each(context: StageContext, tasks: Sequence[SubmapTask], *kinds: str) -> st
     alone has nobody to join and to agree with: the first is the last."""
     kinds = kinds if len(tasks) > 1 else kinds[:1]
     for kind in kinds:
-        context.each(STEPS[kind], tasks)
+        context.each(grow_submap if kind == GROWN else STEPS[kind], tasks)
     return kinds[-1]
 
 
@@ -158,15 +167,6 @@ def _depths(
             height, width = maps.depth.shape
             depth = fields.in_world(i, maps).depth
             yield PosedDepth(camera.resized(width, height), poses[i], depth, maps.confidence)
-
-
-def rows_of(trajectory: Trajectory, frame_ids: NDArray[np.int64]) -> Trajectory:
-    """Select these frames of a trajectory."""
-    rows = np.flatnonzero(np.isin(trajectory.frame_ids, frame_ids))
-    t, reasons = trajectory, tuple(trajectory.lost_reasons[r] for r in rows)
-    return Trajectory(
-        t.frame_ids[rows], t.timestamps[rows], t.cam_from_world[rows], t.is_keyframe[rows], reasons, t.by_rotation[rows]
-    )
 
 
 def _only(fields: DepthFields, frame_ids: NDArray[np.int64]) -> DepthFields:

@@ -51,16 +51,19 @@ def optimise_map(
     exposure: Exposures | None = None,
     paper: PaperConfig | None = None,
     first_rate: float = 1.0,
+    seeding: bool | None = None,
 ) -> OptimisedMap:
     """The map that explains the views (MSGS-SLAM eqs. 17-20), with their poses and exposures refined together.
 
-    Without `initial` the map is seeded along the views; with it the views are only visited, `passes` times each. With
-    `snapshot`, a file, the work goes on from there when it exists, and ends with the same bytes. `exposure`: log gains
-    and offsets (N, 3) to start from; `first_rate`: learning rates of the first visit, as a share.
+    Without `initial` the map is seeded along the views; with it the views are only visited, `passes` times each, unless
+    `seeding`, which fills the holes that it has. With `snapshot`, a file, the work goes on from there when it exists,
+    and ends with the same bytes. `exposure`: log gains and offsets (N, 3) to start from; `first_rate`: learning rates
+    of the first visit, as a share.
     """
     state = OptimiserState.load(snapshot, views) or OptimiserState.fresh(views, classes, initial, exposure)
     paper = paper or PaperConfig()
-    schedule = Schedule.plan(views, settings, seed, initial is None, passes, paper.keyframe_miou, first_rate)
+    seeding = initial is None if seeding is None else seeding
+    schedule = Schedule.plan(views, settings, seed, seeding, passes, paper.keyframe_miou, first_rate)
     optimiser = MapOptimiser(views, classes, settings, paper, state)
     # A map and its visits grow together: were it written every so many visits, all of it would be written ever longer.
     every = max(settings.snapshot_every, len(views))

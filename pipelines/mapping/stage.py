@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from msgs_slam.formats.errors import InputError
@@ -12,6 +13,7 @@ from msgs_slam.pipelines.mapping.build import Mapped, build_map
 from msgs_slam.pipelines.mapping.load import split_frames, survey, with_rigid_panoramas
 from msgs_slam.pipelines.mapping.measure import mean_figures
 from msgs_slam.pipelines.mapping.submaps import submap_count
+from msgs_slam.pipelines.run.before import before_inputs, before_of
 from msgs_slam.pipelines.run.folder import RunFolder, save_exposure, save_figures, save_map, save_trajectory
 from msgs_slam.pipelines.system.memory import submap_size
 
@@ -22,7 +24,7 @@ def run(context: StageContext) -> dict[str, Any]:
     trajectory = context.run.load_trajectory("tracking")
     kept, _ = split_frames(trajectory, context.config.mapping.hold_out)
     class_ids = _require_views(context, kept)
-    mapped = build_map(context, trajectory, class_ids)
+    mapped = build_map(context, trajectory, class_ids, before_of(context.source))
     result, ids = mapped.result, mapped.keyframe_ids
     save_map(context.folder, result.gaussian_map)
     save_trajectory(context.folder, mapped.moved)
@@ -73,4 +75,8 @@ def _division(run: RunFolder, config: Config) -> int:
     return submap_count(len(kept), submap_size(config, run.load_calibration().intrinsics))
 
 
-STAGE = Stage("mapping", run, "the semantic Gaussian map from the keyframes", division=_division)
+def _inputs(source: Path, config: Config) -> dict[str, str] | None:
+    return before_inputs(source) or None
+
+
+STAGE = Stage("mapping", run, "the semantic Gaussian map from the keyframes", inputs=_inputs, division=_division)

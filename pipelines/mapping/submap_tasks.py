@@ -30,6 +30,7 @@ from msgs_slam.pipelines.mapping.parameters import KEYS
 from msgs_slam.pipelines.mapping.state import Exposures, OptimisedMap
 from msgs_slam.pipelines.mapping.submaps import Submap, nearest_seeing
 from msgs_slam.pipelines.mapping.views import View
+from msgs_slam.pipelines.run.before import Before
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.device import resolve_device
 from msgs_slam.pipelines.system.memory import memory_room
@@ -52,7 +53,8 @@ _DEPTH_SIDE = 160
 class SubmapTask:
     """What it takes to work on submap `number`: `trajectory` holds its views (to measure it: its own keyframes, and
     what is held out), `exposure` theirs, `fields` brings their depths into the world, `files` is the folder of all
-    submaps' results; `passes` of the refinement where they are not a share of making's; `measured`: kind of result."""
+    submaps' results; `passes` of the refinement where they are not a share of making's; `measured`: kind of result;
+    `before`: the run that this one extends, whose map is grown."""
 
     run: RunFolder
     config: Config
@@ -66,6 +68,7 @@ class SubmapTask:
     exposure: Exposures | None = None
     passes: float | None = None
     measured: str = AGREED
+    before: Before | None = None
 
     @property
     def device(self) -> str:
@@ -73,12 +76,12 @@ class SubmapTask:
         return resolve_device(self.config.run.device)
 
     def file(self, kind: str, number: int | None = None) -> Path:
-        """Of a result of this submap, or of another one."""
+        """Name the file of a result of this submap, or of another one."""
         return self.files / f"{kind}_{self.number if number is None else number:04d}.safetensors"
 
     @property
     def exposures(self) -> Path:
-        """Of all views that it was made from."""
+        """File of the exposures of all views that it was made from."""
         return self.files / f"exposures_{self.number:04d}.npz"
 
     def load(self, kind: str, number: int) -> SubmapResult:
@@ -120,7 +123,7 @@ class SubmapResult:
 
     @property
     def without_map(self) -> SubmapResult:
-        """The same with no Gaussian."""
+        """This result with no Gaussian."""
         return replace(self, gaussian_map=self.gaussian_map.only(torch.arange(0)))
 
 
@@ -179,7 +182,7 @@ def _shown(
     """What the views show of the maps, as one: its Gaussians, their rows in the maps they are from (M,), and how many
     pixels each fills (M,). One map alone is all that they show."""
     whole, places = together(maps), torch.cat([torch.arange(len(m)) for m in maps])
-    weights = _pixels(whole, views) if len(maps) > 1 else torch.ones(len(whole), device=whole.means.device)
+    weights = pixels_filled(whole, views) if len(maps) > 1 else torch.ones(len(whole), device=whole.means.device)
     shown = weights > 0
     return whole.only(shown), places[shown.cpu()].numpy(), weights[shown].cpu().numpy()
 
@@ -291,8 +294,8 @@ def belonging(gaussian_map: GaussianMap, anchors: NDArray[np.int64], submap: Sub
     return anchored.only(kept)
 
 
-def _pixels(gaussian_map: GaussianMap, views: Iterable[View]) -> Tensor:
-    """(M,) how many pixels of these views each Gaussian fills."""
+def pixels_filled(gaussian_map: GaussianMap, views: Iterable[View]) -> Tensor:
+    """Count the pixels of these views that each Gaussian fills, (M,)."""
     m = gaussian_map
     filled = torch.zeros(len(m), device=m.means.device)
     for view in views:

@@ -38,6 +38,7 @@ PROXY_MAPS = {"inverse_depth": "f H W", "confidence": "i H W", "labels": "i H W"
 EXPOSURE = {"frame_ids": "i N", "log_gains": "f N 3", "offsets": "f N 3"}
 DESCRIPTORS = {"frame_ids": "i N", "vectors": "f N F"}
 DEPTH_FIELDS = {"frame_ids": "i N", "log_scales": "f N R C"}
+BEFORE = {"source_index": "i N", "cam_from_world": "f N 4 4", "is_placed": "b N", "was_chosen": "b N"}
 
 
 def what_to_do(path: Path) -> str:

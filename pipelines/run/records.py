@@ -17,7 +17,7 @@ from msgs_slam.formats.reading import parsing
 from msgs_slam.pipelines.config import Config, config_to_dict, settings_of_stage
 from msgs_slam.pipelines.read_config import merge_known_settings
 from msgs_slam.pipelines.run.layouts import dataclass_from_json
-from msgs_slam.pipelines.run.names import SOURCE_LIST, STAGES
+from msgs_slam.pipelines.run.names import EXTENSION, SOURCE_LIST, STAGES
 
 if TYPE_CHECKING:
     from msgs_slam.pipelines.run.folder import RunFolder
@@ -127,9 +127,12 @@ def load_records(run: RunFolder) -> dict[str, StageRecord]:
 def load_source(run: RunFolder) -> Source:
     """Load the source of a run. Raises InputError for a folder that is not a run."""
     source = read_manifest(run.manifest_file).source
-    inside = run.root / SOURCE_LIST
+    path = Path(source.path)
+    if path.name != SOURCE_LIST:
+        return source
     # The list of several videos is in the run, wherever that has been moved to.
-    return replace(source, path=str(inside)) if Path(source.path).name == SOURCE_LIST and inside.is_file() else source
+    folder = run.root / path.parent.name if path.parent.name.startswith(EXTENSION) else run.root
+    return replace(source, path=str(folder / SOURCE_LIST)) if (folder / SOURCE_LIST).is_file() else source
 
 
 def recorded_config(records: Mapping[str, StageRecord], config: Config) -> Config:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msgs_slam.formats.atomic import write_text
@@ -12,6 +13,7 @@ from msgs_slam.formats.jsonfile import MAX_TOML_BYTES, read_toml
 from msgs_slam.formats.reading import opened
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.read_config import config_to_toml, merge_known_settings
+from msgs_slam.pipelines.run.before import before_of
 from msgs_slam.pipelines.run.records import load_records, load_source, recorded_config
 from msgs_slam.pipelines.system.progress import log
 
@@ -26,7 +28,8 @@ def save_settings(run: RunFolder, config: Config) -> None:
     source, so that neither an emptied file nor that of another run is taken for this one's. Raises InputError when the
     disk refuses."""
     text = config_to_toml(config)
-    mark = f"# Written by msgs-slam. Change settings with --set or --config. Check: {_check(run, text)}\n"
+    check = _check(load_source(run).digest, text)
+    mark = f"# Written by msgs-slam. Change settings with --set or --config. Check: {check}\n"
     if not run.settings_file.exists() or run.settings_file.read_bytes() != (mark + text).encode():
         write_text(run.settings_file, mark + text)
 
@@ -49,7 +52,7 @@ def load_settings(run: RunFolder) -> Config:
     with opened(run.settings_file, MAX_TOML_BYTES, any_content=True) as file:
         text = file.read().decode("utf-8", errors="replace")
     mark = _MARK.match(text)
-    as_written = mark is not None and mark[1] == _check(run, text[mark.end() :])
+    as_written = mark is not None and mark[1] in [_check(s, text[mark.end() :]) for s in _sources(run)]
     if not as_written:
         raise InputError(
             f"{run.settings_file} is not as the program left it: damaged, or edited by hand. Delete it and run "
@@ -59,8 +62,16 @@ def load_settings(run: RunFolder) -> Config:
     return _known(read_toml(run.settings_file), run)
 
 
-def _check(run: RunFolder, text: str) -> str:
-    return hashlib.sha256(f"{load_source(run).digest}\n{text}".encode()).hexdigest()
+def _check(source_digest: str, text: str) -> str:
+    return hashlib.sha256(f"{source_digest}\n{text}".encode()).hexdigest()
+
+
+def _sources(run: RunFolder) -> list[str]:
+    """Digests of the run's source and, of a run that was extended, of the one before: the manifest alone says when a
+    run is the extended one, and this file is written after it."""
+    source = load_source(run)
+    before = before_of(Path(source.path))
+    return [source.digest] if before is None else [source.digest, before.source_digest]
 
 
 def _known(values: dict[str, Any], run: RunFolder) -> Config:

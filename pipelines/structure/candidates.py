@@ -81,8 +81,8 @@ class Adjusted:
 @dataclass(frozen=True, kw_only=True)
 class Candidates:
     """Inputs of candidate models besides the keyframes: `camera` is the prior, `is_fixed` holds it, `is_stated` holds
-    it unless the images contradict it. cam_from_rig (C, 3, 3): keyframes are ordered direction by direction, as in
-    `Rig`."""
+    it unless the images contradict it. `is_extension`: the given poses are those of a finished run that images were
+    added to, and are tried first. cam_from_rig (C, 3, 3): keyframes are ordered direction by direction, as in `Rig`."""
 
     config: FramesConfig
     camera: pycolmap.Camera
@@ -91,6 +91,7 @@ class Candidates:
     progress: Progress
     seed: int
     is_stated: bool = False
+    is_extension: bool = False
     cam_from_rig: NDArray[np.float64] = field(default_factory=lambda: ONE_CAMERA.cam_from_rig)
 
     def _calibrated(self, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
@@ -123,7 +124,8 @@ class Candidates:
 
     def _self_calibrated(self, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
         """The best model; of two where the first is not sure of its camera."""
-        found = self._adjusted(views, pairs, ("global", "incremental", GIVEN))
+        mappers = ("global", "incremental", GIVEN)
+        found = self._adjusted(views, pairs, (GIVEN, *mappers[:2]) if self.is_extension else mappers)
         if found is not None and found.focal_sd > _UNSURE_FOCAL * found.model.cameras[1].mean_focal_length():
             # A lens that is bent before the poses are stable can run away with the focal length.
             again = self._adjusted(views, pairs, (LENS_HELD,))
@@ -153,8 +155,9 @@ class Candidates:
         """The best of the mappers' models, None where none is any; the next is only made when those before it are
         doubtful."""
         best: _Tried | None = None
-        wanted = [name for name in mappers if name != GIVEN and self.config.mapper in ("auto", name)]
-        wanted += [GIVEN] if GIVEN in mappers and views.given is not None else []
+        possible = {GIVEN} if views.given is not None else set()
+        possible |= {name for name in mappers if name != GIVEN and self.config.mapper in ("auto", name)}
+        wanted = [name for name in mappers if name in possible]
         for name in self.progress.track(wanted, "camera model", len(wanted)):
             if best is not None and (best[2].is_sound or (best[1].startswith(NEIGHBOURS) and name != GIVEN)):
                 continue

@@ -16,9 +16,9 @@ from msgs_slam.pipelines.engine.stages import StageContext, run_stages
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.global_ba.move_map import move_map
 from msgs_slam.pipelines.mapping import growth
 from msgs_slam.pipelines.mapping import stage as mapping_stage
+from msgs_slam.pipelines.mapping.move_map import move_map
 from msgs_slam.pipelines.mapping.parameters import MapParameters, empty_map
 from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.render_run import render_run

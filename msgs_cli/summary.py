@@ -1,0 +1,28 @@
+"""The last words of a command that has brought a run to its end: table, warnings, where the results are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from msgs_slam.msgs_cli.options import is_said
+from msgs_slam.msgs_cli.text import say
+
+
+def print_summary(root: Path, records: dict[str, Any]) -> None:
+    """Print the table, what is not said yet, and where the results are."""
+    from msgs_slam.msgs_cli.tables import scale_lines, status_table, warning_lines
+    from msgs_slam.pipelines.status import DONE, StageStatus
+
+    say(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
+    for line in warning_lines(records, is_said):
+        say(line, err=True)
+    for line in scale_lines(root, records):
+        say(line)
+    if "export" in records:
+        say(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")
+
+
+def result_paths(root: Path, records: dict[str, Any]) -> dict[str, Path]:
+    """Return the folders of the run and, where it got that far, of its exports."""
+    return {"run": root} | ({"export": root / "export"} if "export" in records else {})

@@ -1,0 +1,24 @@
+"""The world of a run that was extended stays where it was."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
+from msgs_slam.pipelines.run.before import Before
+from msgs_slam.pipelines.structure.given import agreement
+from msgs_slam.pipelines.types import Frame
+
+
+def in_world_of(before: Before, model: SparseModel, frames: Sequence[Frame]) -> SparseModel:
+    """The model moved, turned and scaled to where its keyframes were before; as it is where none tells that."""
+    poses = before.poses_of([frames[i] for i in model.frame_ids.tolist()])
+    known = np.isfinite(poses).all(axis=(1, 2))
+    agreed = agreement(model.cam_from_world[known], poses[known])
+    if agreed is None:
+        return model
+    moved = agreed.move.apply_to_poses(model.cam_from_world)
+    return replace(model, cam_from_world=moved, points_in_world=agreed.move.apply(model.points_in_world))

@@ -1,0 +1,134 @@
+"""The state of a run before it was extended: the poses of its frames, its camera, its map.
+
+`msgs-slam extend` leaves it in a folder of the run, extension_1 and so on, beside the longer list of sources that the
+run is made from then on. So a stage finds it by the source that it is given, and makes the same of it however often.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_slam.formats.atomic import copy_file
+from msgs_slam.formats.digest import file_sha256
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.jsonfile import read_json_object, write_json
+from msgs_slam.formats.tensors import save_arrays
+from msgs_slam.pipelines.run import layouts
+from msgs_slam.pipelines.run.folder import EXPOSURE, MAP, RunFolder
+from msgs_slam.pipelines.run.layouts import dataclass_from_json, load_layout, reading
+from msgs_slam.pipelines.run.names import SOURCE_LIST
+from msgs_slam.pipelines.run.records import load_source
+from msgs_slam.pipelines.types import Calibration, Frame
+
+if TYPE_CHECKING:
+    from msgs_slam.pipelines.gaussian_map import GaussianMap
+
+FRAMES, CONTENTS = "frames.npz", "before.json"
+FINAL = "global_ba"
+"""The stage whose poses and map are taken."""
+
+
+@dataclass(frozen=True)
+class Before:
+    """The files of one extension folder, each checked when it is opened."""
+
+    folder: Path
+
+    @property
+    def contents(self) -> Mapping[str, Any]:
+        """{"source": digest, "camera", "files": name → sha256}."""
+        return read_json_object(self.folder / CONTENTS)
+
+    def _file(self, name: str) -> Path:
+        path = self.folder / name
+        if not path.is_file() or file_sha256(path) != self.contents["files"].get(name):
+            raise InputError(
+                f"{path} is gone or damaged: the run can no longer be extended from it. Reconstruct all videos into "
+                "another folder with --out NEW"
+            )
+        return path
+
+    @cached_property
+    def _frames(self) -> Mapping[str, NDArray]:
+        return load_layout(self._file(FRAMES), layouts.BEFORE)
+
+    @property
+    def camera(self) -> Calibration:
+        """Calibration of the undistorted frames."""
+        with reading(self.folder / CONTENTS, "table of an extended run"):
+            return dataclass_from_json(Calibration, self.contents["camera"])
+
+    @property
+    def source_digest(self) -> str:
+        """Digest of what the run was made from."""
+        return str(self.contents["source"])
+
+    def poses_of(self, frames: Sequence[Frame]) -> NDArray[np.float64]:
+        """cam_from_world (F, 4, 4) of these frames, NaN of those that were not there or had no place."""
+        place = {int(index): row for row, index in enumerate(self._frames["source_index"])}
+        out = np.full((len(frames), 4, 4), np.nan)
+        for k, frame in enumerate(frames):
+            row = place.get(frame.source_index)
+            if row is not None and self._frames["is_placed"][row]:
+                out[k] = self._frames["cam_from_world"][row]
+        return out
+
+    def keyframes_of(self, frames: Sequence[Frame]) -> tuple[list[int], int]:
+        """Numbers of the frames that were keyframes, and of the first frame behind all that were there."""
+        known = self._frames["source_index"]
+        chosen = set(known[self._frames["was_chosen"]].tolist())
+        first_new = sum(f.source_index <= int(known.max(initial=-1)) for f in frames)
+        return [k for k, f in enumerate(frames[:first_new]) if f.source_index in chosen], first_new
+
+    def load_map(self, device: str = "cpu") -> GaussianMap:
+        """Load the map onto a device."""
+        from msgs_slam.formats.tensors import load_tensors
+        from msgs_slam.pipelines.gaussian_map import GaussianMap
+
+        tensors = load_tensors(path := self._file(MAP))
+        with reading(path, "Gaussian map"):
+            return GaussianMap(**{name: tensor.to(device) for name, tensor in tensors.items()})
+
+    def exposures(self) -> dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]]:
+        """Frame id → log gain (3,) and offset (3,)."""
+        rows = load_layout(self._file(EXPOSURE), layouts.EXPOSURE)
+        return dict(zip(rows["frame_ids"].tolist(), zip(rows["log_gains"], rows["offsets"], strict=True), strict=True))
+
+
+def before_of(source: Path) -> Before | None:
+    """Find the earlier state of the run made from `source`; None where it was never extended."""
+    is_extended = source.name == SOURCE_LIST and (source.parent / CONTENTS).is_file()
+    return Before(source.parent) if is_extended else None
+
+
+def before_inputs(source: Path) -> dict[str, str]:
+    """Return the digest of that state as an input of a stage, {} where there is none."""
+    before = before_of(source)
+    return {} if before is None else {"before": file_sha256(before.folder / CONTENTS)}
+
+
+def save_before(run: RunFolder, folder: Path) -> None:
+    """Write that state into a folder, the table of contents last. Raises InputError where the run is damaged."""
+    frames, trajectory, backbone = run.load_frames(), run.load_trajectory(FINAL), run.load_backbone()
+    ids = trajectory.frame_ids.tolist()
+    chosen = set(trajectory.frame_ids[trajectory.is_keyframe].tolist())
+    chosen |= set() if backbone is None else set(backbone.frame_ids.tolist())
+    arrays = {
+        "source_index": np.array([frames[i].source_index for i in ids], np.int64),
+        "cam_from_world": trajectory.cam_from_world,
+        "is_placed": trajectory.is_placed,
+        "was_chosen": np.array([i in chosen for i in ids], np.bool_),
+    }
+    save_arrays(folder / FRAMES, arrays)
+    for name in (MAP, EXPOSURE):
+        copy_file(run.file(FINAL, name), folder / name)
+    files = {name: file_sha256(folder / name) for name in (FRAMES, MAP, EXPOSURE)}
+    source, camera = load_source(run).digest, asdict(run.load_calibration())
+    write_json(folder / CONTENTS, {"source": source, "camera": camera, "files": files})
