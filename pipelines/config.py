@@ -148,7 +148,6 @@ class MappingConfig:
     )  # fmt: skip
     depth_weight: float = setting(4.8, "λ_D of eq. (18); 0 = no depth loss", within=(0, 1000))
     use_proxy_depth: bool = setting(True, "false: the proxies only seed the map, no loss and no condition uses them")
-    label_weight: float = setting(0.1, "λ_S of eq. (18); 0 = no semantic loss", within=(0, 1000))
     split_error: float = setting(
         0.1,
         "Gaussians that answer for more colour error 0..1 than this, summed over a view's pixels, are split; 0 = none",
@@ -216,7 +215,12 @@ class PaperConfig:
     edge_weight: float = setting(
         0.0, "λ_E of eq. (18), the edge term (19), 0.02 in the paper", stages=_MAPPING, within=(0, 1000)
     )
-    label_image: bool = setting(False, "eq. (20) for the labels instead of cross-entropy", stages=_MAPPING)
+    label_weight: float = setting(
+        0.0,
+        "λ_S of eq. (18), 0.1 in the paper; 0 = no semantic loss: classes are counted when the map is done",
+        stages=_MAPPING,
+        within=(0, 1000),
+    )
     class_growth: bool = setting(False, "grow the map where it shows another class than the label", stages=_MAPPING)
     keyframe_miou: float = setting(
         0.0,

@@ -139,7 +139,9 @@ MOVED = {
     "mapping.densify_classes": "paper.class_growth",
     "mapping.edge_weight": "paper.edge_weight",
     "mapping.kappa": "paper.kappa",
-    "mapping.label_loss": "paper.label_image",
+    "mapping.label_loss": "paper.label_weight",
+    "mapping.label_weight": "paper.label_weight",
+    "paper.label_image": "paper.label_weight",
 }
 """Old name → the one that decides it now."""
 

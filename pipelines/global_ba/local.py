@@ -17,12 +17,15 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.global_ba.verify import Loop
 from msgs_slam.pipelines.mapping import losses
 from msgs_slam.pipelines.mapping.optimise import scene_depth
+from msgs_slam.pipelines.mapping.paper.label_image import label_image_loss
 from msgs_slam.pipelines.mapping.views import View
 
 _RATE = 1e-3
 """Of Adam, rotations in radians and translations in units of the world; the paper has 3e-3 for its tracking."""
 _POSE_WEIGHT = 100.0
 """Of the squared twist: a hundredth of the depth away costs as much as a hundredth of the depth's error."""
+_LABEL_WEIGHT = 0.1
+"""λ_S."""
 _AROUND = 2
 """Keyframes to either side of each end of a loop that are adjusted with it."""
 
@@ -56,7 +59,7 @@ def _adjusted(
             view.cam_from_world, view.intrinsics, twist=twist,
         )  # fmt: skip
         loss = settings.depth_weight * losses.depth_loss(shown.depth, view.depth, weight, unit)
-        loss = loss + settings.label_weight * losses.label_loss(shown.features, view.channels, view.label_weight)
+        loss = loss + _LABEL_WEIGHT * label_image_loss(shown.features, view.channels, view.label_weight)
         away = (twist[:3] / unit).square().sum() + twist[3:].square().sum()
         loss = loss + _POSE_WEIGHT * beside(away, loss)
         if (value := float(loss.detach())) < best:

@@ -1,4 +1,4 @@
-"""The loss of a view on a card: photo, silhouette, depth, classes and sizes by kernels of Triton, in one operation.
+"""The loss of a view on a card: photo, silhouette, depth and sizes by kernels of Triton, in one operation.
 
 `objective` has the same terms by torch's own functions, and says what they are.
 """
@@ -22,16 +22,15 @@ from msgs_slam.pipelines.mapping.photo_loss import SSIM_WEIGHT
 from msgs_slam.pipelines.mapping.views import View
 
 _BLOCK = 512
-"""Numbers a program of the kernels, pixels of one that reads classes a quarter of it."""
+"""Numbers a program of the kernels."""
 
 
 @dataclass(frozen=True)
 class TermWeights:
-    """Weights of silhouette, depth and labels beside the photo; `unit`: the scene's median depth."""
+    """Weights of silhouette and depth beside the photo; `unit`: the scene's median depth."""
 
     silhouette: float
     depth: float
-    labels: float
     unit: float
 
 
@@ -84,9 +83,9 @@ class _CardLoss(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> Tensor:
         features, depth, silhouette, log_radii = (x.detach().contiguous() for x in arguments[:4])
         view, exposure, in_view, weights = arguments[4:]
-        loss, d_features = features.new_zeros(()), torch.empty_like(features)
+        loss, d_features = features.new_zeros(()), torch.zeros_like(features)  # of classes there is none
         _add_photo(features, exposure, view, loss, d_features)
-        d_depth, d_silhouette = _add_maps(features, depth, silhouette, view, weights, loss, d_features)
+        d_depth, d_silhouette = _add_maps(depth, silhouette, view, weights, loss)
         d_log_radii = _add_sizes(log_radii, in_view, weights.unit, loss)
         ctx.save_for_backward(d_features, d_depth, d_silhouette, d_log_radii)
         return loss
@@ -118,27 +117,15 @@ def _add_photo(features: Tensor, exposure: Tensor, view: View, loss: Tensor, gra
 
 
 def _add_maps(
-    features: Tensor,
-    depth: Tensor,
-    silhouette: Tensor,
-    view: View,
-    weights: TermWeights,
-    loss: Tensor,
-    gradient: Tensor,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Silhouette, depth and labels; returns the gradients of the first two."""
+    depth: Tensor, silhouette: Tensor, view: View, weights: TermWeights, loss: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Silhouette and depth; returns their gradients."""
     from msgs_slam.pipelines.mapping.map_kernels import compare_maps  # imports triton
 
-    pixels, classes = depth.numel(), features.shape[-1] - 3
-    d_depth, d_silhouette = torch.empty_like(depth), torch.empty_like(silhouette)
-    maps = (view.depth, view.reliability, view.channels, view.channel_confidence, _mask(view))
-    results = (loss, gradient, d_depth, d_silhouette)
-    counts = (weights.silhouette, weights.depth / weights.unit, weights.labels)
-    _run(
-        compare_maps, pixels, features, depth, silhouette, *maps, *results, pixels, classes, *counts, NU=NU,
-        LABELS=weights.labels > 0, PADDED=classes and max(2, 1 << (classes - 1).bit_length()),
-        MASKED=view.scene is not None, BLOCK=_BLOCK // 4,
-    )  # fmt: skip
+    d_depth, d_silhouette, pixels = torch.empty_like(depth), torch.empty_like(silhouette), depth.numel()
+    given = (depth, silhouette, view.depth, view.reliability, _mask(view), loss, d_depth, d_silhouette, pixels)
+    shares = (weights.silhouette, weights.depth / weights.unit)
+    _run(compare_maps, pixels, *given, *shares, NU=NU, MASKED=view.scene is not None)
     return d_depth, d_silhouette
 
 

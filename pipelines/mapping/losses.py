@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.entropy import weighted_entropy
-
 NU = 1.2
 """ν of eq. (18)."""
 SIZE_LIMIT = 0.03
@@ -22,11 +20,6 @@ def depth_loss(rendered: Tensor, proxy: Tensor, weight: Tensor, unit: float) -> 
     """w |D̂ - D| of eq. (18), in units of the scene's depth; mean over all H x W pixels, unknown proxy (0) counts 0."""
     known = proxy > 0
     return ((rendered - proxy).abs() * weight * known).mean() / unit
-
-
-def label_loss(logits: Tensor, labels: Tensor, weight: Tensor) -> Tensor:
-    """Cross-entropy of (H, W, C) rendered logits with (H, W) labels, void ignored, weighted; mean over all pixels."""
-    return weighted_entropy(logits, labels, weight)
 
 
 def size_loss(log_radii: Tensor, unit: float) -> Tensor:

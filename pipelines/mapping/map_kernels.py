@@ -14,14 +14,11 @@ from msgs_slam.pipelines.mapping.photo_kernels import scene_at
 
 @triton.jit
 def compare_maps(
-    features: tl.tensor, depth: tl.tensor, silhouette: tl.tensor, proxy: tl.tensor, reliability: tl.tensor,
-    labels: tl.tensor, confidence: tl.tensor, scene: tl.tensor, loss: tl.tensor, d_features: tl.tensor,
-    d_depth: tl.tensor, d_silhouette: tl.tensor, pixels: tl.tensor, classes: tl.tensor,
-    by_silhouette: tl.tensor, by_depth: tl.tensor, by_label: tl.tensor, NU: tl.constexpr,
-    LABELS: tl.constexpr, PADDED: tl.constexpr, MASKED: tl.constexpr, BLOCK: tl.constexpr,
+    depth: tl.tensor, silhouette: tl.tensor, proxy: tl.tensor, reliability: tl.tensor, scene: tl.tensor,
+    loss: tl.tensor, d_depth: tl.tensor, d_silhouette: tl.tensor, pixels: tl.tensor, by_silhouette: tl.tensor,
+    by_depth: tl.tensor, NU: tl.constexpr, MASKED: tl.constexpr, BLOCK: tl.constexpr,
 ) -> None:  # fmt: skip
-    """Add up the terms of silhouette, depth and, with LABELS, classes over a block of pixels, each times its weight and
-    a mean over all pixels; features (pixels, 3 + classes)."""
+    """Add up the terms of silhouette and depth over a block of pixels, each times its weight and a mean over all."""
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = pixel < pixels
     is_scene = scene_at(scene, pixel, inside, MASKED)
@@ -34,25 +31,6 @@ def compare_maps(
     side = tl.where(off > 0, 1.0, 0.0) - tl.where(off < 0, 1.0, 0.0)
     tl.store(d_depth + pixel, by_depth / pixels * trust * side, mask=inside)
     total = by_silhouette * missing + by_depth * trust * tl.abs(off)
-    if PADDED > 0:
-        channel = tl.arange(0, PADDED)
-        used = inside[:, None] & (channel < classes)[None, :]
-        at = pixel[:, None] * (3 + classes) + 3 + channel[None, :]
-        gradient = tl.zeros((BLOCK, PADDED), tl.float32)
-        if LABELS:
-            logits = tl.load(features + at, mask=used, other=float("-inf"))
-            own = tl.load(labels + pixel, mask=inside, other=255).to(tl.int32)
-            weight = tl.load(confidence + pixel, mask=inside, other=0).to(tl.float32) / 255
-            weight = by_label * tl.where(own < classes, weight, 0.0)
-            largest = tl.max(logits, axis=1)
-            largest = tl.where(inside, largest, 0.0)
-            shares = tl.exp(logits - largest[:, None])
-            mass = tl.where(inside, tl.sum(shares, axis=1), 1.0)
-            is_own = channel[None, :] == own[:, None]
-            own_logit = tl.sum(tl.where(is_own & used, logits, 0.0), axis=1)
-            total += weight * (tl.log(mass) + largest - own_logit)
-            gradient = (shares / mass[:, None] - tl.where(is_own, 1.0, 0.0)) * (weight / pixels)[:, None]
-        tl.store(d_features + at, gradient, mask=used)
     tl.atomic_add(loss, tl.sum(tl.where(inside, total, 0.0), axis=0) / pixels)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -34,8 +33,13 @@ class Objective:
 
     def uses_labels(self, iteration: int) -> bool:
         """Whether the semantic terms count at this step."""
-        wanted = max(self.settings.label_weight, self.paper.edge_weight) > 0
+        wanted = max(self.paper.label_weight, self.paper.edge_weight) > 0
         return self.classes > 0 and wanted and iteration % LABEL_EVERY == 0
+
+    @property
+    def counts_labels(self) -> bool:
+        """Whether the classes of the map are counted when it is done, for no term has learnt them."""
+        return self.classes > 0 and self.paper.label_weight == 0
 
     def of(
         self,
@@ -53,10 +57,10 @@ class Objective:
         # split, not slices: the gradient of each slice would be a whole image of zeros around it.
         parts = rendering.features.split([3, rendering.features.shape[-1] - 3], dim=-1)
         if in_view is None:
-            loss = self._seen(view, exposure, rendering, parts, with_labels)
+            loss = self._seen(view, exposure, rendering, parts[0])
             loss = loss + losses.size_loss(log_radii, self.unit)
         else:
-            weights = TermWeights(SILHOUETTE_WEIGHT, self._depth_weight, self._label_weight(with_labels), self.unit)
+            weights = TermWeights(SILHOUETTE_WEIGHT, self._depth_weight, self.unit)
             loss = card_loss(view, exposure, rendering, log_radii, in_view, weights)
         return self._with_paper(loss, view, rendering.depth, parts[1], with_labels)
 
@@ -64,28 +68,21 @@ class Objective:
     def _depth_weight(self) -> float:
         return self.settings.depth_weight if self.settings.use_proxy_depth else 0.0
 
-    def _label_weight(self, with_labels: bool) -> float:
-        return LABEL_EVERY * self.settings.label_weight if with_labels and not self.paper.label_image else 0.0
-
-    def _seen(
-        self, view: View, exposure: Tensor, rendering: Rendering, parts: Sequence[Tensor], with_labels: bool
-    ) -> Tensor:
+    def _seen(self, view: View, exposure: Tensor, rendering: Rendering, colors: Tensor) -> Tensor:
         """The terms of every view: what `card_loss` has for cards, without the sizes."""
-        loss = photo_loss(parts[0], exposure, view.image, view.scene)
+        loss = photo_loss(colors, exposure, view.image, view.scene)
         loss = loss + SILHOUETTE_WEIGHT * losses.silhouette_loss(view.of_scene(rendering.silhouette, 1.0))
         if self._depth_weight > 0:
             weight = losses.depth_weight(view.trust)
             loss = loss + self._depth_weight * losses.depth_loss(rendering.depth, view.depth, weight, self.unit)
-        if (weight_of_labels := self._label_weight(with_labels)) > 0:
-            loss = loss + weight_of_labels * losses.label_loss(parts[1], view.channels, view.label_weight)
         return loss
 
     def _with_paper(self, loss: Tensor, view: View, depth: Tensor, logits: Tensor, with_labels: bool) -> Tensor:
         """And what the paper has beside them."""
         paper = self.paper
-        if with_labels and paper.label_image and self.settings.label_weight > 0:
-            weight = LABEL_EVERY * self.settings.label_weight
-            loss = loss + weight * label_image_loss(logits, view.channels, view.label_weight)
+        if with_labels and paper.label_weight > 0:
+            by_label = label_image_loss(logits, view.channels, view.label_weight)
+            loss = loss + LABEL_EVERY * paper.label_weight * by_label
         if with_labels and paper.edge_weight > 0:
             loss = loss + LABEL_EVERY * paper.edge_weight * edge_loss(depth, view.channels, self.unit)
         return loss

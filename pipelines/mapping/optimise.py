@@ -18,6 +18,7 @@ from msgs_slam.pipelines.gaussians.render import Rendering, blending_weights, in
 from msgs_slam.pipelines.mapping.card_loss import color_errors_on_card, fit_exposure_on_card
 from msgs_slam.pipelines.mapping.exposure import SOLID, expose, fit_exposure
 from msgs_slam.pipelines.mapping.growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
+from msgs_slam.pipelines.mapping.label_votes import voted_logits
 from msgs_slam.pipelines.mapping.objective import Objective
 from msgs_slam.pipelines.mapping.parameters import COLOR_KEYS, KEYS
 from msgs_slam.pipelines.mapping.schedule import Schedule, Seeding, Step
@@ -77,6 +78,8 @@ def optimise_map(
             state.save(snapshot)
     if schedule.grows:
         optimiser.growth.prune()
+    if optimiser.objective.counts_labels:
+        optimiser.count_labels()
     return state.result(views, schedule.total)
 
 
@@ -137,6 +140,13 @@ class MapOptimiser:
         parameters.table.step(of_map, rates, self._shares(rows, values["log_radii"].detach()), rows)
         self.state.step_pose(step.view, view, of_view.get("pose"), POSE_RATE * step.rate)
         return rendering
+
+    @torch.no_grad()
+    def count_labels(self) -> None:
+        """The classes of all Gaussians by the labels of all views."""
+        posed = ((view, self.state.cam_from_world(i, view)) for i, view in enumerate(self.views))
+        parameters = self.state.parameters
+        parameters["class_logits"].copy_(voted_logits(parameters.to_map(), posed))
 
     @torch.no_grad()
     def _seed(self, index: int, what: Seeding) -> None:

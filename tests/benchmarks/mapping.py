@@ -65,7 +65,6 @@ CASES = {
 
 ABLATIONS = {
     **ARTICLE_ABLATIONS,
-    "semantic loss of eq. (20)": ("paper.label_image=true",),
     "with edge term": ("paper.edge_weight=0.02",),
     "kappa = 5": ("paper.kappa=5.0",),
     "without splitting": ("mapping.split_error=0.0",),

@@ -34,6 +34,7 @@ import numpy as np
 import torch
 from render_scenes import room
 from torch import Tensor
+from torch.nn import functional
 
 from msgs_slam.pipelines.gaussians.render import composite, render, set_threads, track_gn
 from msgs_slam.pipelines.gaussians.render.compositing import choose_backend
@@ -160,7 +161,7 @@ def print_table(results: list[dict]) -> None:
 
 
 class Iteration:
-    """A mapping iteration: projection, rendering, colour + SSIM + depth + label loss, fused Adam."""
+    """A mapping iteration: projection, rendering, colour + SSIM + depth + cross-entropy of classes, fused Adam."""
 
     def __init__(self, row: tuple[int, int, int, int], device: torch.device) -> None:
         scene = room(*row)
@@ -172,7 +173,7 @@ class Iteration:
             seen = self.draw(torch.eye(4, dtype=torch.float64))
         self.image, self.depth = (255 * seen.features[..., :3]).to(torch.uint8), seen.depth
         self.exposure = torch.zeros(2, 3, device=device)
-        self.labels = seen.features[..., 3:].argmax(-1).to(torch.uint8)
+        self.labels = seen.features[..., 3:].argmax(-1)
         self.weight = torch.ones_like(self.depth)
 
     def draw(self, pose: Tensor) -> object:
@@ -185,7 +186,7 @@ class Iteration:
         seen = self.draw(POSE)
         loss = photo_loss(seen.features[..., :3], self.exposure, self.image)
         loss = loss + losses.depth_loss(seen.depth, self.depth, self.weight, 1.0)
-        loss = loss + losses.label_loss(seen.features[..., 3:], self.labels, self.weight)
+        loss = loss + functional.cross_entropy(seen.features[..., 3:].flatten(0, 1), self.labels.flatten())
         loss.backward()
         self.optimizer.step()
 

@@ -9,6 +9,7 @@ from msgs_slam.pipelines.gaussians.render.culling import in_view, marked_in_view
 from msgs_slam.pipelines.gaussians.render.inspection import (
     BlendingWeights,
     blending_weights,
+    class_weights,
     error_shares,
     median_and_seen,
     median_depth,
@@ -23,6 +24,7 @@ __all__ = [
     "PoseFit",
     "Rendering",
     "blending_weights",
+    "class_weights",
     "composite",
     "error_shares",
     "get_threads",

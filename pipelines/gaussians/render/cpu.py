@@ -11,11 +11,11 @@ from torch import Tensor
 
 from msgs_slam.pipelines.gaussians.render.cpu_backward import backward_band, sum_shared
 from msgs_slam.pipelines.gaussians.render.cpu_bands import split_into_bands
-from msgs_slam.pipelines.gaussians.render.cpu_forward import forward_band
-from msgs_slam.pipelines.gaussians.render.cpu_inspect import inspect
+from msgs_slam.pipelines.gaussians.render.cpu_forward import draw_bands
+from msgs_slam.pipelines.gaussians.render.cpu_inspect import class_weights, inspect, weighted_errors
 from msgs_slam.pipelines.gaussians.render.threads import for_each
 
-__all__ = ["composite", "inspect"]
+__all__ = ["class_weights", "composite", "inspect", "weighted_errors"]
 
 F32 = np.float32
 _ROWS = 16384
@@ -48,8 +48,7 @@ class _Composite(torch.autograd.Function):
         vectors = None if guide is None and values.shape[1] == 3 else channel_vectors(values.shape[1])
         channels = 3 if vectors is None else 16 * len(vectors)
         bands = split_into_bands(tuple(projected), values, channels, width, height, near)
-        features, planes = np.empty((height, width, values.shape[1]), F32), np.empty((3, height, width), F32)
-        for_each(lambda b: forward_band(vectors, b, *bands.prepared[b], guide, features, planes), len(bands))
+        features, planes = draw_bands(bands, vectors, guide, values.shape[1], width, height)
         outputs = (torch.from_numpy(features), *torch.from_numpy(planes).unbind(0))
         ctx.save_for_backward(outputs[0])
         ctx.state = (bands, vectors, guide, planes)

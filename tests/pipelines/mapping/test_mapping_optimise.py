@@ -9,14 +9,17 @@ import torch
 
 from msgs_slam.pipelines.config import MappingConfig, PaperConfig
 from msgs_slam.pipelines.gaussians.render import Rendering
+from msgs_slam.pipelines.gaussians.seeding import SEED_LOGIT
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project_gaussians
 from msgs_slam.pipelines.mapping import growth, objective, optimise, schedule
+from msgs_slam.pipelines.mapping.label_votes import voted_logits
 from msgs_slam.pipelines.mapping.load import MappingInput
 from msgs_slam.pipelines.mapping.measure import ViewFigures, measure_view
 from msgs_slam.pipelines.mapping.optimise import MapOptimiser, OptimisedMap, optimise_map
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View
+from msgs_slam.pipelines.types import VOID
 
 SETTINGS = MappingConfig(passes=6.0, min_iterations=0, snapshot_every=20, seed_stride=1)
 
@@ -93,23 +96,44 @@ def test_what_stands_only_where_a_view_shows_no_scene_has_no_weight(room: Mappin
 
 @pytest.mark.parametrize("iteration", [0, 1])
 def test_labels_count_as_often_while_the_map_grows(room: MappingInput, iteration: int) -> None:
-    """At every second step and at no other, whether it grows or not."""
+    """At every second step and at no other, whether it grows or not; never where they are counted in the end."""
     plan = schedule.Schedule.plan(room.views, SETTINGS, seed=0, seeding=True, passes=None)
     growing = next(s for i in range(plan.total) if (s := plan.step(i)).grow)
-    state = OptimiserState.fresh(room.views, len(room.class_ids), None, None)
-    optimiser = MapOptimiser(room.views, len(room.class_ids), SETTINGS, PaperConfig(), state)
-    optimiser.visit(replace(plan.step(0), view=growing.view))
-    before = state.parameters["class_logits"].clone()
-    optimiser.visit(replace(growing, iteration=iteration))
-    moved = (state.parameters["class_logits"][: len(before)] - before).abs().max() > 0
-    assert bool(moved) == (iteration % objective.LABEL_EVERY == 0)
+    for weight in (0.0, 0.1):
+        state = OptimiserState.fresh(room.views, len(room.class_ids), None, None)
+        optimiser = MapOptimiser(room.views, len(room.class_ids), SETTINGS, PaperConfig(label_weight=weight), state)
+        optimiser.visit(replace(plan.step(0), view=growing.view))
+        before = state.parameters["class_logits"].clone()
+        optimiser.visit(replace(growing, iteration=iteration))
+        moved = (state.parameters["class_logits"][: len(before)] - before).abs().max() > 0
+        assert bool(moved) == (weight > 0 and iteration % objective.LABEL_EVERY == 0)
+
+
+def test_counted_classes_are_as_good_as_learnt_ones(room: MappingInput, mapped: OptimisedMap) -> None:
+    paper = PaperConfig(label_weight=0.1)
+    learnt = optimise_map(room.views, len(room.class_ids), SETTINGS, seed=0, paper=paper)
+    for views in (room.views, room.held_out):
+        assert mean(mapped, views, "label_agreement") > mean(learnt, views, "label_agreement")
+
+
+def test_a_gaussian_takes_the_classes_of_the_pixels_it_fills(room: MappingInput, mapped: OptimisedMap) -> None:
+    """Of one class everywhere all that is seen has its logit; of pixels that nobody knows nothing changes."""
+    view, m = room.views[0], mapped.gaussian_map
+    same = replace(view, channels=torch.ones_like(view.channels), channel_confidence=view.channel_confidence * 0 + 255)
+    logits = voted_logits(m, [(same, view.cam_from_world)])
+    changed = (logits != m.class_logits).any(1)
+    assert 0.1 < changed.float().mean() < 1
+    assert torch.allclose(logits[changed][:, 1], torch.tensor(SEED_LOGIT))
+    assert logits[changed][:, 0].abs().max() == 0
+    unknown = replace(same, channels=torch.full_like(view.channels, VOID))
+    assert torch.equal(voted_logits(m, [(unknown, view.cam_from_world)]), m.class_logits)
 
 
 def test_the_edge_term_does_not_need_the_labels(room: MappingInput) -> None:
     view, losses = room.views[0], []
     drawn = Rendering(torch.zeros(*view.depth.shape, 5), view.depth + 0.3 * torch.rand(view.depth.shape), view.trust)
     for weight in (0.0, 1.0):
-        terms = objective.Objective(replace(SETTINGS, label_weight=0.0), PaperConfig(edge_weight=weight), 2, 1.0)
+        terms = objective.Objective(SETTINGS, PaperConfig(edge_weight=weight), 2, 1.0)
         losses.append(terms.of(view, torch.zeros(2, 3), drawn, torch.zeros(1), terms.uses_labels(0)).item())
     assert losses[1] > losses[0] + 0.01
 

@@ -6,6 +6,8 @@ from render_scenes import random_gaussians, room
 
 from msgs_slam.pipelines.gaussians.render import (
     blending_weights,
+    class_weights,
+    error_shares,
     in_view,
     median_and_seen,
     median_depth,
@@ -57,6 +59,35 @@ def test_summed_weights_are_the_gradient_of_a_feature_of_ones():
     torch.testing.assert_close(weights.total, ones.grad[:, 0], rtol=1e-4, atol=1e-5)
     assert (weights.largest <= weights.total + 1e-6).all()
     assert 0.3 < weights.largest.max() <= 0.99
+
+
+def test_weights_by_class_are_those_of_the_pixels_of_the_class():
+    """Compiled, and by the gradient of the readable renderer; in patches, so that tiles show one class or several."""
+    scene = room(90, 70, 2000, 1)
+    generator = torch.Generator().manual_seed(0)
+    patches = torch.randint(0, 5, (4, 5), generator=generator, dtype=torch.uint8).repeat_interleave(18, 0)
+    channels, counts = patches.repeat_interleave(18, 1)[:70, :90], torch.rand(70, 90, generator=generator)
+    seen, beside = (scene.means, scene.radii, scene.opacities), (POSE, scene.intrinsics)
+    for classes in (1, 4):
+        found = class_weights(*seen, *beside, channels, counts, classes)
+        exact = (x.double() for x in seen)
+        plain = class_weights(*exact, *beside, channels, counts.double(), classes, backend="reference")
+        torch.testing.assert_close(found.double(), plain, rtol=1e-4, atol=1e-5)
+        counted = torch.where(channels < classes, counts, 0.0)
+        whole = blending_weights(*seen, *beside, counts=counted)
+        torch.testing.assert_close(found.sum(1), whole.total, rtol=1e-4, atol=1e-5)
+    assert (found > 0.01).float().mean(0).min() > 0.05
+
+
+def test_errors_are_shared_as_weights_say():
+    scene = room(90, 70, 2000, 1)
+    seen, beside = (scene.means, scene.radii, scene.opacities), (POSE, scene.intrinsics)
+    errors, footprints = error_shares(*seen, scene.colors, *beside, lambda colors: (colors - 0.3).abs().mean(-1))
+    shown = render(*seen, scene.colors, *beside).features
+    weights = blending_weights(*seen, *beside, counts=(shown - 0.3).abs().mean(-1))
+    torch.testing.assert_close(errors, weights.total, rtol=1e-5, atol=1e-6)
+    assert (footprints[errors > 0] > 0).all()
+    assert errors.max() > 0.1
 
 
 def test_unseen_gaussians_weigh_nothing():

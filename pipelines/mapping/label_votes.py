@@ -1,0 +1,37 @@
+"""The classes of a finished map, counted: each Gaussian takes those of the pixels that it fills.
+
+What eq. (18) of MSGS-SLAM learns by its semantic term in hundreds of visits is, once the map stands, close to a
+weighted mean, which takes one drawing of each view (so do Marrie et al., "LUDVIG", ICCV 2025, bring features of images
+to a map). Not at half the size: at the outlines of things every pixel counts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from msgs_slam.pipelines.gaussian_map import GaussianMap
+from msgs_slam.pipelines.gaussians.render import class_weights
+from msgs_slam.pipelines.gaussians.seeding import SEED_LOGIT
+from msgs_slam.pipelines.mapping.views import View
+
+_FLOOR = 1 / (math.exp(SEED_LOGIT) - 1)
+"""Added to every share of a class: one that has all votes gets the logit of a seed's own class, one without any 0."""
+_LEAST = 1e-6
+"""Pixels: who has less of all views keeps the classes that he has."""
+
+
+def voted_logits(gaussian_map: GaussianMap, posed: Iterable[tuple[View, Tensor]]) -> Tensor:
+    """(M, C) class logits by the labels of views, each with its pose (4, 4): a pixel gives its confidence to its class,
+    shared among the Gaussians as they are blended in it."""
+    votes = torch.zeros_like(gaussian_map.class_logits)
+    m, classes = gaussian_map, gaussian_map.class_logits.shape[1]
+    for view, pose in posed:
+        seen = (m.means, m.radii, m.opacities, pose, view.intrinsics)
+        votes += class_weights(*seen, view.channels, view.label_weight, classes)
+    total = votes.sum(1, keepdim=True)
+    logits = torch.log1p(votes / total.clamp(min=_LEAST) / _FLOOR)
+    return torch.where(total > _LEAST, logits, gaussian_map.class_logits)
