@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,6 +21,7 @@ from msgs_slam.pipelines.mapping.schedule import Seeding
 from msgs_slam.pipelines.mapping.splitting import CHILDREN, DensificationError, split
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View
+from msgs_slam.pipelines.system.lru_sequence import LruSequence
 
 GROWN_OPACITY = 0.3
 """Of Gaussians added to a map that is already there: opaque ones would hide what has been learnt."""
@@ -35,6 +38,8 @@ SPLIT_RADIUS = 1.0
 PRUNE_OPACITY, PRUNE_WEIGHT, PRUNE_RADIUS = 0.03, 0.03, 0.15
 """Gaussians go that are more transparent than this, of less blending weight in every pixel of every keyframe (a fifth
 fewer at +0.06 dB), or larger than this in units of the scene's median depth."""
+SPACINGS_ROOM = 50e6
+"""Bytes of seed distances that are kept."""
 _SOLID = 0.8
 """Silhouette above which the map knows the depth of a pixel."""
 
@@ -57,7 +62,7 @@ class Growth:
         `rendering`: the map as the view sees it, None while there is none.
         """
         view = self.views[index]
-        spacing = self._spacing(view)
+        spacing = self._spacings[index].float()
         pixels = spacing > 0
         if rendering is None:
             completed = self._completed(index)
@@ -76,7 +81,7 @@ class Growth:
         needed = self._needed(view, rendering)
         if self.paper.class_growth:
             needed |= wrong_classes(rendering.features[..., 3:], view.channels, view.label_weight)
-        spacing = self._spacing(view)
+        spacing = self._spacings[index].float()
         depth, trust = self._grown_depth(view, rendering)
         self._append(index, needed & (spacing > 0), depth, trust, spacing, GROWN_OPACITY)
 
@@ -104,12 +109,17 @@ class Growth:
         if bad.any():
             parameters.keep(~bad)
 
-    def _spacing(self, view: View) -> Tensor:
-        """(H, W) distance in pixels to the next seed, 0 = no seed here; none in what is no part of the scene."""
-        s = self.settings
+    @cached_property
+    def _spacings(self) -> LruSequence[Tensor]:
+        """Of each view (H, W) uint8 distances in pixels to the next seed, 0 = no seed here; none in what is no part of
+        the scene. Each is asked for twice as the map is seeded, and in every round of growth."""
+        return LruSequence(len(self.views), self._spacing, lambda t: t.nbytes, SPACINGS_ROOM)
+
+    def _spacing(self, index: int) -> Tensor:
+        view, s = self.views[index], self.settings
         image, depth = view.image.cpu().numpy(), view.depth.cpu().numpy()
-        spacing = seed_spacing(image, depth, s.seed_stride, FINE_SHARE, FLAT_SHARE)
-        return view.of_scene(torch.from_numpy(spacing).to(view.image.device))
+        spacing = seed_spacing(image, depth, s.seed_stride, FINE_SHARE, FLAT_SHARE).astype(np.uint8)
+        return view.of_scene(torch.from_numpy(spacing).to(view.image.device), 0)
 
     def _holes(self, rendering: Rendering) -> Tensor:
         """Condition (a)."""
