@@ -24,8 +24,8 @@ _MULTIPLE = 32
 """Sides of the network's input; the image's last row and column go on to fill it."""
 _LEAST_SCORE, _LEAST_MATCH = 0.2, 0.1
 """Of a feature, and of a match."""
-_INPUTS = {EXTRACTOR: {"image", "max_keypoints", "min_score"},
-           MATCHER: {"kpts0", "kpts1", "desc0", "desc1", "image_size0", "image_size1"}}  # fmt: skip
+_INPUTS = {"aliked": {"image", "max_keypoints", "min_score"},
+           "lightglue": {"kpts0", "kpts1", "desc0", "desc1", "image_size0", "image_size1"}}  # fmt: skip
 
 
 class LearnedFeatures:
@@ -96,6 +96,8 @@ def picture_features(
 
 
 def _required(store: ModelStore) -> Model:
+    if (here := store.first_here("features")) is not None:
+        return here
     model = store.get(EXTRACTOR)
     if not store.is_here(model):
         size = (model.bytes + store.get(model.needs).bytes) / 1e6
@@ -112,6 +114,6 @@ def _opened(store: ModelStore, model: Model) -> Runtime:
         raise InputError(f"{path}: is damaged; run: msgs-slam models pull {model.name}")
     # One thread each: pairs and images already go side by side, and results must not depend on how many there are.
     runtime = open_runtime(path, [], 1, "cpu")
-    if set(runtime.inputs) != _INPUTS[model.name]:
+    if set(runtime.inputs) != _INPUTS[model.family]:
         raise InputError(f"{path}: its inputs are {', '.join(runtime.inputs)}; another kind of file is needed")
     return runtime

@@ -1,7 +1,7 @@
 """Learned features, by networks of the real ones' names and shapes: patches of the picture, and their best partners.
 
-The real files cannot be had here. What is tested is all that is around them: padding, pixels, masks, packing, matching,
-and what is said where they are missing.
+What is tested with them is all that is around the networks: padding, pixels, masks, packing, matching, and what is said
+where they are missing. One test runs the published weights, where their files lie beside the repository.
 """
 
 import hashlib
@@ -18,11 +18,20 @@ import msgs_slam.pipelines.frames.learned as learned
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.correspondence.matching import match_descriptors
-from msgs_slam.pipelines.frames.learned import EXTRACTOR, MATCHER, LearnedFeatures, learned_inputs, open_learned
+from msgs_slam.pipelines.frames.learned import (
+    EXTRACTOR,
+    MATCHER,
+    LearnedFeatures,
+    learned_inputs,
+    open_learned,
+)
 from msgs_slam.pipelines.frames.stage import check
+from msgs_slam.pipelines.geometry.camera import project, unproject
+from msgs_slam.pipelines.masks.people import people_cards
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.types import Features
+from tests.world import ClipOptions, make_world, render_frame
 
 STEP, SIDE = 16, 128
 """The stand-in has a feature in each cell; the picture it is made for has this side after padding."""
@@ -149,12 +158,34 @@ def test_both_matchers_find_the_same_picture_and_not_another(store: ModelStore) 
     assert networks.match(first, none, (120, 100)).shape == (0, 2)
 
 
+def test_published_weights_find_the_same_places_from_far_apart(tmp_path: Path) -> None:
+    files = Path(__file__).resolve().parents[4] / "shared" / "data" / "models"
+    store = ModelStore.open(tmp_path)
+    models = store.with_needed([f"{EXTRACTOR}-export"])
+    if not files.is_dir() or len(store.take(files, models)) < 2:
+        pytest.skip("the files are not here")
+    clip = ClipOptions(frames=60, width=320, height=240)
+    world = make_world(texel=0.02)
+    first, second = (render_frame(world, clip, i) for i in (0, 7))
+    networks = LearnedFeatures(store)
+    a, b = (networks.extract(frame.rgb, 1000, None) for frame in (first, second))
+    matches = networks.match(a, b, (320, 240))
+    column, row = a.xy[matches[:, 0]].astype(int).T
+    points = unproject(a.xy[matches[:, 0]], first.depth[row, column].astype(float), clip.intrinsics)
+    moved = np.linalg.inv(second.world_from_cam) @ first.world_from_cam
+    there, _ = project(points @ moved[:3, :3].T + moved[:3, 3], clip.intrinsics)
+    right = np.linalg.norm(there - b.xy[matches[:, 1]], axis=1) < 3
+    assert right.sum() > 40
+    assert right.mean() > 0.7
+
+
 def test_networks_are_part_of_what_the_stage_is_made_from(store: ModelStore) -> None:
     asked = load_config(overrides=["frames.features=aliked"]).frames
     assert learned_inputs(asked) == {EXTRACTOR: store.get(EXTRACTOR).sha256, MATCHER: store.get(MATCHER).sha256}
     assert learned_inputs(FramesConfig()) == {}
     assert open_learned(FramesConfig()) is None
     assert isinstance(open_learned(asked), LearnedFeatures)
+    assert people_cards(store) is None, "they are no networks for people, and have no card"
     path = store.path(store.get(MATCHER))
     path.write_bytes(path.read_bytes()[:-1] + b"x")
     with pytest.raises(InputError, match=f"damaged; run: msgs-slam models pull {MATCHER}"):
@@ -165,6 +196,7 @@ def test_without_the_networks_the_stage_says_what_to_type(tmp_path: Path, monkey
     monkeypatch.setenv("MSGS_SLAM_CACHE", str(tmp_path / "empty"))
     for i in range(3):
         cv2.imwrite(str(tmp_path / f"{i}.png"), picture(i))
+    assert learned_inputs(FramesConfig()) == {}
     with pytest.raises(InputError, match=r"49 MB.*run: msgs-slam models pull aliked-n16rot"):
         check(tmp_path, load_config(overrides=["frames.features=aliked"]))
     check(tmp_path, load_config())
