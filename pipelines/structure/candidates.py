@@ -41,10 +41,9 @@ from msgs_slam.pipelines.types import Features
 
 _MIN_KEYFRAMES = 3
 _MIN_POINTS = 30
-LENS_HELD, NEIGHBOURS, GIVEN, GIVEN_ALONE = "global-lens-held", "neighbours", "given", "given-alone"
-_UNSURE_FOCAL = 0.03
+NEIGHBOURS, GIVEN, GIVEN_ALONE = "neighbours", "given", "given-alone"
 _AS_GOOD = 0.98
-"""The second attempt's share of the first one's score, from which it is as good and its surer focal length decides."""
+"""Share of the score of a stated camera's model, from which that of a camera found anew is as good."""
 _Tried = tuple[pycolmap.Reconstruction, str, ModelReport]
 """A model, the mapper that made it, and how good it is."""
 
@@ -97,7 +96,7 @@ class Candidates:
     def _calibrated(self, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
         """The best model; of a stated camera the model of one that is found anew, where that explains the images
         much better, or where the stated one gives none."""
-        held = self._self_calibrated(views, pairs)
+        held = self._best(views, pairs)
         if not self.is_stated:
             return held
         if held is not None:
@@ -118,25 +117,13 @@ class Candidates:
         snapshots = Snapshots(self.snapshots.folder / f"freed_from_{start}")
         snapshots.folder.mkdir(exist_ok=True)
         camera = unknown_camera(width, height, focal, is_prior)
-        return replace(self, camera=camera, is_fixed=False, is_stated=False, snapshots=snapshots)._self_calibrated(
-            views, pairs
-        )
+        return replace(self, camera=camera, is_fixed=False, is_stated=False, snapshots=snapshots)._best(views, pairs)
 
-    def _self_calibrated(self, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
-        """The best model; of two where the first is not sure of its camera."""
-        mappers = ("global", "incremental", GIVEN)
-        found = self._adjusted(views, pairs, (GIVEN, *mappers[:2]) if self.is_extension else mappers)
-        if found is not None and found.focal_sd > _UNSURE_FOCAL * found.model.cameras[1].mean_focal_length():
-            # A lens that is bent before the poses are stable can run away with the focal length.
-            again = self._adjusted(views, pairs, (LENS_HELD,))
-            if again is not None and again.focal_sd < found.focal_sd and again.score >= _AS_GOOD * found.score:
-                return again
-        return found
-
-    def _adjusted(self, views: Views, pairs: Sequence[VerifiedPair], mappers: Sequence[str]) -> Adjusted | None:
+    def _best(self, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
         """The best model, its camera calibrated unless it is fixed; with the readout of a rolling shutter, where one is
         given or the model shows it."""
-        found = self._map(views, pairs, mappers)
+        mappers = ("global", "incremental")
+        found = self._map(views, pairs, (GIVEN, *mappers) if self.is_extension else (*mappers, GIVEN))
         if found is None:
             return None
         model, mapper, report = found
@@ -254,7 +241,7 @@ class Candidates:
             calibrate_focal(database, self.seed)
         if name == "incremental":
             return map_incrementally(database, work, not self.is_fixed, self.seed)
-        return map_globally(database, work, not self.is_fixed, self.seed, bend_lens=name != LENS_HELD)
+        return map_globally(database, work, not self.is_fixed, self.seed)
 
     def _places(self, views: Sequence[object]) -> int:
         return len(views) // len(self.cam_from_rig)

@@ -25,11 +25,8 @@ def calibrate_focal(database: Path, seed: int) -> None:
     pycolmap.calibrate_view_graph(database, options)
 
 
-def map_globally(
-    database: Path, work: Path, refine_camera: bool, seed: int, bend_lens: bool = True
-) -> pycolmap.Reconstruction | None:
-    """Poses of all images at once (Pan et al., Global Structure-from-Motion Revisited, ECCV 2024); None on failure.
-    The camera's distortion stays as it is unless `bend_lens`."""
+def map_globally(database: Path, work: Path, refine_camera: bool, seed: int) -> pycolmap.Reconstruction | None:
+    """Poses of all images at once (Pan et al., Global Structure-from-Motion Revisited, ECCV 2024); None on failure."""
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     mapper = options.mapper
@@ -39,7 +36,7 @@ def map_globally(
     mapper.bundle_adjustment.refine_focal_length = refine_camera
     # Half the time, on two recordings the same poses: the longest tracks hold the views together as well as all do,
     # and the last adjustment has all of them again.
-    mapper.bundle_adjustment.refine_extra_params = refine_camera and bend_lens
+    mapper.bundle_adjustment.refine_extra_params = refine_camera
     mapper.refine_sensor_from_rig = mapper.bundle_adjustment.refine_sensor_from_rig = False
     mapper.track_required_tracks_per_view, mapper.ba_num_iterations = 300, 2
     if not refine_camera:

@@ -11,7 +11,6 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
-import pycolmap
 import pytest
 
 from msgs_slam.formats.errors import DiskFullError, InputError
@@ -26,8 +25,7 @@ from msgs_slam.pipelines.run.folder import BACKBONE, SPARSE, RunFolder, save_spa
 from msgs_slam.pipelines.run.layouts import dataclass_from_json
 from msgs_slam.pipelines.run.sparse_files import load_sparse_model
 from msgs_slam.pipelines.source.opening import source_digest
-from msgs_slam.pipelines.structure import candidates, sfm
-from msgs_slam.pipelines.structure.adjust import adjust
+from msgs_slam.pipelines.structure import sfm
 from msgs_slam.pipelines.structure.window_size import windows_of
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration
@@ -294,27 +292,6 @@ def test_an_unreadable_image_is_left_out_with_a_warning(
     assert figures["keyframes_placed"] == figures["keyframes"]
     assert any("view_004.png" in w for w in context.warnings)
     assert not (context.folder / "view_004.png").exists()
-
-
-def test_a_focal_length_that_ran_away_is_found_again_with_the_lens_held(
-    bent_walk: Walk, make_context: Callable[..., StageContext], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The first attempt is made to look unsure; the second must be asked for, be as good, and be taken."""
-    sure = []
-
-    def adjust_unsure(model: pycolmap.Reconstruction, refine_camera: bool, narrowly: bool) -> float:
-        sure.append(adjust(model, refine_camera, narrowly))
-        return sure[0] + 0.1 * bent_walk.focal if len(sure) == 1 else sure[-1]
-
-    monkeypatch.setattr(candidates, "adjust", adjust_unsure)
-    context = make_context(bent_walk.folder)
-    figures = run(context)
-    assert figures["mapper"] == candidates.LENS_HELD
-    assert len(sure) == 2
-    assert figures["keyframes_placed"] == figures["keyframes"]
-    focal, k1 = read_json(context.folder / "calibration.json")["intrinsics"]["fx"], bent_walk.k1
-    assert abs(focal / bent_walk.focal - 1) < 0.02
-    assert read_json(context.folder / "calibration.json")["distortion"][0] == pytest.approx(k1, abs=0.03)
 
 
 def test_what_shows_another_place_is_a_piece_of_its_own(
