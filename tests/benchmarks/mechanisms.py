@@ -1,0 +1,185 @@
+"""What each mechanism of structure from motion is worth: where it acts, and the poses with it switched off.
+
+    python tests/benchmarks/mechanisms.py --keep DIR                        all recordings, features and matches kept
+    python tests/benchmarks/mechanisms.py --keep DIR kitchen house_portrait [--only unfolding readout]
+
+Each recording is mapped once with everything, then once more without each mechanism that acted (the others change
+nothing there). Features and matches are made once and shared. ATE in centimetres over placed keyframes; seconds of CPU.
+"""
+
+# ruff: noqa: E402 (the packages are found only once the path is set)
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+import numpy as np
+from poses import compare, recordings
+from tracking import Case, in_process, original_names, prepare
+
+from msgs_slam.pipelines.correspondence.snapshots import Snapshots
+from msgs_slam.pipelines.engine.stages import StageContext
+from msgs_slam.pipelines.frames import stage as frames_stage
+from msgs_slam.pipelines.frames import tasks
+from msgs_slam.pipelines.frames.picking import pick_frames
+from msgs_slam.pipelines.geometry.rig import ONE_CAMERA
+from msgs_slam.pipelines.read_config import load_config
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.source.opening import open_source
+from msgs_slam.pipelines.structure import candidates, sfm
+from msgs_slam.pipelines.structure.backbone import pose_of
+from msgs_slam.pipelines.system.progress import SilentProgress
+
+SMALL = ("replica", "kitchen", "whiteroom", "fr1_rpy", "house_portrait", "corridor", "office_loop", "bedroom")
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """`owner.name` is what does it; off(arguments) is what it returns where it is switched off; acted(result,
+    arguments): whether it did anything."""
+
+    owner: Any
+    name: str
+    off: Callable[..., Any]
+    acted: Callable[[Any, tuple[Any, ...]], bool]
+
+
+def _same(position: int) -> Callable[..., Any]:
+    return lambda *arguments: arguments[position]
+
+
+_MAP = candidates.Candidates._map
+
+
+def _first_mapper(self: Any, views: Any, pairs: Any, names: tuple[str, ...] = ("global",)) -> Any:
+    return _MAP(self, views, pairs, names[:1])
+
+
+MECHANISMS = {
+    "second mapper": Mechanism(
+        candidates.Candidates, "_map", _first_mapper,
+        lambda found, _: found is not None and found[1] != "global",
+    ),
+    "misplaced removed": Mechanism(
+        candidates, "without_misplaced", _same(0), lambda out, a: out.num_reg_images() < a[0].num_reg_images()
+    ),
+    "bridges": Mechanism(sfm, "weakly_connected", lambda *_: [], lambda weak, _: bool(weak)),
+    "mending of size": Mechanism(
+        candidates, "mended", lambda model, report, *_: (model, report), lambda out, a: out[0] is not a[0]
+    ),
+    "unfolding": Mechanism(candidates.Candidates, "_unfolded", lambda *_: None, lambda found, _: found is not None),
+    "closing": Mechanism(candidates.Candidates, "_closed", _same(1), lambda out, a: out is not a[1]),
+    "growing": Mechanism(candidates.Candidates, "_grown", _same(1), lambda out, a: out is not a[1]),
+    "readout": Mechanism(candidates, "adjust_rolling", lambda *_: None, lambda out, _: out is not None),
+    "freeing": Mechanism(candidates.Candidates, "_freed", lambda *_: None, lambda found, _: found is not None),
+    "pieces": Mechanism(sfm.StructureFromMotion, "_pieces", lambda *_: [], lambda found, _: bool(found)),
+}  # fmt: skip
+
+
+@contextmanager
+def watched(acting: set[str]) -> Iterator[None]:
+    """Collect the names of the mechanisms that act in this block."""
+    with ExitStack() as stack:
+        for name, m in MECHANISMS.items():
+            original = getattr(m.owner, m.name)
+
+            def spy(*arguments: Any, _of: Any = original, _m: Mechanism = m, _name: str = name, **more: Any) -> Any:
+                result = _of(*arguments, **more)
+                if _m.acted(result, arguments):
+                    acting.add(_name)
+                return result
+
+            stack.enter_context(patch.object(m.owner, m.name, spy))
+        yield
+
+
+def begun(case: Case, source: Path, folder: Path) -> tuple[sfm.StructureFromMotion, list[Any], list[int]]:
+    """Structure from motion of a source, its frames and keyframes; pictures, features and matches stay in `folder`."""
+    config = load_config(overrides=["run.threads=1", *case.settings])
+    context = StageContext(RunFolder(folder / "no.msgs"), source, config, folder, SilentProgress())
+    opened = open_source(source, config.run.format)
+    camera, origin = tasks.known_camera(context, opened, None)
+    frames = pick_frames(context, opened, None)
+    masks = tasks.masks_of(context, opened, None, ONE_CAMERA)
+    keyframes = frames_stage._keyframes(context, frames, masks, ONE_CAMERA)
+    return tasks.structure_from_motion(context, camera, origin, frames, masks, ONE_CAMERA, None), frames, keyframes
+
+
+def measured(name: str, form: str, off: str, work: Path) -> dict[str, Any]:
+    """One row, in a process of its own, without the mechanism `off` ("" for none)."""
+    case = recordings(work)[name][form]
+    source, folder = prepare(name, case, work), work / f"{name}_{form}"
+    folder.mkdir(exist_ok=True)
+    structure, frames, keyframes = begun(case, source, folder)
+    structure.pairs_of(features := structure.features_of(keyframes), structure._proposed(features, _words(features)))
+    apart = folder / "without" / (off.replace(" ", "_") or "nothing")
+    apart.mkdir(parents=True, exist_ok=True)
+    for shared in ("features", "pairs"):
+        if not (apart / shared).exists():
+            (apart / shared).symlink_to((structure.snapshots.folder / shared).resolve())
+    acting: set[str] = set()
+    started = time.process_time()
+    m = MECHANISMS.get(off)
+    with patch.object(m.owner, m.name, m.off) if m else watched(acting):
+        found = replace(structure, snapshots=Snapshots(apart)).run(keyframes)
+    ids = sorted(found.model.reg_image_ids())
+    poses = np.array([pose_of(found.model.images[i]) for i in ids])
+    originals = original_names(source, frames) if form != "set" else [""] * len(frames)
+    chosen = [frames[keyframes[i - 1]] for i in ids]
+    truth = [case.truth(originals[f.id], f.source_index) for f in chosen]
+    r, seconds = found.report, time.process_time() - started
+    return {
+        "acting": sorted(acting), "placed": r.registered, "of": r.total, "part": len(r.parts[0]),
+        "mapper": found.mapper, "agreeing": r.pairs_agreeing, "seconds": seconds, **compare(poses, truth),
+        "pieces": [p.num_reg_images() for p in found.pieces],
+    }  # fmt: skip
+
+
+def _words(features: Any) -> Any:
+    from msgs_slam.pipelines.correspondence.retrieval import learn_vocabulary
+
+    return learn_vocabulary(features, 0)
+
+
+def print_row(name: str, off: str, row: dict[str, Any]) -> None:
+    """One line."""
+    if "failed" in row:
+        print(f"{name:16} {off:18} {row['failed'][:100]}", flush=True)
+        return
+    size = f"{row['placed']:>4}/{row['of']} {row['part']:>4} {row.get('ate_cm', '-')!s:>8}"
+    more = f"{row['mapper']} {row['pieces'] or ''} {', '.join(row['acting'])}"
+    print(f"{name:16} {off or '(nothing)':18} {size} {row['agreeing']:.3f} {row['seconds']:6.0f}  {more}", flush=True)
+
+
+def main() -> None:
+    """Parse, run, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recordings", nargs="*", metavar="RECORDING[:FORM]")
+    parser.add_argument("--keep", type=Path, required=True, help="folder for features and matches")
+    parser.add_argument("--only", nargs="*", choices=MECHANISMS, help="these, whether they act or not")
+    arguments = parser.parse_args()
+    work = arguments.keep.resolve()
+    work.mkdir(exist_ok=True)
+    print(f"{'recording':16} {'without':18} placed part  ATE cm  agree  CPU s  mapper, pieces, what acts")
+    for wanted in arguments.recordings or SMALL:
+        name, _, form = wanted.partition(":")
+        form = form or next(iter(recordings(work)[name]))
+        whole = in_process(measured, name, form, "", work)
+        print_row(name, "", whole)
+        for off in arguments.only or whole.get("acting", []):
+            print_row(name, off, in_process(measured, name, form, off, work))
+
+
+if __name__ == "__main__":
+    main()
