@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 FLOOR_PLAN = "floorplan.svg"
 _WIDTH, _MARGIN, _FOOT = 900, 60, 70
+_SIGNS = "≥: an end of this wall was not seen. ≈: it meets the next one at a flat angle, so its length is uncertain."
 _STYLE = (
     "text{font:14px system-ui,sans-serif;fill:#111;text-anchor:middle}.n{text-anchor:start;fill:#555;font-size:12px}"
     ".w{stroke:#111;stroke-width:5;stroke-linecap:round}.o{stroke:#111;stroke-width:2;stroke-dasharray:3 4}"
@@ -73,7 +74,7 @@ def floor_plan(walls: list[Wall], path: Array, title: str, per_unit: float, unit
         return np.asarray((at - low) * scale * (1, -1) + (_MARGIN, height - _MARGIN))
 
     way = " ".join(f"{x:.1f},{y:.1f}" for x, y in place(path[:, :2]))
-    notes = enumerate(["≥: an end of this wall was not seen.", f"{about[0].upper()}{about[1:]}." if about else ""])
+    notes = enumerate([_SIGNS, f"{about[0].upper()}{about[1:]}." if about else ""])
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {max(width, 420):.0f} {height + _FOOT:.0f}">',
         f"<title>{escape(title)}: floor plan</title><style>{_STYLE}</style>",
@@ -99,7 +100,7 @@ def _drawn(wall: Wall, ends: Array, per_unit: float, unit: str) -> str:
     turn = float(np.degrees(np.arctan2(y2 - y1, x2 - x1)))
     turn = turn - 180 if turn > 90 else turn + 180 if turn < -90 else turn
     x, y = ends.mean(axis=0) + 16 * outside
-    told = f"{'' if wall.is_whole else '≥ '}{wall.length * per_unit:.2f} {unit}"
+    told = f"{wall.sign}{wall.length * per_unit:.2f} {unit}"
     parts.append(f'<text transform="translate({x:.1f} {y:.1f}) rotate({turn:.1f})" dy="5">{told}</text>')
     return "".join(parts)
 

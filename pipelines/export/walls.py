@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise, permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +20,16 @@ _SQUARE = np.radians(3)
 """Directions that are so nearly at right angles are."""
 _STEPS = 60
 """Of the room's height: a wall is one thick, twice that where pictures hang on it."""
+_ROUGH = 0.03
+"""Lengths that are less certain are approximate."""
 _LAYERS, _LEAST_LAYERS = 20, 8
 """Of the room's height: a column of a wall shows so many."""
 _FITS = 8
 _LEAST_SHARE, _LEAST_AREA = 0.08, 0.045
 """A direction's area, of that of the strongest; a plane's, in squared heights of the room."""
-_GAP, _LEAST_LENGTH, _CORNER, _IN_FRONT = 0.7, 0.3, 0.4, 0.35
+_BETWEEN, _COVERED = 0.5, 0.9
+"""In heights of the room: the longest wall that is looked for between two ends; and how much of it has to be seen."""
+_SMALL_GAP, _GAP, _LEAST_LENGTH, _CORNER, _IN_FRONT = 0.1, 0.7, 0.3, 0.4, 0.35
 """In heights of the room: openings and furniture that a wall goes on behind, shorter is no wall, ends that meet, and
 how far a cupboard stands before the wall that it hides."""
 
@@ -32,15 +37,23 @@ how far a cupboard stands before the wall that it hides."""
 @dataclass(frozen=True)
 class Wall:
     """ends (2, 2) on the floor; the side that is seen lies to the left of the way from the first to the second.
-    corners: which ends are where another wall meets; the others are where no more was seen."""
+    corners: which ends are where another wall meets; the others are where no more was seen. blur: how far the corners
+    may lie from there along the wall, both together."""
 
     ends: Array
     corners: tuple[bool, bool] = (False, False)
+    blur: float = 0.0
 
     @property
     def is_whole(self) -> bool:
         """Whether both ends are corners, so that its length is that of the wall."""
         return all(self.corners)
+
+    @property
+    def sign(self) -> str:
+        """What stands before its length: ≥ where an end was not seen, ≈ where it meets its neighbours at flat angles,
+        as the sides of a bay do, so that its ends are uncertain."""
+        return "≥ " if not self.is_whole else "≈ " if self.blur > _ROUGH * self.length else ""
 
     @property
     def length(self) -> float:
@@ -105,9 +118,9 @@ def find_walls(vertices: NDArray, faces: NDArray) -> list[Wall]:
         walls += [
             Wall(found.place + np.array([[start], [end]]) * found.along) for start, end in _stretches(here, found)
         ]
-    walls = _without_doubles(walls, upright.height)
-    walls = _without_doubles(_meeting(_without_cupboards(walls, upright.height), upright.height), upright.height)
-    return sorted(walls, key=lambda wall: -wall.length)
+    walls = _without_cupboards(_without_doubles(walls, upright.height), upright.height)
+    walls = _without_doubles(walls + _between_ends(walls, upright), upright.height)
+    return _without_doubles(_meeting(walls, upright.height), upright.height)
 
 
 def _upright_faces(vertices: NDArray, faces: NDArray) -> _Faces:
@@ -164,40 +177,99 @@ def _strongest_line(faces: _Faces, angle: float) -> _Line:
         place = np.average(faces.centers[near, :2], axis=0, weights=faces.area[near])
         away = (faces.centers[near, :2] - place) * np.sqrt(faces.area[near])[:, None]
         along = np.linalg.eigh(away.T @ away)[1][:, 1]
+        along = _not_across(along, np.array([normal[1], -normal[0]]))
         near = np.abs((faces.centers[:, :2] - place) @ (-along[1], along[0])) < 2 * step
     area = float(faces.area[near].sum())
-    along = along * np.sign(along @ (normal[1], -normal[0]))
     return _Line(area if area > least else 0.0, angle, place, along)
+
+
+def _not_across(along: Array, expected: Array) -> Array:
+    """The fitted direction, the way of the expected one; the expected one where it leans too far from it, as the line
+    through two walls that stand one behind the other does."""
+    along = along * np.sign(along @ expected or 1.0)
+    return along if along @ expected > np.cos(_APART) else expected
+
+
+def _full_columns(faces: _Faces, t: Array) -> NDArray[np.int64]:
+    """Columns, two steps wide along `t` (F,) from its least, that reach over enough of the room's height."""
+    layer = np.clip((faces.centers[:, 2] - faces.low) / faces.height * _LAYERS, 0, _LAYERS - 1)
+    column = np.floor((t - t.min()) / (2 * faces.height / _STEPS)).astype(int)
+    shown = np.zeros((column.max() + 1, _LAYERS), bool)
+    shown[column, layer.astype(int)] = True
+    return np.flatnonzero(shown.sum(axis=1) >= _LEAST_LAYERS)
+
+
+def _between_ends(walls: list[Wall], faces: _Faces) -> list[Wall]:
+    """Short walls from the end of one to the beginning of another, where a surface stands on most of the way: they are
+    what cuts off the corner that the two would have."""
+    found = []
+    step = faces.height / _STEPS
+    for first, second in permutations(walls, 2):
+        wall = Wall(np.stack([first.ends[1], second.ends[0]]))
+        if not 3 * step < wall.length < _BETWEEN * faces.height or _touch(first, second, step):
+            continue
+        away, looks = faces.centers[:, :2] - wall.ends[0], np.stack([np.cos(faces.angle), np.sin(faces.angle)], axis=1)
+        t = away @ wall.along
+        here = (np.abs(away @ wall.normal) < 2 * step) & (t >= 0) & (t <= wall.length)
+        here &= looks @ wall.normal > _SAME_WAY
+        if here.any() and len(_full_columns(faces.only(here), t[here])) * 2 * step > _COVERED * wall.length:
+            found.append(wall)
+    return found
+
+
+def _touch(first: Wall, second: Wall, step: float) -> bool:
+    """Whether the end of the first and the beginning of the second reach the place where the two lines cross."""
+    if abs(first.along @ second.normal) < np.sin(_APART):
+        return False
+    place = _crossing(first, second)
+    short = (place - first.ends[1]) @ first.along, (second.ends[0] - place) @ second.along
+    return bool(max(short) < 2 * step)
 
 
 def _stretches(faces: _Faces, line: _Line) -> list[tuple[float, float]]:
     """Where along a plane its columns reach over enough of the room's height; gaps are closed."""
     step, t = faces.height / _STEPS, (faces.centers[:, :2] - line.place) @ line.along
-    layer = np.clip((faces.centers[:, 2] - faces.low) / faces.height * _LAYERS, 0, _LAYERS - 1)
-    column = np.floor((t - t.min()) / (2 * step)).astype(int)
-    shown = np.zeros((column.max() + 1, _LAYERS), bool)
-    shown[column, layer.astype(int)] = True
-    full = np.flatnonzero(shown.sum(axis=1) >= _LEAST_LAYERS)
+    full = _full_columns(faces, t)
     if len(full) == 0:
         return []
-    cuts = np.flatnonzero(np.diff(full) * 2 * step > _GAP * faces.height)
+    cuts = np.flatnonzero(np.diff(full) * 2 * step > _SMALL_GAP * faces.height)
     starts, ends = full[np.append(0, cuts + 1)], full[np.append(cuts, len(full) - 1)] + 1
     found = [(t.min() + 2 * step * a, t.min() + 2 * step * b) for a, b in zip(starts, ends, strict=True)]
+    found = _over_gaps(found, _GAP * faces.height)
     return [(a, b) for a, b in found if b - a > _LEAST_LENGTH * faces.height]
 
 
+def _over_gaps(pieces: list[tuple[float, float]], most: float) -> list[tuple[float, float]]:
+    """Neighbours joined, the closest first, where the gap is shorter than `most` and than each of the two."""
+    pieces = list(pieces)
+    while True:
+        gaps = [
+            (b[0] - a[1], k)
+            for k, (a, b) in enumerate(pairwise(pieces))
+            if b[0] - a[1] < min(most, a[1] - a[0], b[1] - b[0])
+        ]
+        if not gaps:
+            return pieces
+        _, k = min(gaps)
+        pieces[k : k + 2] = [(pieces[k][0], pieces[k + 1][1])]
+
+
 def _without_doubles(walls: list[Wall], height: float) -> list[Wall]:
-    """Those of which not most lies on a longer one that looks about the same way."""
+    """Those of which not most lies on one as long or longer that looks about the same way, longest first."""
 
     def on(short: Wall, long: Wall) -> bool:
-        if short.length >= long.length or short.normal @ long.normal < _SAME_WAY:
+        if short.normal @ long.normal < _SAME_WAY:
             return False
         away = short.ends[0] + np.linspace(0, 1, 21)[:, None] * (short.ends[1] - short.ends[0]) - long.ends[0]
         beside = np.abs(away @ long.normal) < _BESIDE * height
         inside = (away @ long.along > -_BESIDE * height) & (away @ long.along < long.length + _BESIDE * height)
         return bool((beside & inside).mean() > 0.5)
 
-    return [wall for wall in walls if not any(on(wall, other) for other in walls)]
+    kept: list[Wall] = []
+    for wall in sorted(walls, key=lambda wall: -wall.length):
+        if not any(on(wall, longer) for longer in kept):
+            kept.append(wall)
+    return kept
 
 
 def _without_cupboards(walls: list[Wall], height: float) -> list[Wall]:
@@ -218,19 +290,20 @@ def _without_cupboards(walls: list[Wall], height: float) -> list[Wall]:
 def _meeting(walls: list[Wall], height: float) -> list[Wall]:
     """Ends that lie close to where two walls cross are moved there, the closest first."""
     options = []
+    step = height / _STEPS
     for i, first in enumerate(walls):
         for j in range(i):
             second = walls[j]
             if abs(first.along @ second.normal) < np.sin(_APART):
                 continue
             place = _crossing(first, second)
-            k, m = (int(np.linalg.norm(w.ends - place, axis=1).argmin()) for w in (first, second))
-            far = max(np.linalg.norm(first.ends[k] - place), np.linalg.norm(second.ends[m] - place))
-            if far < _CORNER * height:
-                options.append((float(far), (i, k), (j, m), place))
+            (k, far), (m, too) = (_nearest_end(w, place) for w in (first, second))
+            flat = 1 / abs(float(first.along @ second.normal))
+            if max(far, too) < _CORNER * height and min(far, too) > -3 * step * (1 + flat):
+                options.append((max(abs(far), abs(too)), (i, k), (j, m), place, flat * step / 2))
     done: set[tuple[int, int]] = set()
     walls = list(walls)
-    for _, one, other, place in sorted(options, key=lambda option: option[0]):
+    for _, one, other, place, blur in sorted(options, key=lambda option: option[0]):
         if {one, other} & done:
             continue
         done |= {one, other}
@@ -238,8 +311,15 @@ def _meeting(walls: list[Wall], height: float) -> list[Wall]:
             ends = walls[number].ends.copy()
             ends[end] = place
             met = [end == k or walls[number].corners[k] for k in (0, 1)]
-            walls[number] = replace(walls[number], ends=ends, corners=(met[0], met[1]))
+            blurred = walls[number].blur + blur
+            walls[number] = replace(walls[number], ends=ends, corners=(met[0], met[1]), blur=blurred)
     return walls
+
+
+def _nearest_end(wall: Wall, place: Array) -> tuple[int, float]:
+    """The end nearest to a place on the wall's line, and how far the wall would have to grow to it (or shrink: < 0)."""
+    beyond = float((place - wall.ends.mean(axis=0)) @ wall.along)
+    return int(beyond > 0), abs(beyond) - wall.length / 2
 
 
 def _crossing(first: Wall, second: Wall) -> Array:

@@ -240,7 +240,7 @@ class Viewer:
         lines = ends.astype(np.float32)
         self.server.scene.add_line_segments("/walls/lines", lines, _RED, thickness=4.0, thickness_units="screen")
         for number, wall in enumerate(walls):
-            told = f"{'' if wall.is_whole else '≥ '}{length_text(wall.length, self.scene)}"
+            told = f"{wall.sign}{length_text(wall.length, self.scene)}"
             self.server.scene.add_label(f"/walls/{number}", told, position=ends[number].mean(axis=0))
 
     def _add_camera(self, number: int, camera: ViewerCamera) -> Any:

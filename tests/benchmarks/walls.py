@@ -58,8 +58,9 @@ def main() -> None:
     move = align_points(matched.world_from_cam[rows, :3, 3], t.centers[rows])
     for name, walls in (("true", true_walls(truth, move)), ("found", walls_of_run(run))):
         for wall in walls:
+            told = ", not whole" if not wall.is_whole else f" ± {wall.blur / move.scale:.2f}"
             ends = ", ".join(f"{v:.2f}" for v in wall.ends.ravel())
-            print(f"{name}: {wall.length / move.scale:.3f} m{'' if wall.is_whole else ', not whole'} ({ends})")
+            print(f"{name}: {wall.length / move.scale:.3f} m{told} ({ends})")
 
 
 if __name__ == "__main__":

@@ -21,6 +21,9 @@ from msgs_slam.pipelines.upright.world import SAME, World, save_world
 OracleRun = Callable[..., RunFolder]
 ROOM = np.array([[0.0, 0], [6.4, 0], [6.4, 3.1], [4.2, 3.1], [4.2, 5.2], [0, 5.2]])
 """An L, counterclockwise."""
+_HALF = np.array([[0.0, 5], [1.3, 5], [1.3, 5.25], [2.4, 5.95]])
+BAY = np.concatenate([[[0, 0], [6, 0]], (6, 0) + _HALF * (-1, 1), _HALF[::-1]])
+"""A room with a bay window between two short walls, its sides behind the corners."""
 
 
 def room(noise: float, degrees: float = 0.0) -> trimesh.Trimesh:
@@ -53,6 +56,29 @@ def test_walls_are_as_long_as_they_are(noise: float, degrees: float) -> None:
     middle = Rotation.from_euler("z", degrees, degrees=True).apply([1.5, 2.5, 0])[:2]
     for wall in walls[:2]:
         assert (middle - wall.ends[0]) @ wall.normal > 0
+
+
+def test_a_bay_window_does_not_take_the_walls_beside_it() -> None:
+    sheets = [sheet(a, b, 0, 2.6) for a, b in zip(BAY, np.roll(BAY, -1, axis=0), strict=True)]
+    mesh = trimesh.util.concatenate(sheets)
+    mesh.vertices += np.random.default_rng(0).normal(size=mesh.vertices.shape) * 0.008
+    walls = find_walls(mesh.vertices, mesh.faces)
+    np.testing.assert_allclose([wall.length for wall in walls[:3]], [6, 5, 5], rtol=0.01)
+    assert [wall.sign for wall in walls[:3]] == ["", "", ""]
+    assert {wall.sign for wall in walls[3:]} == {"≈ ", "≥ "}
+    seen = 0
+    for a, b in zip(BAY, np.roll(BAY, -1, axis=0), strict=True):
+        true = np.linalg.norm(b - a)
+        seen += any(np.abs(w.ends - (a, b)).max() < 0.15 and abs(w.length - true) < 0.15 for w in walls)
+    assert seen == len(walls) == len(BAY) - 1  # one of the two pieces of 25 cm is missed
+
+
+def test_pieces_far_apart_are_no_wall() -> None:
+    """Two short sheets that happen to stand in line, in the middle of nothing."""
+    sheets = [sheet(ROOM[k], ROOM[(k + 1) % 6], 0, 2.6) for k in range(6)]
+    sheets += [sheet(np.array([x, 2.0]), np.array([x + 0.5, 2.0]), 0, 1.6) for x in (1.0, 2.4)]
+    mesh = trimesh.util.concatenate(sheets)
+    assert len(find_walls(mesh.vertices, mesh.faces)) == 6
 
 
 def test_a_wall_that_ends_unseen_says_so_and_nothing_upright_is_none() -> None:
