@@ -88,16 +88,23 @@ def evaluate(
 @click.option(
     "--to", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Default: report.html in the run."
 )
+@click.option("--pdf", is_flag=True, help="Print it beside as a PDF, too; needs Chromium or Chrome.")
 @verbosity_options
-def report(run_path: Path, to: Path | None, quiet: bool, verbose: bool) -> None:
+def report(run_path: Path, to: Path | None, pdf: bool, quiet: bool, verbose: bool) -> None:
     """Write one HTML file that says what was found, how good it is, and what to film better."""
     set_up_logging(quiet, verbose)
+    from msgs_slam.pipelines.evaluation.pdf import find_browser, print_pdf
     from msgs_slam.pipelines.evaluation.report import write_report
 
+    browser = find_browser() if pdf else ""
     with ending_quietly():
-        made = write_report(open_run(run_path), to, make_progress(quiet))
-    say(made)
-    tell_result(quiet, report=made)
+        made = [write_report(open_run(run_path), to, make_progress(quiet))]
+        if pdf:
+            made.append(made[0].with_suffix(".pdf"))
+            print_pdf(made[0], made[1], browser)
+    for path in made:
+        say(path)
+    tell_result(quiet, report=made[0], **dict(zip(["pdf"], made[1:], strict=False)))
 
 
 SPLAT_FILES = (".ply", ".spz", ".glb", ".splat", ".safetensors")
