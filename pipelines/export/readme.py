@@ -94,6 +94,12 @@ _ENTRIES = (
         "texture", f"{_SET.format('texture')}, or {_ONLY.format('texture')}",
     ),
     Entry(
+        "collision.glb",
+        "the surface to walk in, without colours: at most 20,000 triangles, and a floor without holes where one was "
+        "found. Game engines, PlayCanvas.",
+        "collision", _ONLY.format("collision"),
+    ),
+    Entry(
         "floorplan.svg", "the walls seen from above, with their lengths, and the camera's path. Browsers, Inkscape.",
         "floorplan", _ONLY.format("floorplan"),
     ),

@@ -15,6 +15,7 @@ from msgs_slam.formats.mesh import mesh_blocks, read_mesh_ply, write_mesh_glb, w
 from msgs_slam.pipelines.config import Config, ExportConfig
 from msgs_slam.pipelines.engine.chunks import in_chunks
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
+from msgs_slam.pipelines.export.collision import write_collision
 from msgs_slam.pipelines.export.floor_plan import write_floor_plan
 from msgs_slam.pipelines.export.joined import joined
 from msgs_slam.pipelines.export.mesh import (
@@ -266,6 +267,7 @@ def export_run(
         "html": lambda: write_web_page(outcome, world, folder),
         "mesh": lambda: mesh("mesh"),
         "texture": lambda: mesh("texture"),
+        "collision": lambda: write_collision(found, world, folder),
         "floorplan": lambda: write_floor_plan(found, folder),
         "tum": lambda: write_trajectory(outcome, folder),
     }

@@ -32,7 +32,7 @@ SMALL = (
 FILES = {
     "colmap": "sparse/0/images.bin", "ply": "point_cloud.ply", "spz": "point_cloud.spz", "sog": "point_cloud.sog",
     "glb": "point_cloud.glb", "mesh": "mesh.ply", "texture": "mesh_textured.glb", "tum": "trajectory.txt",
-    "html": "map.html", "tiles": "tiles/tileset.json", "floorplan": "floorplan.svg",
+    "html": "map.html", "tiles": "tiles/tileset.json", "floorplan": "floorplan.svg", "collision": "collision.glb",
 }  # fmt: skip
 
 
