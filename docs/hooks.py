@@ -24,6 +24,9 @@ _SHIM = "https://unpkg.com/iframe-worker/shim"
 _COLUMNS = 78
 """As wide as the page."""
 
+_ANY = {"bool": "true &#124; false", "str": "text"}
+"""What a setting of that type may be where nothing else restricts it."""
+
 
 def on_files(files: Files, config: Any) -> Files:
     """Adds commands.md and settings.md."""
@@ -76,6 +79,7 @@ def settings_page() -> str:
         parts.append("| --- | --- | --- | --- |")
         defaults = config_to_dict(values)
         for f in fields(values):
-            cells = (f"`{f.name}`", f"`{defaults[f.name]!r}`", allowed_values(f), f.metadata["help"])
+            may_be = allowed_values(f) or _ANY[str(f.type)]
+            cells = (f"`{f.name}`", f"`{defaults[f.name]!r}`", may_be, f.metadata["help"])
             parts.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join(parts) + "\n"

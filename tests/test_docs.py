@@ -159,6 +159,7 @@ def test_settings_page_has_every_setting() -> None:
     for section in fields(Config):
         for key in fields(getattr(Config(), section.name)):
             assert f"| `{key.name}` |" in page.split(f"## {section.name}\n")[1].split("\n## ")[0], key.name
+    assert not re.findall(r"^\| `\w+` \| `[^|]*` \|  \|", page, flags=re.MULTILINE)  # what each may be
 
 
 def test_dockerfile_copies_what_is_here_and_asks_for_the_same_torch() -> None:
