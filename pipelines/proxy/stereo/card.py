@@ -14,7 +14,9 @@ from torch import Tensor
 import msgs_slam.pipelines.gaussians.render.cards as cards
 import msgs_slam.pipelines.proxy.stereo.matching as rules
 from msgs_slam.pipelines.proxy.stereo.refine import ALIKE
-from msgs_slam.pipelines.proxy.stereo.smoothing import DIRECTIONS, path_starts
+from msgs_slam.pipelines.proxy.stereo.smoothing import DIRECTIONS, UNREACHED, path_starts, tried_ranges
+from msgs_slam.pipelines.proxy.stereo.sweep import UNTRIED
+from msgs_slam.pipelines.proxy.stereo.tiles import TILE
 from msgs_slam.pipelines.proxy.stereo.window import LIKENESS, OUTSIDE, RADIUS, SIDE, STEP, VARIANCE_FLOOR
 
 Array = NDArray[np.float32]
@@ -27,14 +29,27 @@ def takes_kernels_on(device: str) -> bool:
     return cards.takes_kernels(torch.empty(0, device=device))
 
 
-def match_planes(
-    image: Array, others: Array, warps: NDArray[np.float64], planes: NDArray[np.float64], device: str
-) -> Array:
+def match_planes(pictures: rules.Pictures, planes: NDArray[np.float64], device: str) -> Array:
     """Return what `matching.match_planes` does, but for rounding."""
-    on_card = Matching(*(_there(x, device) for x in (image, others, warps.reshape(-1, 12))))
-    inverse = on_card.soften(on_card.found_by(planes), rules.SOFT_VALUES[0] * (planes[1] - planes[0]))
-    inverse = on_card.refined(inverse, rules.MOVE * (planes[1] - planes[0]))
-    return on_card.soften(inverse, rules.SOFT_VALUES[1] * (planes[1] - planes[0])).cpu().numpy()
+    step, size = planes[1] - planes[0], pictures.image.shape
+    coarse, fine = (Matching.of(some, device) for some in (pictures.halved(), pictures))
+    cost = coarse.cost(planes)
+    found = (coarse.picked(coarse.smoothed(cost), planes).cpu().numpy() - planes[0]) / step
+    alone, least = (x.cpu().numpy() for x in (cost.argmin(2), cost.amin(2)))
+    tried = rules.planes_to_try(found.astype(np.float32), alone, least, size, len(planes))
+    inverse = fine.picked(fine.smoothed(leave_out(fine.cost(planes), tried)), planes)
+    inverse = fine.refined(fine.soften(inverse, rules.SOFT_VALUES[0] * step), rules.MOVE * step)
+    return fine.soften(inverse, rules.SOFT_VALUES[1] * step).cpu().numpy()
+
+
+def leave_out(cost: Tensor, tried: NDArray[np.bool_]) -> Tensor:
+    """(H, W, D) cost as the CPU has it where planes are not `tried`. All are compared: a card gains nothing else."""
+    height, width, planes = cost.shape
+    first, last = np.moveaxis(tried_ranges(tried, (height, width), planes)[..., None, :], -1, 0)
+    inside = (np.arange(planes) >= first) & (np.arange(planes) < last)
+    kinds = torch.from_numpy(np.where(tried, np.float32(0), np.where(inside, np.float32(UNTRIED), UNREACHED)))
+    kinds = kinds.to(cost.device).repeat_interleave(TILE, 0)[:height].repeat_interleave(TILE, 1)[:, :width]
+    return torch.where(kinds > 0, kinds, cost)
 
 
 def fuse_depths(
@@ -68,11 +83,16 @@ class Matching:
             "OUTSIDE": OUTSIDE, "SIDE": SIDE, "STEP": STEP, "RADIUS": RADIUS,
         }  # fmt: skip
 
-    def found_by(self, planes: NDArray[np.float64]) -> Tensor:
-        """(H, W) inverse depth after sweep and smoothing."""
+    @classmethod
+    def of(cls, pictures: rules.Pictures, device: str) -> Matching:
+        """Pictures of the host, there."""
+        return cls(*(_there(x, device) for x in (pictures.image, pictures.others, pictures.warps.reshape(-1, 12))))
+
+    def picked(self, total: Tensor, planes: NDArray[np.float64]) -> Tensor:
+        """(H, W) inverse depth of least total cost (H, W, D)."""
         from msgs_slam.pipelines.proxy.stereo.card_kernels import pick_pixels
 
-        total, inverse = self.smoothed(self.cost(planes)), torch.empty_like(self._image)
+        inverse = torch.empty_like(self._image)
         numbers = (inverse.numel(), len(planes), float(planes[0]), float(planes[1] - planes[0]))
         _run(pick_pixels, inverse.numel(), total, inverse, *numbers, PLANES=_power_of_two(len(planes)))
         return inverse

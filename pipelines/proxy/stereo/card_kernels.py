@@ -216,7 +216,7 @@ def pick_pixels(
     a, b = tl.load(at - 1, mask=inside & (rim == 0), other=0.0), tl.load(at, mask=inside, other=0.0)
     c = tl.load(at + 1, mask=inside & (rim == 0), other=0.0)
     bend = a + c - 2.0 * b
-    bends = (rim == 0) & (bend > 0)
+    bends = (rim == 0) & (bend > 0) & (tl.maximum(a, c) < 1e9)
     offset = tl.where(bends, (a - c) / (2.0 * tl.where(bends, bend, 1.0)), 0.0)
     offset = tl.minimum(tl.maximum(offset, -0.5), 0.5)
     tl.store(inverse + pixel, nearest + (best.to(tl.float32) + offset) * step, mask=inside)

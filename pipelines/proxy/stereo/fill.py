@@ -16,12 +16,14 @@ Array = NDArray[np.float64]
 
 SURE = 0.3
 """Confidence from which a depth is evidence and stays as it is."""
-_COMPANY_REACH, _COMPANY_SD = 12.0, 30.0
+_COMPANY_REACH, _COMPANY_SD = 3 / 80, 30.0
+"""As a part of the width; colours."""
 _COMPANY_POWER = 0.9
 """Brings the calibration: from confidence 0.42 (reliability 0.5) on, at most 3 % are off by more than 5 %."""
 _EVIDENCE_POWER = 2.5
-_REACHES = ((20.0, 30.0, 1.0), (80.0, 60.0, 0.1))
-"""How far a depth speaks along like colours (pixels), the colour step that stops it, and how much it then counts."""
+_REACHES = ((1 / 16, 30.0, 1.0), (1 / 4, 60.0, 0.1))
+"""How far a depth speaks along like colours (as a part of the width), the colour step that stops it, and how much it
+then counts."""
 _ANYWHERE, _ANYWHERE_REACH = 1e-5, 1 / 4
 """Weight and reach, as a part of the width, of what speaks across all colours: only where nothing else does."""
 _RIDGE = 3e-4
@@ -35,7 +37,7 @@ _KNOWN_MASS = 1e-3
 def judge_by_company(confidence: NDArray[np.float32], image: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(h, w) confidence that also counts how sure the pixels around are that have a like colour; image (h, w, 3)."""
     both = np.stack([confidence, np.ones_like(confidence)], axis=-1)
-    total, mass = np.moveaxis(spread_votes(both, image, _COMPANY_REACH, _COMPANY_SD), -1, 0)
+    total, mass = np.moveaxis(spread_votes(both, image, _COMPANY_REACH * image.shape[1], _COMPANY_SD), -1, 0)
     return np.power(confidence * np.clip(total / mass, 0, 1), _COMPANY_POWER).astype(np.float32)
 
 
@@ -63,7 +65,7 @@ def _local_planes(inverse: Array, weight: Array, image: NDArray[np.uint8]) -> tu
     votes = np.stack([weight * p for p in products], axis=-1).astype(np.float32)
     sums = np.zeros(votes.shape)
     for reach, color_sd, share in _REACHES:
-        sums += share * spread_votes(votes, image, reach, color_sd).astype(np.float64)
+        sums += share * spread_votes(votes, image, reach * width, color_sd).astype(np.float64)
     mass = sums[..., 0].copy()
     sums += _ANYWHERE * _spread_anywhere(votes)
     total = np.maximum(sums[..., 0], 1e-30)

@@ -27,7 +27,7 @@ from msgs_slam.pipelines.proxy.stereo.borrow import agreed_depth, borrow_depth, 
 from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
 from msgs_slam.pipelines.proxy.stereo.evidence import evidence_of, prefer_matches, surface_contrast
 from msgs_slam.pipelines.proxy.stereo.fill import SURE, fill_unsure, judge_by_company
-from msgs_slam.pipelines.proxy.stereo.matching import match_planes
+from msgs_slam.pipelines.proxy.stereo.matching import Pictures, match_planes
 from msgs_slam.pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
 from msgs_slam.pipelines.proxy.stereo.sweep import warps_to
 from msgs_slam.pipelines.proxy.stereo.upsample import upsample_depth
@@ -113,15 +113,18 @@ class MultiviewDepth:
         limits = depth_range(self._model, index, companions[:_RANGE_VIEWS])
         if len(companions) == 0 or limits is None:
             return np.zeros((camera.height, camera.width), np.float32)
-        image, left_out = self._grey(int(self._model.frame_ids[index]))
-        others = np.stack([_blanked(*self._grey(int(self._model.frame_ids[j]))) for j in companions])
-        warps = self._warps(index, companions)
         planes = np.linspace(1 / limits[1], 1 / limits[0], self._planes)
-        given, card = (image, others, warps, planes), self._card
+        given, card = (self._pictures(index, companions), planes), self._card
         inverse = match_planes(*given, self._bands) if card is None else card.match_planes(*given, self._device)
+        left_out = self._grey(int(self._model.frame_ids[index]))[1]
         inverse = np.clip(inverse, planes[0], planes[-1]).astype(np.float32)
         unknown = at_stops(inverse, planes)
         return np.where(unknown if left_out is None else unknown | left_out, np.float32(0), inverse)
+
+    def _pictures(self, index: int, others: NDArray[np.int64]) -> Pictures:
+        ids = self._model.frame_ids[others].tolist()
+        image = self._grey(int(self._model.frame_ids[index]))[0]
+        return Pictures(image, np.stack([_blanked(*self._grey(i)) for i in ids]), self._warps(index, others))
 
     # second pass ------------------------------------------------------------------------------------------------
 
@@ -134,10 +137,12 @@ class MultiviewDepth:
         index = self._index[frame.id]
         borrowed, sure = self._borrow(index)
         filled, confidence = fill_unsure(borrowed, sure, self._small(index))
-        depth = np.where(sure < SURE, self._prefer_matches(index, filled), filled)
+        depth = self._prefer_matches(index, filled, sure < SURE)
         return upsample_depth(depth, confidence, self._sequence.image(frame))
 
-    def _prefer_matches(self, index: int, filled: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _prefer_matches(
+        self, index: int, filled: NDArray[np.float32], unsure: NDArray[np.bool_]
+    ) -> NDArray[np.float32]:
         """The keyframe's own matches where the depths of others bear them out better than what was filled in."""
         companions = self._present(self._neighbours(index, _VIEWS))
         if len(companions) == 0:
@@ -146,7 +151,7 @@ class MultiviewDepth:
         warps, back = self._warps(index, companions), self._rows_back(index, companions)
 
         def borne_out(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-            _, support, conflict = self._compare(depth, others, warps, back, 2 * _TOLERANCE)
+            _, support, conflict = self._compare(np.where(unsure, depth, 0), others, warps, back, 2 * _TOLERANCE)
             return np.asarray(support - conflict)
 
         return prefer_matches(filled, self._fused(index)[0], borne_out, self._contrast(index))

@@ -68,6 +68,7 @@ def _refine_band(
     length = row_length(width)
     samples = np.zeros(views * SAMPLED_ROWS * length, np.float32)
     seen = np.zeros(views * SAMPLED_ROWS * length, np.float32)
+    needed = np.ones(length // 16 + 1, np.bool_)
     surface, top = np.zeros(length, np.float32), np.empty(16 * best, np.float32)
     weights, weighted, moments = weigh_windows(image, first, last, ALIKE)
     total = np.empty((2 * reach + 1, last - first, length), np.float32)
@@ -77,8 +78,8 @@ def _refine_band(
             surface[:width] = inverse_depth[y]
             for n in range(views):
                 warp_row(
-                    others[n].reshape(-1), columns, rows, warps[n], surface, (d - reach) * step, y, width, samples,
-                    seen, (n * SAMPLED_ROWS + k) * length,
+                    others[n].reshape(-1), columns, rows, warps[n], surface, (d - reach) * step, y, width, needed,
+                    samples, seen, (n * SAMPLED_ROWS + k) * length,
                 )  # fmt: skip
         penalty = np.float32(stiffness * (d - reach) ** 2)
         for k in range(last - first):

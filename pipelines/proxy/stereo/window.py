@@ -100,13 +100,14 @@ def warp_row(
     offset: float,
     y: int,
     width: int,
+    needed: NDArray[np.bool_],
     samples: NDArray[np.float32],
     seen: NDArray[np.float32],
     at: int,
 ) -> None:
     """Samples of the flat picture `other` (rows, columns) for row y of the reference, its pixels of inverse depths
     (row length,) plus `offset`, the border repeated, into `samples` from `at` on; likewise into `seen` 1 or 0, whether
-    they lie in the other view."""
+    they lie in the other view. Sixteen pixels that are not `needed` are left as they were."""
     v = y + 0.5
     bx = np.float32(warp[0, 1] * v + warp[0, 2])
     by = np.float32(warp[1, 1] * v + warp[1, 2])
@@ -115,6 +116,8 @@ def warp_row(
     tx, ty, tz = np.float32(warp[0, 3]), np.float32(warp[1, 3]), np.float32(warp[2, 3])
     right, bottom = np.float32(columns - 1.001), np.float32(rows - 1.001)
     for x in range(0, width, _LANES):
+        if not needed[x // _LANES]:
+            continue
         w, u = load(inverse_depths, x) + np.float32(offset), counting(np.float32(x) + _HALF)
         z = u * az + bz + w * tz
         scale = _ONE / largest(z, splat(_NEAR))

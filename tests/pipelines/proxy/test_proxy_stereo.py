@@ -9,11 +9,12 @@ from msgs_slam.pipelines.proxy.stereo.borrow import agreed_depth, borrow_depth, 
 from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
 from msgs_slam.pipelines.proxy.stereo.evidence import evidence_of, prefer_matches, surface_contrast
 from msgs_slam.pipelines.proxy.stereo.fill import SURE, fill_unsure, judge_by_company
-from msgs_slam.pipelines.proxy.stereo.matching import best_count
+from msgs_slam.pipelines.proxy.stereo.matching import CLEAR, MARGIN, Pictures, best_count, match_planes, planes_to_try
 from msgs_slam.pipelines.proxy.stereo.provider import at_stops
 from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth
-from msgs_slam.pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
-from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost, warps_to
+from msgs_slam.pipelines.proxy.stereo.smoothing import UNREACHED, pick_planes, smooth_cost
+from msgs_slam.pipelines.proxy.stereo.sweep import UNTRIED, sweep_cost, warps_to
+from msgs_slam.pipelines.proxy.stereo.tiles import TILE, tiles_of
 from msgs_slam.pipelines.proxy.stereo.upsample import upsample_depth
 from msgs_slam.pipelines.proxy.stereo.window import LIKENESS, RADIUS, STEP, VARIANCE_FLOOR
 
@@ -76,6 +77,65 @@ def test_sweep_is_the_correlation_written_out() -> None:
     for y, x, d in ((15, 25, 1), (20, 30, 3), (24, 36, 6)):
         scores = sorted(slow_score(image, o, w, planes[d], y, x) for o, w in zip(others, warps, strict=True))
         assert cost[y, x, d] == pytest.approx(1 - np.mean(scores[-2:]), abs=2e-4)
+
+
+def test_only_planes_that_are_tried_are_compared_and_searched() -> None:
+    """Costs elsewhere are those of a whole sweep, and paths as if the planes left out were out of reach."""
+    image, others, warps, _ = scene(0.3)
+    planes = np.linspace(1 / 3, 1 / 1.4, 24)
+    tried = np.zeros((*tiles_of(HEIGHT, WIDTH), 24), np.bool_)
+    rng = np.random.default_rng(5)
+    for tile in np.ndindex(tried.shape[:2]):
+        first = rng.integers(0, 16)
+        tried[tile][first : first + rng.integers(2, 8)] = True
+        tried[tile][first] = True
+    pixels = tried.repeat(TILE, 0)[:HEIGHT].repeat(TILE, 1)[:, :WIDTH]
+    whole = sweep_cost(image, others, warps, planes, 2, Bands(1))
+    cost = sweep_cost(image, others, warps, planes, 2, Bands(1), tried)
+    np.testing.assert_array_equal(cost, np.where(pixels, whole, np.float32(UNTRIED)))
+    total = smooth_cost(cost, image, 0.1, 1.2, 0.05, Bands(1), tried)
+    expected = smooth_cost(np.where(pixels, whole, np.float32(1e5)), image, 0.1, 1.2, 0.05, Bands(1))
+    np.testing.assert_array_equal(total[pixels], expected[pixels])
+    assert (total[~pixels] == UNREACHED).all()
+    picked = np.round(pick_planes(total)).astype(np.int64)
+    assert np.take_along_axis(pixels, picked[..., None], 2).mean() > 0.9
+
+
+def test_planes_near_the_coarse_ones_are_tried_and_what_is_thin_too() -> None:
+    found, alone, least = (
+        np.full((20, 40), 9.0, np.float32),
+        np.zeros((20, 40), np.int64),
+        np.ones((20, 40), np.float32),
+    )
+    alone[:, 21], least[:, 21] = 40, CLEAR / 2
+    tried = planes_to_try(found, alone, least, (40, 80), 64)
+    assert tried.shape == (*tiles_of(40, 80), 64)
+    wall, bar = np.zeros(64, np.bool_), np.zeros(64, np.bool_)
+    wall[9 - MARGIN : 9 + MARGIN + 1], bar[40 - MARGIN : 40 + MARGIN + 1] = True, True
+    np.testing.assert_array_equal(tried[0], [wall, wall, wall | bar, wall, wall])
+    assert not planes_to_try(found, alone, least + 1, (40, 80), 64)[..., 40].any()
+
+
+def test_a_bar_thinner_than_the_coarse_window_is_found() -> None:
+    """Before a wall twice as far, by the whole match."""
+
+    def view(cam_from_world: NDArray) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        v, u = (np.indices((80, 120)) + 0.5) / 2
+        x, y = (u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL
+        near, far = (np.stack([x, y], -1) * z - cam_from_world[:2, 3] for z in (1.5, 3.0))
+        on_bar = np.abs(near[..., 0]) < 0.06
+        bar, wall = (0.6 * (texture(p[..., 0], p[..., 1]) - 0.5) for p in (near, far))
+        return np.where(on_bar, 0.75 + bar, 0.3 + wall).astype(np.float32), on_bar
+
+    matrix = np.array([[2 * FOCAL, 0, WIDTH], [0, 2 * FOCAL, HEIGHT], [0, 0, 1]])
+    image, on_bar = view(np.eye(4))
+    pictures = Pictures(
+        image, np.stack([view(c)[0] for c in CAMERAS]), warps_to(matrix, np.eye(4), [matrix] * 4, CAMERAS)
+    )
+    found = match_planes(pictures, np.linspace(1 / 4, 1, 48), Bands(1))[10:-10, 20:-20]
+    on_bar = on_bar[10:-10, 20:-20]
+    assert np.median(np.abs(found[on_bar] * 1.5 - 1)) < 0.03
+    assert np.median(np.abs(found[~on_bar] * 3 - 1)) < 0.03
 
 
 def test_views_that_do_not_see_the_point_do_not_count() -> None:

@@ -20,8 +20,8 @@ from msgs_slam.pipelines.proxy.stereo import card, matching  # noqa: E402
 from msgs_slam.pipelines.proxy.stereo.bands import Bands  # noqa: E402
 from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths  # noqa: E402
 from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth  # noqa: E402
-from msgs_slam.pipelines.proxy.stereo.smoothing import smooth_cost  # noqa: E402
-from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost, warps_to  # noqa: E402
+from msgs_slam.pipelines.proxy.stereo.smoothing import UNREACHED, pick_planes, smooth_cost  # noqa: E402
+from msgs_slam.pipelines.proxy.stereo.sweep import UNTRIED, sweep_cost, warps_to  # noqa: E402
 from tests.card_builds import build  # noqa: E402
 
 DEVICE = "cuda" if ON_CARD else "cpu"
@@ -60,6 +60,20 @@ def test_paths_are_smoothed_as_on_the_cpu(pictures: tuple, on_card: card.Matchin
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
+def test_planes_that_are_not_tried_are_left_out_as_on_the_cpu(pictures: tuple, on_card: card.Matching) -> None:
+    cost = np.random.default_rng(1).random((*pictures[0].shape, 19)).astype(np.float32)
+    tried = np.zeros((1, 2, 19), np.bool_)
+    tried[0, 0, [2, 3, 6]], tried[0, 1, 9:14] = True, True
+    left = card.leave_out(torch.from_numpy(cost).to(DEVICE), tried)
+    cost[:, :16, 4:6] = UNTRIED
+    expected = smooth_cost(cost, pictures[0], matching.SMALL_STEP, matching.JUMP, matching.EDGE, BANDS, tried)
+    found = on_card.picked(on_card.smoothed(left), PLANES).cpu().numpy()
+    planes = PLANES[0] + pick_planes(expected) * (PLANES[1] - PLANES[0])
+    np.testing.assert_allclose(found, planes, atol=1e-4)
+    assert (expected[:, :16, 7:] >= UNREACHED).all()
+    assert (expected[:, :16, 2:7] < UNREACHED).all()
+
+
 def test_the_refinement_and_the_filter_are_those_of_the_cpu(pictures: tuple, on_card: card.Matching) -> None:
     inverse = (0.45 + 0.05 * np.random.default_rng(2).random(pictures[0].shape)).astype(np.float32)
     there = torch.from_numpy(inverse).to(DEVICE)
@@ -75,8 +89,8 @@ def test_the_refinement_and_the_filter_are_those_of_the_cpu(pictures: tuple, on_
 
 
 def test_the_whole_match_finds_the_plane(pictures: tuple) -> None:
-    found = card.match_planes(*pictures, PLANES, DEVICE)
-    expected = matching.match_planes(*pictures, PLANES, BANDS)
+    found = card.match_planes(matching.Pictures(*pictures), PLANES, DEVICE)
+    expected = matching.match_planes(matching.Pictures(*pictures), PLANES, BANDS)
     truth = 1 / view_of_plane(np.eye(4), 0.3)[1][:ROWS, :COLUMNS]
     assert np.median(np.abs(found - truth)) < 0.5 * (PLANES[1] - PLANES[0])
     assert (np.abs(found - expected) > 1e-3).mean() < 0.02
@@ -102,9 +116,9 @@ def test_depths_are_fused_as_on_the_cpu() -> None:
 def test_a_keyframe_asks_for_few_launches(pictures: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
     launched, right = [], cards.launch
     monkeypatch.setattr(cards, "launch", lambda kernel, *a, **k: launched.append(kernel) or right(kernel, *a, **k))
-    small = (pictures[0][:6, :8].copy(), pictures[1][:, :6, :8].copy(), pictures[2])
-    card.match_planes(*small, PLANES[:4], DEVICE)
-    assert len(launched) == 8 + 5
+    small = matching.Pictures(pictures[0][:6, :8].copy(), pictures[1][:, :6, :8].copy(), pictures[2])
+    card.match_planes(small, PLANES[:4], DEVICE)
+    assert len(launched) == (8 + 2) + (8 + 5)
 
 
 @pytest.mark.skipif(ON_CARD, reason="the tests above compile and run the kernels")
