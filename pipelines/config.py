@@ -114,10 +114,6 @@ class ProxyConfig:
 class TrackingConfig:
     """Settings of camera tracking."""
 
-    new_segments: bool = setting(True, "begin anew from proxy depth after a loss, and join the parts later")
-    render: str = setting(
-        "fallback", "compare with Gaussians, eq. (16): lost frames, all, or never", ("fallback", "all", "never")
-    )
     use_depth: bool = setting(True, "tie triangulated points to metric proxy depths in the adjustment")
 
 
@@ -207,47 +203,13 @@ _MAPPING = ("mapping",)
 
 @dataclass(frozen=True)
 class PaperConfig:
-    """Terms of the paper that earned nothing measurable; their modules say the figures."""
+    """The term of the paper whose work something cheaper does."""
 
-    kappa: float = setting(
-        0.0, "κ of eq. (7), in units of the scene's median depth; 0 = off", stages=_MAPPING, within=(0, 1000)
-    )
-    edge_weight: float = setting(
-        0.0, "λ_E of eq. (18), the edge term (19), 0.02 in the paper", stages=_MAPPING, within=(0, 1000)
-    )
     label_weight: float = setting(
         0.0,
         "λ_S of eq. (18), 0.1 in the paper; 0 = no semantic loss: classes are counted when the map is done",
         stages=_MAPPING,
         within=(0, 1000),
-    )
-    class_growth: bool = setting(False, "grow the map where it shows another class than the label", stages=_MAPPING)
-    keyframe_miou: float = setting(
-        0.0,
-        "eq. (12): a step beside a new keyframe is on one whose labels agree less than this, 0.65 there; 0 = on any",
-        stages=_MAPPING,
-        within=(0, 1),
-    )
-    loop_steps: int = setting(
-        0,
-        "eq. (25): steps by labels and depth of the poses at a loop's ends, before map and poses are refined; 0 = none",
-        stages=("global_ba",),
-        within=(0, 10_000),
-    )
-    boundary_clip: float = setting(
-        0.0,
-        "clip gradients beside class boundaries to this times their mean; 0 = off",
-        stages=_MAPPING,
-        within=(0, 1_000_000),
-    )
-    tracking_depth_weight: float = setting(
-        0.0,
-        "λ_D of eq. (16), depths in units of the median; for frames with proxies (proxy.frames=all); 0 = off",
-        stages=("tracking",),
-        within=(0, 1000),
-    )
-    tracking_label_weight: float = setting(
-        0.0, "λ_S of eq. (16), likewise; 0 = off", stages=("tracking",), within=(0, 1000)
     )
 
 

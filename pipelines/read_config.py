@@ -40,10 +40,13 @@ def merge_settings(config: Config, changes: Mapping[str, Any], where: str) -> Co
     """`config` with a mapping section → key → value laid over it; `where` names its source in errors."""
     sections = {f.name: getattr(config, f.name) for f in fields(config)}
     for section, values in changes.items():
-        if section not in sections:
-            raise SettingError(f"{where}: there is no section {section!r}{nearest(section, sections)}")
         if not isinstance(values, Mapping):
             raise SettingError(f"{where}: {section} is a section of settings, got {values!r:.80}")
+        known = {f.name for f in fields(sections[section])} if section in sections else set()
+        if retired := explain_retired(f"{section}.{key}" for key in values if key not in known):
+            raise SettingError(f"{where}: settings of an earlier version: {retired}")
+        if section not in sections:
+            raise SettingError(f"{where}: there is no section {section!r}{nearest(section, sections)}")
         sections[section] = _merge_section(sections[section], section, values, where)
     return Config(**sections)
 
@@ -63,8 +66,6 @@ def merge_known_settings(config: Config, changes: Mapping[str, Any]) -> tuple[Co
 def _merge_section(section: Any, name: str, values: Mapping[str, Any], where: str) -> Any:
     types = get_type_hints(type(section))
     known = {f.name: f for f in fields(section)}
-    if retired := explain_retired(f"{name}.{key}" for key in values if key not in known):
-        raise SettingError(f"{where}: settings of an earlier version: {retired}")
     checked = {}
     for key, value in values.items():
         if key not in known:
@@ -132,17 +133,7 @@ def _toml_value(value: Any) -> str:
     return json.dumps(value) if isinstance(value, str) else repr(value)
 
 
-MOVED = {
-    "tracking.depth_weight": "paper.tracking_depth_weight",
-    "tracking.label_weight": "paper.tracking_label_weight",
-    "mapping.boundary_clip": "paper.boundary_clip",
-    "mapping.densify_classes": "paper.class_growth",
-    "mapping.edge_weight": "paper.edge_weight",
-    "mapping.kappa": "paper.kappa",
-    "mapping.label_loss": "paper.label_weight",
-    "mapping.label_weight": "paper.label_weight",
-    "paper.label_image": "paper.label_weight",
-}
+MOVED = {key: "paper.label_weight" for key in ("mapping.label_loss", "mapping.label_weight", "paper.label_image")}
 """Old name → the one that decides it now."""
 
 _FIXED = {
@@ -165,21 +156,31 @@ FIXED = frozenset(f"{section}.{name}" for section, names in _FIXED.items() for n
 """Constants now, beside the code that uses them, at what was their default."""
 
 
+_NOTHING = "it brought nothing that could be measured (docs/method.md)"
 GONE = {
     "frames.max_frames": "however many frames there are, they are taken",
+    "tracking.new_segments": "after a loss tracking begins anew, and the segments are joined later",
+    "tracking.render": "frames that are lost otherwise are compared with Gaussians, no others",
     "paper.symmetry_weight": "pulling mirror-symmetric halves together cost 0.1 dB",
-}
+    **dict.fromkeys(
+        (
+            "paper.kappa", "paper.edge_weight", "paper.class_growth", "paper.keyframe_miou",
+            "paper.loop_steps", "paper.boundary_clip", "paper.tracking_depth_weight", "paper.tracking_label_weight",
+        ),
+        _NOTHING,
+    ),
+}  # fmt: skip
+"""What has left the program, and why."""
 
 
 def explain_retired(keys: Iterable[str]) -> str:
     """Explain what became of the retired settings among `keys` (section.name); "" where there are none."""
     keys = list(keys)
-    moved = [f"{k} is {MOVED[k]} now (off unless set)" for k in keys if k in MOVED]
-    fixed = [k for k in keys if k in FIXED]
-    moved += [f"{k} is no more: {GONE[k]}" for k in keys if k in GONE]
-    if fixed:
-        moved.append(f"{', '.join(fixed)}: fixed at what was the default")
-    return "; ".join(moved)
+    told = [f"{k} is no more: {GONE[k]}" for k in keys if k in GONE]
+    told += [f"{k} is {MOVED[k]} now (off unless set)" for k in keys if k in MOVED]
+    if fixed := [k for k in keys if k in FIXED]:
+        told.append(f"{', '.join(fixed)}: fixed at what was the default")
+    return "; ".join(told)
 
 
 _SAME_AS = {"article": "paper", "gpu": "cuda", "nvidia": "cuda", "cuda:0": "cuda", "video": "images", "mp4": "images"}

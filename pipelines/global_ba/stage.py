@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.atomic import copy_file
 from msgs_slam.pipelines.correspondence.retrieval import GlobalDescriptors, compute_global_descriptors, unit
-from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.depth.scales import sample_proxy
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.gaussian_map import GaussianMap
@@ -18,14 +17,13 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.candidates import loop_candidates
 from msgs_slam.pipelines.global_ba.close import Closed, close_loops
-from msgs_slam.pipelines.global_ba.local import adjusted_poses, loop_keyframes
 from msgs_slam.pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_found
 from msgs_slam.pipelines.global_ba.semantics import LabelSummary, summarise_labels
 from msgs_slam.pipelines.global_ba.verify import KeyframeView, Loop, make_view
 from msgs_slam.pipelines.mapping.build import Refined, refine_map
-from msgs_slam.pipelines.mapping.load import load_views, with_rigid_panoramas
+from msgs_slam.pipelines.mapping.load import with_rigid_panoramas
 from msgs_slam.pipelines.mapping.move_map import follow_keyframes, move_map
-from msgs_slam.pipelines.mapping.poses import move_trajectory, rows_of
+from msgs_slam.pipelines.mapping.poses import move_trajectory
 from msgs_slam.pipelines.run.folder import (
     MAP,
     RunFolder,
@@ -84,7 +82,7 @@ def run(context: StageContext) -> dict[str, Any]:
     if settings.joint == "always" or (settings.joint == "moved" and moved_px >= JOINT_PX):
         if gaussian_map is None:
             gaussian_map = context.run.load_map("mapping", context.device)
-        refined = refine(context, gaussian_map, trajectory, fields, found)
+        refined = refine_map(context, gaussian_map, trajectory, fields, settings.joint_passes)
     return save(context, model, trajectory, gaussian_map, found, closed, refined, moved_px)
 
 
@@ -214,40 +212,6 @@ def largest_motion(context: StageContext, state: TrackState, model: SparseModel)
     depth = np.array([state.median_depth(i) for i in model.frame_ids.tolist()])
     focal = context.run.load_calibration().intrinsics.fx
     return float((focal * (se3.rotation_angle(apart) + shift / depth)).max())
-
-
-def refine(
-    context: StageContext,
-    gaussian_map: GaussianMap,
-    trajectory: Trajectory,
-    fields: DepthFields,
-    found: FoundLoops,
-) -> Refined:
-    """Map and poses together, against all keyframes (second term of MSGS-SLAM eq. 26)."""
-    trajectory = at_loop_ends(context, gaussian_map, trajectory, fields, found)
-    return refine_map(context, gaussian_map, trajectory, fields, context.config.global_ba.joint_passes)
-
-
-def at_loop_ends(
-    context: StageContext,
-    gaussian_map: GaussianMap,
-    trajectory: Trajectory,
-    fields: DepthFields,
-    found: FoundLoops,
-) -> Trajectory:
-    """The poses at the ends of loops by labels and depth, eq. (25); the other keyframes where they were."""
-    keyframe_ids = context.run.load_exposure()["frame_ids"]
-    steps, ends = context.config.paper.loop_steps, loop_keyframes(found.loops, keyframe_ids.tolist())
-    if not steps or not ends:
-        return trajectory
-    mapping, memory = context.config.mapping, context.memory_room
-    around = rows_of(trajectory, np.array(sorted(ends)))
-    class_ids = context.run.load_class_ids()
-    views = load_views(context.run, around, mapping, context.device, fields, memory, class_ids).views
-    poses = poses_of(trajectory, keyframe_ids).copy()
-    for frame_id, pose in adjusted_poses(views, gaussian_map, mapping, steps).items():
-        poses[np.searchsorted(keyframe_ids, frame_id)] = pose
-    return move_trajectory(trajectory, keyframe_ids, poses)
 
 
 def save(

@@ -11,11 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from msgs_slam.pipelines.config import MappingConfig, PaperConfig
+from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.gaussians.render import Rendering
 from msgs_slam.pipelines.gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
 from msgs_slam.pipelines.mapping import densify
-from msgs_slam.pipelines.mapping.paper.class_growth import wrong_classes
 from msgs_slam.pipelines.mapping.region_prior import with_region_prior
 from msgs_slam.pipelines.mapping.schedule import Seeding
 from msgs_slam.pipelines.mapping.splitting import CHILDREN, DensificationError, split
@@ -51,7 +50,6 @@ class Growth:
     views: Sequence[View]
     classes: int
     settings: MappingConfig
-    paper: PaperConfig
     state: OptimiserState
     unit: float
 
@@ -79,8 +77,6 @@ class Growth:
         """Add Gaussians by the conditions of the paper."""
         view = self.views[index]
         needed = self._needed(view, rendering)
-        if self.paper.class_growth:
-            needed |= wrong_classes(rendering.features[..., 3:], view.channels, view.label_weight)
         spacing = self._spacings[index].float()
         depth, trust = self._grown_depth(view, rendering)
         self._append(index, needed & (spacing > 0), depth, trust, spacing, GROWN_OPACITY)

@@ -10,8 +10,6 @@ from msgs_slam.pipelines.config import MappingConfig, PaperConfig
 from msgs_slam.pipelines.gaussians.render import Rendering
 from msgs_slam.pipelines.mapping import losses
 from msgs_slam.pipelines.mapping.card_loss import TermWeights, card_loss
-from msgs_slam.pipelines.mapping.paper.boundary_clip import clip_beside_boundary
-from msgs_slam.pipelines.mapping.paper.edge_term import edge_loss
 from msgs_slam.pipelines.mapping.paper.label_image import label_image_loss
 from msgs_slam.pipelines.mapping.photo_loss import photo_loss
 from msgs_slam.pipelines.mapping.views import View
@@ -33,8 +31,7 @@ class Objective:
 
     def uses_labels(self, iteration: int) -> bool:
         """Whether the semantic terms count at this step."""
-        wanted = max(self.paper.label_weight, self.paper.edge_weight) > 0
-        return self.classes > 0 and wanted and iteration % LABEL_EVERY == 0
+        return self.classes > 0 and self.paper.label_weight > 0 and iteration % LABEL_EVERY == 0
 
     @property
     def counts_labels(self) -> bool:
@@ -52,8 +49,6 @@ class Objective:
     ) -> Tensor:
         """Scalar; `exposure` (2, 3) is the view's, `log_radii` (M,) those of the Gaussians in view, or of all Gaussians
         of a card, of which `in_view` (M,) bool tells them."""
-        if self.paper.boundary_clip > 0:
-            clip_beside_boundary(rendering.features, view.channels, self.paper.boundary_clip)
         # split, not slices: the gradient of each slice would be a whole image of zeros around it.
         parts = rendering.features.split([3, rendering.features.shape[-1] - 3], dim=-1)
         if in_view is None:
@@ -62,7 +57,7 @@ class Objective:
         else:
             weights = TermWeights(SILHOUETTE_WEIGHT, self._depth_weight, self.unit)
             loss = card_loss(view, exposure, rendering, log_radii, in_view, weights)
-        return self._with_paper(loss, view, rendering.depth, parts[1], with_labels)
+        return self._with_labels(loss, view, parts[1]) if with_labels else loss
 
     @property
     def _depth_weight(self) -> float:
@@ -77,12 +72,7 @@ class Objective:
             loss = loss + self._depth_weight * losses.depth_loss(rendering.depth, view.depth, weight, self.unit)
         return loss
 
-    def _with_paper(self, loss: Tensor, view: View, depth: Tensor, logits: Tensor, with_labels: bool) -> Tensor:
-        """And what the paper has beside them."""
-        paper = self.paper
-        if with_labels and paper.label_weight > 0:
-            by_label = label_image_loss(logits, view.channels, view.label_weight)
-            loss = loss + LABEL_EVERY * paper.label_weight * by_label
-        if with_labels and paper.edge_weight > 0:
-            loss = loss + LABEL_EVERY * paper.edge_weight * edge_loss(depth, view.channels, self.unit)
-        return loss
+    def _with_labels(self, loss: Tensor, view: View, logits: Tensor) -> Tensor:
+        """And the paper's semantic term, where it is asked for."""
+        by_label = label_image_loss(logits, view.channels, view.label_weight)
+        return loss + LABEL_EVERY * self.paper.label_weight * by_label

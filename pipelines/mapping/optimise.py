@@ -64,7 +64,7 @@ def optimise_map(
     state = OptimiserState.load(snapshot, views) or OptimiserState.fresh(views, classes, initial, exposure)
     paper = paper or PaperConfig()
     seeding = initial is None if seeding is None else seeding
-    schedule = Schedule.plan(views, settings, seed, seeding, passes, paper.keyframe_miou, first_rate)
+    schedule = Schedule.plan(views, settings, seed, seeding, passes, first_rate)
     optimiser = MapOptimiser(views, classes, settings, paper, state)
     # A map and its visits grow together: were it written every so many visits, all of it would be written ever longer.
     every = max(settings.snapshot_every, len(views))
@@ -98,7 +98,7 @@ class MapOptimiser:
         self.halves = LruSequence(len(views), lambda i: halved(views[i]), lambda v: v.nbytes, HALVES_ROOM)
         self.unit = scene_depth(views)
         self.objective = Objective(settings, paper, classes, self.unit)
-        self.growth = Growth(views, classes, settings, paper, state, self.unit)
+        self.growth = Growth(views, classes, settings, state, self.unit)
 
     def visit(self, step: Step) -> None:
         """Do what the schedule says: seed, compare, grow, prune."""
@@ -119,7 +119,7 @@ class MapOptimiser:
         """Compare and move the map, the view's pose and its exposure; returns what the view showed before."""
         parameters, on_card = self.state.parameters, cards.takes_kernels(self.state.parameters["means"])
         with_labels = self.objective.uses_labels(step.iteration)
-        keys = KEYS if with_labels or (step.grow and self.paper.class_growth) else COLOR_KEYS
+        keys = KEYS if with_labels else COLOR_KEYS
         pose, radii = self.state.cam_from_world(step.view, view), torch.exp(parameters["log_radii"].detach())
         seeing = (parameters["means"].detach(), radii, pose, view.intrinsics)
         rows, seen = None, None
@@ -197,7 +197,7 @@ class MapOptimiser:
 
     def draw(self, view: View, cam_from_world: Tensor, values: Mapping[str, Tensor]) -> Rendering:
         """Gaussians of raw parameters as the view sees them from (4, 4), with class logits where they have any."""
-        kappa, colors = self.paper.kappa, values["colors"]
+        colors = values["colors"]
         return render(
             values["means"],
             torch.exp(values["log_radii"]),
@@ -205,8 +205,6 @@ class MapOptimiser:
             torch.cat([colors, values["class_logits"]], dim=1) if "class_logits" in values else colors,
             cam_from_world,
             view.intrinsics,
-            proxy_depth=view.depth if kappa > 0 else None,
-            kappa=kappa / self.unit**2,
         )
 
     def _shares(self, rows: Tensor | None, log_radii: Tensor) -> dict[str, Tensor]:

@@ -13,7 +13,6 @@ from scipy.sparse import csr_matrix
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.depth.posed import overlaps
 from msgs_slam.pipelines.mapping.covisibility import keyframe_weights
-from msgs_slam.pipelines.mapping.paper.label_choice import label_likeness
 from msgs_slam.pipelines.mapping.views import View
 
 WINDOW_STEPS = 2
@@ -81,12 +80,10 @@ class Schedule:
         seed: int,
         seeding: bool,
         passes: float | None,
-        keyframe_miou: float = 0.0,
         first_rate: float = 1.0,
     ) -> Schedule:
         """The schedule for these views; `passes` overrides that of the settings, which also have a least count;
-        `keyframe_miou` is T_sem of eq. (12), 0 leaves it away; `first_rate`: learning rates of the first visit; below 1
-        the map only settles, and keeps its Gaussians."""
+        `first_rate`: learning rates of the first visit; below 1 the map only settles, and keeps its Gaussians."""
         # Read once: views may be on disk.
         reliability, shares = np.array([(float(v.trust.mean()), v.shown) for v in views]).T
         shown = max(float(shares.mean()), LEAST_SHOWN)
@@ -95,8 +92,6 @@ class Schedule:
             visits = max(visits, settings.min_iterations)
         steps = (WINDOW_STEPS + 1) * len(views) if seeding else 0
         overlap = overlaps(v.posed_depth() for v in views)
-        if keyframe_miou > 0:
-            overlap = overlap.multiply(label_likeness(views) < keyframe_miou).tocsr()
         return Schedule(seed, len(views), steps, visits, overlap, reliability, first_rate)
 
     @property

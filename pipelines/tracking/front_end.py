@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.config import TrackingConfig
 from msgs_slam.pipelines.correspondence.flow import FLOW_SD, follow
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.tracking.extend import promote, start_segment
 from msgs_slam.pipelines.tracking.motion import predict_pose
 from msgs_slam.pipelines.tracking.pictures import Pictures
 from msgs_slam.pipelines.tracking.pnp import MIN_INLIERS, FramePose, solve_pose
-from msgs_slam.pipelines.tracking.refine import RenderWeights, compare_frame
+from msgs_slam.pipelines.tracking.refine import compare_frame
 from msgs_slam.pipelines.tracking.relocalise import relocalise
 from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
 
@@ -29,10 +28,9 @@ RENDER_LOSS = 0.4
 class FrontEnd:
     """Poses frames one after the other, in the order of their ids, into a `TrackState`."""
 
-    def __init__(
-        self, state: TrackState, pictures: Pictures, settings: TrackingConfig, seed: int, weights: RenderWeights
-    ) -> None:
-        self.state, self.pictures, self.settings, self.seed, self.weights = state, pictures, settings, seed, weights
+    def __init__(self, state: TrackState, pictures: Pictures, seed: int) -> None:
+        self.state, self.pictures, self.seed = state, pictures, seed
+        self.is_rig = len(state.rig) > 1
         self.times = {i: frame.timestamp for i, frame in pictures.frames.items()}
         self.looked: dict[int, int] = {}
 
@@ -78,14 +76,14 @@ class FrontEnd:
     def _by_rendering(self, frame_id: int) -> bool:
         """Pose the frame by comparing it with Gaussians, where a neighbour is posed and the image agrees well."""
         neighbours = [i for i in (frame_id - 1, frame_id + 1) if i in self.state.poses]
-        if not neighbours or self.settings.render == "never":
+        if not neighbours or self.is_rig:  # what one direction does not show, the others do
             return False
         segment = self.state.segment[neighbours[0]]
         keyframes = [k for k in self.state.nearest_keyframes(frame_id, 1) if self.state.segment[k] == segment]
         start = self.by_flow(frame_id)[2]
         if start is None or not keyframes:
             return False
-        found = compare_frame(frame_id, start, keyframes, self.state, self.pictures, self.weights)
+        found = compare_frame(frame_id, start, keyframes, self.state, self.pictures)
         if found is None or not found.is_better or found.unexplained > RENDER_LOSS:
             return False
         self.state.add_frame(frame_id, found.cam_from_world, NO_SIGHTINGS, False, segment)
@@ -117,7 +115,7 @@ class FrontEnd:
         return True
 
     def _start(self, frame_id: int, start: Array | None) -> bool:
-        if not self.settings.new_segments:
+        if self.is_rig:
             return False
         pose = np.eye(4) if start is None else start
         return start_segment(frame_id, pose, self.state, self.pictures)

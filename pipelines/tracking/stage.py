@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
-
-import numpy as np
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
@@ -20,7 +17,6 @@ from msgs_slam.pipelines.tracking.adjust import Report, adjust_state, align_dept
 from msgs_slam.pipelines.tracking.carry import carry_given
 from msgs_slam.pipelines.tracking.front_end import FrontEnd
 from msgs_slam.pipelines.tracking.pictures import Pictures, load_shutter
-from msgs_slam.pipelines.tracking.refine import RenderWeights, compare_frame
 from msgs_slam.pipelines.tracking.result import split_worlds, to_sparse_model, to_trajectory
 from msgs_slam.pipelines.tracking.rig_poses import sync_rig_poses
 from msgs_slam.pipelines.tracking.rotation_only import set_rotation_only_poses
@@ -49,7 +45,6 @@ def run(context: StageContext) -> dict[str, Any]:
         )
     report = adjust_state(state, intrinsics, pictures.proxy, metric, settings)
     release_free_memory()
-    compared = compare_all(context, state, pictures) if settings.render == "all" else {}
     carried = carry_given(context, state)
     set_rotation_only_poses(state, pictures, context.config.run.seed)
     if state.turned:
@@ -65,7 +60,7 @@ def run(context: StageContext) -> dict[str, Any]:
     model = to_sparse_model(state)
     save_sparse(context.folder, model)
     save_depth_fields(context.folder, align_depths(model, report, intrinsics, pictures.proxy))
-    figures = {**describe(state, frames, report, metric), **compared, **carried}
+    figures = {**describe(state, frames, report, metric), **carried}
     figures["pieces"] = [len(p.poses) for p in pieces]
     if "reference_relative_sd" in proxy:  # what the user's reference leaves open; depths agree far better
         figures["scale_relative_sd"] = proxy["reference_relative_sd"]
@@ -78,14 +73,11 @@ def run(context: StageContext) -> dict[str, Any]:
 
 def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures) -> TrackState:
     """Every frame visited once; goes on from the last snapshot."""
-    settings, weights = context.config.tracking, RenderWeights.of(context.config.paper)
     snapshot = context.snapshot / "state.npz"
     rig = rig_of(context.run.load_calibration().directions, len(frames))
-    if len(rig) > 1:  # what one direction does not show, the others do
-        settings = replace(settings, new_segments=False, render="never")
     shutter = load_shutter(context.run)
     state = TrackState.load(snapshot, rig, shutter) if snapshot.exists() else start_state(context, rig, shutter)
-    front_end = FrontEnd(state, pictures, settings, context.config.run.seed, weights)
+    front_end = FrontEnd(state, pictures, context.config.run.seed)
     every = max(SNAPSHOT_EVERY, len(frames) // SNAPSHOTS)
     for frame in context.progress.track(frames[state.done :], "tracking", len(frames) - state.done):
         if frame.id not in state.poses:
@@ -112,22 +104,6 @@ def start_state(context: StageContext, rig: Rig, shutter: Shutter) -> TrackState
     for piece in context.run.pieces("frames"):
         state.add_segment(TrackState.from_backbone(context.run.load_sparse("frames", piece), FEATURE_SD))
     return state
-
-
-def compare_all(context: StageContext, state: TrackState, pictures: Pictures) -> dict[str, Any]:
-    """Every frame but the keyframes against Gaussians seeded around it; the new pose stays where the loss falls."""
-    weights = RenderWeights.of(context.config.paper)
-    others = [i for i in sorted(state.poses) if i not in state.keyframes]
-    better = []
-    for frame_id in context.progress.track(others, "comparing", len(others)):
-        segment = state.segment[frame_id]
-        keyframes = [k for k in state.nearest_keyframes(frame_id, 1) if state.segment[k] == segment]
-        found = compare_frame(frame_id, state.poses[frame_id], keyframes, state, pictures, weights)
-        if found is not None and found.is_better:
-            state.poses[frame_id] = found.cam_from_world
-            better.append(found.loss_after / found.loss_before)
-    share = float(np.mean(better)) if better else 1.0
-    return {"compared": len(others), "compared_better": len(better), "compared_loss_ratio": round(share, 4)}
 
 
 def save_pieces(context: StageContext, pieces: list[TrackState], frames: list[Frame]) -> None:

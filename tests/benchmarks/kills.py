@@ -49,7 +49,7 @@ SETTINGS = (
 )  # fmt: skip
 CHANGES = (
     (), ("export.spz=true",), ("proxy.stereo_planes=12",), ("mapping.min_iterations=24",), ("export.mesh_side=100",),
-    ("global_ba.use_loops=false",), ("tracking.render=never",), ("frames.max_features=500",),
+    ("global_ba.use_loops=false",), ("tracking.use_depth=false",), ("frames.max_features=500",),
 )  # fmt: skip
 """Settings of one round after the other, each beside SETTINGS: rounds begin at different stages."""
 CALLS = ("replace", "fsync", "unlink", "rmdir", "mkdir", "open")

@@ -65,11 +65,7 @@ CASES = {
 
 ABLATIONS = {
     **ARTICLE_ABLATIONS,
-    "with edge term": ("paper.edge_weight=0.02",),
-    "kappa = 5": ("paper.kappa=5.0",),
     "without splitting": ("mapping.split_error=0.0",),
-    "densified by classes": ("paper.class_growth=true",),
-    "gradients clipped at boundaries": ("paper.boundary_clip=1.0",),
     "without exposure": ("mapping.exposure=false",),
     "without pose refinement": ("mapping.refine_poses=false",),
 }

@@ -1,1 +1,1 @@
-"""Terms of the paper that earn nothing measurable, one a module; off unless `[paper]` asks for them."""
+"""Terms of the paper that something cheaper does as well; off unless `[paper]` asks for them."""

@@ -72,18 +72,6 @@ def test_changed_setting_reruns_its_stage_and_what_follows(recorder: Recorder, t
     assert bring_up_to_date(recorder, tmp_path / "r", config) == ["mapping", "global_ba", "export"]
 
 
-@pytest.mark.parametrize(
-    ("setting", "first"),
-    [("kappa=5.0", "mapping"), ("tracking_depth_weight=1.0", "tracking")],
-)
-def test_a_term_of_the_article_reruns_the_stages_that_read_it(
-    recorder: Recorder, tmp_path: Path, setting: str, first: str
-) -> None:
-    bring_up_to_date(recorder, tmp_path / "r")
-    config = load_config(overrides=[f"paper.{setting}"])
-    assert bring_up_to_date(recorder, tmp_path / "r", config) == list(STAGES[STAGES.index(first) :])
-
-
 def another_value(value: Any) -> Any:
     if isinstance(value, bool):
         return str(not value).lower()

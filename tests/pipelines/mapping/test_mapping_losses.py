@@ -8,7 +8,6 @@ from skimage.metrics import structural_similarity
 from msgs_slam.pipelines.gaussians.ssim import ssim_map
 from msgs_slam.pipelines.mapping import losses
 from msgs_slam.pipelines.mapping.exposure import expose, fit_exposure
-from msgs_slam.pipelines.mapping.paper.edge_term import edge_loss
 from msgs_slam.pipelines.mapping.paper.label_image import label_image_loss
 from msgs_slam.pipelines.mapping.photo_loss import photo_loss, plain_photo_loss
 from msgs_slam.pipelines.types import VOID
@@ -117,16 +116,6 @@ def test_the_label_loss_ignores_void_and_falls_with_the_right_logit() -> None:
     assert gradient.grad is not None
     assert gradient.grad[1, 1].abs().max() == 0
     assert gradient.grad[0, 1, 1] < 0
-
-
-def test_edge_loss_wants_steps_at_class_edges_and_nowhere_else() -> None:
-    labels = torch.tensor([[0, 0, 1, 1]] * 4, dtype=torch.uint8)
-    step_at_edge = torch.tensor([[1.0, 1.0, 2.0, 2.0]] * 4)
-    step_inside = torch.tensor([[1.0, 2.0, 2.0, 2.0]] * 4)
-    right, flat, wrong = (edge_loss(d, labels, 1.0) for d in (step_at_edge, torch.ones(4, 4), step_inside))
-    assert right < 1e-6 < flat < wrong
-    void = torch.full((4, 4), VOID, dtype=torch.uint8)
-    assert edge_loss(step_inside, void, 1.0) == 0
 
 
 def test_size_and_silhouette() -> None:

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from msgs_slam.pipelines.config import MappingConfig, PaperConfig
-from msgs_slam.pipelines.gaussians.render import Rendering
 from msgs_slam.pipelines.gaussians.seeding import SEED_LOGIT
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project_gaussians
@@ -127,15 +126,6 @@ def test_a_gaussian_takes_the_classes_of_the_pixels_it_fills(room: MappingInput,
     assert logits[changed][:, 0].abs().max() == 0
     unknown = replace(same, channels=torch.full_like(view.channels, VOID))
     assert torch.equal(voted_logits(m, [(unknown, view.cam_from_world)]), m.class_logits)
-
-
-def test_the_edge_term_does_not_need_the_labels(room: MappingInput) -> None:
-    view, losses = room.views[0], []
-    drawn = Rendering(torch.zeros(*view.depth.shape, 5), view.depth + 0.3 * torch.rand(view.depth.shape), view.trust)
-    for weight in (0.0, 1.0):
-        terms = objective.Objective(SETTINGS, PaperConfig(edge_weight=weight), 2, 1.0)
-        losses.append(terms.of(view, torch.zeros(2, 3), drawn, torch.zeros(1), terms.uses_labels(0)).item())
-    assert losses[1] > losses[0] + 0.01
 
 
 class Killed(Exception):

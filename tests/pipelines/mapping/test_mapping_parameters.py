@@ -8,7 +8,6 @@ from msgs_slam.pipelines.gaussian_map import decided_channels
 from msgs_slam.pipelines.gaussians.seeding import complete_depth, fill_smoothly, seed_gaussians, seed_grid, seed_spacing
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.mapping import densify
-from msgs_slam.pipelines.mapping.paper.class_growth import wrong_classes
 from msgs_slam.pipelines.mapping.parameters import KEYS, MapParameters, empty_map
 from msgs_slam.pipelines.mapping.region_prior import with_region_prior
 from msgs_slam.pipelines.types import VOID, Intrinsics
@@ -150,9 +149,6 @@ def test_conditions_of_densification() -> None:
     rendered, proxy = torch.tensor([2.0, 2.0, 2.0, 2.0]), torch.tensor([1.0, 3.0, 0.0, 1.7])
     trust = torch.tensor([1.0, 1.0, 1.0, 0.1])
     assert densify.hidden_surfaces(rendered, proxy, trust, 0.05).tolist() == [True, False, False, False]
-    logits = torch.tensor([[[2.0, 0.0], [0.0, 2.0], [2.0, 0.0]]])
-    channels = torch.tensor([[0, 0, VOID]], dtype=torch.uint8)
-    assert wrong_classes(logits, channels, torch.ones(1, 3)).tolist() == [[False, True, False]]
 
 
 def test_useless_gaussians() -> None:

@@ -17,21 +17,16 @@ from msgs_slam.pipelines.config import Config, MappingConfig, RunConfig
 from msgs_slam.pipelines.depth.posed import PosedDepth
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.global_ba.loops import FoundLoops
-from msgs_slam.pipelines.global_ba.stage import refine
-from msgs_slam.pipelines.global_ba.verify import Loop
 from msgs_slam.pipelines.mapping import gauge, submaps
 from msgs_slam.pipelines.mapping import stage as mapping_stage
 from msgs_slam.pipelines.mapping.build import refine_map
 from msgs_slam.pipelines.mapping.gauge import SeenExposures, common_exposure
 from msgs_slam.pipelines.mapping.submaps import BORDER, divide, nearest_seeing
 from msgs_slam.pipelines.outcome import load_outcome, maps_around
-from msgs_slam.pipelines.read_config import merge_settings
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.memory import LEAST_SUBMAP, submap_size
 from msgs_slam.pipelines.system.progress import SilentProgress
-from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS
-from msgs_slam.pipelines.types import Intrinsics, LoopEdge
+from msgs_slam.pipelines.types import Intrinsics
 
 CONFIG = Config(
     run=RunConfig(device="cpu"),
@@ -220,26 +215,6 @@ def test_a_shaken_map_is_refined_in_its_parts(finished: RunFolder, tmp_path: Pat
     assert refined.psnr_after > refined.psnr_before + 1
     assert 0.8 < len(refined.result.gaussian_map) / len(gaussian_map) < 1.6
     assert refined.result.cam_from_world.shape == (14, 4, 4)
-
-
-def test_poses_at_the_ends_of_a_loop_are_adjusted_in_parts_too(finished: RunFolder, tmp_path: Path) -> None:
-    """Eq. (25) without any refinement after it; a pose that is off comes nearer, others stay."""
-    poses, ids = finished.load_trajectory("mapping"), finished.load_exposure()["frame_ids"]
-    loop = Loop(LoopEdge(int(ids[1]), int(ids[12]), np.eye(4), 1.0, 30), NO_SIGHTINGS, NO_SIGHTINGS)
-    true, off = poses.cam_from_world[ids], poses.cam_from_world.copy()
-    off[ids[1]] = se3.exp(np.array([0.02, -0.015, 0.02, 0.004, 0.006, -0.003])) @ off[ids[1]]
-    config = merge_settings(CONFIG, {"paper": {"loop_steps": 40}, "global_ba": {"joint_passes": 0.0}}, "")
-    context = StageContext(finished, finished.root, config, tmp_path, SilentProgress())
-    refined = refine(
-        context, finished.load_map("mapping"), replace(poses, cam_from_world=off),
-        finished.load_depth_fields("tracking"), FoundLoops([loop], 1, 0, 0, 0),
-    ).result.cam_from_world  # fmt: skip
-
-    def apart(pose: NDArray[np.float64]) -> float:
-        return float(np.linalg.norm(se3.log(pose @ se3.inverse(true[1]))))
-
-    assert 0 < apart(refined[1]) < 0.8 * apart(off[ids[1]])
-    np.testing.assert_allclose(refined[4:10], true[4:10], atol=1e-6)
 
 
 def test_a_view_is_drawn_from_its_submap_and_those_beside_it(finished: RunFolder) -> None:

@@ -26,7 +26,7 @@ from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.tracking.pictures import Pictures
-from msgs_slam.pipelines.tracking.refine import RenderWeights, compare_frame
+from msgs_slam.pipelines.tracking.refine import compare_frame
 from msgs_slam.pipelines.tracking.state import FEATURE_SD, TrackState
 from msgs_slam.pipelines.viewer.scene import load_scenes
 from tests.pipelines.mapping.small_run import make_run
@@ -64,7 +64,7 @@ def run(device: None, tmp_path_factory: pytest.TempPathFactory, world_sequence: 
 
 def test_a_frame_is_compared_with_gaussians_there(run: RunFolder) -> None:
     state = TrackState.from_backbone(run.load_sparse("tracking"), FEATURE_SD)
-    found = compare_frame(5, state.poses[5], [4, 6], state, Pictures(run, CONFIG.frames), RenderWeights())
+    found = compare_frame(5, state.poses[5], [4, 6], state, Pictures(run, CONFIG.frames))
     assert found is not None
     assert found.unexplained < 0.5
 

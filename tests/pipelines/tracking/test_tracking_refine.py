@@ -4,13 +4,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.tracking.front_end import RENDER_LOSS
 from msgs_slam.pipelines.tracking.pictures import Pictures
-from msgs_slam.pipelines.tracking.refine import RenderWeights, compare_frame
+from msgs_slam.pipelines.tracking.refine import compare_frame
 from msgs_slam.pipelines.tracking.state import TrackState
 from tests.pipelines.tracking.conftest import MadeRun
 
@@ -23,47 +22,19 @@ def test_comparison_brings_a_pose_nearer(tmp_path: Path, make_run: Callable[...,
     for k in (9, 12):
         state.poses[k] = made.cam_from_world[k]
     pictures = Pictures(made.run, FramesConfig())
-    weights = RenderWeights()
     truth = made.cam_from_world[10]
     start = se3.exp(np.array([0.025, -0.02, 0.025, 0.008, -0.01, 0.005])) @ truth
-    found = compare_frame(10, start, [9, 12], state, pictures, weights)
+    found = compare_frame(10, start, [9, 12], state, pictures)
     assert found is not None
     assert found.is_better
     assert 0 < found.loss_after < found.loss_before
     before, after = (np.linalg.norm(se3.log(p @ se3.inverse(truth))) for p in (start, found.cam_from_world))
     assert 0 < after < 0.5 * before
     assert found.unexplained < RENDER_LOSS
-    nothing = compare_frame(11, made.cam_from_world[11], [9, 12], state, pictures, weights)
+    nothing = compare_frame(11, made.cam_from_world[11], [9, 12], state, pictures)
     assert nothing is None or nothing.unexplained > 1
     # Without depth there is nothing to compare with.
-    assert compare_frame(10, start, [10], _with_keyframe(state, 10, truth), pictures, weights) is None
-
-
-@pytest.mark.parametrize("term", ["depth", "label"])
-@pytest.mark.parametrize("depth_factor", [1.0, 1.2])
-def test_depth_and_labels_of_the_frame_bring_its_pose_nearer_without_its_colours(
-    tmp_path: Path, make_run: Callable[..., MadeRun], term: str, depth_factor: float
-) -> None:
-    made = make_run(tmp_path / "run", (9, 12), backbone_scale=1.0, all_proxies=True, depth_factor=depth_factor)
-    backbone = made.run.load_backbone()
-    assert backbone is not None
-    state = TrackState.from_backbone(backbone, 0.5)
-    for k in (9, 12):
-        state.poses[k] = made.cam_from_world[k]
-    pictures = Pictures(made.run, FramesConfig())
-    truth = made.cam_from_world[10]
-    # Mostly along the view: there depth tells most. Its blending is some millimetres in front of the surface.
-    start = se3.exp(np.array([0.01, -0.01, 0.06, 0.003, -0.004, 0.002])) @ truth
-
-    def found_with(weights: RenderWeights) -> float:
-        found = compare_frame(10, start, [9, 12], state, pictures, weights)
-        assert found is not None
-        assert found.is_better
-        return float(np.linalg.norm(se3.log(found.cam_from_world @ se3.inverse(truth))))
-
-    begin = float(np.linalg.norm(se3.log(start @ se3.inverse(truth))))
-    assert 0 < found_with(RenderWeights(color=0.0, **{term: 1.0})) < 0.6 * begin
-    assert compare_frame(10, start, [9, 12], state, pictures, RenderWeights(color=0.0)) is None
+    assert compare_frame(10, start, [10], _with_keyframe(state, 10, truth), pictures) is None
 
 
 def _with_keyframe(state: TrackState, frame_id: int, pose: np.ndarray) -> TrackState:

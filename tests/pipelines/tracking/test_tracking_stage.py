@@ -15,7 +15,6 @@ from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.sparse_files import load_sparse_model, save_sparse_model
 from msgs_slam.pipelines.tracking import adjust, stage
 from msgs_slam.pipelines.tracking.stage import STAGE, stretches
@@ -212,14 +211,6 @@ def test_a_part_that_shows_another_place_is_not_glued_on(
     assert set(figures["lost"]) == {str(i) for i in range(14, 24)}
     assert any("15-23" in w and "piece_2" in w for w in context.warnings)
     assert 0 < trajectory_error(made, scale=True) < 0.01
-
-
-def test_without_new_segments_what_cannot_be_reached_is_lost(
-    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
-) -> None:
-    made = make_run(tmp_path / "run", keyframes=(), all_proxies=True)
-    with pytest.raises(InputError, match="no camera motion"):
-        STAGE.run(open_stage(made.run, "tracking", load_config(overrides=["tracking.new_segments=false"])))
 
 
 def test_nothing_to_go_by_is_refused(
