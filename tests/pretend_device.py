@@ -129,11 +129,9 @@ class PretendBackend:
 
     @staticmethod
     def composite(*arguments: Any) -> tuple[torch.Tensor, ...]:
-        """As a backend's: six tensors, width, height, the guiding depth or None, and numbers."""
-        guide = arguments[8]
+        """As a backend's: six tensors, width, height, and the least depth."""
         values = [_taken(x) for x in arguments[:6]]
-        rest = (*arguments[6:8], None if guide is None else _taken(guide), *arguments[9:])
-        return _Composite.apply(rest, *values)
+        return _Composite.apply(arguments[6:], *values)
 
     @staticmethod
     def inspect(*arguments: Any) -> tuple[torch.Tensor, ...]:
@@ -157,7 +155,7 @@ class _Composite(torch.autograd.Function):
     def forward(ctx: Any, rest: tuple[Any, ...], *values: PretendTensor) -> tuple[torch.Tensor, ...]:
         ctx.inputs = [v.inner.detach().contiguous().requires_grad_() for v in values]
         with torch.enable_grad():
-            ctx.outputs = cpu.composite(*ctx.inputs, *rest[:2], _inner(rest[2]), *rest[3:])
+            ctx.outputs = cpu.composite(*ctx.inputs, *rest)
         return tuple(PretendTensor(x.detach()) for x in ctx.outputs)
 
     @staticmethod

@@ -17,8 +17,8 @@ import msgs_slam.pipelines.gaussians.render.reference as reference
 class Composite:
     """features (H, W, C); depth_sum, depth_silhouette, silhouette (H, W).
 
-    silhouette is 1 - T of the plain chain. depth_sum and depth_silhouette come from the chain of eq. (7), whose weights
-    may sum past 1 when κ > 0: the depth of a pixel is their ratio.
+    silhouette is 1 - T. depth_silhouette has the same values, and is what the depth sum is divided by: the gradient of
+    the depth comes back apart from that of the silhouette.
     """
 
     features: Tensor
@@ -36,34 +36,25 @@ def composite(
     features: Tensor,
     width: int,
     height: int,
-    proxy_depth: Tensor | None = None,
-    kappa: float = 0.0,
     backend: str | None = None,
     near: float = 0.0,
 ) -> Composite:
     """Blend M Gaussians into a width x height image; differentiable in the first six arguments.
 
     u, v, sigma_px (M,) pixels, pixel centres at half integers; z (M,) depth, ignored where <= near; opacity (M,) 0..1;
-    features (M, C). proxy_depth (H, W), 0 = unknown, no gradient; kappa >= 0 in 1/depth². backend: "reference", "cpu",
-    "cuda" or None for the fastest that runs these tensors. Raises ValueError for wrong shapes, for NaN or infinity on
-    the CPU (by the argument's name) and for an unknown backend.
+    features (M, C). backend: "reference", "cpu", "cuda" or None for the fastest that runs these tensors. Raises
+    ValueError for wrong shapes, for NaN or infinity on the CPU (by the argument's name) and for an unknown backend.
     """
     arguments = {"u": u, "v": v, "sigma_px": sigma_px, "z": z, "opacity": opacity, "features": features}
-    check_arguments(arguments, width, height, proxy_depth, kappa)
+    check_arguments(arguments, width, height)
     module = choose_backend(backend, u)
-    return Composite(
-        *module.composite(u, v, sigma_px, z, opacity, features, width, height, proxy_depth, float(kappa), float(near))
-    )
+    return Composite(*module.composite(u, v, sigma_px, z, opacity, features, width, height, float(near)))
 
 
-def check_arguments(
-    arguments: dict[str, Tensor], width: int, height: int, proxy_depth: Tensor | None, kappa: float
-) -> None:
+def check_arguments(arguments: dict[str, Tensor], width: int, height: int) -> None:
     """Raise ValueError, naming the argument, for wrong shapes and values that are not finite."""
     if width < 1 or height < 1:
         raise ValueError(f"image size must be positive, got {width}x{height}")
-    if not 0 <= kappa < float("inf"):
-        raise ValueError(f"kappa: got {kappa}, expected a finite number >= 0")
     count = len(next(iter(arguments.values())))
     for name, tensor in arguments.items():
         wanted = 2 if name == "features" else 1
@@ -72,10 +63,6 @@ def check_arguments(
                 f"{name}: got shape {tuple(tensor.shape)}, expected {count} rows and {wanted} dimension(s)"
             )
         require_finite(name, tensor)
-    if proxy_depth is not None:
-        if tuple(proxy_depth.shape) != (height, width):
-            raise ValueError(f"proxy_depth: got shape {tuple(proxy_depth.shape)}, expected {(height, width)}")
-        require_finite("proxy_depth", proxy_depth)
 
 
 def require_finite(name: str, tensor: Tensor) -> None:

@@ -30,41 +30,37 @@ def composite(
     features: Tensor,
     width: int,
     height: int,
-    proxy_depth: Tensor | None,
-    kappa: float,
     near: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Feature image (H, W, C), depth sum, depth silhouette and silhouette (H, W) of float32 CPU tensors."""
-    return _Composite.apply(u, v, sigma_px, z, opacity, features, width, height, proxy_depth, kappa, near)
+    return _Composite.apply(u, v, sigma_px, z, opacity, features, width, height, near)
 
 
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         *projected, values = (_array(tensor) for tensor in arguments[:6])
-        width, height, proxy_depth, kappa, near = arguments[6:]
-        # The type of the guide, not its value, chooses the depth chain: who uses only one compiles only one.
-        guide = None if proxy_depth is None or kappa == 0 else (_array(proxy_depth), F32(kappa))
-        vectors = None if guide is None and values.shape[1] == 3 else channel_vectors(values.shape[1])
+        width, height, near = arguments[6:]
+        vectors = None if values.shape[1] == 3 else channel_vectors(values.shape[1])
         channels = 3 if vectors is None else 16 * len(vectors)
         bands = split_into_bands(tuple(projected), values, channels, width, height, near)
-        features, planes = draw_bands(bands, vectors, guide, values.shape[1], width, height)
+        features, planes = draw_bands(bands, vectors, values.shape[1], width, height)
         outputs = (torch.from_numpy(features), *torch.from_numpy(planes).unbind(0))
         ctx.save_for_backward(outputs[0])
-        ctx.state = (bands, vectors, guide, planes)
+        ctx.state = (bands, vectors, planes)
         ctx.set_materialize_grads(False)
         return outputs
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        bands, vectors, guide, planes = ctx.state
+        bands, vectors, planes = ctx.state
         features = _array(ctx.saved_tensors[0])
         images = (features, *planes)
         upstream = [
             np.zeros_like(image) if gradient is None else _array(gradient)
             for image, gradient in zip(images, gradients, strict=True)
         ]
-        job = (guide, features, planes, upstream[0], np.stack(upstream[1:]))
+        job = (features, planes, upstream[0], np.stack(upstream[1:]))
         count, channels = len(bands.first), features.shape[2]
         d_geometry, d_features = np.zeros((5, count), F32), np.zeros((count, channels), F32)
         shared = np.empty((int(bands.slots[-1]), 5 + channels), F32)
@@ -76,7 +72,7 @@ class _Composite(torch.autograd.Function):
         for_each(
             lambda n: sum_shared(n * _ROWS, _ROWS, bands.slots, shared, d_geometry, d_features), -(-count // _ROWS)
         )
-        return (*torch.from_numpy(d_geometry).unbind(0), torch.from_numpy(d_features), *[None] * 5)
+        return (*torch.from_numpy(d_geometry).unbind(0), torch.from_numpy(d_features), *[None] * 3)
 
 
 def channel_vectors(channels: int) -> tuple[int, ...]:

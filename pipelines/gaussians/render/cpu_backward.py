@@ -22,7 +22,6 @@ from msgs_slam.pipelines.gaussians.render.cpu_bands import (
 from msgs_slam.pipelines.gaussians.render.cpu_forward import (
     CHECK_EVERY,
     PIXELS,
-    Guide,
     Vectors,
     channels_of,
     clear,
@@ -42,16 +41,13 @@ from msgs_slam.pipelines.gaussians.render.lanes import (
 )
 
 F32 = np.float32
-LIGHT, DEPTH_LIGHT, BEHIND, DEPTH_BEHIND, PROXY, KAPPA = (PIXELS * i for i in range(6))
-D_DEPTH, D_DEPTH_SEEN, D_SEEN, ALPHA, WEIGHT, PRODUCT = (PIXELS * i for i in range(6, 12))
-"""Planes of a tile's state: light, proxy and κ as in the forward pass; what is still behind, in the plain and in the
-depth chain; the gradients of depth sum, depth silhouette and silhouette; and three that pass from one step of a
-Gaussian to the next. With κ = 0 the chains are one: the plain planes stand for both."""
-PLANES = 12
+LIGHT, BEHIND, D_DEPTH, D_SEEN, ALPHA, WEIGHT, PRODUCT = (PIXELS * i for i in range(7))
+"""Planes of a tile's state: light as in the forward pass; what is still behind; the gradients of depth sum and
+silhouette; and three that pass from one step of a Gaussian to the next."""
+PLANES = 7
 
 _ALPHA_MAX, _LIGHT_MIN = F32(rules.ALPHA_MAX), F32(rules.TRANSMITTANCE_MIN)
-_HALF, _ZERO, _ONE, _TWO = F32(0.5), F32(0), F32(1), F32(2)
-_TINY = F32(1e-30)
+_HALF, _ZERO, _ONE = F32(0.5), F32(0), F32(1)
 
 
 @inner
@@ -63,7 +59,6 @@ def open_tile(
     top: int,
     columns: int,
     rows: int,
-    guide: Guide,
     features: NDArray[np.float32],
     planes: NDArray[np.float32],
     d_features: NDArray[np.float32],
@@ -84,25 +79,13 @@ def open_tile(
             state[LIGHT + pixel] = _ONE
             state[D_DEPTH + pixel] = d_depth
             depth_behind = d_depth * planes[0, row, column] + d_depth_seen * planes[1, row, column]
-            if guide is not None:
-                proxy, kappa = guide
-                state[DEPTH_LIGHT + pixel] = _ONE
-                state[DEPTH_BEHIND + pixel] = depth_behind
-                state[BEHIND + pixel] = behind
-                state[D_DEPTH_SEEN + pixel] = d_depth_seen
-                state[D_SEEN + pixel] = d_seen
-                if proxy[row, column] > _ZERO:
-                    state[PROXY + pixel] = proxy[row, column]
-                    state[KAPPA + pixel] = kappa
-            else:
-                state[BEHIND + pixel] = behind + depth_behind
-                state[D_SEEN + pixel] = d_seen + d_depth_seen
+            state[BEHIND + pixel] = behind + depth_behind
+            state[D_SEEN + pixel] = d_seen + d_depth_seen
 
 
 @inner
 def weigh_rows(
     state: NDArray[np.float32],
-    decisive: int,
     falloff_y: NDArray[np.float32],
     falloff_x: object,
     dx2: object,
@@ -116,7 +99,7 @@ def weigh_rows(
         row = TILE * y
         dy = F32(y) + _HALF - y_center
         alpha = at_most(falloff_x * falloff_y[y], _ALPHA_MAX)
-        inside = (dx2 <= splat(reach2 - dy * dy)) & (load(state, decisive + row) >= _LIGHT_MIN)
+        inside = (dx2 <= splat(reach2 - dy * dy)) & (load(state, LIGHT + row) >= _LIGHT_MIN)
         alpha = where(inside, alpha)
         store(state, ALPHA + row, alpha)
         store(state, WEIGHT + row, alpha * load(state, LIGHT + row))
@@ -186,39 +169,6 @@ def pull_painted_rows(
     return pull, pull_y, pull_y2, d_z, d_red, d_green, d_blue
 
 
-@inner
-def pull_rows_by_proxy(
-    state: NDArray[np.float32], z: np.float32, y_center: np.float32, first: int, last: int
-) -> tuple[object, object, object, object]:
-    """`pull_rows` with the depth chain of MSGS-SLAM eq. (7)."""
-    pull, pull_y, pull_y2, d_z = splat(_ZERO), splat(_ZERO), splat(_ZERO), splat(_ZERO)
-    for y in range(first, last + 1):
-        row = TILE * y
-        dy = F32(y) + _HALF - y_center
-        alpha, weight, light = load(state, ALPHA + row), load(state, WEIGHT + row), load(state, LIGHT + row)
-        q = load(state, PRODUCT + row) + load(state, D_SEEN + row)
-        behind = load(state, BEHIND + row) - weight * q
-        store(state, BEHIND + row, behind)
-        light_after = light - weight
-        store(state, LIGHT + row, where(light_after > splat(_TINY), light_after))
-        d_alpha = light * q - behind / (_ONE - alpha)
-
-        d_depth, depth_light = load(state, D_DEPTH + row), load(state, DEPTH_LIGHT + row)
-        error, kappa = splat(z) - load(state, PROXY + row), load(state, KAPPA + row)
-        agreement = exp(splat(_ZERO) - kappa * error * error)
-        value = d_depth * z + load(state, D_DEPTH_SEEN + row)
-        depth_weight = alpha * depth_light
-        depth_behind = load(state, DEPTH_BEHIND + row) - depth_weight * value
-        store(state, DEPTH_BEHIND + row, depth_behind)
-        store(state, DEPTH_LIGHT + row, depth_light - depth_weight * agreement)
-        d_occlusion = splat(_ZERO) - depth_behind / (_ONE - alpha * agreement)
-        d_alpha = d_alpha + depth_light * value + agreement * d_occlusion
-        m = where(alpha < splat(_ALPHA_MAX), d_alpha * alpha)
-        pull, pull_y, pull_y2 = pull + m, pull_y + m * dy, pull_y2 + m * (dy * dy)
-        d_z = d_z + depth_weight * d_depth - alpha * agreement * d_occlusion * (_TWO * kappa * error)
-    return pull, pull_y, pull_y2, d_z
-
-
 @kernel
 def backward_band(
     vectors: Vectors,
@@ -230,7 +180,6 @@ def backward_band(
     padded: NDArray[np.float32],
     tile_starts: NDArray[np.int64],
     members: NDArray[np.int32],
-    guide: Guide,
     features: NDArray[np.float32],
     planes: NDArray[np.float32],
     d_image: NDArray[np.float32],
@@ -253,12 +202,11 @@ def backward_band(
     image = np.zeros(PIXELS * channels, np.float32)
     state = np.empty(PIXELS * PLANES, np.float32)
     falloff_y = np.empty(TILE, np.float32)
-    decisive = LIGHT if guide is None else DEPTH_LIGHT
     for tile in range(len(tile_starts) - 1):
         left, top = TILE * (tile % across), band_top + TILE * (tile // across)
         columns, rows = min(TILE, width - left), min(TILE, height - top)
         open_tile(
-            state, image, vectors, left, top, columns, rows, guide,
+            state, image, vectors, left, top, columns, rows,
             features, planes, d_image, d_planes,
         )  # fmt: skip
         for k in range(tile_starts[tile], tile_starts[tile + 1]):
@@ -282,20 +230,17 @@ def backward_band(
                 )
                 add_totals(d_records, 8 * i + 4, pull, d_red, d_green, d_blue)
             else:
-                weigh_rows(state, decisive, falloff_y, falloff_x, dx2, v_tile, r * r, y0, y1)
+                weigh_rows(state, falloff_y, falloff_x, dx2, v_tile, r * r, y0, y1)
                 quads = (x1 - x0 + 4) // 4
                 corner = TILE * y0 + min(x0, TILE - 4 * quads)  # four at a time, without leaving the tile
                 gradients_of_box(
                     image, corner * channels, padded, i * channels, d_padded, i * channels,
                     state, WEIGHT + corner, state, PRODUCT + corner, y1 - y0 + 1, quads, vectors,
                 )  # fmt: skip
-                if guide is None:
-                    pull, pull_y, pull_y2, d_z = pull_rows(state, depth, v_tile, y0, y1)
-                else:
-                    pull, pull_y, pull_y2, d_z = pull_rows_by_proxy(state, depth, v_tile, y0, y1)
+                pull, pull_y, pull_y2, d_z = pull_rows(state, depth, v_tile, y0, y1)
                 add_totals(d_records, 8 * i + 4, pull, unused, unused, unused)
             add_totals(d_records, 8 * i, pull * dx, pull_y, pull * dx2 + pull_y2, d_z)
-            if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, decisive):
+            if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, LIGHT):
                 break
     for k in range(len(own)):
         i, at = own[k], 8 * k

@@ -37,21 +37,17 @@ from msgs_slam.pipelines.gaussians.render.threads import for_each
 
 F32 = np.float32
 PIXELS = TILE * TILE
-LIGHT, DEPTH_LIGHT, DEPTH_SUM, DEPTH_SILHOUETTE, PROXY, KAPPA = (PIXELS * i for i in range(6))
-"""Where the planes of the tile's state start: transmittance of the plain and of the depth chain, the two sums of the
-depth chain, the proxy depth and the κ of the pixel (0 where the proxy is unknown)."""
-PLANES = 6
-Guide: TypeAlias = tuple[NDArray[np.float32], np.float32] | None
-"""The proxy depth (H, W), 0 where unknown, and κ of eq. (7); None for κ = 0, where both chains are one."""
+LIGHT, DEPTH_SUM = 0, PIXELS
+"""Where the planes of the tile's state start: transmittance, and the sum of weighted depths."""
+PLANES = 2
 Vectors: TypeAlias = tuple[int, ...] | None
 """A tuple with one 0 per sixteen channels of a pixel, which lie side by side: its type tells the kernels how many
-vectors a pixel has. None for three channels without a guide, which lie in planes as the rest of a tile's state does:
+vectors a pixel has. None for three channels, which lie in planes as the rest of a tile's state does:
 one vector is sixteen pixels of a channel instead of a pixel's sixteen channels, at two thirds of the time."""
 CHECK_EVERY = 32  # Gaussians between two looks at whether the whole tile is opaque
 
 _ALPHA_MAX, _LIGHT_MIN = F32(rules.ALPHA_MAX), F32(rules.TRANSMITTANCE_MIN)
 _HALF, _ZERO, _ONE = F32(0.5), F32(0), F32(1)
-_TINY = F32(1e-30)
 
 
 @inner
@@ -73,9 +69,6 @@ def clear(numbers: NDArray[np.float32]) -> None:
 @inner
 def open_tile(
     state: NDArray[np.float32],
-    guide: Guide,
-    left: int,
-    top: int,
     columns: int,
     rows: int,
 ) -> None:
@@ -83,14 +76,7 @@ def open_tile(
     clear(state)
     for y in range(rows):
         for x in range(columns):
-            pixel = TILE * y + x
-            state[LIGHT + pixel] = _ONE
-            state[DEPTH_LIGHT + pixel] = _ONE
-            if guide is not None:
-                proxy, kappa = guide
-                if proxy[top + y, left + x] > _ZERO:
-                    state[PROXY + pixel] = proxy[top + y, left + x]
-                    state[KAPPA + pixel] = kappa
+            state[LIGHT + TILE * y + x] = _ONE
 
 
 @inner
@@ -129,39 +115,6 @@ def blend_rows(
 
 
 @inner
-def blend_rows_by_proxy(
-    state: NDArray[np.float32],
-    weights: NDArray[np.float32],
-    falloff_y: NDArray[np.float32],
-    falloff_x: object,
-    dx2: object,
-    y_center: np.float32,
-    reach2: np.float32,
-    z: np.float32,
-    first: int,
-    last: int,
-) -> None:
-    """`blend_rows` with the depth chain of MSGS-SLAM eq. (7): who disagrees with the proxy occludes less there."""
-    for y in range(first, last + 1):
-        row = TILE * y
-        dy = F32(y) + _HALF - y_center
-        alpha = at_most(falloff_x * falloff_y[y], _ALPHA_MAX)
-        depth_light = load(state, DEPTH_LIGHT + row)
-        alpha = where((dx2 <= splat(reach2 - dy * dy)) & (depth_light >= _LIGHT_MIN), alpha)
-        light = load(state, LIGHT + row)
-        weight = alpha * light
-        store(weights, row, weight)
-        light = light - weight
-        store(state, LIGHT + row, where(light > splat(_TINY), light))  # denormal numbers are slow
-        depth_weight = alpha * depth_light
-        store(state, DEPTH_SUM + row, load(state, DEPTH_SUM + row) + depth_weight * z)
-        store(state, DEPTH_SILHOUETTE + row, load(state, DEPTH_SILHOUETTE + row) + depth_weight)
-        error = splat(z) - load(state, PROXY + row)
-        agreement = exp(splat(_ZERO) - load(state, KAPPA + row) * error * error)
-        store(state, DEPTH_LIGHT + row, depth_light - depth_weight * agreement)
-
-
-@inner
 def paint_rows(
     image: NDArray[np.float32],
     weights: NDArray[np.float32],
@@ -180,11 +133,11 @@ def paint_rows(
 
 
 def draw_bands(
-    bands: Bands, vectors: Vectors, guide: Guide, channels: int, width: int, height: int
+    bands: Bands, vectors: Vectors, channels: int, width: int, height: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The image (H, W, channels) of all bands, and depth sum, depth silhouette and silhouette (3, H, W)."""
     features, planes = np.empty((height, width, channels), F32), np.empty((3, height, width), F32)
-    for_each(lambda b: forward_band(vectors, b, *bands.prepared[b], guide, features, planes), len(bands))
+    for_each(lambda b: forward_band(vectors, b, *bands.prepared[b], features, planes), len(bands))
     return features, planes
 
 
@@ -196,7 +149,6 @@ def forward_band(
     padded: NDArray[np.float32],
     tile_starts: NDArray[np.int64],
     members: NDArray[np.int32],
-    guide: Guide,
     out_features: NDArray[np.float32],
     out_planes: NDArray[np.float32],
 ) -> None:
@@ -208,11 +160,10 @@ def forward_band(
     image = np.empty(PIXELS * channels, np.float32)
     state = np.empty(PIXELS * PLANES, np.float32)
     weights, falloff_y = np.zeros(PIXELS, np.float32), np.empty(TILE, np.float32)
-    decisive = LIGHT if guide is None else DEPTH_LIGHT
     for tile in range(len(tile_starts) - 1):
         left, top = TILE * (tile % across), band_top + TILE * (tile // across)
         columns, rows = min(TILE, width - left), min(TILE, height - top)
-        open_tile(state, guide, left, top, columns, rows)
+        open_tile(state, columns, rows)
         clear(image)
         for k in range(tile_starts[tile], tile_starts[tile + 1]):
             i = members[k]
@@ -229,10 +180,7 @@ def forward_band(
             falloff_x = exp(dx2 * sharpness)
             store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
             depth = records[at + 3]
-            if guide is None:
-                blend_rows(state, weights, falloff_y, falloff_x, dx2, v_tile, r * r, depth, y0, y1)
-            else:
-                blend_rows_by_proxy(state, weights, falloff_y, falloff_x, dx2, v_tile, r * r, depth, y0, y1)
+            blend_rows(state, weights, falloff_y, falloff_x, dx2, v_tile, r * r, depth, y0, y1)
             if vectors is None:
                 paint_rows(image, weights, padded, i * channels, y0, y1)
             else:
@@ -240,7 +188,7 @@ def forward_band(
                 add_to_box(
                     image, corner * channels, padded, i * channels, weights, corner, y1 - y0 + 1, x1 - x0 + 1, vectors
                 )
-            if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, decisive):
+            if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, LIGHT):
                 break
         for y in range(rows):
             for x in range(columns):
@@ -250,5 +198,5 @@ def forward_band(
                     row[c] = image[PIXELS * c + pixel if vectors is None else pixel * channels + c]
                 seen = _ONE - state[LIGHT + pixel]
                 out_planes[0, top + y, left + x] = state[DEPTH_SUM + pixel]
-                out_planes[1, top + y, left + x] = seen if guide is None else state[DEPTH_SILHOUETTE + pixel]
+                out_planes[1, top + y, left + x] = seen
                 out_planes[2, top + y, left + x] = seen

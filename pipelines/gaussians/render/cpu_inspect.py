@@ -66,7 +66,7 @@ def weighted_errors(
     """(M,) blending weights of each Gaussian, summed over the pixels, each weighed with its error: `error_of` the
     (H, W, 3) colours that are shown, (H, W); float32 CPU tensors."""
     bands = bands_of((u, v, sigma_px, z, opacity), colors, width, height, near)
-    shown, _ = draw_bands(bands, None, None, 3, width, height)
+    shown, _ = draw_bands(bands, None, 3, width, height)
     errors = error_of(torch.from_numpy(shown))
     return _walk(bands, errors, torch.zeros(height, width, dtype=torch.uint8), 0)[1][:, 0]
 
@@ -132,7 +132,7 @@ def inspect_band(
     for tile in range(len(tile_starts) - 1):
         left, top = TILE * (tile % across), band_top + TILE * (tile // across)
         columns, rows = min(TILE, width - left), min(TILE, height - top)
-        open_tile(state, None, left, top, columns, rows)
+        open_tile(state, columns, rows)
         clear(medians)
         clear(count)
         only, is_mixed = -1, False

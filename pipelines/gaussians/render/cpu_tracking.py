@@ -198,7 +198,7 @@ def normal_equations_of_band(
             dx, dy = counting(_HALF - u_tile), counting(_HALF - v_tile)
             dx2 = dx * dx
             store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
-            weigh_rows(state, LIGHT, falloff_y, exp(dx2 * sharpness), dx2, v_tile, r * r, y0, y1)
+            weigh_rows(state, falloff_y, exp(dx2 * sharpness), dx2, v_tile, r * r, y0, y1)
             jacobian, color = jacobians[i * _JACOBIAN : (i + 1) * _JACOBIAN], colors[3 * i : 3 * i + 3]
             blend_duals(duals, state, jacobian, color, u_tile, v_tile, records[at + 3], y0, y1, x0, x1)
             if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, LIGHT):

@@ -37,13 +37,11 @@ def composite(
     features: Tensor,
     width: int,
     height: int,
-    proxy_depth: Tensor | None,
-    kappa: float,
     near: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Feature image (H, W, C), depth sum, depth silhouette and silhouette (H, W) of float32 tensors on one card."""
     records = record((u, v, sigma_px, z, opacity), width, height, near)
-    return composite_records(records, features, width, height, proxy_depth, kappa)
+    return composite_records(records, features, width, height)
 
 
 def composite_records(
@@ -51,14 +49,12 @@ def composite_records(
     features: Tensor,
     width: int,
     height: int,
-    proxy_depth: Tensor | None,
-    kappa: float,
     tiles: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The same of the Gaussians' records (M, 6); `tiles`: what `list_tiles` says of them, where that is known."""
     if features.dtype != torch.float32:
         raise ValueError(f"the cuda backend renders float32, got {features.dtype}")
-    return _Composite.apply(records, features, width, height, proxy_depth, kappa, tiles)
+    return _Composite.apply(records, features, width, height, tiles)
 
 
 def inspect(
@@ -78,7 +74,7 @@ def inspect_records(
     starts, members = tiles or list_tiles(records, width, height)
     counted = records if counts is None else counts.to(records).contiguous()
     median, weights = records.new_empty(height, width), records.new_zeros(2, len(records))
-    settings = {key: value for key, value in _settings(False, 1).items() if key not in ("GUIDED", "PADDED")}
+    settings = {key: value for key, value in _settings(1).items() if key != "PADDED"}
     cards.launch(
         inspect_tile, len(starts) - 1, starts, members, records, counted, median, *weights.unbind(0), width, height,
         COUNTED=counts is not None, **settings,
@@ -95,34 +91,32 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         records, features = (x.detach().contiguous() for x in arguments[:2])
-        width, height, proxy_depth, kappa, tiles = arguments[2:]
-        guided = proxy_depth is not None and kappa > 0
-        proxy = proxy_depth.to(features).contiguous() if guided else records
+        width, height, tiles = arguments[2:]
         starts, members = tiles or list_tiles(records, width, height)
         image = features.new_empty(height, width, features.shape[1])
         planes = [features.new_empty(height, width) for _ in range(3)]
-        inputs = (starts, members, records, features, proxy, kappa)
-        settings = _settings(guided, features.shape[1])
+        inputs = (starts, members, records, features)
+        settings = _settings(features.shape[1])
         size = (width, height, features.shape[1])
         cards.launch(forward_tile, len(starts) - 1, *inputs, image, *planes, *size, **settings)
-        ctx.save_for_backward(*inputs[:5], image, *planes)
-        ctx.kappa, ctx.size, ctx.settings = kappa, size, settings
+        ctx.save_for_backward(*inputs, image, *planes)
+        ctx.size, ctx.settings = size, settings
         ctx.set_materialize_grads(False)
         return (image, *planes)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
-        inputs, images = saved[:5], saved[5:]
-        starts, _, records, features, _ = inputs
+        inputs, images = saved[:4], saved[4:]
+        starts, _, records, features = inputs
         upstream = [
             torch.zeros_like(image) if gradient is None else gradient.contiguous()
             for image, gradient in zip(images, gradients, strict=True)
         ]
         results = features.new_zeros(records.numel() + features.numel()).split([records.numel(), features.numel()])
         given = (*results, *ctx.size)
-        cards.launch(backward_tile, len(starts) - 1, *inputs, ctx.kappa, *images, *upstream, *given, **ctx.settings)
-        return results[0].view_as(records), results[1].view_as(features), *[None] * 5
+        cards.launch(backward_tile, len(starts) - 1, *inputs, *images, *upstream, *given, **ctx.settings)
+        return results[0].view_as(records), results[1].view_as(features), *[None] * 3
 
 
 class _Ratio(torch.autograd.Function):
@@ -146,11 +140,10 @@ class _Ratio(torch.autograd.Function):
         return pulls[1], pulls[2]
 
 
-def _settings(guided: bool, channels: int) -> dict[str, Any]:
+def _settings(channels: int) -> dict[str, Any]:
     """Compile-time numbers; matrix products want powers of two, at least 16."""
     padded = max(16, 1 << (channels - 1).bit_length())
     return {
-        "GUIDED": guided,
         "PADDED": padded,
         "STEP": STEP,
         "TILE": TILE,

@@ -55,13 +55,6 @@ def transmittance(light: tl.tensor, occlusion: tl.tensor, STEP: tl.constexpr) ->
 
 
 @triton.jit
-def agreements(z: tl.tensor, proxy: tl.tensor, kappa: tl.tensor) -> tl.tensor:
-    """(pixels, Gaussians) error against the proxy depth and w_d of MSGS-SLAM eq. (7); 1 where there is no proxy."""
-    error = z[None, :] - proxy[:, None]
-    return error, tl.where(proxy[:, None] > 0, tl.exp(-kappa * error * error), 1.0)
-
-
-@triton.jit
 def pixels_of_tile(width: tl.tensor, height: tl.tensor, TILE: tl.constexpr) -> tl.tensor:
     """This program's tile; index, whether it is inside the image, and centre (x, y) of each of its pixels."""
     tile = tl.program_id(0)
@@ -75,61 +68,45 @@ def pixels_of_tile(width: tl.tensor, height: tl.tensor, TILE: tl.constexpr) -> t
 @triton.jit
 def forward_tile(
     starts: tl.tensor, members: tl.tensor, records: tl.tensor, features: tl.tensor,
-    proxy_depth: tl.tensor, kappa: tl.tensor,
     out_features: tl.tensor, out_depth: tl.tensor, out_depth_seen: tl.tensor, out_seen: tl.tensor,
     width: tl.tensor, height: tl.tensor, channels: tl.tensor,
-    GUIDED: tl.constexpr, PADDED: tl.constexpr, STEP: tl.constexpr, TILE: tl.constexpr,
+    PADDED: tl.constexpr, STEP: tl.constexpr, TILE: tl.constexpr,
     ALPHA_MAX: tl.constexpr, LIGHT_MIN: tl.constexpr,
 ) -> None:  # fmt: skip
     """Blends the Gaussians of one tile and stores its four images."""
     tile, pixel, inside, x, y = pixels_of_tile(width, height, TILE)
     channel = tl.arange(0, PADDED)
     light = tl.where(inside, 1.0, 0.0)
-    depth_light = light
     image = tl.zeros((TILE * TILE, PADDED), tl.float32)
     depth = tl.zeros((TILE * TILE,), tl.float32)
-    depth_seen = tl.zeros((TILE * TILE,), tl.float32)
     seen = tl.zeros((TILE * TILE,), tl.float32)
-    proxy = tl.zeros((TILE * TILE,), tl.float32)
-    if GUIDED:
-        proxy = tl.load(proxy_depth + pixel, mask=inside, other=0.0)
     first, end = tl.load(starts + tile), tl.load(starts + tile + 1)
-    while (first < end) & (tl.max(depth_light, axis=0) >= LIGHT_MIN):
+    while (first < end) & (tl.max(light, axis=0) >= LIGHT_MIN):
         index, used, u, v, sigma, z, opacity, reach = load_step(records, members, first, end, STEP)
         _, _, _, alpha = opacities(x, y, u, v, sigma, opacity, reach, ALPHA_MAX)
         before, light = transmittance(light, alpha, STEP)
-        depth_before = before
-        if GUIDED:
-            _, agreement = agreements(z, proxy, kappa)
-            depth_before, depth_light = transmittance(depth_light, alpha * agreement, STEP)
-        else:
-            depth_light = light
-        live = depth_before >= LIGHT_MIN
-        weight = tl.where(live, alpha * before, 0.0)
-        depth_weight = tl.where(live, alpha * depth_before, 0.0)
+        weight = tl.where(before >= LIGHT_MIN, alpha * before, 0.0)
         mask = used[:, None] & (channel < channels)[None, :]
         values = tl.load(features + index[:, None] * channels + channel[None, :], mask=mask, other=0.0)
         image += tl.dot(weight, values, input_precision="tf32x3")
-        depth += tl.sum(depth_weight * z[None, :], axis=1)
-        depth_seen += tl.sum(depth_weight, axis=1)
+        depth += tl.sum(weight * z[None, :], axis=1)
         seen += tl.sum(weight, axis=1)
         first += STEP
     mask = inside[:, None] & (channel < channels)[None, :]
     tl.store(out_features + pixel[:, None] * channels + channel[None, :], image, mask=mask)
     tl.store(out_depth + pixel, depth, mask=inside)
-    tl.store(out_depth_seen + pixel, depth_seen, mask=inside)
+    tl.store(out_depth_seen + pixel, seen, mask=inside)
     tl.store(out_seen + pixel, seen, mask=inside)
 
 
 @triton.jit
 def backward_tile(
     starts: tl.tensor, members: tl.tensor, records: tl.tensor, features: tl.tensor,
-    proxy_depth: tl.tensor, kappa: tl.tensor,
     image: tl.tensor, depth: tl.tensor, depth_seen: tl.tensor, seen: tl.tensor,
     d_image: tl.tensor, d_depth: tl.tensor, d_depth_seen: tl.tensor, d_seen: tl.tensor,
     d_records: tl.tensor, d_features: tl.tensor,
     width: tl.tensor, height: tl.tensor, channels: tl.tensor,
-    GUIDED: tl.constexpr, PADDED: tl.constexpr, STEP: tl.constexpr, TILE: tl.constexpr,
+    PADDED: tl.constexpr, STEP: tl.constexpr, TILE: tl.constexpr,
     ALPHA_MAX: tl.constexpr, LIGHT_MIN: tl.constexpr,
 ) -> None:  # fmt: skip
     """Front to back once more; what is behind a Gaussian is the pixel's total minus what has been blended so far."""
@@ -146,12 +123,8 @@ def backward_tile(
     depth_behind = pull_depth * tl.load(depth + pixel, mask=inside, other=0.0)
     depth_behind += pull_depth_seen * tl.load(depth_seen + pixel, mask=inside, other=0.0)
     light = tl.where(inside, 1.0, 0.0)
-    depth_light = light
-    proxy = tl.zeros((TILE * TILE,), tl.float32)
-    if GUIDED:
-        proxy = tl.load(proxy_depth + pixel, mask=inside, other=0.0)
     first, end = tl.load(starts + tile), tl.load(starts + tile + 1)
-    while (first < end) & (tl.max(depth_light, axis=0) >= LIGHT_MIN):
+    while (first < end) & (tl.max(light, axis=0) >= LIGHT_MIN):
         index, used, u, v, sigma, z, opacity, reach = load_step(records, members, first, end, STEP)
         dx, dy, distance2, alpha = opacities(x, y, u, v, sigma, opacity, reach, ALPHA_MAX)
         before, light = transmittance(light, alpha, STEP)
@@ -160,26 +133,12 @@ def backward_tile(
         values = tl.load(features + feature_at, mask=feature_mask, other=0.0)
         q = tl.dot(pull, tl.trans(values), input_precision="tf32x3") + pull_seen[:, None]
         depth_q = pull_depth[:, None] * z[None, :] + pull_depth_seen[:, None]
-        if GUIDED:
-            error, agreement = agreements(z, proxy, kappa)
-            depth_before, depth_light = transmittance(depth_light, alpha * agreement, STEP)
-            live = depth_before >= LIGHT_MIN
-            depth_weight = tl.where(live, alpha * depth_before, 0.0)
-            depth_left = depth_behind[:, None] - tl.cumsum(depth_weight * depth_q, axis=1)
-            depth_behind -= tl.sum(depth_weight * depth_q, axis=1)
-            d_occlusion = tl.where(live, -depth_left / (1.0 - alpha * agreement), 0.0)
-            d_alpha = depth_before * depth_q + agreement * d_occlusion
-            known = tl.where(proxy[:, None] > 0, 2.0 * kappa * error, 0.0)
-            d_z = tl.sum(depth_weight * pull_depth[:, None] - alpha * agreement * d_occlusion * known, axis=0)
-            weight = tl.where(live, alpha * before, 0.0)
-        else:
-            depth_light = light
-            live = before >= LIGHT_MIN
-            weight = tl.where(live, alpha * before, 0.0)
-            left = depth_behind[:, None] - tl.cumsum(weight * depth_q, axis=1)
-            depth_behind -= tl.sum(weight * depth_q, axis=1)
-            d_alpha = before * depth_q - left / (1.0 - alpha)
-            d_z = tl.sum(weight * pull_depth[:, None], axis=0)
+        live = before >= LIGHT_MIN
+        weight = tl.where(live, alpha * before, 0.0)
+        left = depth_behind[:, None] - tl.cumsum(weight * depth_q, axis=1)
+        depth_behind -= tl.sum(weight * depth_q, axis=1)
+        d_alpha = before * depth_q - left / (1.0 - alpha)
+        d_z = tl.sum(weight * pull_depth[:, None], axis=0)
         left = behind[:, None] - tl.cumsum(weight * q, axis=1)
         behind -= tl.sum(weight * q, axis=1)
         d_alpha += before * q - left / (1.0 - alpha)

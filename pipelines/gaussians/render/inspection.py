@@ -120,7 +120,7 @@ def error_shares(
     size = (intrinsics.width, intrinsics.height)
     records = kernels.project(*seen, cam_from_world.to(means), intrinsics, NEAR)
     tiles = kernels.list_tiles(records, *size)
-    shown = kernels.composite_records(records, colors.detach(), *size, None, 0.0, tiles)[0]
+    shown = kernels.composite_records(records, colors.detach(), *size, tiles)[0]
     return kernels.inspect_records(records, *size, error_of(shown), tiles)[1], records[:, 2]
 
 

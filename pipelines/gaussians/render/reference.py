@@ -39,25 +39,16 @@ def composite(
     features: Tensor,
     width: int,
     height: int,
-    proxy_depth: Tensor | None,
-    kappa: float,
     near: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Feature image (H, W, C), depth sum, depth silhouette and silhouette (H, W): eq. (6)-(9) by autograd."""
     pairs = list_pairs(u, v, sigma_px, z, opacity, width, height, near)
-    alpha, depth = pair_opacities(pairs, u, v, sigma_px, z, opacity, width)
+    alpha, _ = pair_opacities(pairs, u, v, sigma_px, z, opacity, width)
     before = transmittance_before(alpha, pairs)
-    occlusion = alpha
-    if kappa > 0 and proxy_depth is not None:
-        proxy = proxy_depth.reshape(-1).to(z.dtype)[pairs.pixel]
-        occlusion = alpha * torch.where(proxy > 0, torch.exp(-kappa * (depth - proxy) ** 2), 1.0)
-    before_in_depth = before if occlusion is alpha else transmittance_before(occlusion, pairs)
-    live = before_in_depth.detach() >= TRANSMITTANCE_MIN
-    weights = torch.where(live, alpha * before, 0.0)
-    depth_weights = weights if occlusion is alpha else torch.where(live, alpha * before_in_depth, 0.0)
+    weights = torch.where(before.detach() >= TRANSMITTANCE_MIN, alpha * before, 0.0)
     ones = torch.ones_like(z).unsqueeze(1)
     blended = _Blend.apply(weights, torch.cat([features, ones], dim=1), pairs)
-    depths = _Blend.apply(depth_weights, torch.stack([z, ones[:, 0]], dim=1), pairs)
+    depths = _Blend.apply(weights, torch.stack([z, ones[:, 0]], dim=1), pairs)
     shape = (height, width)
     return (
         blended[:, :-1].reshape(*shape, -1),

@@ -38,33 +38,29 @@ def render(
     features: Tensor,
     cam_from_world: Tensor,
     intrinsics: Intrinsics,
-    proxy_depth: Tensor | None = None,
-    kappa: float = 0.0,
     twist: Tensor | None = None,
     near: float = NEAR,
     backend: str | None = None,
 ) -> Rendering:
-    """Draw M Gaussians from the pose exp(twist) @ cam_from_world; differentiable in everything but proxy_depth.
+    """Draw M Gaussians from the pose exp(twist) @ cam_from_world; differentiable in all of them.
 
     means (M, 3), radii (M,) world standard deviations, opacities (M,) 0..1, features (M, C), cam_from_world (4, 4),
-    proxy_depth (H, W) or None, twist (6,) translation first (see `pipelines.geometry.se3`). Pose and twist best stay on
+    twist (6,) translation first (see `pipelines.geometry.se3`). Pose and twist best stay on
     the host where the Gaussians lie on a card: on six numbers a card is slower. Raises ValueError for wrong shapes, and
     for NaN and infinity in what lies on the CPU.
     """
     pose = cam_from_world if twist is None else moved(cam_from_world, twist)
     if (kernels := kernels_for(backend, means)) is not None:
         size = (intrinsics.width, intrinsics.height)
-        check_arguments({"radii": radii, "opacities": opacities, "features": features}, *size, proxy_depth, kappa)
+        check_arguments({"radii": radii, "opacities": opacities, "features": features}, *size)
         records = kernels.project(means, radii, opacities, beside(pose, means), intrinsics, near)
-        shown, above, below, silhouette = kernels.composite_records(records, features, *size, proxy_depth, kappa)
+        shown, above, below, silhouette = kernels.composite_records(records, features, *size)
         return Rendering(shown, kernels.depth_ratio(above, below), silhouette)
     if not torch.is_grad_enabled():
         rows = in_view(means, radii, pose, intrinsics, near)
         means, radii, opacities, features = means[rows], radii[rows], opacities[rows], features[rows]
     u, v, sigma_px, z = project_map(means, radii, pose, intrinsics, near)
-    image = composite(
-        u, v, sigma_px, z, opacities, features, intrinsics.width, intrinsics.height, proxy_depth, kappa, backend, near
-    )
+    image = composite(u, v, sigma_px, z, opacities, features, intrinsics.width, intrinsics.height, backend, near)
     depth = depth_ratio(image.depth_sum, image.depth_silhouette)
     return Rendering(image.features, depth, image.silhouette)
 

@@ -3,7 +3,7 @@
 A Gaussian with opacity o and image radius s reaches the pixel centres at which f = o exp(-distance² / 2 s²) (MSGS-SLAM
 eq. 4, 5) is at least ALPHA_MIN and the distance at most CUT_SIGMAS s; there it counts with min(f, ALPHA_MAX). Gaussians
 are blended by increasing depth, ties by index. A pixel takes no more of them once its transmittance before the next one
-is below TRANSMITTANCE_MIN; with κ > 0 that is the transmittance of the depth chain (eq. 7), never the smaller one.
+is below TRANSMITTANCE_MIN.
 """
 
 from __future__ import annotations

@@ -39,17 +39,8 @@ def random_gaussians(
     return {name: torch.from_numpy(value).float() for name, value in zip(NAMES, values, strict=True)}
 
 
-def random_proxy(width: int, height: int, seed: int) -> Tensor:
-    """(H, W) proxy depth with holes."""
-    rng = np.random.default_rng(seed + 1000)
-    depth = rng.uniform(0.5, 6.0, (height, width)) * (rng.random((height, width)) < 0.8)
-    return torch.from_numpy(depth).float()
-
-
-def dense_composite(
-    gaussians: dict[str, Tensor], width: int, height: int, proxy_depth: Tensor | None = None, kappa: float = 0.0
-) -> dict[str, Tensor]:
-    """The same images from a (H*W, M) table of opacities and two running products; for small scenes only."""
+def dense_composite(gaussians: dict[str, Tensor], width: int, height: int) -> dict[str, Tensor]:
+    """The same images from a (H*W, M) table of opacities and a running product; for small scenes only."""
     u, v, sigma, z, opacity, features = (gaussians[name] for name in NAMES)
     order = torch.argsort(z.detach(), stable=True)
     order = order[z.detach()[order] > 0]
@@ -59,18 +50,9 @@ def dense_composite(
     raw = opacity * torch.exp(-distance2 / (2 * sigma**2))
     seen = (distance2 <= (rules.CUT_SIGMAS * sigma) ** 2) & (raw >= rules.ALPHA_MIN)
     alpha = torch.where(seen, raw.clamp(max=rules.ALPHA_MAX), 0.0)
-    occlusion = alpha
-    if proxy_depth is not None and kappa > 0:
-        proxy = proxy_depth.reshape(-1, 1).to(z.dtype)
-        occlusion = alpha * torch.where(proxy > 0, torch.exp(-kappa * (z - proxy) ** 2), 1.0)
-
-    def before(x: Tensor) -> Tensor:
-        return torch.cat([torch.ones_like(x[:, :1]), torch.cumprod(1 - x, 1)[:, :-1]], 1)
-
-    live = (before(occlusion) >= rules.TRANSMITTANCE_MIN).detach()
-    weight = torch.where(live, alpha * before(alpha), 0.0)
-    depth_weight = torch.where(live, alpha * before(occlusion), 0.0)
-    images = (weight @ features, depth_weight @ z, depth_weight.sum(1), weight.sum(1))
+    before = torch.cat([torch.ones_like(alpha[:, :1]), torch.cumprod(1 - alpha, 1)[:, :-1]], 1)
+    weight = torch.where((before >= rules.TRANSMITTANCE_MIN).detach(), alpha * before, 0.0)
+    images = (weight @ features, weight @ z, weight.sum(1), weight.sum(1))
     shapes = ((height, width, -1), (height, width), (height, width), (height, width))
     return {name: image.reshape(shape) for name, image, shape in zip(IMAGES, images, shapes, strict=True)}
 

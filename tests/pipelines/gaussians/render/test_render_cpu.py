@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from render_scenes import IMAGES, NAMES, random_gaussians, random_proxy, room
+from render_scenes import IMAGES, NAMES, random_gaussians, room
 from torch import Tensor
 
 from msgs_slam.pipelines.gaussians.render import composite, get_threads, render, set_threads
@@ -22,12 +22,10 @@ def run(
     height: int,
     backend: str,
     dtype: torch.dtype,
-    proxy: Tensor | None = None,
-    kappa: float = 0.0,
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Images, and gradients of a fixed random weighting of all of them."""
     inputs = {name: tensor.detach().clone().to(dtype).requires_grad_() for name, tensor in scene.items()}
-    image = composite(**inputs, width=width, height=height, proxy_depth=proxy, kappa=kappa, backend=backend)
+    image = composite(**inputs, width=width, height=height, backend=backend)
     images = {name: getattr(image, name) for name in IMAGES}
     generator = torch.Generator().manual_seed(5)
     upstream = [torch.randn(x.shape, generator=generator).to(dtype) for x in images.values()]
@@ -35,11 +33,9 @@ def run(
     return {name: x.detach() for name, x in images.items()}, {name: inputs[name].grad for name in NAMES}
 
 
-def assert_agrees(
-    scene: dict[str, Tensor], width: int, height: int, proxy: Tensor | None = None, kappa: float = 0.0
-) -> None:
-    images, gradients = run(scene, width, height, "cpu", torch.float32, proxy, kappa)
-    expected, expected_gradients = run(scene, width, height, "reference", torch.float64, proxy, kappa)
+def assert_agrees(scene: dict[str, Tensor], width: int, height: int) -> None:
+    images, gradients = run(scene, width, height, "cpu", torch.float32)
+    expected, expected_gradients = run(scene, width, height, "reference", torch.float64)
     for name in IMAGES:
         # Depths are larger than 1; what counts is the error of their ratio.
         scale = max(1.0, float(expected[name].abs().max())) if images[name].numel() else 1.0
@@ -64,12 +60,12 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("kappa", [0.0, 0.5, 20.0])
+@pytest.mark.parametrize("channels", [3, 5])
 @pytest.mark.parametrize("name", SCENES)
-def test_random_scenes(name, kappa):
+def test_random_scenes(name, channels):
     width, height = 75, 53
-    scene = random_gaussians(width=width, height=height, channels=5, seed=len(name), **SCENES[name])
-    assert_agrees(scene, width, height, random_proxy(width, height, seed=2), kappa)
+    scene = random_gaussians(width=width, height=height, channels=channels, seed=len(name), **SCENES[name])
+    assert_agrees(scene, width, height)
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (3, 200), (161, 2), (16, 32), (33, 65)])
@@ -135,16 +131,14 @@ def test_map_and_pose_gradients_through_the_projection():
         assert (ours - exact).norm() < 1e-3 * exact.norm(), name
 
 
-@pytest.mark.parametrize("kappa", [0.0, 3.0])
-def test_same_bytes_for_any_number_of_threads(kappa):
+def test_same_bytes_for_any_number_of_threads():
     width, height = 90, 400
     scene = random_gaussians(4000, width, height, 20, seed=6, sigma=(0.3, 30.0))
-    proxy = random_proxy(width, height, seed=6)
     first = None
     for threads in (1, 2, 4, 1, 3):
         set_threads(threads)
         assert get_threads() == threads
-        images, gradients = run(scene, width, height, "cpu", torch.float32, proxy, kappa)
+        images, gradients = run(scene, width, height, "cpu", torch.float32)
         found = [x.numpy().tobytes() for x in (*images.values(), *gradients.values())]
         first = first or found
         assert found == first
@@ -174,10 +168,6 @@ def test_wrong_arguments_are_refused():
     scene = random_gaussians(5, 20, 20, 3, seed=7)
     with pytest.raises(ValueError, match="opacity: got shape"):
         composite(**{**scene, "opacity": scene["opacity"][:4]}, width=20, height=20)
-    with pytest.raises(ValueError, match="proxy_depth: got shape"):
-        composite(**scene, width=20, height=20, proxy_depth=torch.zeros(3, 3), kappa=1.0)
-    with pytest.raises(ValueError, match="kappa"):
-        composite(**scene, width=20, height=20, kappa=-1.0)
     with pytest.raises(ValueError, match="image size"):
         composite(**scene, width=0, height=20)
     with pytest.raises(ValueError, match="expected 'reference', 'cpu', 'cuda'"):

@@ -10,7 +10,7 @@ if not ON_CARD:
     os.environ["TRITON_INTERPRET"] = "1"  # read when triton is imported and again when the kernels are
 pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip install 'msgs-slam[cuda-check]'")
 
-from render_scenes import IMAGES, NAMES, random_gaussians, random_proxy, room  # noqa: E402
+from render_scenes import IMAGES, NAMES, random_gaussians, room  # noqa: E402
 
 from msgs_slam.pipelines.gaussians.render import (  # noqa: E402
     cards,
@@ -41,12 +41,11 @@ SCENES = {
 }
 
 
-def assert_agrees(scene, width, height, proxy=None, kappa=0.0):
+def assert_agrees(scene, width, height):
     results = []
     for backend, device, dtype in (("cuda", DEVICE, torch.float32), ("reference", "cpu", torch.float64)):
         inputs = {name: x.clone().to(device, dtype).requires_grad_() for name, x in scene.items()}
-        guide = None if proxy is None else proxy.to(device)
-        image = composite(**inputs, width=width, height=height, proxy_depth=guide, kappa=kappa, backend=backend)
+        image = composite(**inputs, width=width, height=height, backend=backend)
         images = [getattr(image, name) for name in IMAGES]
         generator = torch.Generator().manual_seed(5)
         torch.autograd.backward(images, [torch.randn(x.shape, generator=generator).to(x) for x in images])
@@ -59,11 +58,10 @@ def assert_agrees(scene, width, height, proxy=None, kappa=0.0):
         assert (ours - exact).norm() <= 1e-3 * exact.norm() + 1e-12, f"gradient of {name}"
 
 
-@pytest.mark.parametrize("kappa", [0.0, 3.0])
 @pytest.mark.parametrize("name", SCENES)
-def test_random_scenes(name, kappa):
+def test_random_scenes(name):
     scene = random_gaussians(width=SIZE[0], height=SIZE[1], channels=5, seed=len(name), **SCENES[name])
-    assert_agrees(scene, *SIZE, random_proxy(*SIZE, seed=2), kappa)
+    assert_agrees(scene, *SIZE)
 
 
 @pytest.mark.parametrize("channels", [1, 16, 17, 43, 64])
@@ -107,13 +105,13 @@ def test_full_size_room():
 
 @pytest.mark.skipif(ON_CARD, reason="the tests above compile and run the kernels")
 @pytest.mark.parametrize(
-    ("name", "guided", "padded"),
-    [("forward_tile", True, 64), ("backward_tile", True, 64), ("backward_tile", False, 16), ("inspect_tile", True, 16)],
+    ("name", "padded"),
+    [("forward_tile", 64), ("backward_tile", 64), ("backward_tile", 16), ("inspect_tile", 16)],
 )
-def test_kernels_compile_for_cards_and_fit_their_shared_memory(name, guided, padded, tmp_path):
+def test_kernels_compile_for_cards_and_fit_their_shared_memory(name, padded, tmp_path):
     """The interpreter accepts more than the compiler does; compiling needs no card."""
-    constants = {"GUIDED": guided, "COUNTED": guided, "PADDED": padded, "STEP": 16, "TILE": 16, "ALPHA_MAX": 0.99}
-    kinds = {**dict.fromkeys(("width", "height", "channels"), "i32"), "kappa": "fp32", "starts": "*i64"}
+    constants = {"COUNTED": True, "PADDED": padded, "STEP": 16, "TILE": 16, "ALPHA_MAX": 0.99}
+    kinds = {**dict.fromkeys(("width", "height", "channels"), "i32"), "starts": "*i64"}
     of = {"gaussians.render.cuda_kernels": [name]}
     build(of, constants | {"LIGHT_MIN": 1e-4, "num_warps": 8}, kinds | {"members": "*i64"}, tmp_path)
 
@@ -135,16 +133,15 @@ def test_what_projects_and_lists_compiles_for_cards(tmp_path):
 POSE = se3.exp(torch.tensor([0.1, -0.05, 0.02, 0.03, -0.04, 0.05], dtype=torch.float64))
 
 
-@pytest.mark.parametrize("kappa", [0.0, 3.0])
-def test_a_map_is_rendered_as_by_the_reference(kappa):
+def test_a_map_is_rendered_as_by_the_reference():
     """With gradients of all that moves, the pose among it; some Gaussians lie behind the camera and some beside it."""
     scene = room(SIZE[0], SIZE[1], COUNT, 5)
     means = torch.cat([scene.means, scene.means[:40] * torch.tensor([1.0, 1.0, -1.0]), scene.means[:40] * 9])
     rest = [torch.cat([x, x[:40], x[:40]]) for x in (scene.radii, scene.opacities, scene.colors)]
-    proxy, found = random_proxy(*SIZE, seed=2), []
+    found = []
     for backend, device, kind in (("cuda", DEVICE, torch.float32), ("reference", "cpu", torch.float64)):
         leaves = [x.to(device, kind, copy=True).requires_grad_() for x in (means, *rest, POSE)]
-        image = render(*leaves, scene.intrinsics, proxy.to(device), kappa, backend=backend)
+        image = render(*leaves, scene.intrinsics, backend=backend)
         images = [image.features, image.depth, image.silhouette]
         generator = torch.Generator().manual_seed(5)
         pulls = [torch.randn(x.shape, generator=generator).to(x) for x in images]

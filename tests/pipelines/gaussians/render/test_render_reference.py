@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from render_scenes import IMAGES, NAMES, dense_composite, random_gaussians, random_proxy
+from render_scenes import IMAGES, NAMES, dense_composite, random_gaussians
 from torch import Tensor
 
 from msgs_slam.pipelines.gaussians.render import composite, rules
@@ -14,16 +14,14 @@ def leaves(gaussians: dict[str, Tensor], dtype: torch.dtype = torch.float64) -> 
     return {name: tensor.to(dtype).requires_grad_() for name, tensor in gaussians.items()}
 
 
-@pytest.mark.parametrize("kappa", [0.0, 0.7, 30.0])
 @pytest.mark.parametrize(("count", "opacity"), [(0, (0.1, 1)), (1, (0.5, 0.6)), (300, (0.001, 0.3)), (300, (0.9, 1.0))])
-def test_images_and_gradients_equal_the_dense_table(count, opacity, kappa):
+def test_images_and_gradients_equal_the_dense_table(count, opacity):
     scene = random_gaussians(count, WIDTH, HEIGHT, 3, seed=count, opacity=opacity)
-    proxy = random_proxy(WIDTH, HEIGHT, seed=1)
     torch.manual_seed(0)
     upstream = [torch.randn(HEIGHT, WIDTH, 3).double(), *torch.randn(3, HEIGHT, WIDTH).double()]
     ours, dense = leaves(scene), leaves(scene)
-    image = composite(**ours, width=WIDTH, height=HEIGHT, proxy_depth=proxy, kappa=kappa, backend="reference")
-    expected = dense_composite(dense, WIDTH, HEIGHT, proxy, kappa)
+    image = composite(**ours, width=WIDTH, height=HEIGHT, backend="reference")
+    expected = dense_composite(dense, WIDTH, HEIGHT)
     for name in IMAGES:
         torch.testing.assert_close(getattr(image, name), expected[name], rtol=0, atol=1e-9)
     if count == 0:
@@ -37,10 +35,9 @@ def test_images_and_gradients_equal_the_dense_table(count, opacity, kappa):
 
 def test_gradients_equal_finite_differences():
     scene = random_gaussians(6, 5, 4, 2, seed=3, sigma=(0.8, 2.0), opacity=(0.2, 0.9), behind=0.0)
-    proxy = random_proxy(5, 4, seed=3)
 
     def images(*tensors):
-        image = composite(*tensors, 5, 4, proxy, 0.8, backend="reference")
+        image = composite(*tensors, 5, 4, backend="reference")
         return tuple(getattr(image, name) for name in IMAGES)
 
     # Where a Gaussian ends, its opacity jumps: no finite difference may cross that circle.
@@ -52,18 +49,12 @@ def test_gradients_equal_finite_differences():
     assert torch.autograd.gradcheck(images, tuple(leaves(scene).values()), eps=1e-6, atol=1e-6)
 
 
-def test_depth_is_normalised_by_its_own_silhouette():
-    """Two opaque layers, the nearer one against the proxy: depth lies between them, near the farther one."""
+def test_depth_is_normalised_by_the_silhouette():
+    """Two opaque layers: depth lies between them, near the nearer one."""
     two = {
         "u": torch.full((2,), 1.5), "v": torch.full((2,), 1.5), "sigma_px": torch.full((2,), 50.0),
         "z": torch.tensor([1.0, 3.0]), "opacity": torch.full((2,), 0.9), "features": torch.eye(2),
     }  # fmt: skip
-    proxy = torch.full((3, 3), 3.0)
-    plain = composite(**two, width=3, height=3, backend="reference")
-    guided = composite(**two, width=3, height=3, proxy_depth=proxy, kappa=10.0, backend="reference")
-    assert (plain.depth_silhouette == plain.silhouette).all()
-    torch.testing.assert_close(guided.features, plain.features)
-    torch.testing.assert_close(guided.silhouette, plain.silhouette)
-    assert guided.depth_silhouette[1, 1] == pytest.approx(1.8, abs=1e-2)  # past 1: both layers count in full
-    assert (guided.depth_sum / guided.depth_silhouette)[1, 1] == pytest.approx(2.0, abs=1e-2)
-    assert (plain.depth_sum / plain.depth_silhouette)[1, 1] == pytest.approx(0.9 * 1 / 0.99 + 0.09 * 3 / 0.99, abs=1e-2)
+    image = composite(**two, width=3, height=3, backend="reference")
+    assert (image.depth_silhouette == image.silhouette).all()
+    assert (image.depth_sum / image.depth_silhouette)[1, 1] == pytest.approx(0.9 * 1 / 0.99 + 0.09 * 3 / 0.99, abs=1e-2)
