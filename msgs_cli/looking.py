@@ -56,17 +56,11 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
 )  # fmt: skip
 @click.option("--format", "truth_format", default="auto", help="Layout of the truth; auto recognises it.")
 @click.option(
-    "--protocol", type=click.Choice(["msgs", "splatam"]), default="msgs",
-    help="splatam adds that code's figures, for comparison with papers.",
-)  # fmt: skip
-@click.option(
     "--class-map", metavar="FILE|NAME",
     help="A TOML of the run's classes to the truth's. Default: one that comes with the program, where it fits.",
 )  # fmt: skip
 @verbosity_options
-def evaluate(
-    run_path: Path, truth: Path, truth_format: str, protocol: str, class_map: str | None, quiet: bool, verbose: bool
-) -> None:
+def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | None, quiet: bool, verbose: bool) -> None:
     """Compare RUN with the truth: poses, images, depth, labels, mesh. Writes RUN/evaluation/."""
     set_up_logging(quiet, verbose)
     from msgs_slam.formats.datasets import open_sequence
@@ -78,7 +72,7 @@ def evaluate(
     run = open_run(run_path)
     sequence = open_sequence(truth, truth_format)
     with ending_quietly():
-        figures = write_evaluation(run, sequence, make_progress(quiet), legacy=protocol == "splatam", class_map=joins)
+        figures = write_evaluation(run, sequence, make_progress(quiet), class_map=joins)
     say(evaluation_table(figures))
     tell_result(quiet, evaluation=run.evaluation_file.parent)
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.evaluation.class_map import ClassMap, Matching, match_classes
-from msgs_slam.pipelines.evaluation.legacy import legacy_cells
 from msgs_slam.pipelines.evaluation.measure import Measured, measure_views
 from msgs_slam.pipelines.evaluation.mesh_cells import mesh_cells
 from msgs_slam.pipelines.evaluation.trajectory_error import (
@@ -45,14 +44,14 @@ PROTOCOL = (
 
 
 def evaluate_run(
-    run: RunFolder, truth: Sequence, progress: Progress | None = None, max_views: int = 100, legacy: bool = False
+    run: RunFolder, truth: Sequence, progress: Progress | None = None, max_views: int = 100
 ) -> dict[str, Any]:
     """All figures as plain JSON values; a group that cannot be had is {"missing": why}.
 
     At most `max_views` of the keyframes, and as many of the other frames, are rendered. Raises InputError for a run
     without poses and for a truth of which no frame belongs to the run.
     """
-    return evaluate_outcome(load_outcome(run), truth, progress, max_views, legacy)[0]
+    return evaluate_outcome(load_outcome(run), truth, progress, max_views)[0]
 
 
 def evaluate_outcome(
@@ -60,7 +59,6 @@ def evaluate_outcome(
     truth: Sequence,
     progress: Progress | None = None,
     max_views: int = 100,
-    legacy: bool = False,
     class_map: ClassMap | None = None,
 ) -> tuple[dict[str, Any], Measured | None]:
     """Evaluate like `evaluate_run`; returns the figures and the measured views."""
@@ -89,8 +87,6 @@ def evaluate_outcome(
         "mesh": mesh_cells(outcome, matched, alignment),
         "cost": cost_cells(outcome),
     }
-    if legacy:
-        result["legacy"] = legacy_cells(outcome, matched, measured)
     # A round trip: what cannot be written as JSON (NaN, arrays) shows here and not at the user's.
     return json.loads(json.dumps(result, allow_nan=False)), measured
 

@@ -13,9 +13,6 @@ def evaluation_table(result: dict[str, Any]) -> str:
     lines += [f"- {line}" for line in result["protocol"]]
     lines += ["", "| what | value | of |", "| --- | --- | --- |"]
     lines += [f"| {what} | {value} | {of} |" for what, value, of in _rows(result)]
-    if "legacy" in result:
-        lines += ["", f"_{result['legacy']['note']}:_", ""]
-        lines += [f"- {k}: {_text(v)}" for k, v in result["legacy"].items() if k != "note"]
     return "\n".join(lines) + "\n"
 
 

@@ -41,7 +41,6 @@ def write_evaluation(
     truth: Sequence,
     progress: Progress | None = None,
     max_views: int = 100,
-    legacy: bool = False,
     class_map: ClassMap | None = None,
 ) -> dict[str, Any]:
     """Evaluate and write RUN/evaluation/: evaluation.json, evaluation.md, two plots of the path, views.png.
@@ -49,7 +48,7 @@ def write_evaluation(
     Returns the figures (see `evaluate_run`). Raises InputError as that does, before anything is written.
     """
     outcome = load_outcome(run)
-    result, _ = evaluate_outcome(outcome, truth, progress, max_views, legacy, class_map)
+    result, _ = evaluate_outcome(outcome, truth, progress, max_views, class_map)
     folder = run.evaluation_file.parent
     write_json(run.evaluation_file, result)
     write_text(folder / "evaluation.md", evaluation_table(result))

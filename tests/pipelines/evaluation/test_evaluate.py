@@ -31,7 +31,7 @@ MOVE = Similarity(2.5, Rotation.from_euler("xyz", (0.3, -0.5, 0.9)).as_matrix(),
 
 def test_every_cell_of_a_true_run(oracle_run: OracleRun, truth: Sequence) -> None:
     run = oracle_run(hold_out=8, mesh=True)
-    result = write_evaluation(run, truth, max_views=4, legacy=True)
+    result = write_evaluation(run, truth, max_views=4)
     assert json.loads((run.root / "evaluation" / "evaluation.json").read_text()) == result
     assert result["frames"]["posed"] == 32
     for name in ("sim3 all", "se3 all", "sim3 keyframes", "se3 keyframes"):
@@ -56,10 +56,8 @@ def test_every_cell_of_a_true_run(oracle_run: OracleRun, truth: Sequence) -> Non
     assert 0.5 < result["labels"]["mean_iou"] < result["labels"]["pixel_accuracy"]
     assert 0 < result["mesh"]["accuracy"] < 0.02
     assert result["cost"]["total seconds"] == 10
-    assert result["legacy"]["ate as they call it, m"] < 1e-6
     table = (run.root / "evaluation" / "evaluation.md").read_text()
     assert "ATE Sim(3)" in table
-    assert "legacy figures" in table
     assert (run.root / "evaluation" / "views.png").stat().st_size > 20_000
 
 
