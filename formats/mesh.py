@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import json
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,11 +13,10 @@ from numpy.typing import NDArray
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.glb import Part, write_primitive
 from msgs_slam.formats.ply_table import Rows, columns, read_ply, read_rows, write_ply
-from msgs_slam.formats.reading import parsing, read_bytes
+from msgs_slam.formats.reading import parsing
 from msgs_slam.formats.trajectory import FARTHEST
 
 _LABEL_ATTRIBUTE = "_LABEL"
-_MAX_GLB_BYTES = 4 * 1024**3
 _PLACE, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 _VERTEX = np.dtype([*((n, "<f4") for n in _PLACE), *((n, "u1") for n in (*_COLOR, "label"))])
 _FACE = np.dtype([("vertex_indices", "<i4", (3,))])
@@ -152,35 +149,6 @@ def write_mesh_glb(
         Part("", 3 * mesh.face_count, 1, "<u4", mesh.faces()),
     ]
     write_primitive(path, parts, {"mode": 4}, class_names, {"name": "mesh"})
-
-
-def read_mesh_glb(path: Path) -> MeshArrays:
-    """A mesh as `write_mesh_glb` wrote it. Raises InputError for a damaged file or one without triangles."""
-    import trimesh
-
-    data = read_bytes(path, _MAX_GLB_BYTES)
-    with parsing(path, "GLB with a triangle mesh", "export it again"):
-        _require_own_bytes(data)
-        scene = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False)
-        mesh: Any = next(m for m in scene.geometry.values() if isinstance(m, trimesh.Trimesh))
-        labels = mesh.vertex_attributes.get(_LABEL_ATTRIBUTE, np.full(len(mesh.vertices), 255))
-        return MeshArrays(
-            np.asarray(mesh.vertices, dtype=np.float32),
-            np.asarray(mesh.faces, dtype=np.int32),
-            np.asarray(mesh.visual.vertex_colors[:, :3], dtype=np.uint8),
-            np.asarray(labels).reshape(-1).astype(np.uint8),
-        )
-
-
-def _require_own_bytes(data: bytes) -> None:
-    """Raise ValueError unless the GLB's arrays are all inside it: a count alone would be filled with zeros."""
-    length = int.from_bytes(data[12:16], "little")
-    header = json.loads(data[20 : 20 + length])
-    accessors = header.get("accessors", [])
-    if any("uri" in buffer for buffer in [*header.get("buffers", []), *header.get("images", [])]):
-        raise ValueError("it names other files")
-    if any("bufferView" not in a or "sparse" in a or a["count"] > len(data) for a in accessors):
-        raise ValueError("an array of it is not in it")
 
 
 def _triangles(polygons: NDArray, vertices: int) -> NDArray[np.int32]:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import safe_open
 
 from msgs_slam.formats.atomic import atomic_path
 from msgs_slam.formats.errors import InputError
@@ -18,9 +17,6 @@ from msgs_slam.formats.reading import parsing, require_file
 
 if TYPE_CHECKING:
     import torch
-
-MAX_ARRAY_BYTES = 16 * 1024**3
-"""A foreign file of arrays in their layout in memory that is larger is refused."""
 
 _DTYPES = {
     "float64": "F64", "float32": "F32", "float16": "F16", "int64": "I64", "int32": "I32", "int16": "I16", "int8": "I8",
@@ -76,7 +72,8 @@ def save_tensors(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
 
 
 def load_tensors(path: Path) -> dict[str, torch.Tensor]:
-    """All tensors of a run's .safetensors file, of any size, on the CPU. Raises InputError as `load_safetensors`."""
+    """All tensors of a run's .safetensors file, of any size, on the CPU. Raises InputError when it is missing
+    or damaged."""
     import safetensors.torch
 
     require_file(path)
@@ -104,13 +101,3 @@ def save_safetensors(path: Path, arrays: Mapping[str, NDArray], meta: Mapping[st
         file.write(len(text).to_bytes(8, "little") + text)
         for name in names:
             file.write(contiguous[name].reshape(-1).view(np.uint8).data)
-
-
-def load_safetensors(path: Path) -> tuple[dict[str, NDArray], dict[str, str]]:
-    """The arrays and the metadata of a .safetensors file.
-
-    Raises InputError when it is missing, damaged, cut short or too large.
-    """
-    require_file(path, MAX_ARRAY_BYTES)
-    with parsing(path, ".safetensors file", "make it again"), safe_open(str(path), framework="numpy") as file:
-        return {name: file.get_tensor(name) for name in sorted(file.keys())}, dict(file.metadata() or {})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -148,11 +148,6 @@ class Sequence:
         for index, label_class in enumerate(self.classes):
             table[[label_class.id, *label_class.other_ids]] = index
         return table[read_label_png(path)]
-
-    def with_used_classes(self) -> Sequence:
-        """Return the sequence with only the classes that occur in the label images (reads all of them)."""
-        used = used_label_ids([p for p in self.label_paths if p is not None])
-        return replace(self, classes=tuple(c for c in self.classes if not used.isdisjoint((c.id, *c.other_ids))))
 
     def _raw_depth(self, index: int) -> NDArray[np.uint16] | None:
         if self.store is not None:

@@ -53,9 +53,9 @@ from msgs_slam.formats.images import (
     write_rgb,
 )  # fmt: skip
 from msgs_slam.formats.jsonfile import read_toml, write_json
-from msgs_slam.formats.mesh import MeshArrays, MeshBlocks, read_mesh_glb, read_mesh_ply, write_mesh_glb, write_mesh_ply
+from msgs_slam.formats.mesh import MeshArrays, MeshBlocks, read_mesh_ply, write_mesh_ply
 from msgs_slam.formats.spz import write_spz
-from msgs_slam.formats.tensors import load_arrays, load_safetensors, load_tensors, save_arrays, save_tensors
+from msgs_slam.formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
 from msgs_slam.formats.trajectory import read_matrices, read_tum, write_matrices, write_tum
 from msgs_slam.formats.video import VideoReader, probe_video
 from msgs_slam.formats.video_writer import write_video
@@ -484,11 +484,10 @@ DOORS: dict[str, Door] = {
     "class map": Door(text("a.toml", CLASS_MAP), read_class_map, "a.toml"),
     "masks": Door(make_masks, masks, damaged="0.png"),
     "mesh PLY": Door(lambda f: write_mesh_ply(f / "a.ply", _mesh()), mesh(read_mesh_ply), "a.ply", in_ply),
-    "mesh GLB": Door(lambda f: write_mesh_glb(f / "a.glb", _mesh()), mesh(read_mesh_glb), "a.glb", with_json_head(12)),
     "npz": Door(lambda f: save_arrays(f / "a.npz", ARRAYS), load_arrays, "a.npz"),
     "safetensors": Door(
         lambda f: save_tensors(f / "a.safetensors", {"a": torch.zeros(3, 4)}),
-        lambda p: read_any(p, load_tensors, load_safetensors), "a.safetensors", JSON_HEAD,
+        load_tensors, "a.safetensors", JSON_HEAD,
     ),
     "TUM trajectory": Door(
         lambda f: write_tum(f / "a.txt", np.arange(float(FRAMES)), _poses()), tum, "a.txt"

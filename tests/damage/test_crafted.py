@@ -26,8 +26,8 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gaussian_files import read_gaussians
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.jsonfile import read_json, read_toml
-from msgs_slam.formats.mesh import read_mesh_glb, read_mesh_ply
-from msgs_slam.formats.tensors import load_arrays, load_safetensors
+from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.formats.tensors import load_arrays, load_tensors
 from msgs_slam.formats.trajectory import read_matrices, read_tum
 from msgs_slam.pipelines.source.opening import FolderSource, open_source, source_digest
 from msgs_slam.pipelines.source.recording import RecordingSource
@@ -93,12 +93,12 @@ BAD_FILES: dict[str, tuple[str, bytes, Read]] = {
         "a.ply", ply(MESH + b"property list uchar int vertex_indices\n", b"nan 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", b"ascii"),
         read_mesh_ply,
     ),
-    "GLB of a billion zeros": ("a.glb", glb({"asset": {}, "accessors": [{"count": 10**9}]}), read_mesh_glb),
-    "GLB that names another file": ("a.glb", glb({"asset": {}, "buffers": [{"uri": "/etc/passwd"}]}), read_mesh_glb),
+    "GLB of a billion zeros": ("a.glb", glb({"asset": {}, "accessors": [{"count": 10**9}]}), read_gaussians),
+    "GLB that names another file": ("a.glb", glb({"asset": {}, "buffers": [{"uri": "/etc/passwd"}]}), read_gaussians),
     "SPZ bomb": ("a.spz", spz(10_000_000, bytes(190_000_000)), read_gaussians),
     "SPZ of 255 fraction bits": ("a.spz", spz(2, b"\x55" * 38, 255), read_gaussians),
     "npz bomb": ("a.npz", npz_bomb(), load_arrays),
-    "safetensors header of 2^62 bytes": ("a.safetensors", struct.pack("<Q", 1 << 62) + b"{}", load_safetensors),
+    "safetensors header of 2^62 bytes": ("a.safetensors", struct.pack("<Q", 1 << 62) + b"{}", load_tensors),
     "quaternion of length 3": ("a.txt", b"0 0 0 0 0 0 0 3\n", read_tum),
     "quaternion whose length overflows": ("a.txt", b"0 0 0 0 1e308 1e308 0 0\n", read_tum),
     "position beyond reach": ("a.txt", b"0 1e300 0 0 0 0 0 1\n", read_tum),

@@ -12,7 +12,7 @@ import trimesh
 
 from msgs_slam.formats import ply_table
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.mesh import MeshBlocks, mesh_blocks, read_mesh_glb, read_mesh_ply, write_mesh_glb, write_mesh_ply
+from msgs_slam.formats.mesh import MeshBlocks, mesh_blocks, read_mesh_ply, write_mesh_glb, write_mesh_ply
 
 
 @pytest.fixture
@@ -67,9 +67,6 @@ def test_glb_round_trip_and_foreign_reader(tmp_path: Path, sphere: tuple) -> Non
     assert (mesh.visual.vertex_colors[:, :3] == colors).all()
     assert (mesh.vertex_attributes["_LABEL"].ravel() == labels).all()
     assert mesh.metadata["classes"] == ["wall", "floor"]
-    ours = read_mesh_glb(path)
-    for got, expected in zip((ours.vertices, ours.faces, ours.colors, ours.labels), sphere, strict=True):
-        assert (got == expected).all()
 
 
 def test_the_same_mesh_gives_the_same_bytes_in_blocks_of_any_size(tmp_path: Path, sphere: tuple) -> None:
@@ -114,12 +111,6 @@ def test_bad_meshes_are_explained(tmp_path: Path, shared_data: Path, sphere: tup
         (tmp_path / "cut.ply").write_bytes(data[:keep])
         with pytest.raises(InputError):
             read_mesh_ply(tmp_path / "cut.ply")
-    write_mesh_glb(tmp_path / "whole.glb", blocks(*sphere))
-    data = (tmp_path / "whole.glb").read_bytes()
-    for keep in (0, 10, len(data) // 2):
-        (tmp_path / "cut.glb").write_bytes(data[:keep])
-        with pytest.raises(InputError):
-            read_mesh_glb(tmp_path / "cut.glb")
     (tmp_path / "bad.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
         "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n3 0 1 2\n"
@@ -155,10 +146,11 @@ def test_a_mesh_goes_from_ply_to_glb_in_blocks(tmp_path: Path, sphere: tuple, mo
     mesh = mesh_blocks(tmp_path / "m.ply")
     assert [len(faces) for faces in mesh.faces()] == [100] * 12 + [80]
     write_mesh_glb(tmp_path / "m.glb", mesh, ("wall",), turn)
-    found = read_mesh_glb(tmp_path / "m.glb")
-    np.testing.assert_array_equal(found.vertices, sphere[0] @ turn.T)
-    for name, wanted in zip(("faces", "colors", "labels"), sphere[1:], strict=True):
-        np.testing.assert_array_equal(getattr(found, name), wanted)
+    (found,) = trimesh.load_scene(str(tmp_path / "m.glb"), process=False).geometry.values()
+    np.testing.assert_array_equal(np.asarray(found.vertices, np.float32), sphere[0] @ turn.T)
+    shown = (found.faces, found.visual.vertex_colors[:, :3], found.vertex_attributes["_LABEL"].ravel())
+    for ours, wanted in zip(shown, sphere[1:], strict=True):
+        np.testing.assert_array_equal(ours, wanted)
     (tmp_path / "m.ply").write_bytes((tmp_path / "m.ply").read_bytes()[:-1])
     with pytest.raises(InputError, match="export it again"):
         mesh_blocks(tmp_path / "m.ply")

@@ -17,7 +17,6 @@ import torch
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.tensors import (
     load_arrays,
-    load_safetensors,
     load_tensors,
     save_arrays,
     save_safetensors,
@@ -37,12 +36,11 @@ ARRAYS = {
 
 def test_safetensors_round_trip(tmp_path: Path) -> None:
     save_safetensors(tmp_path / "t.safetensors", ARRAYS, {"kind": "test", "ü": "x\ny"})
-    back, meta = load_safetensors(tmp_path / "t.safetensors")
     foreign = safetensors.numpy.load_file(str(tmp_path / "t.safetensors"))
-    assert meta == {"kind": "test", "ü": "x\ny"}
+    with safetensors.safe_open(str(tmp_path / "t.safetensors"), framework="numpy") as file:
+        assert file.metadata() == {"kind": "test", "ü": "x\ny"}
     for name, array in ARRAYS.items():
-        assert back[name].dtype == foreign[name].dtype == array.dtype
-        np.testing.assert_array_equal(back[name], array)
+        assert foreign[name].dtype == array.dtype
         np.testing.assert_array_equal(foreign[name], array)
 
 
@@ -51,7 +49,6 @@ def test_tensors_round_trip_with_their_layout_undone(tmp_path: Path) -> None:
     save_tensors(tmp_path / "t.safetensors", tensors)
     back = load_tensors(tmp_path / "t.safetensors")
     assert all(torch.equal(back[name], tensor) for name, tensor in tensors.items())
-    assert (load_safetensors(tmp_path / "t.safetensors")[0]["t"] == tensors["t"].numpy()).all()
     (tmp_path / "t.safetensors").write_bytes(b"no")
     with pytest.raises(InputError, match="damaged"):
         load_tensors(tmp_path / "t.safetensors")
@@ -92,7 +89,7 @@ def test_nothing_in_a_file_is_executed(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no \.npz file of plain arrays"):
         load_arrays(tmp_path / "trap.npz")
     with pytest.raises(InputError, match="damaged"):
-        load_safetensors(tmp_path / "trap.safetensors")
+        load_tensors(tmp_path / "trap.safetensors")
     assert not (tmp_path / "sprung").exists()
     with pytest.raises(ValueError, match=r"[Oo]bject"):
         save_arrays(tmp_path / "o.npz", {"a": np.array([Trap()], dtype=object)})
@@ -101,7 +98,7 @@ def test_nothing_in_a_file_is_executed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
 def test_damaged_files_are_explained(tmp_path: Path, suffix: str) -> None:
-    path, load = tmp_path / f"t{suffix}", load_arrays if suffix == ".npz" else load_safetensors
+    path, load = tmp_path / f"t{suffix}", load_arrays if suffix == ".npz" else load_tensors
     with pytest.raises(InputError, match="no such file"):
         load(path)
     (save_arrays if suffix == ".npz" else save_safetensors)(path, ARRAYS)
@@ -113,15 +110,11 @@ def test_damaged_files_are_explained(tmp_path: Path, suffix: str) -> None:
 
 
 def test_arrays_larger_than_the_limit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for limit in ("MAX_ARRAY_BYTES", "MAX_UNPACKED_BYTES"):
-        monkeypatch.setattr(f"msgs_slam.formats.tensors.{limit}", 100_000)
+    monkeypatch.setattr("msgs_slam.formats.tensors.MAX_UNPACKED_BYTES", 100_000)
     np.savez_compressed(tmp_path / "bomb.npz", a=np.zeros(1_000_000, np.uint8))
     assert (tmp_path / "bomb.npz").stat().st_size < 10_000
     with pytest.raises(InputError, match="unpack"):
         load_arrays(tmp_path / "bomb.npz")
-    save_safetensors(tmp_path / "big.safetensors", {"a": np.zeros(200_000, np.uint8)})
-    with pytest.raises(InputError, match="larger"):
-        load_safetensors(tmp_path / "big.safetensors")
 
 
 def test_a_header_that_claims_more_than_the_entry(tmp_path: Path) -> None:
