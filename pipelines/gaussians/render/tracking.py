@@ -56,20 +56,17 @@ def track_gn(
     max_evaluations: int = 10,
     tolerance_px: float = 0.05,
     near: float = NEAR,
-    labels: tuple[Tensor, Tensor] | None = None,
-    label_weight: float = 0.0,
 ) -> PoseFit:
     """Fit cam_from_world (4, 4) so that the map looks like image (H, W, 3) in 0..1 and depth (H, W), 0 = unknown.
 
     Minimises Σ color_weight |C - I| + depth_weight depth_weights |D - depth| over the pixels with silhouette >=
-    min_silhouette, depth_weights (H, W) being the reliability of the depth (1 where not given); labels, the colours of
-    the Gaussians' classes (M, 3) and of the picture's (H, W, 3), add label_weight |S - labels|. Ends when a step moves
+    min_silhouette, depth_weights (H, W) being the reliability of the depth (1 where not given). Ends when a step moves
     the image by less than tolerance_px; refuses, with `converged` False, if less than min_overlap of the image shows
     the map, if the cost grows or if max_evaluations do not suffice. Computes in float32 on the CPU wherever the tensors
     are. Raises ValueError for NaN, infinity or wrong shapes.
     """
-    problem = _Problem(means, radii, opacities, colors, intrinsics, image, depth, depth_weights, near, labels)
-    weights = (color_weight, depth_weight, min_silhouette, label_weight)
+    problem = _Problem(means, radii, opacities, colors, intrinsics, image, depth, depth_weights, near)
+    weights = (color_weight, depth_weight, min_silhouette)
     start = cam_from_world.detach().cpu().double()
     require_finite("cam_from_world", start)
     pose, floor, first_cost, cost = start, FIRST_FLOOR, np.inf, np.inf
@@ -109,7 +106,6 @@ class _Problem:
         depth: Tensor | None,
         depth_weights: Tensor | None,
         near: float,
-        labels: tuple[Tensor, Tensor] | None = None,
     ) -> None:
         size, count = (intrinsics.height, intrinsics.width), len(means)
         depth = torch.zeros(size) if depth is None else depth
@@ -122,10 +118,6 @@ class _Problem:
         self.image = _checked("image", image, (*size, 3)).numpy()
         self.depth = _checked("depth", depth, size).numpy()
         self.depth_weights = _checked("depth_weights", depth_weights, size).numpy()
-        self.labels: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
-        if labels is not None:
-            shown, seen = _checked("labels", labels[0], (count, 3)), _checked("label image", labels[1], (*size, 3))
-            self.labels = shown.numpy(), seen.numpy()
 
     def normal_equations(
         self,
@@ -134,7 +126,6 @@ class _Problem:
         color_weight: float,
         depth_weight: float,
         min_silhouette: float,
-        label_weight: float = 0.0,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, int, float]:
         """JᵀWJ, JᵀWr, cost, pixels, and the median depth of the Gaussians in front of the camera."""
         from msgs_slam.pipelines.gaussians.render.cpu_tracking import normal_equations  # imports numba
@@ -144,27 +135,19 @@ class _Problem:
         front = z[z > self.near]
         projected = (u.numpy(), v.numpy(), sigma_px.numpy(), z.contiguous().numpy(), self.opacities)
 
-        def evaluate(
-            colors: NDArray[np.float32], image: NDArray[np.float32], weights: NDArray[np.float32], weight: float
-        ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, int]:
-            return normal_equations(
-                projected,
-                points_in_cam.numpy(),
-                colors,
-                image,
-                self.depth,
-                weights,
-                (self.intrinsics.fx, self.intrinsics.fy),
-                weight,
-                floor,
-                min_silhouette,
-                self.near,
-            )
-
-        result = evaluate(self.colors, self.image, self.depth_weights * np.float32(depth_weight), color_weight)
-        if self.labels is not None and label_weight > 0:
-            more = evaluate(*self.labels, np.zeros_like(self.depth), label_weight)
-            result = result[0] + more[0], result[1] + more[1], result[2] + more[2], result[3]
+        result = normal_equations(
+            projected,
+            points_in_cam.numpy(),
+            self.colors,
+            self.image,
+            self.depth,
+            self.depth_weights * np.float32(depth_weight),
+            (self.intrinsics.fx, self.intrinsics.fy),
+            color_weight,
+            floor,
+            min_silhouette,
+            self.near,
+        )
         return (*result, float(front.median()) if len(front) else 1.0)
 
 

@@ -118,26 +118,6 @@ def test_a_start_too_far_away_is_refused_or_right(seed):
         assert torch.equal(fit.cam_from_world, start)
 
 
-def test_labels_fix_the_pose_of_a_picture_without_colour():
-    scene = room(160, 120, 12000, 1)
-    # Large and solid: the colour is the same everywhere.
-    solid, radii = torch.full_like(scene.opacities, 1.0), 2 * scene.radii
-    grey, image = torch.full_like(scene.colors, 0.5), torch.full((120, 160, 3), 0.5)
-    classes = (torch.arange(27) // torch.tensor([[9], [3], [1]]) % 3).T / 2
-    # Cubes of space of 27 kinds: borders in all directions.
-    shown = classes[((scene.means / 0.4).floor().long() % 3 * torch.tensor([9, 3, 1])).sum(1)]
-    seen = render(scene.means, radii, solid, shown, TRUE_POSE, scene.intrinsics).features
-    start = displaced(0.01, 0.3, 1)
-    gaussians = scene.means, radii, solid, grey, start, scene.intrinsics, image
-    with_labels = track_gn(*gaussians, min_silhouette=0.99, labels=(shown, seen), label_weight=0.3)
-    without = track_gn(*gaussians, min_silhouette=0.99, labels=(shown, seen))
-    assert with_labels.converged, with_labels.reason
-    assert 0 < error_of(with_labels.cam_from_world)[0] < 1e-3 < error_of(without.cam_from_world)[0]
-    assert with_labels.cost > 0
-    with pytest.raises(ValueError, match="label image: got shape"):
-        track_gn(*gaussians, labels=(shown, seen[:7]), label_weight=0.3)
-
-
 def test_a_camera_that_does_not_see_the_map_is_refused():
     scene = room(80, 60, 3000, 1)
     image, depth = observation(scene)
