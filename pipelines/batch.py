@@ -27,6 +27,7 @@ from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.system.progress import Progress, log
+from msgs_slam.pipelines.system.wording import markdown_table
 
 _VIDEOS = {
     ".3gp", ".avi", ".flv", ".insv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".sens",
@@ -178,7 +179,6 @@ def _last_line(file: Path) -> str:
 def write_table(runs: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """batch.json and batch.md beside the runs."""
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    lines = ["| " + " | ".join(columns) + " |", "|" + " --- |" * len(columns)]
-    lines += ["| " + " | ".join(str(row.get(c, "")).replace("|", "\\|") for c in columns) + " |" for row in rows]
+    lines = markdown_table(columns, ([str(row.get(c, "")) for c in columns] for row in rows))
     write_json(runs / "batch.json", list(rows))
     write_text(runs / "batch.md", "\n".join(lines) + "\n")

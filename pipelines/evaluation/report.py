@@ -18,7 +18,7 @@ from msgs_slam.pipelines.evaluation.html import bullets, chips, drawing, page, s
 from msgs_slam.pipelines.evaluation.lengths import found_lengths
 from msgs_slam.pipelines.evaluation.plots import RED, Line, plot
 from msgs_slam.pipelines.evaluation.report_views import RenderedViews, class_legend, quality_section, render_views
-from msgs_slam.pipelines.evaluation.table import evaluation_table
+from msgs_slam.pipelines.evaluation.table import TABLE_HEADER, evaluation_rows
 from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, trajectory_plots
 from msgs_slam.pipelines.export.readme import lengths, readme
 from msgs_slam.pipelines.export.stage import on_earth
@@ -172,8 +172,6 @@ def _path_section(outcome: Outcome) -> str:
 
 
 def _truth_section(evaluation: dict[str, Any], run: RunFolder) -> str:
-    lines = evaluation_table(evaluation).splitlines()
-    cells = [[c.strip() for c in line.strip("|").split("|")] for line in lines if line.startswith("| ")]
     errors = np.array(evaluation.get("frame errors", []), np.float64).reshape(-1, 2)
     drawn = ""
     if len(errors):
@@ -184,7 +182,7 @@ def _truth_section(evaluation: dict[str, Any], run: RunFolder) -> str:
     return section(
         f"Against the truth: {evaluation['truth']}",
         f'<div class="two">{drawn}</div>',
-        table(cells[0], [c for c in cells[1:] if not c[0].startswith("---")]),
+        table(TABLE_HEADER, evaluation_rows(evaluation)),
         "<details><summary>How this was measured</summary>", bullets(evaluation["protocol"]), "</details>",
     )  # fmt: skip
 

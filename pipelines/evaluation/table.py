@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from typing import Any
 
+from msgs_slam.pipelines.system.wording import markdown_table
+
 Row = tuple[str, str, str]
+TABLE_HEADER: Row = ("what", "value", "of")
 
 
 def evaluation_table(result: dict[str, Any]) -> str:
     """The protocol, then one row a figure; an empty cell says why."""
     lines = [f"# {result['run']} against {result['truth']}", ""]
     lines += [f"- {line}" for line in result["protocol"]]
-    lines += ["", "| what | value | of |", "| --- | --- | --- |"]
-    lines += [f"| {what} | {value} | {of} |" for what, value, of in _rows(result)]
+    lines += ["", *markdown_table(TABLE_HEADER, evaluation_rows(result))]
     return "\n".join(lines) + "\n"
 
 
-def _rows(result: dict[str, Any]) -> list[Row]:
+def evaluation_rows(result: dict[str, Any]) -> list[Row]:
+    """The cells under `TABLE_HEADER`."""
     stage = result["stage"]
     frames = result["frames"]
     of = f"{frames['picked']} picked, {frames['keyframes']} keyframes, {frames['with true pose']} with a true pose"
