@@ -34,11 +34,12 @@ def borrow_depth(
 
 
 def agreed_depth(
-    carried: list[tuple[NDArray[np.float32], NDArray[np.float32]]],
+    carried: list[tuple[NDArray[np.float32], NDArray[np.float32]]], wanted: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(h, w) mean of the carried depths that most likeness agrees on, and the sum of that likeness."""
+    """(h, w) mean of the carried depths that most likeness agrees on, and the sum of that likeness; 0 where it is not
+    wanted (h, w)."""
     depths, likeness = (np.stack(part) for part in zip(*carried, strict=True))
-    return _agree(depths, likeness)
+    return _agree(depths, likeness, wanted)
 
 
 def carry_depth(
@@ -94,12 +95,16 @@ def _splat(
 
 
 @kernel
-def _agree(lent: NDArray[np.float32], likeness: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _agree(
+    lent: NDArray[np.float32], likeness: NDArray[np.float32], wanted: NDArray[np.bool_]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     views, height, width = lent.shape
     found = np.zeros((height, width), np.float32)
     mass = np.zeros((height, width), np.float32)
     for y in range(height):
         for x in range(width):
+            if not wanted[y, x]:
+                continue
             for a in range(views):
                 z = lent[a, y, x]
                 if z <= 0:

@@ -163,7 +163,7 @@ class MultiviewDepth:
         for j in self._present(self._neighbours(index, _LENDERS)).tolist():
             warp = self._warps(j, np.array([index]))[0]
             carried.append(carry_depth(*self._fused(j), self._lab(j), warp, lab))
-        return borrow_depth(*own, *agreed_depth(carried)) if carried else own
+        return borrow_depth(*own, *agreed_depth(carried, own[1] < SURE)) if carried else own
 
     def _fuse(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth of one keyframe and those of its neighbours that agree, and its confidence."""

@@ -368,16 +368,18 @@ def lend(truth: NDArray, color: float, confidence: float = 0.9) -> tuple[NDArray
 def test_unsure_depths_are_taken_from_views_that_show_the_same_colour() -> None:
     truth = view_of_plane(np.eye(4), 0.3)[1]
     own, unsure = (truth * 3).astype(np.float32), np.full(truth.shape, 0.1, np.float32)
+    everywhere = np.ones(truth.shape, np.bool_)
     inner = (slice(4, -4), slice(10, -10))
-    depth, confidence = borrow_depth(own, unsure, *agreed_depth([lend(truth, 0.5), lend(truth, 0.0)]))
+    depth, confidence = borrow_depth(own, unsure, *agreed_depth([lend(truth, 0.5), lend(truth, 0.0)], everywhere))
     assert np.abs(depth / truth - 1)[inner].max() < 0.02
     assert confidence[inner].min() > SURE
     for carried in ([lend(truth, 12.0)] * 4, [lend(truth, 0.0, 0.2)] * 4, [lend(truth, 0.0)]):
-        depth, confidence = borrow_depth(own, unsure, *agreed_depth(carried))
+        depth, confidence = borrow_depth(own, unsure, *agreed_depth(carried, everywhere))
         np.testing.assert_array_equal(depth, own)
         np.testing.assert_array_equal(confidence, unsure)
     sure = np.full(truth.shape, SURE, np.float32)
-    depth, _ = borrow_depth(own, sure, *agreed_depth([lend(truth, 0.0)] * 3))
+    depth, _ = borrow_depth(own, sure, *agreed_depth([lend(truth, 0.0)] * 3, everywhere))
+    assert not agreed_depth([lend(truth, 0.0)] * 3, ~everywhere)[1].any()
     np.testing.assert_array_equal(depth, own)
 
 
