@@ -105,7 +105,7 @@ class ProxyConfig:
         ("learned", "always", "never"),
     )
     stereo_side: int = setting(640, "multiview matches images of this many pixels on the long side", within=(32, 4096))
-    stereo_planes: int = setting(96, "multiview tries this many depths", within=(4, 1024))
+    stereo_planes: int = setting(128, "multiview tries this many depths", within=(4, 1024))
     moving: str = setting("auto", "auto leaves out what moved, by depth and poses; keep maps it", ("auto", "keep"))
     max_classes: int = setting(16, "segments and clusters make at most this many classes", within=(1, 254))
 

@@ -12,7 +12,9 @@ from msgs_slam.pipelines.types import Intrinsics
 _MAX_POINTS = 400
 _UNSEEN_WEIGHT = 0.3
 """Weight of a point that should be in the other view but was not matched there: it may be hidden."""
-_NEAR_MARGIN, _FAR_MARGIN = 0.7, 1.5
+_NEAR_MARGIN, _FAR_MARGIN = 0.45, 1.5
+"""What is plain has no points: a near sofa may stand well before the nearest of them, and beyond the range nothing can
+be found."""
 _LEAST_POINTS = 12
 _MOST_CANDIDATES = 128
 """So many that share points, and so many of the nearest, are compared: a longer recording has no better ones."""

@@ -17,6 +17,7 @@ from msgs_slam.pipelines.proxy.reliability import semantic_agreement, warp_label
 from msgs_slam.pipelines.proxy.scale import measure_scale
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth
 from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.proxy.stereo.neighbours import depth_range
 from msgs_slam.pipelines.proxy.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame, Intrinsics
@@ -49,6 +50,19 @@ def test_multiview_is_exact_where_it_is_sure_and_its_confidence_sorts(room: Room
     assert 0 < np.median(error[reliable]) < 0.008
     low, high = np.quantile(confidence, [1 / 3, 2 / 3])
     assert error[confidence >= high].mean() < 0.5 * error[confidence <= low].mean()
+
+
+def test_the_range_of_depths_holds_what_is_plain_and_nearer_than_all_points(room: Room) -> None:
+    """Such as a sofa in the foreground: beyond the range nothing can match."""
+    model = room.sequence().backbone
+    assert model is not None
+    for index in (0, 4):
+        limits = depth_range(model, index, np.array([index + 1, index + 2]))
+        assert limits is not None
+        points = model.points_in_world[model.points_of(index)]
+        depths = points @ model.cam_from_world[index, 2, :3] + model.cam_from_world[index, 2, 3]
+        assert limits[0] < 0.5 * np.percentile(depths, 1)
+        assert limits[1] > depths.max()
 
 
 def test_multiview_gives_the_same_bytes_with_other_threads(room: Room, stereo: MultiviewDepth, tmp_path: Path) -> None:
