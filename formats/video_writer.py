@@ -27,7 +27,7 @@ def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, cod
     """
     codec = codec or CODECS.get(path.suffix.lower())
     if codec is None:
-        raise InputError(f"{path}: the ending of a video is one of {', '.join(CODECS)}; choose one of them")
+        raise InputError(f"{path}: cannot tell the video format; give a file name that ends in {' or '.join(CODECS)}")
     with atomic_path(path) as temporary:
         writer: cv2.VideoWriter | None = None
         size, written = (0, 0), 0

@@ -137,7 +137,9 @@ class Posted:
     def _do_locked(self, number: int, about: dict[str, Any], prepare: Callable[[str], Progress]) -> None:
         """What the work raises is the work's own, a file that is missing above all: nobody tries again for it."""
         if about["work"].partition(":")[0] not in TASK_MODULES:
-            raise InputError(f"{self.folder / _READY}: {about['work']} is no work on a task. Delete the folder")
+            raise InputError(
+                f"{self.folder / _READY}: {about['work']} is not a task of this program. Delete {self.folder}"
+            )
         work, folder = of_name(about["work"]), self.folder.parents[1] / about["folder"]
         name, task = f"{work.__name__} {number + 1}", load_value(self.task(number))
         refused, value = work_here(work, task, name, prepare, folder, about["threads"], about["code"])

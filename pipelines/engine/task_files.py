@@ -88,5 +88,5 @@ def _value(tree: Any, arrays: Mapping[str, NDArray]) -> Any:
         return {_value(k, arrays): _value(v, arrays) for k, v in content}
     found = of_name(kind)
     if not (isinstance(found, type) and is_dataclass(found)):
-        raise InputError(f"{kind} is no dataclass")
+        raise TypeError(f"{kind} is no dataclass")
     return found(**{name: _value(v, arrays) for name, v in content.items()})

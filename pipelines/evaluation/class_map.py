@@ -147,7 +147,8 @@ def match_classes(
         return by_name
     fitting = [m for m in shipped_maps() if vocabulary and _fits(m, vocabulary, true_names)]
     if len(fitting) > 1:
-        log.warning("more than one class map fits: give --class-map %s", " or ".join(m.name for m in fitting))
+        fits = " or ".join(m.name for m in fitting)
+        log.warning("more than one class map fits: choose one with --class-map %s", fits)
     return fitting[0].match(names, vocabulary, true_names) if len(fitting) == 1 else by_name
 
 

@@ -127,14 +127,14 @@ def check(source: Path, config: Config) -> None:
 def _check_panoramas(config: Config) -> None:
     """What knows pixels of the source's own pictures does not know its panoramas."""
     if config.frames.poses:
-        raise InputError("--poses cannot be used with panoramas: omit it")
+        raise InputError("--poses cannot be used with panoramas, which are cut into several images first: omit it")
     files = [p for p in (config.proxy.depth, config.proxy.semantics) if p.startswith("files")]
     reference = config.proxy.scale_ref.strip()
     if files or (reference and not reference.startswith("height")):
         what = f"{files[0]!r}" if files else f"--scale-ref {reference}"
         raise InputError(
-            f"{what} cannot be used with panoramas: omit it; --scale-ref height=METRES, the camera over the "
-            "floor, makes metres"
+            f"{what} cannot be used with panoramas, which are cut into several images first: omit it. For metres, give "
+            "--scale-ref height=METRES, the height of the camera above the floor"
         )
 
 

@@ -144,5 +144,6 @@ def _require_fitting(card: Card, shape: Sequence[int | str | None]) -> None:
     if shape[1] != planes:
         wanted = f"{planes} classes" if planes > 1 else "one plane"
         raise InputError(
-            f"{card.model}: output {card.output} has {shape[1]} channels, the card is for {wanted}. Correct the card"
+            f"{card.model}: output {card.output} has {shape[1]} channels, the card is for {wanted}. Correct "
+            "`classes` or `output` in the card"
         )

@@ -33,7 +33,7 @@ def written_names(names: Sequence[str], root: Path) -> tuple[str, ...]:
                 f"{root}: the name {name!r} holds a line break, a control character or no UTF-8: rename it"
             )
         if len(frame.encode("utf-8")) > _LONGEST_NAME:
-            raise InputError(f"{root}: the name {name!r} is too long: rename the image")
+            raise InputError(f"{root}: the name {name!r} is longer than {_LONGEST_NAME} bytes: rename the image")
         if frame in written:
             raise InputError(f"{root}: {written[frame]!r} and {name!r} would both become {frame!r}: rename one of them")
         written[frame] = name

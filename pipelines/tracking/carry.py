@@ -31,7 +31,10 @@ def carry_given(context: StageContext, state: TrackState) -> dict[str, Any]:
     joined = join_by_given(state, given)
     carried = pose_lost(state, given)
     if joined:
-        context.warn(f"{joined} stretches that no image ties to the rest are joined to it by the given poses")
+        context.warn(
+            f"{joined} disconnected components (no image links them to the rest) are placed by --poses alone: they are "
+            "as accurate as those poses"
+        )
     if carried:
         context.warn(
             f"{len(carried)} frames ({stretches(carried)}) are posed by --poses alone: the images say nothing of them"

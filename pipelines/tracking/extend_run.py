@@ -36,7 +36,10 @@ def require_extendable(run: RunFolder, videos: Sequence[Path], config: Config, p
     if unfinished:
         raise InputError(f"{run.root}: {unfinished[0]} is not done. Run `msgs-slam resume {run.root}` first")
     if run.load_calibration().directions > 1:
-        raise InputError(f"{run.root} was made from panoramas: only runs of plain videos are extended")
+        raise InputError(
+            f"{run.root} was made from panoramas, and only a run of ordinary videos can be extended: reconstruct "
+            "all the recordings together, in a new run"
+        )
     width, height = _size(video_files(source)[0])
     for video in videos:
         if video.resolve() in [file.resolve() for file in video_files(source)]:

@@ -288,7 +288,7 @@ def test_video_decodes_to_its_frames(world: World, tmp_path: Path, name: str, le
 
 
 def test_video_of_an_unknown_kind_or_without_frames_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="ending of a video"):
+    with pytest.raises(InputError, match="cannot tell the video format"):
         write_video(tmp_path / "clip.gif", [], 10)
     with pytest.raises(InputError, match="no frame"):
         write_video(tmp_path / "clip.mp4", [], 10)

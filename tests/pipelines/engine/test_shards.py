@@ -114,7 +114,7 @@ def test_a_node_with_another_version_says_so_and_leaves_the_task(folder: Path, m
 def test_a_run_cannot_name_other_work(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shards, "TASK_MODULES", ("msgs_slam.pipelines.proxy.stage",))
     posted = Posted.post(engine_calls.halve, [4], folder, 1)
-    with pytest.raises(InputError, match="is no work on a task"):
+    with pytest.raises(InputError, match="is not a task of this program"):
         posted.do_one(Shard(0, 1), engine_calls.silent)
 
 
