@@ -25,5 +25,5 @@ def test_a_card_is_asked_for_little_and_seldom_waited_for() -> None:
     assert votes["launches"] <= 40 * VIEWS
     assert weights["reads"] == blame["reads"] == VIEWS
     assert weights["bytes from it"] == blame["bytes from it"] == 0
-    assert stereo["launches"] <= 20
-    assert stereo["reads"] == 2
+    assert stereo["launches"] <= 36  # matched at two sizes
+    assert stereo["reads"] == 5
