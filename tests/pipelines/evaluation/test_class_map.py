@@ -85,7 +85,7 @@ def test_the_map_that_fits_is_found_and_none_where_it_is_not_sure(caplog: pytest
     assert same.how == "by name"
     # Replica's and ScanNet's names both hold these.
     assert match_classes(("rug", "armchair", "wall"), ADE20K, ("wall", "table", "picture"), None) is None
-    assert "give --class-map ade20k-replica or ade20k-scannet" in caplog.text
+    assert "choose one with --class-map ade20k-replica or ade20k-scannet" in caplog.text
 
 
 def test_the_maps_that_come_with_the_program_are_sound() -> None:
