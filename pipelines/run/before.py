@@ -21,7 +21,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.jsonfile import read_json_object, write_json
 from msgs_slam.formats.tensors import save_arrays
 from msgs_slam.pipelines.run import layouts
-from msgs_slam.pipelines.run.folder import EXPOSURE, MAP, RunFolder
+from msgs_slam.pipelines.run.folder import EXPOSURE, MAP, RunFolder, read_map
 from msgs_slam.pipelines.run.layouts import dataclass_from_json, load_layout, reading
 from msgs_slam.pipelines.run.names import SOURCE_LIST
 from msgs_slam.pipelines.run.records import load_source
@@ -41,7 +41,7 @@ class Before:
 
     folder: Path
 
-    @property
+    @cached_property
     def contents(self) -> Mapping[str, Any]:
         """{"source": digest, "camera", "files": name → sha256}."""
         return read_json_object(self.folder / CONTENTS)
@@ -89,12 +89,7 @@ class Before:
 
     def load_map(self, device: str = "cpu") -> GaussianMap:
         """Load the map onto a device."""
-        from msgs_slam.formats.tensors import load_tensors
-        from msgs_slam.pipelines.gaussian_map import GaussianMap
-
-        tensors = load_tensors(path := self._file(MAP))
-        with reading(path, "Gaussian map"):
-            return GaussianMap(**{name: tensor.to(device) for name, tensor in tensors.items()})
+        return read_map(self._file(MAP), device)
 
     def exposures(self) -> dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]]:
         """Frame id → log gain (3,) and offset (3,)."""

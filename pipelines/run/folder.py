@@ -192,16 +192,7 @@ class RunFolder(FinishedFiles):
 
     def load_map(self, stage: str, device: str = "cpu") -> GaussianMap:
         """The Gaussian map as `stage` left it."""
-        from msgs_slam.pipelines.gaussian_map import (
-            GaussianMap,  # torch takes seconds to import, and few who read a run need it
-        )
-
-        path = self.file(stage, MAP)
-        tensors = load_tensors(path)
-        with reading(path, "Gaussian map"):
-            if not all(bool(t.isfinite().all()) for t in tensors.values()):
-                raise ValueError("it holds numbers that are not finite")
-            return GaussianMap(**{name: tensor.to(device) for name, tensor in tensors.items()})
+        return read_map(self.file(stage, MAP), device)
 
     def load_class_ids(self) -> tuple[int, ...]:
         """The label of each class channel of the map."""
@@ -228,6 +219,17 @@ class RunFolder(FinishedFiles):
 
 
 # writers: pure functions of a folder and a value ----------------------------------------------------------------
+
+
+def read_map(path: Path, device: str = "cpu") -> GaussianMap:
+    """Read a Gaussian map onto a device. Raises InputError for a damaged one."""
+    from msgs_slam.pipelines.gaussian_map import GaussianMap  # imports torch, and few who read a run need it
+
+    tensors = load_tensors(path)
+    with reading(path, "Gaussian map"):
+        if not all(bool(t.isfinite().all()) for t in tensors.values()):
+            raise ValueError("it holds numbers that are not finite")
+        return GaussianMap(**{name: tensor.to(device) for name, tensor in tensors.items()})
 
 
 def save_frames(folder: Path, frames: list[Frame]) -> None:

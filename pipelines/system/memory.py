@@ -16,8 +16,7 @@ NEEDS = {
 }  # fmt: skip
 """MB that a stage needs at its peak: at least, for each million pixels of a frame, each keyframe, each million
 Gaussians. Fitted to the peaks of 63 runs of 10 to 219 keyframes and 0.01 to 0.7 million pixels: half of them lie within
-15 % (global_ba 26), nine of ten within 40 %. The least of proxy is of five later runs: it matches at
-640 pixels."""
+15 % (global_ba 26), nine of ten within 40 %. The least of proxy is of five later runs."""
 GAUSSIANS = 22_000
 """A map has about so many for each keyframe and million pixels of it."""
 VIEWS_SHARE = 0.25

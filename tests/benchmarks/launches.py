@@ -44,7 +44,7 @@ from msgs_slam.pipelines.mapping.schedule import Seeding, Step
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View, make_view
 from msgs_slam.pipelines.proxy.stereo import card
-from msgs_slam.pipelines.proxy.stereo.matching import Pictures
+from msgs_slam.pipelines.proxy.stereo.matching import StereoImages
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 from tests import pretend_device
 from tests.pretend_device import DEVICE, PretendTensor
@@ -206,7 +206,7 @@ def stereo_of_a_keyframe() -> None:
     pictures = np.random.default_rng(0).random((9, 6, 10)).astype(np.float32)
     warps = np.repeat(np.eye(3, 4)[None], 8, 0)
     warps[:, 0, 3] = 5 * np.arange(8)
-    card.match_planes(Pictures(pictures[0], pictures[1:7], warps[:6]), np.linspace(0.2, 1.0, 4), DEVICE)
+    card.match_planes(StereoImages(pictures[0], pictures[1:7], warps[:6]), np.linspace(0.2, 1.0, 4), DEVICE)
     card.fuse_depths(pictures[0], pictures[1:], warps, warps[:, 2], 0.01, DEVICE)
 
 

@@ -29,10 +29,10 @@ def takes_kernels_on(device: str) -> bool:
     return cards.takes_kernels(torch.empty(0, device=device))
 
 
-def match_planes(pictures: rules.Pictures, planes: NDArray[np.float64], device: str) -> Array:
+def match_planes(images: rules.StereoImages, planes: NDArray[np.float64], device: str) -> Array:
     """Return what `matching.match_planes` does, but for rounding."""
-    step, size = planes[1] - planes[0], pictures.image.shape
-    coarse, fine = (Matching.of(some, device) for some in (pictures.halved(), pictures))
+    step, size = planes[1] - planes[0], images.image.shape
+    coarse, fine = (Matching.of(some, device) for some in (images.halved(), images))
     cost = coarse.cost(planes)
     found = (coarse.picked(coarse.smoothed(cost), planes).cpu().numpy() - planes[0]) / step
     alone, least = (x.cpu().numpy() for x in (cost.argmin(2), cost.amin(2)))
@@ -84,9 +84,9 @@ class Matching:
         }  # fmt: skip
 
     @classmethod
-    def of(cls, pictures: rules.Pictures, device: str) -> Matching:
-        """Pictures of the host, there."""
-        return cls(*(_there(x, device) for x in (pictures.image, pictures.others, pictures.warps.reshape(-1, 12))))
+    def of(cls, images: rules.StereoImages, device: str) -> Matching:
+        """StereoImages of the host, there."""
+        return cls(*(_there(x, device) for x in (images.image, images.others, images.warps.reshape(-1, 12))))
 
     def picked(self, total: Tensor, planes: NDArray[np.float64]) -> Tensor:
         """(H, W) inverse depth of least total cost (H, W, D)."""
@@ -94,7 +94,8 @@ class Matching:
 
         inverse = torch.empty_like(self._image)
         numbers = (inverse.numel(), len(planes), float(planes[0]), float(planes[1] - planes[0]))
-        _run(pick_pixels, inverse.numel(), total, inverse, *numbers, PLANES=_power_of_two(len(planes)))
+        _run(pick_pixels, inverse.numel(), total, inverse, *numbers, PLANES=_power_of_two(len(planes)),
+             UNREACHED=float(UNREACHED))  # fmt: skip
         return inverse
 
     def cost(self, planes: NDArray[np.float64]) -> Tensor:

@@ -202,9 +202,10 @@ def scan_paths(
 @triton.jit
 def pick_pixels(
     total: tl.tensor, inverse: tl.tensor, pixels: tl.tensor, count: tl.tensor, nearest: tl.tensor, step: tl.tensor,
-    PLANES: tl.constexpr, BLOCK: tl.constexpr,
+    PLANES: tl.constexpr, UNREACHED: tl.constexpr, BLOCK: tl.constexpr,
 ) -> None:  # fmt: skip
-    """The inverse depth of each pixel: a parabola through the lowest sum and its two neighbours."""
+    """The inverse depth of each pixel: a parabola through the lowest sum and its two neighbours, where those are
+    below UNREACHED."""
     pixel = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = pixel < pixels
     plane = tl.arange(0, PLANES)
@@ -216,7 +217,7 @@ def pick_pixels(
     a, b = tl.load(at - 1, mask=inside & (rim == 0), other=0.0), tl.load(at, mask=inside, other=0.0)
     c = tl.load(at + 1, mask=inside & (rim == 0), other=0.0)
     bend = a + c - 2.0 * b
-    bends = (rim == 0) & (bend > 0) & (tl.maximum(a, c) < 1e9)
+    bends = (rim == 0) & (bend > 0) & (tl.maximum(a, c) < UNREACHED)
     offset = tl.where(bends, (a - c) / (2.0 * tl.where(bends, bend, 1.0)), 0.0)
     offset = tl.minimum(tl.maximum(offset, -0.5), 0.5)
     tl.store(inverse + pixel, nearest + (best.to(tl.float32) + offset) * step, mask=inside)

@@ -1,4 +1,4 @@
-"""The depth of one keyframe from pictures of others: sweep, smoothing, refinement, coarse and fine."""
+"""The depth of one keyframe from images of others: sweep, smoothing, refinement, coarse and fine."""
 
 from __future__ import annotations
 
@@ -31,38 +31,38 @@ SOFT_SIZE, SOFT_PLACE, SOFT_VALUES = 7, 2.0, (1.0, 0.7)
 refinement."""
 
 
-class Pictures(NamedTuple):
+class StereoImages(NamedTuple):
     """An image (H, W), others (N, H, W), intensities 0..1, and how they lie, (N, 3, 4) as of `warps_to`."""
 
     image: NDArray[np.float32]
     others: NDArray[np.float32]
     warps: NDArray[np.float64]
 
-    def halved(self) -> Pictures:
+    def halved(self) -> StereoImages:
         """Return them at half the size."""
         height, width = self.image.shape
         columns, rows = max(width // 2, 1), max(height // 2, 1)
         small = [cv2.resize(x, (columns, rows), interpolation=cv2.INTER_AREA) for x in (self.image, *self.others)]
         down, up = np.diag([columns / width, rows / height, 1.0]), np.diag([width / columns, height / rows, 1.0, 1.0])
-        return Pictures(small[0], np.stack(small[1:]), down @ self.warps @ up)
+        return StereoImages(small[0], np.stack(small[1:]), down @ self.warps @ up)
 
 
-def match_planes(pictures: Pictures, planes: NDArray[np.float64], bands: Bands) -> NDArray[np.float32]:
+def match_planes(images: StereoImages, planes: NDArray[np.float64], bands: Bands) -> NDArray[np.float32]:
     """(H, W) inverse depth of the image, found among the inverse depths `planes` (D,), which are evenly spaced, and
     refined.
 
     A match at half the size, whose windows see twice as far over plain surfaces, says which planes are tried where
     (Rothermel et al., SURE, LC3D 2012): a fifth of them, so that the whole size costs little more than the half.
     """
-    step, best, coarse = planes[1] - planes[0], best_count(len(pictures.others)), pictures.halved()
+    step, best, coarse = planes[1] - planes[0], best_count(len(images.others)), images.halved()
     cost = sweep_cost(*coarse, planes, best, bands)
     found = pick_planes(smooth_cost(cost, coarse.image, SMALL_STEP, JUMP, EDGE, bands))
-    tried = planes_to_try(found, cost.argmin(2), cost.min(2), pictures.image.shape, len(planes))
-    cost = sweep_cost(*pictures, planes, best, bands, tried)
-    total = smooth_cost(cost, pictures.image, SMALL_STEP, JUMP, EDGE, bands, tried)
+    tried = planes_to_try(found, cost.argmin(2), cost.min(2), images.image.shape, len(planes))
+    cost = sweep_cost(*images, planes, best, bands, tried)
+    total = smooth_cost(cost, images.image, SMALL_STEP, JUMP, EDGE, bands, tried)
     inverse = (planes[0] + pick_planes(total) * step).astype(np.float32)
     inverse = cv2.bilateralFilter(inverse, SOFT_SIZE, SOFT_VALUES[0] * step, SOFT_PLACE)
-    inverse = refine_inverse_depth(*pictures, inverse, MOVE * step, REACH, STIFFNESS, best, bands)
+    inverse = refine_inverse_depth(*images, inverse, MOVE * step, REACH, STIFFNESS, best, bands)
     return np.asarray(cv2.bilateralFilter(inverse, SOFT_SIZE, SOFT_VALUES[1] * step, SOFT_PLACE), np.float32)
 
 

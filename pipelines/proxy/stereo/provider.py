@@ -27,7 +27,7 @@ from msgs_slam.pipelines.proxy.stereo.borrow import agreed_depth, borrow_depth, 
 from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
 from msgs_slam.pipelines.proxy.stereo.evidence import evidence_of, prefer_matches, surface_contrast
 from msgs_slam.pipelines.proxy.stereo.fill import SURE, fill_unsure, judge_by_company
-from msgs_slam.pipelines.proxy.stereo.matching import Pictures, match_planes
+from msgs_slam.pipelines.proxy.stereo.matching import StereoImages, match_planes
 from msgs_slam.pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
 from msgs_slam.pipelines.proxy.stereo.sweep import warps_to
 from msgs_slam.pipelines.proxy.stereo.upsample import upsample_depth
@@ -114,17 +114,17 @@ class MultiviewDepth:
         if len(companions) == 0 or limits is None:
             return np.zeros((camera.height, camera.width), np.float32)
         planes = np.linspace(1 / limits[1], 1 / limits[0], self._planes)
-        given, card = (self._pictures(index, companions), planes), self._card
+        given, card = (self._stereo_images(index, companions), planes), self._card
         inverse = match_planes(*given, self._bands) if card is None else card.match_planes(*given, self._device)
         left_out = self._grey(int(self._model.frame_ids[index]))[1]
         inverse = np.clip(inverse, planes[0], planes[-1]).astype(np.float32)
         unknown = at_stops(inverse, planes)
         return np.where(unknown if left_out is None else unknown | left_out, np.float32(0), inverse)
 
-    def _pictures(self, index: int, others: NDArray[np.int64]) -> Pictures:
+    def _stereo_images(self, index: int, others: NDArray[np.int64]) -> StereoImages:
         ids = self._model.frame_ids[others].tolist()
         image = self._grey(int(self._model.frame_ids[index]))[0]
-        return Pictures(image, np.stack([_blanked(*self._grey(i)) for i in ids]), self._warps(index, others))
+        return StereoImages(image, np.stack([_blanked(*self._grey(i)) for i in ids]), self._warps(index, others))
 
     # second pass ------------------------------------------------------------------------------------------------
 

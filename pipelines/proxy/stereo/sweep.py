@@ -67,7 +67,7 @@ def sweep_cost(
     def work(first: int, last: int) -> None:
         _sweep_band(image, others, warps, inverse_depths, wanted[first // TILE], best, first, last, cost)
 
-    bands.run(height, work, TILE)
+    bands.run(height, work)
     return cost
 
 

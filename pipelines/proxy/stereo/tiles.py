@@ -1,11 +1,13 @@
-"""Tiles of a picture for which the same planes are tried."""
+"""Tiles of an image for which the same planes are tried."""
 
 from __future__ import annotations
 
-TILE = 16
-"""Pixels across and down."""
+from msgs_slam.pipelines.proxy.stereo.bands import BAND_ROWS
+
+TILE = BAND_ROWS
+"""Pixels across and down: the rows of a band, and the pixels that one vector holds."""
 
 
 def tiles_of(height: int, width: int) -> tuple[int, int]:
-    """Return how many tiles a picture of that size has down and across."""
+    """Return how many tiles an image of that size has down and across."""
     return -(-height // TILE), -(-width // TILE)

@@ -9,7 +9,14 @@ from msgs_slam.pipelines.proxy.stereo.borrow import agreed_depth, borrow_depth, 
 from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
 from msgs_slam.pipelines.proxy.stereo.evidence import evidence_of, prefer_matches, surface_contrast
 from msgs_slam.pipelines.proxy.stereo.fill import SURE, fill_unsure, judge_by_company
-from msgs_slam.pipelines.proxy.stereo.matching import CLEAR, MARGIN, Pictures, best_count, match_planes, planes_to_try
+from msgs_slam.pipelines.proxy.stereo.matching import (
+    CLEAR,
+    MARGIN,
+    StereoImages,
+    best_count,
+    match_planes,
+    planes_to_try,
+)
 from msgs_slam.pipelines.proxy.stereo.provider import at_stops
 from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth
 from msgs_slam.pipelines.proxy.stereo.smoothing import UNREACHED, pick_planes, smooth_cost
@@ -129,7 +136,7 @@ def test_a_bar_thinner_than_the_coarse_window_is_found() -> None:
 
     matrix = np.array([[2 * FOCAL, 0, WIDTH], [0, 2 * FOCAL, HEIGHT], [0, 0, 1]])
     image, on_bar = view(np.eye(4))
-    pictures = Pictures(
+    pictures = StereoImages(
         image, np.stack([view(c)[0] for c in CAMERAS]), warps_to(matrix, np.eye(4), [matrix] * 4, CAMERAS)
     )
     found = match_planes(pictures, np.linspace(1 / 4, 1, 48), Bands(1))[10:-10, 20:-20]

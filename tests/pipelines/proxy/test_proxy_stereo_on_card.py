@@ -89,8 +89,8 @@ def test_the_refinement_and_the_filter_are_those_of_the_cpu(pictures: tuple, on_
 
 
 def test_the_whole_match_finds_the_plane(pictures: tuple) -> None:
-    found = card.match_planes(matching.Pictures(*pictures), PLANES, DEVICE)
-    expected = matching.match_planes(matching.Pictures(*pictures), PLANES, BANDS)
+    found = card.match_planes(matching.StereoImages(*pictures), PLANES, DEVICE)
+    expected = matching.match_planes(matching.StereoImages(*pictures), PLANES, BANDS)
     truth = 1 / view_of_plane(np.eye(4), 0.3)[1][:ROWS, :COLUMNS]
     assert np.median(np.abs(found - truth)) < 0.5 * (PLANES[1] - PLANES[0])
     assert (np.abs(found - expected) > 1e-3).mean() < 0.02
@@ -116,7 +116,7 @@ def test_depths_are_fused_as_on_the_cpu() -> None:
 def test_a_keyframe_asks_for_few_launches(pictures: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
     launched, right = [], cards.launch
     monkeypatch.setattr(cards, "launch", lambda kernel, *a, **k: launched.append(kernel) or right(kernel, *a, **k))
-    small = matching.Pictures(pictures[0][:6, :8].copy(), pictures[1][:, :6, :8].copy(), pictures[2])
+    small = matching.StereoImages(pictures[0][:6, :8].copy(), pictures[1][:, :6, :8].copy(), pictures[2])
     card.match_planes(small, PLANES[:4], DEVICE)
     assert len(launched) == (8 + 2) + (8 + 5)
 
@@ -125,7 +125,7 @@ def test_a_keyframe_asks_for_few_launches(pictures: tuple, monkeypatch: pytest.M
 def test_the_kernels_compile_for_cards(tmp_path: Path) -> None:
     names = ["sweep_pixels", "refine_pixels", "scan_paths", "pick_pixels", "soften_pixels", "fuse_pixels"]
     constants = {"BEST": 3, "VIEWS": 8, "FLOOR": 2e-5, "OUTSIDE": -2.0, "SIDE": 4, "STEP": 2, "RADIUS": 3, "BLOCK": 64}
-    constants |= {"REACH": 2, "MOVES": 8, "PLANES": 128, "TOLERANCE": 0.01}
+    constants |= {"REACH": 2, "MOVES": 8, "PLANES": 128, "TOLERANCE": 0.01, "UNREACHED": 1e9}
     numbers = ("views", "count", "width", "height", "down", "across", "pixels")
     floats = ("narrow", "step", "stiffness", "small", "large", "edge", "nearest", "by_value", "by_place")
     kinds = dict.fromkeys(numbers, "i32") | dict.fromkeys(floats, "fp32") | {"starts": "*i32"}
