@@ -206,7 +206,7 @@ def total(typing_context: Any, value: Any) -> Any:
     """Sum of the lanes, always added in the same order."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return _fold(builder, args[0], lambda x, y: builder.fadd(x, y, flags=FLAGS))
+        return fold(builder, args[0], lambda x, y: builder.fadd(x, y, flags=FLAGS))
 
     return types.float32(lanes), emit
 
@@ -229,7 +229,7 @@ def largest_of(typing_context: Any, value: Any) -> Any:
     """The largest of the lanes."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return _fold(builder, args[0], lambda x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y))
+        return fold(builder, args[0], lambda x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y))
 
     return types.float32(lanes), emit
 
@@ -318,7 +318,7 @@ def exp(typing_context: Any, value: Any) -> Any:
     return lanes(lanes), emit
 
 
-def _fold(builder: ir.IRBuilder, value: ir.Value, join: Callable[[ir.Value, ir.Value], ir.Value]) -> ir.Value:
+def fold(builder: ir.IRBuilder, value: ir.Value, join: Callable[[ir.Value, ir.Value], ir.Value]) -> ir.Value:
     """Halves onto halves: a fixed order, four steps for sixteen lanes."""
     undefined = ir.Constant(vector_type(), ir.Undefined)
     for step in (8, 4, 2, 1):

@@ -14,9 +14,9 @@ from torch import Tensor
 import msgs_slam.pipelines.gaussians.render.cards as cards
 import msgs_slam.pipelines.proxy.stereo.matching as rules
 from msgs_slam.pipelines.proxy.stereo.refine import ALIKE
-from msgs_slam.pipelines.proxy.stereo.smoothing import DIRECTIONS, UNREACHED, path_starts, tried_ranges
-from msgs_slam.pipelines.proxy.stereo.sweep import UNTRIED
+from msgs_slam.pipelines.proxy.stereo.smoothing import DIRECTIONS, path_starts
 from msgs_slam.pipelines.proxy.stereo.tiles import TILE
+from msgs_slam.pipelines.proxy.stereo.volume import UNREACHED
 from msgs_slam.pipelines.proxy.stereo.window import LIKENESS, OUTSIDE, RADIUS, SIDE, STEP, VARIANCE_FLOOR
 
 Array = NDArray[np.float32]
@@ -31,25 +31,25 @@ def takes_kernels_on(device: str) -> bool:
 
 def match_planes(images: rules.StereoImages, planes: NDArray[np.float64], device: str) -> Array:
     """Return what `matching.match_planes` does, but for rounding."""
-    step, size = planes[1] - planes[0], images.image.shape
+    step, size, few = planes[1] - planes[0], images.image.shape, planes[:: rules.COARSE]
     coarse, fine = (Matching.of(some, device) for some in (images.halved(), images))
-    cost = coarse.cost(planes)
-    found = (coarse.picked(coarse.smoothed(cost), planes).cpu().numpy() - planes[0]) / step
+    cost = coarse.cost(few)
+    smoothed = coarse.smoothed(cost, rules.COARSE * rules.SMALL_STEP)
+    found = (coarse.picked(smoothed, few).cpu().numpy() - planes[0]) / step
     alone, least = (x.cpu().numpy() for x in (cost.argmin(2), cost.amin(2)))
-    tried = rules.planes_to_try(found.astype(np.float32), alone, least, size, len(planes))
-    inverse = fine.picked(fine.smoothed(leave_out(fine.cost(planes), tried)), planes)
+    tried = rules.planes_to_try(found.astype(np.float32), rules.COARSE * alone, least, size, len(planes))
+    total = fine.smoothed(leave_out(fine.cost(planes), tried), rules.SMALL_STEP)
+    inverse = fine.picked(total, planes)
     inverse = fine.refined(fine.soften(inverse, rules.SOFT_VALUES[0] * step), rules.MOVE * step)
     return fine.soften(inverse, rules.SOFT_VALUES[1] * step).cpu().numpy()
 
 
 def leave_out(cost: Tensor, tried: NDArray[np.bool_]) -> Tensor:
     """(H, W, D) cost as the CPU has it where planes are not `tried`. All are compared: a card gains nothing else."""
-    height, width, planes = cost.shape
-    first, last = np.moveaxis(tried_ranges(tried, (height, width), planes)[..., None, :], -1, 0)
-    inside = (np.arange(planes) >= first) & (np.arange(planes) < last)
-    kinds = torch.from_numpy(np.where(tried, np.float32(0), np.where(inside, np.float32(UNTRIED), UNREACHED)))
-    kinds = kinds.to(cost.device).repeat_interleave(TILE, 0)[:height].repeat_interleave(TILE, 1)[:, :width]
-    return torch.where(kinds > 0, kinds, cost)
+    height, width, _ = cost.shape
+    there = torch.from_numpy(tried).to(cost.device)
+    there = there.repeat_interleave(TILE, 0)[:height].repeat_interleave(TILE, 1)[:, :width]
+    return torch.where(there, cost, float(UNREACHED))
 
 
 def fuse_depths(
@@ -108,12 +108,13 @@ class Matching:
         _run(sweep_pixels, self._image.numel(), *self._given, depths, cost, *numbers, **self._window)
         return cost
 
-    def smoothed(self, cost: Tensor) -> Tensor:
-        """(H, W, D) as of `smooth_cost`; a launch for each direction, a program for each path."""
+    def smoothed(self, cost: Tensor, small: float) -> Tensor:
+        """(H, W, D) as of `smooth_cost`, `small` the price of a step of one plane; a launch for each direction, a
+        program for each path."""
         from msgs_slam.pipelines.proxy.stereo.card_kernels import scan_paths
 
         total, count = torch.zeros_like(cost), cost.shape[2]
-        numbers = (count, rules.SMALL_STEP, rules.JUMP, rules.EDGE)
+        numbers = (count, small, rules.JUMP, rules.EDGE)
         for direction in DIRECTIONS:
             starts = _starts(*self._size, *direction, cost.device)
             given = (cost, self._image, starts, total, *self._size, *direction, *numbers)

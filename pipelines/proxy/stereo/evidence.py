@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.gaussians.render.jit import kernel
-from msgs_slam.pipelines.proxy.stereo.window import LIKENESS, row_length, weigh_windows
+from msgs_slam.pipelines.proxy.stereo.window import LIKENESS, pad_rows, row_length, weigh_windows
 
 _FAINT, _POWER = 5e-5, 0.25
 """Variance (intensities 0..1; two grey levels) and power by which agreement on a blank surface counts less."""
@@ -21,8 +21,10 @@ def surface_contrast(image: NDArray[np.float32]) -> NDArray[np.float32]:
     """(h, w) variance of the intensities (0..1) of each pixel's window, which count by how like the pixel they are: of
     a blank surface it is small also beside its border."""
     height, width = image.shape
-    moments = weigh_windows(image, 0, height, LIKENESS)[2].reshape((height, 2, row_length(width)))
-    return moments[:, 1, :width].copy()
+    length, contrast = row_length(width), np.empty((height, width), np.float32)
+    for y in range(height):
+        contrast[y] = weigh_windows(pad_rows(image, y, y + 1), length, LIKENESS)[1][length : length + width]
+    return contrast
 
 
 def evidence_of(contrast: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -37,10 +39,11 @@ def prefer_matches(
     contrast: NDArray[np.float32],
 ) -> NDArray[np.float32]:
     """(h, w) filled depths, and matched ones (0 where none) where `borne_out` (agreeing less contradicting views)
-    is larger for them and there was something to match.
+    is larger for them and there was something to match; it is asked of no other pixels, which are 0.
 
     What lies beside a near thing is seen by too few views to be sure, and a plane through what is sure would draw the
     near thing over it.
     """
-    better = borne_out(matched) > borne_out(filled)
-    return np.where((matched > 0) & better & (contrast > _CLEAR), matched, filled)
+    asked = (matched > 0) & (contrast > _CLEAR)
+    better = borne_out(np.where(asked, matched, 0)) > borne_out(np.where(asked, filled, 0))
+    return np.where(asked & better, matched, filled)

@@ -15,6 +15,7 @@ from msgs_slam.pipelines.gaussians.render.lanes import (
     address_of,
     call_llvm,
     constant,
+    fold,
     intrinsic,
     lanes,
     load_lanes,
@@ -31,6 +32,16 @@ def smallest(typing_context: Any, value: Any, other: Any) -> Any:
         return builder.select(builder.fcmp_ordered("<", *args), *args)
 
     return lanes(lanes, lanes), emit
+
+
+@intrinsic
+def smallest_of(typing_context: Any, value: Any) -> Any:
+    """The smallest of the lanes."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        return fold(builder, args[0], lambda x, y: builder.select(builder.fcmp_ordered("<", x, y), x, y))
+
+    return types.float32(lanes), emit
 
 
 @intrinsic

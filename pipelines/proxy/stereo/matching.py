@@ -12,9 +12,10 @@ from scipy.ndimage import maximum_filter1d
 
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
 from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth
-from msgs_slam.pipelines.proxy.stereo.smoothing import pick_planes, smooth_cost
+from msgs_slam.pipelines.proxy.stereo.smoothing import smooth_cost
 from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost
 from msgs_slam.pipelines.proxy.stereo.tiles import TILE, tiles_of
+from msgs_slam.pipelines.proxy.stereo.volume import least_planes, pick_planes
 
 LEAST_BEST, MOST_BEST = 3, 5
 """Of the views that one is matched with, the better half counts at a pixel, but not fewer or more than these."""
@@ -23,9 +24,11 @@ SMALL_STEP, JUMP, EDGE = 0.1, 1.2, 0.05
 STIFFNESS = 0.01
 REACH, MOVE = 2, 1 / 3
 """Of the refinement: so many moves either way, of so much of the distance between planes."""
-MARGIN, AROUND, CLEAR = 3, 2, 0.3
+MARGIN, AROUND, CLEAR = 2, 1, 0.3
 """Of the whole size: planes on either side of a coarse one that are tried, coarse pixels around it that try it, and the
 cost below which a match is clear by itself."""
+COARSE = 2
+"""Of half the size every second plane: there they are as far apart in pixels as all are in the whole size."""
 SOFT_SIZE, SOFT_PLACE, SOFT_VALUES = 7, 2.0, (1.0, 0.7)
 """Of the bilateral filters: pixels across, sd in pixels, and sd in distances between planes, before and after the
 refinement."""
@@ -52,14 +55,15 @@ def match_planes(images: StereoImages, planes: NDArray[np.float64], bands: Bands
     refined.
 
     A match at half the size, whose windows see twice as far over plain surfaces, says which planes are tried where
-    (Rothermel et al., SURE, LC3D 2012): a fifth of them, so that the whole size costs little more than the half.
+    (Rothermel et al., SURE, LC3D 2012): an eighth of them, so that the whole size costs little more than the half.
     """
     step, best, coarse = planes[1] - planes[0], best_count(len(images.others)), images.halved()
-    cost = sweep_cost(*coarse, planes, best, bands)
-    found = pick_planes(smooth_cost(cost, coarse.image, SMALL_STEP, JUMP, EDGE, bands))
-    tried = planes_to_try(found, cost.argmin(2), cost.min(2), images.image.shape, len(planes))
+    cost = sweep_cost(*coarse, planes[::COARSE], best, bands)
+    found = pick_planes(smooth_cost(cost, coarse.image, COARSE * SMALL_STEP, JUMP, EDGE, bands))
+    alone, least = least_planes(cost)
+    tried = planes_to_try(COARSE * found, COARSE * alone, least, images.image.shape, len(planes))
     cost = sweep_cost(*images, planes, best, bands, tried)
-    total = smooth_cost(cost, images.image, SMALL_STEP, JUMP, EDGE, bands, tried)
+    total = smooth_cost(cost, images.image, SMALL_STEP, JUMP, EDGE, bands)
     inverse = (planes[0] + pick_planes(total) * step).astype(np.float32)
     inverse = cv2.bilateralFilter(inverse, SOFT_SIZE, SOFT_VALUES[0] * step, SOFT_PLACE)
     inverse = refine_inverse_depth(*images, inverse, MOVE * step, REACH, STIFFNESS, best, bands)

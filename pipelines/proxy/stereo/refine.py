@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.gaussians.render.jit import kernel
 from msgs_slam.pipelines.gaussians.render.lanes import store
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
+from msgs_slam.pipelines.proxy.stereo.tiles import TILE, tiles_of
 from msgs_slam.pipelines.proxy.stereo.window import (
     RADIUS,
     SAMPLED_ROWS,
     best_mean,
+    need_around,
+    pad_rows,
     row_length,
     warp_row,
     weigh_windows,
@@ -35,15 +38,22 @@ def refine_inverse_depth(
     stiffness: float,
     best: int,
     bands: Bands,
+    compared: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float32]:
-    """(H, W) inverse depth moved by up to `reach` steps to where the views correlate best.
+    """(H, W) inverse depth moved by up to `reach` steps to where the views correlate best; `compared` as of
+    `sweep_cost`.
 
     A move of n steps costs `stiffness` n² of correlation, so that a surface without texture stays where it is.
     """
     refined = np.empty_like(inverse_depth)
+    if compared is None:
+        compared = np.ones((*tiles_of(*image.shape), len(others)), np.bool_)
 
     def work(first: int, last: int) -> None:
-        _refine_band(image, others, warps, inverse_depth, step, reach, stiffness, best, first, last, refined)
+        _refine_band(
+            image, others, warps, inverse_depth, step, reach, stiffness, best, compared[first // TILE], first, last,
+            refined,
+        )  # fmt: skip
 
     bands.run(image.shape[0], work)
     return refined
@@ -59,6 +69,7 @@ def _refine_band(
     reach: int,
     stiffness: float,
     best: int,
+    compared: NDArray[np.bool_],
     first: int,
     last: int,
     refined: NDArray[np.float32],
@@ -68,23 +79,27 @@ def _refine_band(
     length = row_length(width)
     samples = np.zeros(views * SAMPLED_ROWS * length, np.float32)
     seen = np.zeros(views * SAMPLED_ROWS * length, np.float32)
-    needed = np.ones(length // 16 + 1, np.bool_)
+    needed = np.zeros((views, len(compared) + 1), np.bool_)
+    for n in range(views):
+        need_around(compared[:, n], needed[n])
     surface, top = np.zeros(length, np.float32), np.empty(16 * best, np.float32)
-    weights, weighted, moments = weigh_windows(image, first, last, ALIKE)
+    reference = pad_rows(image, first, last)
+    weights, moments = weigh_windows(reference, length, ALIKE)
     total = np.empty((2 * reach + 1, last - first, length), np.float32)
     for d in range(2 * reach + 1):
         for k in range(last - first + 2 * RADIUS):
             y = min(max(first + k - RADIUS, 0), height - 1)
-            surface[:width] = inverse_depth[y]
+            for x in range(length):
+                surface[x] = inverse_depth[y, min(max(x - RADIUS, 0), width - 1)]
             for n in range(views):
                 warp_row(
-                    others[n].reshape(-1), columns, rows, warps[n], surface, (d - reach) * step, y, width, needed,
+                    others[n].reshape(-1), columns, rows, warps[n], surface, (d - reach) * step, y, width, needed[n],
                     samples, seen, (n * SAMPLED_ROWS + k) * length,
                 )  # fmt: skip
         penalty = np.float32(stiffness * (d - reach) ** 2)
         for k in range(last - first):
-            for x in range(0, width, 16):
-                score = best_mean(samples, seen, weights, weighted, moments, length, views, k, x, top)
+            for x in range(0, width, TILE):
+                score = best_mean(samples, seen, weights, reference, moments, length, compared[x // TILE], k, x, top)
                 store(total[d, k], x, score - penalty)
     for k in range(last - first):
         for x in range(width):

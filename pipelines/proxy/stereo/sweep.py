@@ -9,24 +9,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.gaussians.render.jit import kernel
+from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
 from msgs_slam.pipelines.gaussians.render.lanes import splat, store
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
 from msgs_slam.pipelines.proxy.stereo.tiles import TILE, tiles_of
+from msgs_slam.pipelines.proxy.stereo.volume import BLOCK, UNREACHED, Volume, pixel_of_tile
 from msgs_slam.pipelines.proxy.stereo.window import (
     LIKENESS,
     RADIUS,
     SAMPLED_ROWS,
     best_mean,
+    need_around,
+    pad_rows,
     row_length,
     warp_row,
     weigh_windows,
 )
-
-_PLANES = 16
-"""So many at a time fit into the cache."""
-UNTRIED = 2.0
-"""Cost of a plane that is not tried: as of a match that could not be worse."""
 
 
 def warps_to(
@@ -52,20 +50,26 @@ def sweep_cost(
     best: int,
     bands: Bands,
     tried: NDArray[np.bool_] | None = None,
-) -> NDArray[np.float32]:
-    """(H, W, D) cost 1 - score in [0, 2] of every inverse depth; `others` (N, H, W) lie as the warps say.
+    compared: NDArray[np.bool_] | None = None,
+) -> Volume:
+    """Cost 1 - score in [0, 2] of the inverse depths (D,); `others` (N, H, W) lie as the warps say.
 
     Intensities are 0..1. Where no view sees the point the cost is 1, as for a surface without texture. Of each tile
-    only the planes `tried` (tiles down, tiles across, D) are compared; others cost UNTRIED. None: all are tried.
+    only the planes `tried` (tiles down, tiles across, D) are there, and only the views `compared` (tiles down, tiles
+    across, N) count; None: all.
     """
     height, width = image.shape
-    cost = np.empty((height, width, len(inverse_depths)), np.float32)
-    if tried is None:
-        tried = np.ones((*tiles_of(height, width), len(inverse_depths)), np.bool_)
-    wanted = np.ascontiguousarray(tried.transpose(0, 2, 1))
+    tiles = tiles_of(height, width)
+    tried = np.ones((*tiles, len(inverse_depths)), np.bool_) if tried is None else tried
+    compared = np.ones((*tiles, len(others)), np.bool_) if compared is None else compared
+    cost, wanted = Volume.of_tried(height, width, tried), np.ascontiguousarray(tried.transpose(0, 2, 1))
 
     def work(first: int, last: int) -> None:
-        _sweep_band(image, others, warps, inverse_depths, wanted[first // TILE], best, first, last, cost)
+        tile = first // TILE
+        _sweep_band(
+            image, others, warps, inverse_depths, wanted[tile], compared[tile], best, first, last, cost.places[tile],
+            cost.strides[tile], cost.values,
+        )  # fmt: skip
 
     bands.run(height, work)
     return cost
@@ -78,9 +82,12 @@ def _sweep_band(
     warps: NDArray[np.float64],
     inverse_depths: NDArray[np.float64],
     wanted: NDArray[np.bool_],
+    compared: NDArray[np.bool_],
     best: int,
     first: int,
     last: int,
+    places: NDArray[np.int64],
+    strides: NDArray[np.int64],
     cost: NDArray[np.float32],
 ) -> None:
     height, width = image.shape
@@ -88,17 +95,18 @@ def _sweep_band(
     length = row_length(width)
     samples = np.zeros(views * SAMPLED_ROWS * length, np.float32)
     seen = np.zeros(views * SAMPLED_ROWS * length, np.float32)
-    needed = np.zeros(wanted.shape[1], np.bool_)
+    needed = np.zeros(wanted.shape[1] + 1, np.bool_)
     plane, top = np.zeros(length, np.float32), np.empty(16 * best, np.float32)
-    weights, weighted, moments = weigh_windows(image, first, last, LIKENESS)
-    block = np.empty(_PLANES * (last - first) * length, np.float32)
-    for start in range(0, len(inverse_depths), _PLANES):
-        count = min(_PLANES, len(inverse_depths) - start)
-        for d in range(count):
+    reference = pad_rows(image, first, last)
+    weights, moments = weigh_windows(reference, length, LIKENESS)
+    block = np.empty(BLOCK * (last - first) * length, np.float32)
+    for start in range(0, len(inverse_depths), BLOCK):
+        block[:] = UNREACHED
+        for d in range(min(BLOCK, len(inverse_depths) - start)):
             here = wanted[start + d]
-            for b in range(len(here)):
-                needed[b] = here[b] or (b > 0 and here[b - 1]) or (b + 1 < len(here) and here[b + 1])
             for n in range(views):
+                if not need_around(here & compared[:, n], needed):
+                    continue
                 picture = others[n].reshape(-1)
                 for k in range(last - first + 2 * RADIUS):
                     y = min(max(first + k - RADIUS, 0), height - 1)
@@ -106,16 +114,33 @@ def _sweep_band(
                         picture, columns, rows, warps[n], plane, inverse_depths[start + d], y, width, needed,
                         samples, seen, (n * SAMPLED_ROWS + k) * length,
                     )  # fmt: skip
-            for k in range(last - first):
-                for x in range(0, width, TILE):
-                    place = (d * (last - first) + k) * length + x
-                    if not here[x // TILE]:
-                        store(block, place, splat(np.float32(UNTRIED)))
-                        continue
-                    score = best_mean(samples, seen, weights, weighted, moments, length, views, k, x, top)
-                    store(block, place, splat(np.float32(1)) - score)
-        # Turned round some planes at a time: writing each into (H, W, D) would miss the cache at every pixel.
-        for k in range(last - first):
-            for x in range(width):
-                for d in range(count):
-                    cost[first + k, x, start + d] = block[(d * (last - first) + k) * length + x]
+            for t in range(len(here)):
+                if here[t]:
+                    for k in range(last - first):
+                        score = best_mean(
+                            samples, seen, weights, reference, moments, length, compared[t], k, t * TILE, top
+                        )
+                        place = (d * (last - first) + k) * length + t * TILE
+                        store(block, place, splat(np.float32(1)) - score)
+        _turn(block, length, last - first, width, places[:, start // BLOCK], strides, cost)
+
+
+@inner
+def _turn(
+    block: NDArray[np.float32],
+    length: int,
+    rows: int,
+    width: int,
+    places: NDArray[np.int64],
+    strides: NDArray[np.int64],
+    cost: NDArray[np.float32],
+) -> None:
+    """Planes side by side for each pixel, out of pixels side by side for each plane: writing each plane would miss the
+    cache at every pixel."""
+    for t in range(len(places)):
+        if places[t] >= 0:
+            for k in range(rows):
+                for x in range(t * TILE, min(t * TILE + TILE, width)):
+                    place = places[t] + pixel_of_tile(k, x) * strides[t]
+                    for d in range(BLOCK):
+                        cost[place + d] = block[(d * rows + k) * length + x]

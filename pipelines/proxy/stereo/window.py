@@ -17,6 +17,7 @@ from msgs_slam.pipelines.gaussians.render.jit import inner
 from msgs_slam.pipelines.gaussians.render.lanes import (
     at_most,
     counting,
+    exp,
     largest,
     load,
     splat,
@@ -47,47 +48,67 @@ _NEAR, _FLOOR, _OUTSIDE = np.float32(1e-6), np.float32(VARIANCE_FLOOR), np.float
 
 @inner
 def row_length(width: int) -> int:
-    """Numbers between the starts of two rows: whole vectors, and the border on both sides."""
-    return (width + _LANES - 1) // _LANES * _LANES + 2 * RADIUS
+    """Numbers between the starts of two rows: whole vectors, one more than the image has, for the border."""
+    return (width + _LANES - 1) // _LANES * _LANES + _LANES
+
+
+@inner
+def pad_rows(image: NDArray[np.float32], first: int, last: int) -> NDArray[np.float32]:
+    """Rows first..last of the image (H, W) and RADIUS more on all sides, the border repeated, flat and `row_length`
+    apart; the first row's first pixel lies RADIUS rows and columns in."""
+    height, width = image.shape
+    length = row_length(width)
+    rows = np.empty((last - first + 2 * RADIUS, length), np.float32)
+    for k in range(len(rows)):
+        y = min(max(first + k - RADIUS, 0), height - 1)
+        for x in range(length):
+            rows[k, x] = image[y, min(max(x - RADIUS, 0), width - 1)]
+    return rows.reshape(-1)
 
 
 @inner
 def weigh_windows(
-    image: NDArray[np.float32], first: int, last: int, likeness: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Of rows first..last of the image (H, W): the windows' weights and the weights times intensity, both flat (rows,
-    SIDE, SIDE, row length) with sums of one window 1 and its mean; and mean and variance, flat (rows, 2, row length).
+    rows: NDArray[np.float32], length: int, likeness: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Of `pad_rows`, `length` apart: the windows' weights, flat (rows, SIDE, SIDE, row length) with sums of one window
+    1, and their mean and variance, flat (rows, 2, row length).
 
-    likeness: standard deviation of the weights, a difference in intensity. The border is repeated outwards.
+    likeness: standard deviation of the weights, a difference in intensity.
     """
-    height, width = image.shape
-    length, taps = row_length(width), SIDE * SIDE
-    weights = np.zeros((last - first) * taps * length, np.float32)
-    weighted = np.zeros((last - first) * taps * length, np.float32)
-    moments = np.zeros((last - first) * 2 * length, np.float32)
-    narrow = np.float32(-0.5 / likeness**2)
-    for k in range(last - first):
-        for x in range(width):
-            middle = image[first + k, x]
-            total, mean, square = np.float32(0), np.float32(0), np.float32(0)
+    count, taps = len(rows) // length - 2 * RADIUS, SIDE * SIDE
+    weights, moments = np.empty(count * taps * length, np.float32), np.empty(count * 2 * length, np.float32)
+    narrow = splat(np.float32(-0.5 / likeness**2))
+    # The middle is no part of the window; the floor keeps a lone bright pixel from dividing by nothing.
+    floor = splat(np.float32(1e-6))
+    for k in range(count):
+        for x in range(0, length - _LANES, _LANES):
+            middle = load(rows, (k + RADIUS) * length + x + RADIUS)
+            total, mean, square = splat(_ZERO), splat(_ZERO), splat(_ZERO)
+            own = k * taps * length + x
+            for j in range(SIDE):
+                for i in range(SIDE):
+                    value = load(rows, (k + j * STEP) * length + i * STEP + x)
+                    off = value - middle
+                    weight = exp(off * off * narrow) + floor
+                    store(weights, own + (j * SIDE + i) * length, weight)
+                    total, mean, square = total + weight, mean + weight * value, square + weight * value * value
+            share = splat(_ONE) / total
             for tap in range(taps):
-                row = min(max(first + k + tap // SIDE * STEP - RADIUS, 0), height - 1)
-                value = image[row, min(max(x + tap % SIDE * STEP - RADIUS, 0), width - 1)]
-                # The middle is no part of the window; the floor keeps a lone bright pixel from dividing by nothing.
-                weight = np.exp(narrow * (value - middle) ** 2) + np.float32(1e-6)
-                total += weight
-                mean += weight * value
-                square += weight * value * value
-                weights[(k * taps + tap) * length + x] = weight
-                weighted[(k * taps + tap) * length + x] = weight * value
-            share = np.float32(1) / total
-            for tap in range(taps):
-                weights[(k * taps + tap) * length + x] *= share
-                weighted[(k * taps + tap) * length + x] *= share
-            mean *= share
-            moments[2 * k * length + x] = mean
-            moments[(2 * k + 1) * length + x] = max(square * share - mean * mean, np.float32(0))
-    return weights, weighted, moments
+                store(weights, own + tap * length, load(weights, own + tap * length) * share)
+            mean = mean * share
+            store(moments, 2 * k * length + x, mean)
+            store(moments, (2 * k + 1) * length + x, largest(square * share - mean * mean, splat(_ZERO)))
+    return weights, moments
+
+
+@inner
+def need_around(tiles: NDArray[np.bool_], needed: NDArray[np.bool_]) -> bool:
+    """Which vectors of a row are to be sampled, so that the windows of those `tiles` are whole; whether any is."""
+    needed[:] = False
+    for t in range(len(tiles)):
+        if tiles[t]:
+            needed[t], needed[t + 1] = True, True
+    return bool(needed.any())
 
 
 @inner
@@ -105,9 +126,9 @@ def warp_row(
     seen: NDArray[np.float32],
     at: int,
 ) -> None:
-    """Samples of the flat picture `other` (rows, columns) for row y of the reference, its pixels of inverse depths
-    (row length,) plus `offset`, the border repeated, into `samples` from `at` on; likewise into `seen` 1 or 0, whether
-    they lie in the other view. Sixteen pixels that are not `needed` are left as they were."""
+    """Samples of the flat picture `other` (rows, columns) for row y of the reference, with the border repeated, its
+    pixels of inverse depths (row length,), the first RADIUS in, plus `offset`, into `samples` from `at` on; likewise
+    into `seen` 1 or 0, whether they lie in the other view. Vectors that are not `needed` are left as they were."""
     v = y + 0.5
     bx = np.float32(warp[0, 1] * v + warp[0, 2])
     by = np.float32(warp[1, 1] * v + warp[1, 2])
@@ -115,10 +136,12 @@ def warp_row(
     ax, ay, az = np.float32(warp[0, 0]), np.float32(warp[1, 0]), np.float32(warp[2, 0])
     tx, ty, tz = np.float32(warp[0, 3]), np.float32(warp[1, 3]), np.float32(warp[2, 3])
     right, bottom = np.float32(columns - 1.001), np.float32(rows - 1.001)
-    for x in range(0, width, _LANES):
-        if not needed[x // _LANES]:
+    for block in range(len(needed)):
+        if not needed[block]:
             continue
-        w, u = load(inverse_depths, x) + np.float32(offset), counting(np.float32(x) + _HALF)
+        x = block * _LANES
+        w, u = load(inverse_depths, x) + np.float32(offset), counting(np.float32(x - RADIUS) + _HALF)
+        u = at_most(largest(u, splat(_HALF)), np.float32(width) - _HALF)
         z = u * az + bz + w * tz
         scale = _ONE / largest(z, splat(_NEAR))
         across = (u * ax + bx + w * tx) * scale - _HALF
@@ -127,10 +150,7 @@ def warp_row(
         inside = inside & (across <= right + _HALF) & (down <= bottom + _HALF)
         store(seen, at + x, where(inside, splat(_ONE)))
         across, down = at_most(largest(across, splat(_ZERO)), right), at_most(largest(down, splat(_ZERO)), bottom)
-        store(samples, at + RADIUS + x, interpolate(other, columns, across, down))
-    for i in range(RADIUS):
-        samples[at + i] = samples[at + RADIUS]
-        samples[at + RADIUS + width + i] = samples[at + RADIUS + width - 1]
+        store(samples, at + x, interpolate(other, columns, across, down))
 
 
 @inner
@@ -138,7 +158,7 @@ def correlate(
     samples: NDArray[np.float32],
     seen: NDArray[np.float32],
     weights: NDArray[np.float32],
-    weighted: NDArray[np.float32],
+    reference: NDArray[np.float32],
     moments: NDArray[np.float32],
     length: int,
     start: int,
@@ -146,20 +166,20 @@ def correlate(
     x: int,
 ) -> object:
     """The weighted correlations of the windows of sixteen pixels, in row k of the band from x on, with the samples of
-    another view from `start` on; OUTSIDE where that does not see them or a sample is NaN."""
+    another view from `start` on; OUTSIDE where that does not see them or a sample is NaN. reference: `pad_rows`."""
     total, square, product = splat(_ZERO), splat(_ZERO), splat(_ZERO)
     own = k * SIDE * SIDE * length + x
     for j in range(SIDE):
         for i in range(SIDE):
-            value = load(samples, start + (k + j * STEP) * length + i * STEP + x)
-            tap = own + (j * SIDE + i) * length
-            part = load(weights, tap) * value
-            total, square, product = total + part, square + part * value, product + load(weighted, tap) * value
+            tap = (k + j * STEP) * length + i * STEP + x
+            value = load(samples, start + tap)
+            part = load(weights, own + (j * SIDE + i) * length) * value
+            total, square, product = total + part, square + part * value, product + part * load(reference, tap)
     variance = largest(square - total * total, splat(_ZERO))
     covariance = product - total * load(moments, 2 * k * length + x)
     value = covariance / square_root((variance + _FLOOR) * (load(moments, (2 * k + 1) * length + x) + _FLOOR))
     # Samples of what is no scene are NaN, and so is what is made of them: it compares with nothing.
-    known = (value > _OUTSIDE) & (load(seen, start + (k + RADIUS) * length + x) > _ZERO)
+    known = (value > _OUTSIDE) & (load(seen, start + (k + RADIUS) * length + x + RADIUS) > _ZERO)
     return choose(known, value, splat(_OUTSIDE))
 
 
@@ -168,20 +188,22 @@ def best_mean(
     samples: NDArray[np.float32],
     seen: NDArray[np.float32],
     weights: NDArray[np.float32],
-    weighted: NDArray[np.float32],
+    reference: NDArray[np.float32],
     moments: NDArray[np.float32],
     length: int,
-    views: int,
+    compared: NDArray[np.bool_],
     k: int,
     x: int,
     top: NDArray[np.float32],
 ) -> object:
-    """Of sixteen pixels, in row k of the band from x on, the mean of the largest correlations among the views that see
-    them; 0 where none does. As many count as `top` has room for, sixteen numbers each."""
+    """Of sixteen pixels, in row k of the band from x on, the mean of the largest correlations among the views that are
+    `compared` and see them; 0 where none does. As many count as `top` has room for, sixteen numbers each."""
     for b in range(0, len(top), _LANES):
         store(top, b, splat(_OUTSIDE))
-    for n in range(views):
-        score = correlate(samples, seen, weights, weighted, moments, length, n * SAMPLED_ROWS * length, k, x)
+    for n in range(len(compared)):
+        if not compared[n]:
+            continue
+        score = correlate(samples, seen, weights, reference, moments, length, n * SAMPLED_ROWS * length, k, x)
         for b in range(0, len(top), _LANES):
             before = load(top, b)
             store(top, b, largest(before, score))

@@ -132,11 +132,11 @@ def test_stereo_compares_no_window_that_touches_what_another_view_leaves_out() -
     blanked = np.where(left_half(), np.float32(np.nan), np.roll(grey, -8, 1))
     shift = np.array([[[1.0, 0, 0, -8], [0, 1, 0, 0], [0, 0, 1, 0]]])  # 8 pixels at the inverse depth 1
     planes, bands = np.array([0.25, 1.0]), Bands(1)
-    cost = sweep_cost(grey, blanked[None], shift, planes, 1, bands)
+    cost = sweep_cost(grey, blanked[None], shift, planes, 1, bands).dense()
     assert (cost[:, : 64 - 8, 0] == 1).all()  # no view sees it: as good as any other depth
     assert np.median(cost[10:-10, 84:110, 1]) < 0.05 < 0.4 < np.median(cost[10:-10, 84:110, 0])
     assert np.isfinite(cost).all()
-    whole = sweep_cost(grey, np.stack([blanked, np.roll(grey, -8, 1)]), shift.repeat(2, 0), planes, 1, bands)
+    whole = sweep_cost(grey, np.stack([blanked, np.roll(grey, -8, 1)]), shift.repeat(2, 0), planes, 1, bands).dense()
     assert np.median(whole[10:-10, 30:110, 1]) < 0.05  # another view does
 
 

@@ -20,8 +20,10 @@ from msgs_slam.pipelines.proxy.stereo import card, matching  # noqa: E402
 from msgs_slam.pipelines.proxy.stereo.bands import Bands  # noqa: E402
 from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths  # noqa: E402
 from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth  # noqa: E402
-from msgs_slam.pipelines.proxy.stereo.smoothing import UNREACHED, pick_planes, smooth_cost  # noqa: E402
-from msgs_slam.pipelines.proxy.stereo.sweep import UNTRIED, sweep_cost, warps_to  # noqa: E402
+from msgs_slam.pipelines.proxy.stereo.smoothing import smooth_cost  # noqa: E402
+from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost, warps_to  # noqa: E402
+from msgs_slam.pipelines.proxy.stereo.tiles import TILE  # noqa: E402
+from msgs_slam.pipelines.proxy.stereo.volume import UNREACHED, Volume, pick_planes  # noqa: E402
 from tests.card_builds import build  # noqa: E402
 
 DEVICE = "cuda" if ON_CARD else "cpu"
@@ -46,7 +48,7 @@ def on_card(pictures: tuple[np.ndarray, np.ndarray, np.ndarray]) -> card.Matchin
 
 def test_the_sweep_has_the_costs_of_the_cpu(pictures: tuple, on_card: card.Matching) -> None:
     found = on_card.cost(PLANES).cpu().numpy()
-    expected = sweep_cost(*pictures, PLANES, matching.best_count(len(pictures[1])), BANDS)
+    expected = sweep_cost(*pictures, PLANES, matching.best_count(len(pictures[1])), BANDS).dense()
     assert found.shape == expected.shape
     assert expected.std() > 0.1
     # Where the rim of a view, or of what is no scene, runs through a pixel, rounding decides whether it is seen.
@@ -55,8 +57,9 @@ def test_the_sweep_has_the_costs_of_the_cpu(pictures: tuple, on_card: card.Match
 
 def test_paths_are_smoothed_as_on_the_cpu(pictures: tuple, on_card: card.Matching) -> None:
     cost = np.random.default_rng(1).random((*pictures[0].shape, 19)).astype(np.float32)
-    found = on_card.smoothed(torch.from_numpy(cost).to(DEVICE)).cpu().numpy()
-    expected = smooth_cost(cost, pictures[0], matching.SMALL_STEP, matching.JUMP, matching.EDGE, BANDS)
+    found = on_card.smoothed(torch.from_numpy(cost).to(DEVICE), matching.SMALL_STEP).cpu().numpy()
+    dense = Volume.of_dense(cost)
+    expected = smooth_cost(dense, pictures[0], matching.SMALL_STEP, matching.JUMP, matching.EDGE, BANDS).dense()
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
@@ -65,13 +68,13 @@ def test_planes_that_are_not_tried_are_left_out_as_on_the_cpu(pictures: tuple, o
     tried = np.zeros((1, 2, 19), np.bool_)
     tried[0, 0, [2, 3, 6]], tried[0, 1, 9:14] = True, True
     left = card.leave_out(torch.from_numpy(cost).to(DEVICE), tried)
-    cost[:, :16, 4:6] = UNTRIED
-    expected = smooth_cost(cost, pictures[0], matching.SMALL_STEP, matching.JUMP, matching.EDGE, BANDS, tried)
-    found = on_card.picked(on_card.smoothed(left), PLANES).cpu().numpy()
+    there = Volume.of_dense(np.where(tried.repeat(TILE, 0)[:ROWS].repeat(TILE, 1)[:, :COLUMNS], cost, UNREACHED))
+    expected = smooth_cost(there, pictures[0], matching.SMALL_STEP, matching.JUMP, matching.EDGE, BANDS)
+    found = on_card.picked(on_card.smoothed(left, matching.SMALL_STEP), PLANES).cpu().numpy()
     planes = PLANES[0] + pick_planes(expected) * (PLANES[1] - PLANES[0])
     np.testing.assert_allclose(found, planes, atol=1e-4)
-    assert (expected[:, :16, 7:] >= UNREACHED).all()
-    assert (expected[:, :16, 2:7] < UNREACHED).all()
+    assert (expected.dense()[:, :16, [*range(2), 4, 5, *range(7, 19)]] == UNREACHED).all()
+    assert (expected.dense()[:, :16, [2, 3, 6]] < UNREACHED).all()
 
 
 def test_the_refinement_and_the_filter_are_those_of_the_cpu(pictures: tuple, on_card: card.Matching) -> None:
