@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
+from msgs_slam.pipelines.gaussians.render.lanes import (
+    any_of,
+    at_most,
+    counting,
+    exp,
+    largest,
+    load,
+    splat,
+    store,
+    where,
+)
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
-from msgs_slam.pipelines.system.jit import kernel
+from msgs_slam.pipelines.proxy.stereo.lane_sampling import choose, corners, smallest
+
+_LANES = 16
+_ZERO, _HALF, _ONE, _THREE, _FOUR = (np.float32(x) for x in (0, 0.5, 1, 3, 4))
+_RIM = np.float32(1e-3)
 
 
 def fuse_depths(
@@ -27,40 +45,39 @@ def fuse_depths(
     support = np.empty_like(depth)
     conflict = np.empty_like(depth)
 
+    flat, back, near = warps.astype(np.float32), back_rows.astype(np.float32), np.float32(tolerance)
+
     def work(first: int, last: int) -> None:
-        _fuse_band(depth, others, warps, back_rows, tolerance, first, last, fused, support, conflict)
+        _fuse_band(depth, others, flat, back, near, first, last, fused, support, conflict)
 
     bands.run(depth.shape[0], work)
     return fused, support, conflict
 
 
-@kernel
-def _sample(depth: NDArray[np.float32], px: float, py: float, tolerance: float) -> float:
-    """Inverse-depth interpolation where the four neighbours lie on one surface, else the nearest pixel's depth."""
-    height, width = depth.shape
-    nearest = depth[min(max(int(py + 0.5), 0), height - 1), min(max(int(px + 0.5), 0), width - 1)]
-    ix = int(np.floor(px))
-    iy = int(np.floor(py))
-    if ix < 0 or iy < 0 or ix + 1 >= width or iy + 1 >= height:
-        return nearest
-    a, b, c, d = depth[iy, ix], depth[iy, ix + 1], depth[iy + 1, ix], depth[iy + 1, ix + 1]
-    low = min(min(a, b), min(c, d))
-    high = max(max(a, b), max(c, d))
-    if low <= 0 or high - low > 3 * tolerance * low:
-        return nearest
-    fx = px - ix
-    fy = py - iy
-    inverse = (1 - fy) * ((1 - fx) / a + fx / b) + fy * ((1 - fx) / c + fx / d)
-    return 1 / inverse
+@inner
+def _sample(depth: NDArray[np.float32], width: int, height: int, px: Any, py: Any, tolerance: np.float32) -> object:
+    """Of a flat depth map: inverse-depth interpolation where the four neighbours of the places lie on one surface, else
+    the nearest pixel's depth."""
+    right, bottom = np.float32(width - 1), np.float32(height - 1)
+    whole = (px >= _ZERO) & (py >= _ZERO) & (px < right) & (py < bottom)
+    inner_x = at_most(largest(px, splat(_ZERO)), right - _RIM)
+    inner_y = at_most(largest(py, splat(_ZERO)), bottom - _RIM)
+    a, b, c, d, fx, fy = corners(depth, width, inner_x, inner_y)
+    low, high = smallest(smallest(a, b), smallest(c, d)), largest(largest(a, b), largest(c, d))
+    whole = whole & (low > _ZERO) & (high - low <= low * (_THREE * tolerance))
+    above = splat(_ONE) / a + fx * (splat(_ONE) / b - splat(_ONE) / a)
+    below = splat(_ONE) / c + fx * (splat(_ONE) / d - splat(_ONE) / c)
+    nearest = choose(fy < _HALF, choose(fx < _HALF, a, b), choose(fx < _HALF, c, d))
+    return choose(whole, splat(_ONE) / (above + fy * (below - above)), nearest)
 
 
 @kernel
 def _fuse_band(
     depth: NDArray[np.float32],
     others: NDArray[np.float32],
-    warps: NDArray[np.float64],
-    back_rows: NDArray[np.float64],
-    tolerance: float,
+    warps: NDArray[np.float32],
+    back_rows: NDArray[np.float32],
+    tolerance: np.float32,
     first: int,
     last: int,
     fused: NDArray[np.float32],
@@ -68,38 +85,39 @@ def _fuse_band(
     conflict: NDArray[np.float32],
 ) -> None:
     height, width = depth.shape
+    rows = np.zeros((4, -(-width // _LANES) * _LANES), np.float32)
     for y in range(first, last):
-        for x in range(width):
-            z = depth[y, x]
-            weights = 1.0
-            total = 0.0
-            against = 0.0
-            if z > 0:
-                total = 1.0 / z
-                for n in range(others.shape[0]):
-                    w = warps[n]
-                    u, v = x + 0.5, y + 0.5
-                    qx = z * (w[0, 0] * u + w[0, 1] * v + w[0, 2]) + w[0, 3]
-                    qy = z * (w[1, 0] * u + w[1, 1] * v + w[1, 2]) + w[1, 3]
-                    qz = z * (w[2, 0] * u + w[2, 1] * v + w[2, 2]) + w[2, 3]
-                    if qz <= 0:
-                        continue
-                    ou, ov = qx / qz, qy / qz
-                    if ou < 0 or ov < 0 or ou >= width or ov >= height:
-                        continue
-                    seen = _sample(others[n], ou - 0.5, ov - 0.5, tolerance)
-                    if seen <= 0:
-                        continue
-                    difference = (seen - qz) / qz
-                    if difference > 4 * tolerance:
-                        against += 1.0
-                    elif abs(difference) < 3 * tolerance:
-                        b = back_rows[n]
-                        back = seen * (b[0] * ou + b[1] * ov + b[2]) + b[3]
-                        if back > 0:
-                            weight = np.exp(-0.5 * (difference / tolerance) ** 2)
-                            weights += weight
-                            total += weight / back
-            fused[y, x] = weights / total if total > 0 else 0.0
-            support[y, x] = weights - 1.0
-            conflict[y, x] = against
+        rows[0, :width] = depth[y]
+        for x in range(0, width, _LANES):
+            z = load(rows[0], x)
+            if not any_of(z > _ZERO):
+                for k in range(1, 4):
+                    store(rows[k], x, splat(_ZERO))
+                continue
+            known, u, v = z > _ZERO, counting(np.float32(x) + _HALF), np.float32(y) + _HALF
+            weights, total, against = splat(_ONE), choose(known, splat(_ONE) / z, splat(_ONE)), splat(_ZERO)
+            for n in range(len(others)):
+                w, b = warps[n], back_rows[n]
+                qz = z * (u * w[2, 0] + (w[2, 1] * v + w[2, 2])) + w[2, 3]
+                shown = known & (qz > _ZERO)
+                scale = splat(_ONE) / choose(shown, qz, splat(_ONE))
+                ou = (z * (u * w[0, 0] + (w[0, 1] * v + w[0, 2])) + w[0, 3]) * scale
+                ov = (z * (u * w[1, 0] + (w[1, 1] * v + w[1, 2])) + w[1, 3]) * scale
+                shown = shown & (ou >= _ZERO) & (ov >= _ZERO) & (ou < np.float32(width)) & (ov < np.float32(height))
+                if not any_of(shown):
+                    continue
+                # Elsewhere the place may be anything, and what is read there does not count.
+                ou, ov = where(shown, ou), where(shown, ov)
+                seen = _sample(others[n].reshape(-1), width, height, ou - _HALF, ov - _HALF, tolerance)
+                shown = shown & (seen > _ZERO)
+                off = (seen - qz) * scale
+                against = against + where(shown & (off > _FOUR * tolerance), splat(_ONE))
+                back = seen * (ou * b[0] + ov * b[1] + b[2]) + b[3]
+                agrees = shown & (largest(off, splat(_ZERO) - off) < _THREE * tolerance) & (back > _ZERO)
+                off = where(agrees, off * (_ONE / tolerance))
+                weight = where(agrees, exp(off * off * -_HALF))
+                weights, total = weights + weight, total + weight / choose(agrees, back, splat(_ONE))
+            store(rows[1], x, where(known, weights / total))
+            store(rows[2], x, weights - _ONE)
+            store(rows[3], x, against)
+        fused[y], support[y], conflict[y] = rows[1, :width], rows[2, :width], rows[3, :width]

@@ -73,20 +73,41 @@ def interpolate(typing_context: Any, array: Any, columns: Any, across: Any, down
     """
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        whole, parts = zip(*(_whole_and_rest(builder, position) for position in args[2:]), strict=True)
-        wide = ir.VectorType(I64, WIDTH)
-        row_length = builder.insert_element(ir.Constant(wide, ir.Undefined), args[1], I32(0))
-        row_length = builder.shuffle_vector(row_length, row_length, constant(0, element=I32))
-        top = builder.add(builder.mul(builder.zext(whole[1], wide), row_length), builder.zext(whole[0], wide))
-        rows = []
-        for places in (top, builder.add(top, row_length)):
-            left, right = _load_pairs(context, builder, sig.args[0], args[0], places)
+        rows, parts = _load_corners(context, builder, sig.args[0], args)
+        means = []
+        for left, right in rows:
             change = builder.fsub(right, left, flags=FLAGS)
-            rows.append(builder.fadd(left, builder.fmul(parts[0], change, flags=FLAGS), flags=FLAGS))
-        change = builder.fsub(rows[1], rows[0], flags=FLAGS)
-        return builder.fadd(rows[0], builder.fmul(parts[1], change, flags=FLAGS), flags=FLAGS)
+            means.append(builder.fadd(left, builder.fmul(parts[0], change, flags=FLAGS), flags=FLAGS))
+        change = builder.fsub(means[1], means[0], flags=FLAGS)
+        return builder.fadd(means[0], builder.fmul(parts[1], change, flags=FLAGS), flags=FLAGS)
 
     return lanes(array, types.intp, lanes, lanes), emit
+
+
+@intrinsic
+def corners(typing_context: Any, array: Any, columns: Any, across: Any, down: Any) -> Any:
+    """The four pixels around places as of `interpolate`: upper left and right, lower left and right; and how far the
+    place is from the first, across and down, of the way to the others."""
+    result = types.UniTuple(lanes, 6)
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        rows, parts = _load_corners(context, builder, sig.args[0], args)
+        return context.make_tuple(builder, result, [*rows[0], *rows[1], *parts])
+
+    return result(array, types.intp, lanes, lanes), emit
+
+
+def _load_corners(
+    context: Any, builder: ir.IRBuilder, array_type: Any, args: Any
+) -> tuple[list[tuple[ir.Value, ir.Value]], tuple[ir.Value, ir.Value]]:
+    """Of (array, columns, across, down): left and right pixel of the upper and of the lower row, and the fractions."""
+    whole, parts = zip(*(_whole_and_rest(builder, position) for position in args[2:]), strict=True)
+    wide = ir.VectorType(I64, WIDTH)
+    row_length = builder.insert_element(ir.Constant(wide, ir.Undefined), args[1], I32(0))
+    row_length = builder.shuffle_vector(row_length, row_length, constant(0, element=I32))
+    top = builder.add(builder.mul(builder.zext(whole[1], wide), row_length), builder.zext(whole[0], wide))
+    places = (top, builder.add(top, row_length))
+    return [_load_pairs(context, builder, array_type, args[0], place) for place in places], (parts[0], parts[1])
 
 
 def _whole_and_rest(builder: ir.IRBuilder, value: ir.Value) -> tuple[ir.Value, ir.Value]:
