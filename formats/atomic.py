@@ -163,6 +163,15 @@ def is_disk_full(error: OSError, folder: Path) -> bool:
     return error.errno in _NO_ROOM or (error.errno is None and free_bytes(folder) < _NEARLY_FULL_BYTES)
 
 
+def require_room(folder: Path, needed: int) -> None:
+    """Raises DiskFullError where a folder, there or not yet, has no room for so many bytes."""
+    if (free := free_bytes(folder)) < needed:
+        raise DiskFullError(
+            f"{folder} needs at least {needed / 1e6:.0f} MB, and {free / 1e6:.0f} MB are free there: free some space, "
+            "or point the output at another disk"
+        )
+
+
 def free_bytes(folder: Path) -> int:
     """Free space on the disk of a folder, whether it exists or not."""
     while not folder.exists():

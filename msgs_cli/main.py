@@ -235,8 +235,8 @@ def export(
 ) -> None:
     """Write the files for other programs: COLMAP model, Gaussian PLY, SPZ, SOG or GLB, labelled mesh, the same with
     a texture, TUM trajectory; `--only html`: one web page that shows the map, to send to somebody; `--only tiles`: 3D
-    Tiles for CesiumJS; `--only collision`: a light mesh to walk in; `--only floorplan`: the walls from above with their
-    lengths.
+    Tiles for CesiumJS; `--only collision`: a light mesh to walk in; `--only usd`: the mesh as USDZ; `--only floorplan`:
+    the walls from above with their lengths.
 
     Other settings than the run's own (--set export.voxel=0.02, --set export.spz=true) need --to; `msgs-slam resume RUN
     --set ...` changes them in the run itself.

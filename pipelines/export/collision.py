@@ -8,14 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.glb import Part, write_primitive
-from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.pipelines.export.atlas import simplified
+from msgs_slam.pipelines.export.mesh import mesh_of_run
 from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.run.folder import MESH
-from msgs_slam.pipelines.types import SemanticMesh
-from msgs_slam.pipelines.upright.world import World, load_world
+from msgs_slam.pipelines.upright.world import World
 
 COLLISION = "collision.glb"
 MOST_FACES = 20_000
@@ -27,18 +24,9 @@ def write_collision(outcome: Outcome, world: World, folder: Path) -> list[Path]:
 
     Raises InputError where the run has no mesh, or an empty one.
     """
-    run = outcome.run
-    if not run.has("export", MESH):
-        raise InputError(
-            f"{run.root} has no mesh yet, and the collision mesh is made from it: finish the run with msgs-slam resume"
-        )
-    mesh = SemanticMesh(**vars(read_mesh_ply(run.file("export", MESH))))
-    if len(mesh.faces) == 0:
-        raise InputError(f"{run.root}: the mesh is empty, so there is nothing to collide with: film the scene again")
+    mesh = mesh_of_run(outcome, world)
     light = simplified(mesh, MOST_FACES / len(mesh.faces)) if len(mesh.faces) > MOST_FACES else mesh
     points = light.vertices.astype(np.float64)
-    if (own := load_world(run)) is not None:
-        points = (world.exported_from_run @ own.exported_from_run.inverse()).apply(points)
     faces = light.faces
     if world.axes == "up" and world.has_floor:
         points, faces = with_floor(points, faces)

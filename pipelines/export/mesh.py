@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.mesh import MeshBlocks
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.mesh import MeshBlocks, read_mesh_ply
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.depth.posed import PosedDepth
 from msgs_slam.pipelines.depth.resize import resample_nearest
@@ -23,9 +24,11 @@ from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid
 from msgs_slam.pipelines.gaussians.render import get_threads
 from msgs_slam.pipelines.mapping.depth_views import DrawnView, Shown, drawn_view
 from msgs_slam.pipelines.outcome import Outcome, maps_around
+from msgs_slam.pipelines.run.folder import MESH
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
+from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps, SemanticMesh
+from msgs_slam.pipelines.upright.world import World, load_world
 
 TRUNCATION = 4.0
 """Voxels on either side of a surface that a depth speaks for."""
@@ -36,6 +39,25 @@ LONG = 200
 SURE = 0.5
 """Confidence of a proxy's depth from which the depth drawn there stays where it is."""
 _KEPT_BYTES = 100e6
+
+
+def mesh_of_run(outcome: Outcome, world: World) -> SemanticMesh:
+    """The mesh that a run's own export has made, in `world`; `outcome` is in the run's own.
+
+    Raises InputError where there is none, or an empty one.
+    """
+    run = outcome.run
+    if not run.has("export", MESH):
+        raise InputError(
+            f"{run.root} has no mesh yet, and this file is made from it: finish the run with msgs-slam resume"
+        )
+    mesh = SemanticMesh(**vars(read_mesh_ply(run.file("export", MESH))))
+    if len(mesh.faces) == 0:
+        raise InputError(f"{run.root}: the mesh is empty, so there is nothing to write: film the scene again")
+    if (own := load_world(run)) is None:
+        return mesh
+    move = world.exported_from_run @ own.exported_from_run.inverse()
+    return replace(mesh, vertices=move.apply(mesh.vertices.astype(np.float64)).astype(np.float32))
 
 
 def keyframe_rows(outcome: Outcome) -> list[int]:

@@ -100,6 +100,12 @@ _ENTRIES = (
         "collision", _ONLY.format("collision"),
     ),
     Entry(
+        "mesh.usdz",
+        "the mesh as USD: colours, the class of each vertex as primvar label, y up, and the metres of a unit in its "
+        "metersPerUnit. Quick Look on Apple devices, Blender, Houdini, Omniverse.",
+        "usd", _ONLY.format("usd"),
+    ),
+    Entry(
         "floorplan.svg", "the walls seen from above, with their lengths, and the camera's path. Browsers, Inkscape.",
         "floorplan", _ONLY.format("floorplan"),
     ),

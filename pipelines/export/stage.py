@@ -30,6 +30,7 @@ from msgs_slam.pipelines.export.pieces import make_pieces
 from msgs_slam.pipelines.export.tasks import draw_keyframes, fuse_views, scratch_of, straighten_views
 from msgs_slam.pipelines.export.textured import make_textured, write_textured
 from msgs_slam.pipelines.export.tiles import write_tiles
+from msgs_slam.pipelines.export.usd import write_usd
 from msgs_slam.pipelines.export.web_page import write_web_page
 from msgs_slam.pipelines.export.writers import (
     write_colmap,
@@ -268,6 +269,7 @@ def export_run(
         "mesh": lambda: mesh("mesh"),
         "texture": lambda: mesh("texture"),
         "collision": lambda: write_collision(found, world, folder),
+        "usd": lambda: write_usd(found, world, folder),
         "floorplan": lambda: write_floor_plan(found, folder),
         "tum": lambda: write_trajectory(outcome, folder),
     }

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.atomic import write_text
+from msgs_slam.formats.atomic import require_room, write_text
 from msgs_slam.formats.gaussians import GaussianCloud
 from msgs_slam.formats.sog import morton_order
 from msgs_slam.pipelines.export.writers import map_cloud
@@ -29,6 +29,8 @@ from msgs_slam.pipelines.upright.world import World
 WEB_PAGE = "map.html"
 MOST_GAUSSIANS = 1_500_000
 """About 20 MB of page, what can be sent by mail; of larger maps the least visible are left out."""
+_LEAST_BYTES = 10
+"""A Gaussian's in the page; 12 in the rooms measured."""
 MOST_CAMERAS = 120
 _PARTS = Path(__file__).parent / "page"
 _SCRIPTS = ("cloud.js", "draw.js", "moves.js", "tape.js", "page.js")
@@ -36,7 +38,9 @@ _Z_UP_FROM_IMAGE_AXES = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
 def write_web_page(outcome: Outcome, world: World, folder: Path) -> list[Path]:
-    """map.html; nothing where there are no Gaussians. `outcome` is in `world`."""
+    """map.html; nothing where there are no Gaussians. `outcome` is in `world`. Raises DiskFullError before it is made
+    where there is no room for it."""
+    require_room(folder / WEB_PAGE, _LEAST_BYTES * min(len(outcome.require_map()), MOST_GAUSSIANS))
     cloud = map_cloud(outcome)
     if len(cloud) == 0:
         return []

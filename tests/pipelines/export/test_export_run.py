@@ -141,7 +141,7 @@ def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
         "tiles": "tiles/tileset.json",
         "tum": "trajectory.txt",
     }
-    for only in set(EXPORTS) - {"mesh", "texture", "collision", "floorplan"}:
+    for only in set(EXPORTS) - {"mesh", "texture", "collision", "usd", "floorplan"}:
         export_run(run, tmp_path / only, only, settings=ExportConfig(axes="first"))
         assert (tmp_path / only / expected[only]).exists()
         notes = (tmp_path / only / "README.txt").read_text()

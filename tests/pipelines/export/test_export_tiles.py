@@ -143,6 +143,18 @@ def test_a_full_disk_leaves_nothing_half_written(
     assert not folder.exists()
 
 
+def test_a_disk_without_room_is_told_before_anything_is_made(
+    oracle_run: OracleRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = oracle_run()
+    free = shutil.disk_usage(tmp_path)._replace(free=10_000)
+    monkeypatch.setattr(atomic.shutil, "disk_usage", lambda _: free)
+    for kind in ("tiles", "html"):
+        with pytest.raises(DiskFullError, match="needs at least"):
+            export_run(run, tmp_path / "out", kind)
+    assert not (tmp_path / "out").exists()
+
+
 def test_another_validator_has_nothing_against_the_files(written: tuple[RunFolder, Path, Any]) -> None:
     """`npm install gltf-validator`, and NODE_PATH where it is not found from here. It knows neither extension, and so
     not the colon that the names of their attributes have."""

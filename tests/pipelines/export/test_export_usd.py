@@ -1,0 +1,64 @@
+"""The mesh as USDZ, read by USD's own library and passed by its checker."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from finished import note_finished
+
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.pipelines.config import ExportConfig
+from msgs_slam.pipelines.export.stage import export_run, find_world
+from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.upright.world import save_world
+
+OracleRun = Callable[..., RunFolder]
+
+
+@pytest.fixture
+def run(oracle_run: OracleRun) -> RunFolder:
+    """Its mesh is in the world of its exported files."""
+    run = oracle_run(mesh=True)
+    world, _ = find_world(load_outcome(run), ExportConfig())
+    assert world.axes == "up"
+    save_world(run.stage("export"), world, "metre")
+    note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
+    return run
+
+
+def test_usd_reads_the_mesh_with_its_colours_and_classes(run: RunFolder, tmp_path: Path) -> None:
+    pytest.importorskip("pxr", reason="needs usd-core")
+    from pxr import Usd, UsdGeom, UsdValidation
+
+    path = export_run(run, tmp_path / "out", "usd")[0]
+    stage = Usd.Stage.Open(str(path))
+    context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
+    assert [error.GetMessage() for error in context.Validate(stage)] == []
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    shape = UsdGeom.Mesh(stage.GetDefaultPrim().GetChild("Mesh"))
+    mesh = read_mesh_ply(run.file("export", "mesh.ply"))
+    points = np.array(shape.GetPointsAttr().Get())
+    np.testing.assert_allclose(
+        points, mesh.vertices @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32), atol=1e-5
+    )
+    np.testing.assert_array_equal(np.array(shape.GetFaceVertexIndicesAttr().Get()), mesh.faces.ravel())
+    labels = UsdGeom.PrimvarsAPI(shape).GetPrimvar("label")
+    np.testing.assert_array_equal(np.array(labels.Get()), mesh.labels)
+    assert list(shape.GetPrim().GetCustomDataByKey("classes")) == list(run.load_classes().names)
+    linear = np.array(shape.GetDisplayColorPrimvar().Get())
+    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    np.testing.assert_allclose(255 * shown, mesh.colors, atol=0.01)
+    assert sorted(p.name for p in path.parent.iterdir()) == ["README.txt", "mesh.usdz", "world.json"]
+
+
+def test_without_the_package_or_a_mesh_nothing_is_written(
+    run: RunFolder, oracle_run: OracleRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    with pytest.raises(InputError, match=r"pip install 'msgs-slam\[usd\]'"):
+        export_run(run, tmp_path / "out", "usd")
+    assert not (tmp_path / "out").exists()
