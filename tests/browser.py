@@ -24,6 +24,11 @@ class NotReady(Exception):
     """The tab cannot answer now."""
 
 
+def button(words: str) -> str:
+    """The page's button with these words, as an expression of its script."""
+    return f"[...document.querySelectorAll('button')].find(b => b.innerText.includes({words!r}))"
+
+
 class Page:
     """One tab, driven over the browser's own protocol."""
 
@@ -65,8 +70,32 @@ class Page:
 
     def press(self, words: str) -> None:
         """The button with these words, as a finger or a mouse would."""
-        button = f"[...document.querySelectorAll('button')].find(b => b.innerText.includes({words!r}))"
-        self.call("Runtime.evaluate", expression=f"{button}.click()")
+        self.call("Runtime.evaluate", expression=f"{button(words)}.click()")
+
+    def be_a_phone(self, width: int = 390, height: int = 844) -> None:
+        """A screen held upright, two pixels a point, and fingers in place of a mouse."""
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=2, mobile=True)
+        self.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
+
+    def fingers(self, *paths: list[tuple[float, float]]) -> None:
+        """Put down a finger at the beginning of each path, move all along them, lift them; one place is a tap."""
+        for step, kind in enumerate(["touchStart"] + ["touchMove"] * (len(paths[0]) - 1)):
+            places = [{"x": path[step][0], "y": path[step][1], "id": n} for n, path in enumerate(paths)]
+            self.call("Input.dispatchTouchEvent", type=kind, touchPoints=places)
+        self.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
+    def tap(self, element: str) -> bool:
+        """Put a finger on an element, an expression of the page's script, where the page shows it; False where it is
+        hidden or covered."""
+        place = (
+            f"(() => {{ const e = {element}; if (!e) return; e.scrollIntoView({{block: 'nearest'}}); "
+            "const b = e.getBoundingClientRect(), x = b.x + b.width / 2, y = b.y + b.height / 2; "
+            "if (e.contains(document.elementFromPoint(x, y))) return JSON.stringify([x, y]); })()"
+        )
+        found = self.value(place)
+        if found:
+            self.fingers([tuple(json.loads(found))])
+        return bool(found)
 
     def wait_for(self, seen: Callable[[NDArray[np.uint8]], bool], seconds: float = 240) -> NDArray[np.uint8]:
         end = time.monotonic() + seconds

@@ -60,7 +60,7 @@ def write_tiles(outcome: Outcome, world: World, folder: Path) -> list[Path]:
         root["refine"], root["transform"] = "REPLACE", _earth_from_tiles(outcome, world).ravel(order="F").tolist()
         splats = [EXTENSION, COMPRESSION]
         document = {
-            "asset": {"version": "1.1", "generator": "msgs-slam"},
+            "asset": {"version": "1.1", "extras": {"generator": "msgs-slam"}},
             "extensionsUsed": ["3DTILES_content_gltf"],  # by which CesiumJS knows Gaussians before it loads any
             "extensions": {"3DTILES_content_gltf": {"extensionsUsed": splats, "extensionsRequired": splats}},
             "geometricError": float(2 * np.max(root["boundingVolume"]["box"][3:])),

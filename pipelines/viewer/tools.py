@@ -215,8 +215,8 @@ class Tape:
         self._server.scene.remove_click_callback()
         self._server.scene.remove_by_name("/tape")
         self._middle.visible = self.kind.visible = on
-        asked = "Click two places of the map." if self.kind.value == "length" else "Click the corners of an area."
-        self._places, self.result, self.told.content = [], "", asked if on else ""
+        asked = "Click two places of the map" if self.kind.value == "length" else "Click the corners of an area"
+        self._places, self.result, self.told.content = [], "", f"{asked}, or mark the middle of the view." if on else ""
         if on:
             self._server.scene.on_click()(self.click)
 

@@ -18,7 +18,7 @@ from msgs_slam.formats.gaussian_ply import read_gaussian_ply
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.viewer.scene import load_scenes
 from msgs_slam.pipelines.viewer.tools import round_range
-from tests.browser import BROWSER, Page, browser
+from tests.browser import BROWSER, Page, browser, button
 
 OracleRun = Callable[..., RunFolder]
 
@@ -178,5 +178,37 @@ def test_page_shows_the_map_and_every_control_changes_it(
             bare = page.wait_for(lambda p: np.abs(p.astype(float) - elsewhere).mean() > 10)
             viewer.boxes["Mesh"].value = True
             page.wait_for(lambda p: np.abs(p.astype(float) - bare).mean() > 10)
+    finally:
+        viewer.stop()
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+def test_fingers_on_a_phone_fold_measure_turn_and_choose_a_camera(oracle_run: OracleRun, tmp_path: Path) -> None:
+    """viser takes no tap on the scene for a click, so the tape has a button."""
+    pytest.importorskip("viser")
+    from msgs_slam.pipelines.viewer.server import open_viewer
+
+    viewer = open_viewer(oracle_run(metric=False, pixel_stride=8).root, port=0)
+    fold = """[...document.querySelectorAll("p, div")].findLast(e => e.innerText == "MSGS-SLAM walk.msgs")"""
+    try:
+        with browser(tmp_path / "profile") as page:
+            page.be_a_phone()
+            page.call("Page.enable")
+            page.call("Page.navigate", url=viewer.url)
+            page.wait_for(lambda p: p.std() > 20)
+            viewer.tape.switch.value = True
+            for told in ("Click the second place.", "±"):
+                until(lambda: page.tap(button("Mark the middle")))
+                until(lambda told=told: told in viewer.tape.told.content)
+                page.fingers([(40 + 6 * n, 250) for n in range(8)])
+                time.sleep(2)
+            viewer.tape.switch.value = False
+            page.tap(fold)
+            until(lambda: not page.tap(button("Reset view")))
+            client, first = next(iter(viewer.server.get_clients().values())), viewer.scene.cameras[0]
+            viewer.visit(viewer.scene.cameras[-1], client)
+            time.sleep(3)
+            page.fingers([where_shown(first.world_from_cam[:3, 3] * viewer.scene.scale, client.camera, page.canvas())])
+            until(lambda: viewer.preview.label.startswith(first.frame.name))
     finally:
         viewer.stop()

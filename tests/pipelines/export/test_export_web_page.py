@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from msgs_slam.pipelines.export.writers import map_cloud
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.upright.world import FIRST, read_world
+from tests.browser import browser
 
 OracleRun = Callable[..., RunFolder]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -119,6 +121,39 @@ def test_a_browser_draws_what_we_draw(page: tuple[Path, Outcome], tmp_path: Path
     intrinsics = replace(k, width=width, height=height, fx=focal, fy=focal, cx=cx, cy=cy)
     drawn = view_map(outcome.require_map(), outcome.label_of_channel, intrinsics, t.cam_from_world[row])
     assert 30 < psnr(shot, drawn.exposed(None, 0.0)) < 80
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed here to open the page with")
+def test_fingers_on_a_phone_fold_measure_turn_and_zoom(page: tuple[Path, Outcome], tmp_path: Path) -> None:
+    text = "document.getElementById('told').textContent"
+    with browser(tmp_path / "profile", (390, 844)) as tab:
+        tab.be_a_phone()
+        tab.call("Page.navigate", url=page[0].as_uri())
+        until(lambda: tab.value("document.documentElement.dataset.ready") == "1")
+        assert tab.value("document.documentElement.scrollWidth") == 390
+        fold, measure = "document.getElementById('fold')", "document.getElementById('measure')"
+        assert not tab.tap(measure)  # folded away: the map has the small screen
+        assert tab.tap(fold)
+        assert tab.tap(measure)
+        until(lambda: "tap two places" in tab.value(text))
+        assert tab.tap(fold)
+        tab.fingers([(150, 500)])
+        until(lambda: "second place" in tab.value(text))
+        tab.fingers([(280, 560)])
+        until(lambda: "±" in tab.value(text))
+        before = tab.scene()
+        tab.fingers([(150 + 10 * n, 500) for n in range(8)])
+        turned = tab.wait_for(lambda p: np.abs(p.astype(float) - before).mean() > 5)
+        tab.fingers([(170 - 10 * n, 500) for n in range(8)], [(230 + 10 * n, 500) for n in range(8)])
+        tab.wait_for(lambda p: np.abs(p.astype(float) - turned).mean() > 5)
+        assert "±" in tab.value(text)  # neither is a tap
+
+
+def until(happened: Callable[[], object]) -> None:
+    end = time.monotonic() + 60
+    while not happened():
+        assert time.monotonic() < end, "the page did not answer"
+        time.sleep(0.2)
 
 
 def screenshot(address: str, folder: Path) -> Path:
