@@ -53,6 +53,28 @@ def test_settings_exist(setting: str) -> None:
     load_config(overrides=[setting])
 
 
+def rows(page: Path, heading: str) -> list[list[str]]:
+    """Cells of the first table after some words."""
+    text = page.read_text(encoding="utf-8").split(heading)[1]
+    lines = re.findall(r"^\|.*\|$", text.split("\n\n|")[1].split("\n\n")[0], re.MULTILINE)
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_figures_of_the_readme_are_those_of_the_page() -> None:
+    """Numbers of frames, dB, minutes and gigabytes as they are, centimetres to the README's places."""
+    page = rows(SITE / "figures.md", "has no scale.")
+    told = rows(DOCS[0], "## How good is it?")
+    assert len(told) == 4
+    for name, frames, path, map_quality, cost in told[1:]:
+        words = {"video": "kitchen", "living": "12 m loop", "Replica": "the same"}
+        key = next(v for k, v in words.items() if k in name)
+        found = next(row for row in page if key in row[0])
+        assert frames == found[2]
+        assert map_quality == found[4].split(",")[0]
+        assert cost == found[5]
+        assert f"{float(found[3].split()[0]):.{len(path.split()[0].split('.')[1])}f}" == path.split()[0]
+
+
 def test_no_placeholder_is_left() -> None:
     assert not re.findall(r"@[A-Z]+@|TODO|TBD", texts())
 

@@ -114,8 +114,8 @@ class StructureFromMotion(Candidates):
         found = self._solved(windows, views, pairs) or self._as_given(views, pairs)
         if found is None:
             raise InputError(
-                f"no structure could be found: {len(pairs)} pairs of {len(features)} views match. The views have too "
-                f"little texture, blur or overlap. {HOW_TO_FILM}, slowly and in good light"
+                f"no structure could be found among {len(features)} views; pairs that match: {len(pairs)}. They have "
+                f"too little texture or overlap, or are blurred. {HOW_TO_FILM}, slowly and in good light"
             )
         found, pieces = self._largest_first(found, self._pieces(views, pairs, found.model), views)
         report = judge(found.model, pairs, views.xy, self._places(features), self.config.overlap)

@@ -34,11 +34,16 @@ def main() -> None:
     parser.add_argument("target", type=Path)
     parser.add_argument("--frame", type=int, help="a row of the run's frames; default: the middle one")
     args = parser.parse_args()
-    outcome = load_outcome(RunFolder(args.run))
-    row = args.frame if args.frame is not None else len(outcome.frames) // 2
+    strip = first_picture(load_outcome(RunFolder(args.run)), args.frame)
+    cv2.imwrite(str(args.target), strip, [cv2.IMWRITE_JPEG_QUALITY, 88])
+
+
+def first_picture(outcome: Outcome, row: int | None = None) -> NDArray[np.uint8]:
+    """All four, BGR, of a row of the run's frames; of the middle one where none is named."""
+    row = row if row is not None else len(outcome.frames) // 2
     panels = {"video": outcome.run.image(outcome.frames[row]), **drawn(outcome, row)}
     strip = np.concatenate([titled(name, picture) for name, picture in panels.items()], axis=1)
-    cv2.imwrite(str(args.target), cv2.cvtColor(strip, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 88])
+    return cv2.cvtColor(strip, cv2.COLOR_RGB2BGR)
 
 
 def drawn(outcome: Outcome, row: int) -> dict[str, NDArray[np.uint8]]:
