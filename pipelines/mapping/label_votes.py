@@ -31,7 +31,10 @@ def voted_logits(gaussian_map: GaussianMap, posed: Iterable[tuple[View, Tensor]]
     m, classes = gaussian_map, gaussian_map.class_logits.shape[1]
     for view, pose in posed:
         seen = (m.means, m.radii, m.opacities, pose, view.intrinsics)
-        votes += class_weights(*seen, view.channels, view.label_weight, classes)
+        votes.index_add_(0, *class_weights(*seen, view.channels, view.label_weight, classes))
     total = votes.sum(1, keepdim=True)
-    logits = torch.log1p(votes / total.clamp(min=_LEAST) / _FLOOR)
-    return torch.where(total > _LEAST, logits, gaussian_map.class_logits)
+    # In place: a table of all classes is the largest that mapping holds.
+    votes.div_(total.clamp(min=_LEAST)).div_(_FLOOR).log1p_()
+    unseen = total[:, 0] <= _LEAST
+    votes[unseen] = gaussian_map.class_logits[unseen]
+    return votes

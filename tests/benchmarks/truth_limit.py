@@ -8,8 +8,8 @@ from the truth's with the arm from the tracked body to the camera, the focal len
 it best. Pixels from where points are seen to where they then lie, medians: all, and by how many keyframes lie between a
 point's first and last view.
 
-With a true depth as well, a row of its own says what the mesh could reach: accuracy, completeness and F-score of the true
-depth itself, each image of it put at the run's pose for it instead of the truth's, aligned as `evaluate` aligns meshes.
+With a true depth as well, a row of its own says what the mesh could reach: accuracy, completeness and F-score of the
+true depth itself, each image put at the run's pose for it instead of the truth's, aligned as `evaluate` aligns meshes.
 """
 
 from __future__ import annotations

@@ -72,15 +72,14 @@ def class_weights(
     counts: Tensor,
     classes: int,
     backend: str | None = None,
-) -> Tensor:
-    """(M, classes) what each Gaussian contributes to the pixels of each class: channels (H, W) uint8, other numbers are
-    no class; counts (H, W). No gradients; the others as in `render`."""
+) -> tuple[Tensor, Tensor]:
+    """Rows (R,) of the Gaussians in view, and (R, classes) what each contributes to the pixels of each class: channels
+    (H, W) uint8, other numbers are no class; counts (H, W). No gradients; the others as in `render`."""
     seen = (means.detach(), radii.detach(), opacities.detach())
     if (module := _compiled(backend, means)) is not None:
         rows = in_view(means, radii, cam_from_world, intrinsics, NEAR)
         projected = project_map(seen[0][rows], seen[1][rows], cam_from_world, intrinsics)
-        found = module.class_weights(*projected, seen[2][rows], NEAR, counts, channels, classes)
-        return found.new_zeros(len(means), classes).index_copy_(0, rows, found)
+        return rows, module.class_weights(*projected, seen[2][rows], NEAR, counts, channels, classes)
     # A rendering changes with a Gaussian's features by the Gaussian's part in each pixel.
     pixels = channels.reshape(-1, 1).long()
     weight = counts.reshape(-1, 1) * (pixels < classes)
@@ -88,7 +87,8 @@ def class_weights(
     with torch.enable_grad():
         features = means.new_zeros(len(means), classes).requires_grad_()
         shown = render(*seen, features, cam_from_world, intrinsics, backend=backend).features
-        return torch.autograd.grad(shown, features, given.reshape(shown.shape))[0]
+        found = torch.autograd.grad(shown, features, given.reshape(shown.shape))[0]
+    return torch.arange(len(means), device=means.device), found
 
 
 def error_shares(
