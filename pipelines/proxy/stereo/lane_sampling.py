@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 from numba import types
+from numpy.typing import NDArray
 
 from msgs_slam.pipelines.gaussians.render.lanes import (
     FLAGS,
@@ -66,22 +68,26 @@ def square_root(typing_context: Any, value: Any) -> Any:
 
 @intrinsic
 def interpolate(typing_context: Any, array: Any, columns: Any, across: Any, down: Any) -> Any:
-    """Samples of a flat image, `columns` wide, between its pixels: `across` (lanes) columns and `down` rows from its
-    first, both >= 0 and below the last.
+    """Samples of a flat image of `with_row_below`, `columns` wide, between its pixels: `across` (lanes) columns and
+    `down` rows from its first, both >= 0 and below the last.
 
-    Neighbours are read in pairs: instructions that gather numbers from all over take several times as long.
+    Neighbours are read together: instructions that gather numbers from all over take several times as long.
     """
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        rows, parts = _load_corners(context, builder, sig.args[0], args)
-        means = []
-        for left, right in rows:
-            change = builder.fsub(right, left, flags=FLAGS)
-            means.append(builder.fadd(left, builder.fmul(parts[0], change, flags=FLAGS), flags=FLAGS))
-        change = builder.fsub(means[1], means[0], flags=FLAGS)
-        return builder.fadd(means[0], builder.fmul(parts[1], change, flags=FLAGS), flags=FLAGS)
+        place, (right, under) = _places(builder, args)
+        place = builder.shl(place, constant(1, element=I32))
+        a, c, b, d = _load_groups(context, builder, sig.args[0], args[0], place, 4)
+        above, below = _between(builder, a, b, right), _between(builder, c, d, right)
+        return _between(builder, above, below, under)
 
     return lanes(array, types.intp, lanes, lanes), emit
+
+
+def with_row_below(images: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, H, W, 2) of images (N, H, W): every pixel and the one below it side by side, so that the four around a place
+    are read at once."""
+    return np.stack([images, np.concatenate([images[:, 1:], images[:, -1:]], axis=1)], axis=-1)
 
 
 @intrinsic
@@ -91,23 +97,28 @@ def corners(typing_context: Any, array: Any, columns: Any, across: Any, down: An
     result = types.UniTuple(lanes, 6)
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        rows, parts = _load_corners(context, builder, sig.args[0], args)
+        place, parts = _places(builder, args)
+        columns = builder.trunc(args[1], I32)
+        row_length = builder.insert_element(ir.Constant(place.type, ir.Undefined), columns, I32(0))
+        under = builder.add(place, builder.shuffle_vector(row_length, row_length, constant(0, element=I32)))
+        rows = [_load_groups(context, builder, sig.args[0], args[0], p, 2) for p in (place, under)]
         return context.make_tuple(builder, result, [*rows[0], *rows[1], *parts])
 
     return result(array, types.intp, lanes, lanes), emit
 
 
-def _load_corners(
-    context: Any, builder: ir.IRBuilder, array_type: Any, args: Any
-) -> tuple[list[tuple[ir.Value, ir.Value]], tuple[ir.Value, ir.Value]]:
-    """Of (array, columns, across, down): left and right pixel of the upper and of the lower row, and the fractions."""
-    whole, parts = zip(*(_whole_and_rest(builder, position) for position in args[2:]), strict=True)
-    wide = ir.VectorType(I64, WIDTH)
-    row_length = builder.insert_element(ir.Constant(wide, ir.Undefined), args[1], I32(0))
+def _places(builder: ir.IRBuilder, args: Any) -> tuple[ir.Value, tuple[ir.Value, ir.Value]]:
+    """Of (array, columns, across, down): the numbers (int32) of the upper left pixels, and the fractions."""
+    (column, right), (row, under) = (_whole_and_rest(builder, position) for position in args[2:])
+    wide = ir.Constant(column.type, ir.Undefined)
+    row_length = builder.insert_element(wide, builder.trunc(args[1], I32), I32(0))
     row_length = builder.shuffle_vector(row_length, row_length, constant(0, element=I32))
-    top = builder.add(builder.mul(builder.zext(whole[1], wide), row_length), builder.zext(whole[0], wide))
-    places = (top, builder.add(top, row_length))
-    return [_load_pairs(context, builder, array_type, args[0], place) for place in places], (parts[0], parts[1])
+    return builder.add(builder.mul(row, row_length), column), (right, under)
+
+
+def _between(builder: ir.IRBuilder, first: ir.Value, second: ir.Value, part: ir.Value) -> ir.Value:
+    change = builder.fsub(second, first, flags=FLAGS)
+    return builder.fadd(first, builder.fmul(part, change, flags=FLAGS), flags=FLAGS)
 
 
 def _whole_and_rest(builder: ir.IRBuilder, value: ir.Value) -> tuple[ir.Value, ir.Value]:
@@ -116,18 +127,17 @@ def _whole_and_rest(builder: ir.IRBuilder, value: ir.Value) -> tuple[ir.Value, i
     return whole, builder.fsub(value, builder.sitofp(whole, vector_type()), flags=FLAGS)
 
 
-def _load_pairs(
-    context: Any, builder: ir.IRBuilder, array_type: Any, array: ir.Value, places: ir.Value
-) -> tuple[ir.Value, ir.Value]:
-    """array[place] and array[place + 1] for each of the places."""
+def _load_groups(
+    context: Any, builder: ir.IRBuilder, array_type: Any, array: ir.Value, places: ir.Value, size: int
+) -> list[ir.Value]:
+    """array[place], array[place + 1] and so on, `size` of them, for each of the places (int32)."""
     parts = []
     for lane in range(WIDTH):
-        place = builder.extract_element(places, I32(lane))
-        parts.append(load_lanes(builder, address_of(context, builder, array_type, array, place), 2))
+        place = builder.zext(builder.extract_element(places, I32(lane)), I64)
+        parts.append(load_lanes(builder, address_of(context, builder, array_type, array, place), size))
     while len(parts) > 1:
         length = 2 * parts[0].type.count
         order = ir.Constant(vector_type(length, I32), list(range(length)))
         parts = [builder.shuffle_vector(a, b, order) for a, b in zip(parts[::2], parts[1::2], strict=True)]
-    orders = (ir.Constant(vector_type(element=I32), list(range(first, 2 * WIDTH, 2))) for first in (0, 1))
-    left, right = (builder.shuffle_vector(parts[0], parts[0], order) for order in orders)
-    return left, right
+    orders = (ir.Constant(vector_type(element=I32), list(range(k, size * WIDTH, size))) for k in range(size))
+    return [builder.shuffle_vector(parts[0], parts[0], order) for order in orders]

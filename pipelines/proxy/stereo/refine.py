@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.gaussians.render.jit import kernel
 from msgs_slam.pipelines.gaussians.render.lanes import store
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
-from msgs_slam.pipelines.proxy.stereo.tiles import TILE, tiles_of
+from msgs_slam.pipelines.proxy.stereo.lane_sampling import with_row_below
+from msgs_slam.pipelines.proxy.stereo.tiles import TILE
 from msgs_slam.pipelines.proxy.stereo.window import (
     RADIUS,
     SAMPLED_ROWS,
     best_mean,
-    need_around,
     pad_rows,
     row_length,
     warp_row,
@@ -38,22 +38,15 @@ def refine_inverse_depth(
     stiffness: float,
     best: int,
     bands: Bands,
-    compared: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float32]:
-    """(H, W) inverse depth moved by up to `reach` steps to where the views correlate best; `compared` as of
-    `sweep_cost`.
+    """(H, W) inverse depth moved by up to `reach` steps to where the views correlate best.
 
     A move of n steps costs `stiffness` n² of correlation, so that a surface without texture stays where it is.
     """
-    refined = np.empty_like(inverse_depth)
-    if compared is None:
-        compared = np.ones((*tiles_of(*image.shape), len(others)), np.bool_)
+    refined, paired = np.empty_like(inverse_depth), with_row_below(others)
 
     def work(first: int, last: int) -> None:
-        _refine_band(
-            image, others, warps, inverse_depth, step, reach, stiffness, best, compared[first // TILE], first, last,
-            refined,
-        )  # fmt: skip
+        _refine_band(image, paired, warps, inverse_depth, step, reach, stiffness, best, first, last, refined)
 
     bands.run(image.shape[0], work)
     return refined
@@ -69,19 +62,16 @@ def _refine_band(
     reach: int,
     stiffness: float,
     best: int,
-    compared: NDArray[np.bool_],
     first: int,
     last: int,
     refined: NDArray[np.float32],
 ) -> None:
     height, width = image.shape
-    views, rows, columns = others.shape
+    views, rows, columns, _ = others.shape
     length = row_length(width)
     samples = np.zeros(views * SAMPLED_ROWS * length, np.float32)
     seen = np.zeros(views * SAMPLED_ROWS * length, np.float32)
-    needed = np.zeros((views, len(compared) + 1), np.bool_)
-    for n in range(views):
-        need_around(compared[:, n], needed[n])
+    needed = np.ones(length // TILE, np.bool_)
     surface, top = np.zeros(length, np.float32), np.empty(16 * best, np.float32)
     reference = pad_rows(image, first, last)
     weights, moments = weigh_windows(reference, length, ALIKE)
@@ -93,13 +83,13 @@ def _refine_band(
                 surface[x] = inverse_depth[y, min(max(x - RADIUS, 0), width - 1)]
             for n in range(views):
                 warp_row(
-                    others[n].reshape(-1), columns, rows, warps[n], surface, (d - reach) * step, y, width, needed[n],
+                    others[n].reshape(-1), columns, rows, warps[n], surface, (d - reach) * step, y, width, needed,
                     samples, seen, (n * SAMPLED_ROWS + k) * length,
                 )  # fmt: skip
         penalty = np.float32(stiffness * (d - reach) ** 2)
         for k in range(last - first):
             for x in range(0, width, TILE):
-                score = best_mean(samples, seen, weights, reference, moments, length, compared[x // TILE], k, x, top)
+                score = best_mean(samples, seen, weights, reference, moments, length, views, k, x, top)
                 store(total[d, k], x, score - penalty)
     for k in range(last - first):
         for x in range(width):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,6 +42,7 @@ def smooth_cost(
     return total
 
 
+@lru_cache(maxsize=2 * len(DIRECTIONS))
 def path_starts(height: int, width: int, dy: int, dx: int) -> NDArray[np.int64]:
     """(S, 2) row and column of the first pixel of every path of a direction; each pixel lies on exactly one path."""
     y, x = np.mgrid[:height, :width]

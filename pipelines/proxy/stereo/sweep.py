@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
 from msgs_slam.pipelines.gaussians.render.lanes import splat, store
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
+from msgs_slam.pipelines.proxy.stereo.lane_sampling import with_row_below
 from msgs_slam.pipelines.proxy.stereo.tiles import TILE, tiles_of
 from msgs_slam.pipelines.proxy.stereo.volume import BLOCK, UNREACHED, Volume, pixel_of_tile
 from msgs_slam.pipelines.proxy.stereo.window import (
@@ -50,24 +51,22 @@ def sweep_cost(
     best: int,
     bands: Bands,
     tried: NDArray[np.bool_] | None = None,
-    compared: NDArray[np.bool_] | None = None,
 ) -> Volume:
     """Cost 1 - score in [0, 2] of the inverse depths (D,); `others` (N, H, W) lie as the warps say.
 
     Intensities are 0..1. Where no view sees the point the cost is 1, as for a surface without texture. Of each tile
-    only the planes `tried` (tiles down, tiles across, D) are there, and only the views `compared` (tiles down, tiles
-    across, N) count; None: all.
+    only the planes `tried` (tiles down, tiles across, D) are there; None: all.
     """
     height, width = image.shape
-    tiles = tiles_of(height, width)
-    tried = np.ones((*tiles, len(inverse_depths)), np.bool_) if tried is None else tried
-    compared = np.ones((*tiles, len(others)), np.bool_) if compared is None else compared
+    if tried is None:
+        tried = np.ones((*tiles_of(height, width), len(inverse_depths)), np.bool_)
     cost, wanted = Volume.of_tried(height, width, tried), np.ascontiguousarray(tried.transpose(0, 2, 1))
+    paired = with_row_below(others)
 
     def work(first: int, last: int) -> None:
         tile = first // TILE
         _sweep_band(
-            image, others, warps, inverse_depths, wanted[tile], compared[tile], best, first, last, cost.places[tile],
+            image, paired, warps, inverse_depths, wanted[tile], best, first, last, cost.places[tile],
             cost.strides[tile], cost.values,
         )  # fmt: skip
 
@@ -82,7 +81,6 @@ def _sweep_band(
     warps: NDArray[np.float64],
     inverse_depths: NDArray[np.float64],
     wanted: NDArray[np.bool_],
-    compared: NDArray[np.bool_],
     best: int,
     first: int,
     last: int,
@@ -91,7 +89,7 @@ def _sweep_band(
     cost: NDArray[np.float32],
 ) -> None:
     height, width = image.shape
-    views, rows, columns = others.shape
+    views, rows, columns, _ = others.shape
     length = row_length(width)
     samples = np.zeros(views * SAMPLED_ROWS * length, np.float32)
     seen = np.zeros(views * SAMPLED_ROWS * length, np.float32)
@@ -104,9 +102,9 @@ def _sweep_band(
         block[:] = UNREACHED
         for d in range(min(BLOCK, len(inverse_depths) - start)):
             here = wanted[start + d]
+            if not need_around(here, needed):
+                continue
             for n in range(views):
-                if not need_around(here & compared[:, n], needed):
-                    continue
                 picture = others[n].reshape(-1)
                 for k in range(last - first + 2 * RADIUS):
                     y = min(max(first + k - RADIUS, 0), height - 1)
@@ -117,9 +115,7 @@ def _sweep_band(
             for t in range(len(here)):
                 if here[t]:
                     for k in range(last - first):
-                        score = best_mean(
-                            samples, seen, weights, reference, moments, length, compared[t], k, t * TILE, top
-                        )
+                        score = best_mean(samples, seen, weights, reference, moments, length, views, k, t * TILE, top)
                         place = (d * (last - first) + k) * length + t * TILE
                         store(block, place, splat(np.float32(1)) - score)
         _turn(block, length, last - first, width, places[:, start // BLOCK], strides, cost)

@@ -126,9 +126,10 @@ def warp_row(
     seen: NDArray[np.float32],
     at: int,
 ) -> None:
-    """Samples of the flat picture `other` (rows, columns) for row y of the reference, with the border repeated, its
-    pixels of inverse depths (row length,), the first RADIUS in, plus `offset`, into `samples` from `at` on; likewise
-    into `seen` 1 or 0, whether they lie in the other view. Vectors that are not `needed` are left as they were."""
+    """Samples of the picture `other` (rows, columns), flat as of `with_row_below`, for row y of the reference, with the
+    border repeated, its pixels of inverse depths (row length,), the first RADIUS in, plus `offset`, into `samples` from
+    `at` on; likewise into `seen` 1 or 0, whether they lie in the other view. Vectors that are not `needed` are left as
+    they were."""
     v = y + 0.5
     bx = np.float32(warp[0, 1] * v + warp[0, 2])
     by = np.float32(warp[1, 1] * v + warp[1, 2])
@@ -191,18 +192,16 @@ def best_mean(
     reference: NDArray[np.float32],
     moments: NDArray[np.float32],
     length: int,
-    compared: NDArray[np.bool_],
+    views: int,
     k: int,
     x: int,
     top: NDArray[np.float32],
 ) -> object:
-    """Of sixteen pixels, in row k of the band from x on, the mean of the largest correlations among the views that are
-    `compared` and see them; 0 where none does. As many count as `top` has room for, sixteen numbers each."""
+    """Of sixteen pixels, in row k of the band from x on, the mean of the largest correlations among the views that see
+    them; 0 where none does. As many count as `top` has room for, sixteen numbers each."""
     for b in range(0, len(top), _LANES):
         store(top, b, splat(_OUTSIDE))
-    for n in range(len(compared)):
-        if not compared[n]:
-            continue
+    for n in range(views):
         score = correlate(samples, seen, weights, reference, moments, length, n * SAMPLED_ROWS * length, k, x)
         for b in range(0, len(top), _LANES):
             before = load(top, b)
