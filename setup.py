@@ -14,5 +14,6 @@ setup(
         *(f"{name}.{sub}" for name, folder in FOLDERS.items() for sub in find_packages(folder, exclude=["msgs_slam"])),
     ],
     package_dir=FOLDERS,
+    data_files=[("share/man/man1", ["docs/msgs-slam.1"])],
     package_data={"msgs_slam.pipelines": ["**/*.toml", "**/*.json", "demo_clip/*", "export/page/*"]},
 )

@@ -184,6 +184,23 @@ def test_settings_page_has_every_setting() -> None:
     assert not re.findall(r"^\| `\w+` \| `[^|]*` \|  \|", page, flags=re.MULTILINE)  # what each may be
 
 
+def test_the_man_page_is_that_of_todays_commands() -> None:
+    """`python docs/man_page.py` writes it."""
+    sys.path.insert(0, str(SITE))
+    try:
+        from man_page import PAGE, man_page
+    finally:
+        sys.path.pop(0)
+    page = PAGE.read_text(encoding="utf-8")
+    assert page == man_page()
+    for name, command in main.commands.items():
+        assert f"\n.SH MSGS\\-SLAM {name.upper()}\n" in page
+        assert all(
+            max(p.opts, key=len).replace("-", "\\-") in page for p in command.params if isinstance(p, click.Option)
+        )
+    assert not re.findall(r"^['.](?!TH|SH|PP|TP|BR?|nf|fi)", page, re.MULTILINE)
+
+
 def test_dockerfile_copies_what_is_here_and_asks_for_the_same_torch() -> None:
     text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
     copied = [name for line in re.findall(r"^COPY (?!--from)(.*) \S+$", text, re.MULTILINE) for name in line.split()]
