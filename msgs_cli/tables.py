@@ -66,10 +66,10 @@ def status_table(stages: Sequence[StageStatus], everything: bool = False) -> str
 
 def scale_lines(root: Path, records: dict[str, StageRecord]) -> list[str]:
     """Return the line about the scale of the world; none before the export has estimated it."""
-    from msgs_slam.pipelines.metres.files import load_metres
+    from msgs_slam.pipelines.run.files import METRES
     from msgs_slam.pipelines.run.folder import RunFolder
 
-    metres = load_metres(RunFolder(root)) if "export" in records else None
+    metres = RunFolder(root).find(METRES) if "export" in records else None
     return [] if metres is None else [f"\nScale: {metres.text}"]
 
 

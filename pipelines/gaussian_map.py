@@ -57,6 +57,10 @@ class GaussianMap:
         """The Gaussians of rows (M,) bool, indices or a slice."""
         return GaussianMap(**{name: tensor[rows] for name, tensor in vars(self).items()})
 
+    def to(self, device: str) -> GaussianMap:
+        """Copy the map to a device, where it is not there already."""
+        return GaussianMap(**{name: tensor.to(device) for name, tensor in vars(self).items()})
+
     def moved(self, other_from_world: Similarity) -> GaussianMap:
         """Transform the map into another world; radii grow with the scale."""
         parts = self.means.detach().cpu().split(_AT_ONCE)

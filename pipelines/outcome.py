@@ -17,7 +17,19 @@ from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.metres.files import load_metres
+from msgs_slam.pipelines.run.files import (
+    CALIBRATION,
+    CLASS_IDS,
+    CLASSES,
+    EXPOSURE,
+    FIGURES,
+    FRAMES,
+    MAP,
+    METRES,
+    SPARSE,
+    SUBMAPS,
+    TRAJECTORY,
+)
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import StageRecord, load_records, load_source, recorded_config
 from msgs_slam.pipelines.run.settings_file import load_settings
@@ -96,8 +108,8 @@ class Outcome:
     def load_sparse(self) -> SparseModel | None:
         """Points and their observations as the last stage that has any left them."""
         for stage in (self.pose_stage, "tracking"):
-            if self.run.has_sparse(stage):
-                return self._in_this_world(self.run.load_sparse(stage))
+            if self.run.holds(SPARSE, stage):
+                return self._in_this_world(self.run.load(SPARSE, stage))
         return None
 
     def _in_this_world(self, model: SparseModel) -> SparseModel:
@@ -139,33 +151,33 @@ def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:
         raise InputError(
             f"{run.root}: no camera poses yet (tracking is not done). Run `msgs-slam resume {run.root}` first"
         )
-    trajectory = run.load_trajectory(pose_stage)
+    trajectory = run.load(TRAJECTORY, pose_stage)
     map_stage = next((s for s in _MAP_STAGES if s in records), "")
-    report = run.load_proxy_report()
+    report = run.load(FIGURES["proxy"])
     return Outcome(
         run=run,
         records=records,
         config=config,
-        frames=run.load_frames(),
-        calibration=run.load_calibration(),
+        frames=run.load(FRAMES),
+        calibration=run.load(CALIBRATION),
         pose_stage=pose_stage,
         trajectory=trajectory,
         map_stage=map_stage,
-        gaussian_map=run.load_map(map_stage, resolve_device(device)) if map_stage else None,
-        classes=run.load_classes(),
-        label_of_channel=np.array(run.load_class_ids() if map_stage else (), np.uint8),
+        gaussian_map=run.load(MAP, map_stage).to(resolve_device(device)) if map_stage else None,
+        classes=run.load(CLASSES),
+        label_of_channel=np.array(run.load(CLASS_IDS) if map_stage else (), np.uint8),
         exposure=_load_exposure(run, map_stage, trajectory),
         metric=bool(report.get("metric", False)),
         semantics=str(report.get("semantics", "")),
         vocabulary=tuple(map(str, report.get("vocabulary", ()))),
-        metres=load_metres(run) if "export" in records else None,
+        metres=run.find(METRES) if "export" in records else None,
     )
 
 
 def maps_around(outcome: Outcome) -> Callable[[int], GaussianMap]:
     """Return a function from keyframe id to the part of the map it may see: of a map made in submaps its own and those
     beside it, so that a view of a long recording takes no longer than one of a short one."""
-    whole, submaps = outcome.require_map(), outcome.run.load_submaps()
+    whole, submaps = outcome.require_map(), outcome.run.load(SUBMAPS)
     number_of = {i: n for n, submap in enumerate(submaps) for i in submap["own"].tolist()}
 
     @functools.lru_cache(maxsize=1)
@@ -181,8 +193,8 @@ def maps_around(outcome: Outcome) -> Callable[[int], GaussianMap]:
 
 def _load_exposure(run: RunFolder, map_stage: str, trajectory: Trajectory) -> Exposure | None:
     for stage in (map_stage, "mapping"):
-        if map_stage and run.has_exposure(stage):
-            arrays = run.load_exposure(stage)
+        if map_stage and run.holds(EXPOSURE, stage):
+            arrays = run.load(EXPOSURE, stage)
             time_of = dict(zip(trajectory.frame_ids.tolist(), trajectory.timestamps.tolist(), strict=True))
             times = np.array([time_of[int(i)] for i in arrays["frame_ids"]])
             order = np.argsort(times, kind="stable")

@@ -22,7 +22,7 @@ from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress, log
 from msgs_slam.pipelines.types import Intrinsics
-from msgs_slam.pipelines.upright.world import load_world, up_in_run
+from msgs_slam.pipelines.upright.world import WORLD, up_in_run
 from msgs_slam.pipelines.viewer.camera_path import EXPORTED, CameraPath, read_camera_path
 from msgs_slam.pipelines.viewer.scene import up_of_file
 
@@ -130,7 +130,7 @@ def _in_world_of_run(path: CameraPath, run: RunFolder) -> tuple[NDArray[np.float
     """The flight in the run's own world: (N, 4, 4) world_from_cam, (N,) fields of view in degrees."""
     poses, fovs = path.flight()
     if path.world == EXPORTED:
-        if (world := load_world(run)) is None:
+        if (world := run.find(WORLD)) is None:
             raise InputError(
                 f"the camera path is in the coordinates of exported files, and {run.root} has none: "
                 f"run `msgs-slam resume {run.root}` first"

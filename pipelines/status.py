@@ -11,6 +11,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import Stage
 from msgs_slam.pipelines.engine.standing import newly_chosen, next_upstream, why_again
+from msgs_slam.pipelines.run.files import CALIBRATION
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.run.records import StageRecord, differing_settings, load_records, load_source
@@ -168,7 +169,7 @@ def expected_mb(stage: str, run: RunFolder, config: Config) -> float | None:
     from msgs_slam.pipelines.mapping.submaps import submap_count
 
     try:
-        camera, found = run.load_calibration().intrinsics, load_records(run)["frames"].figures
+        camera, found = run.load(CALIBRATION).intrinsics, load_records(run)["frames"].figures
     except InputError:  # damaged, which is reported elsewhere
         return None
     keyframes, small = int(found.get("keyframes", found["frames"])), camera.at_most(config.mapping.max_side)

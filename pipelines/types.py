@@ -160,6 +160,21 @@ class Calibration:
 
 
 @dataclass(frozen=True)
+class GivenPoses:
+    """Poses that the user brings: cam_from_world (N, 4, 4) of all frames, NaN for a frame without; whether in metres;
+    `what` they are."""
+
+    cam_from_world: NDArray[np.float64]
+    is_metric: bool
+    what: str
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(N,) which frames have one."""
+        return np.asarray(np.isfinite(self.cam_from_world).all(axis=(1, 2)))
+
+
+@dataclass(frozen=True)
 class ProxyMaps:
     """Proxy maps of one frame, at their own resolution h x w (same field of view as the frame).
 

@@ -45,11 +45,11 @@ class Run:
         """All that the run has found; raises InputError where the folder is no run or its map is not done."""
         from msgs_slam.pipelines.outcome import load_outcome
         from msgs_slam.pipelines.run.folder import RunFolder
-        from msgs_slam.pipelines.upright.world import load_world
+        from msgs_slam.pipelines.upright.world import WORLD
 
         found = load_outcome(RunFolder(self.path))
         found.require_map()
-        world = load_world(found.run)
+        world = found.run.find(WORLD)
         return found if world is None else found.moved(world.exported_from_run)
 
     @property

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.outcome import Outcome
+from msgs_slam.pipelines.run.files import PROXY_MAPS
 from msgs_slam.pipelines.types import LoopEdge
 
 _BLURRED = 0.35
@@ -35,8 +36,8 @@ def read_capture(outcome: Outcome, sparse: SparseModel | None) -> Capture:
     brightness = np.array([float(outcome.run.image(f)[::8, ::8].mean()) for f in outcome.frames])
     ids = np.zeros(0, np.int64) if sparse is None else np.asarray(sparse.frame_ids, np.int64)
     points = np.zeros(0, np.int64) if sparse is None else np.bincount(sparse.obs_frame, minlength=len(ids))
-    proxied = [f.id for f in outcome.frames if outcome.run.has_proxy(f.id)]
-    reliability = np.array([float(outcome.run.load_proxy(i).confidence.mean()) for i in proxied])
+    proxied = [f.id for f in outcome.frames if outcome.run.holds(PROXY_MAPS, of=f.id)]
+    reliability = np.array([float(outcome.run.load(PROXY_MAPS, of=i).confidence.mean()) for i in proxied])
     relative = sharpness / max(float(np.median(sharpness)), 1e-9)
     return Capture(relative, brightness, ids, points, np.array(proxied, np.int64), reliability)
 

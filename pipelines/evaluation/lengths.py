@@ -10,7 +10,7 @@ from msgs_slam.pipelines.export.stage import on_earth
 from msgs_slam.pipelines.geometry.rig import rig_of
 from msgs_slam.pipelines.geometry.tape import tape_text
 from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.upright.world import load_world
+from msgs_slam.pipelines.upright.world import WORLD
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ _LEAST_GAUSSIANS, _LEAST_FRAMES = 1000, 5
 def found_lengths(outcome: Outcome) -> list[tuple[str, str]]:
     """(what, how long) of a run that is exported, in its own world; only the camera's path where nothing says which way
     is up, and nothing before the export."""
-    if outcome.move is not None or "export" not in outcome.records or (world := load_world(outcome.run)) is None:
+    if outcome.move is not None or "export" not in outcome.records or (world := outcome.run.find(WORLD)) is None:
         return []
     shown = on_earth(outcome.moved(world.exported_from_run), world)
     rows = [("length of the path", path_length(shown))]

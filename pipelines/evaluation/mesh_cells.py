@@ -20,9 +20,9 @@ from msgs_slam.pipelines.evaluation.surface_error import (
 from msgs_slam.pipelines.evaluation.trajectory_error import AbsoluteError
 from msgs_slam.pipelines.evaluation.truth import MatchedTruth
 from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.run.folder import MESH
+from msgs_slam.pipelines.run.files import MESH
 from msgs_slam.pipelines.types import Intrinsics
-from msgs_slam.pipelines.upright.world import FIRST, load_world
+from msgs_slam.pipelines.upright.world import FIRST, WORLD
 
 SAMPLES = 200_000
 VIEWS = 60
@@ -43,7 +43,7 @@ def mesh_cells(outcome: Outcome, matched: MatchedTruth, alignment: AbsoluteError
     mesh = _load(outcome.run.file("export", MESH))
     if mesh is None:
         return {"missing": "the mesh is empty"}
-    world = load_world(outcome.run) or FIRST
+    world = outcome.run.find(WORLD) or FIRST
     points = sample_surface(*mesh, SAMPLES)
     points = alignment.alignment.apply(world.exported_from_run.inverse().apply(points))
     points = points[_seen(points, views)]

@@ -26,12 +26,13 @@ from msgs_slam.pipelines.export.writers import IMAGES
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.read_config import config_to_toml
+from msgs_slam.pipelines.run.files import FIGURES, LOOPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_source
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress
 from msgs_slam.pipelines.system.wording import figure_text
 from msgs_slam.pipelines.types import LoopEdge
-from msgs_slam.pipelines.upright.world import FIRST, load_world
+from msgs_slam.pipelines.upright.world import FIRST, WORLD
 
 
 def write_report(run: RunFolder, path: Path | None = None, progress: Progress | None = None) -> Path:
@@ -65,7 +66,7 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
 
 
 def _load_loops(outcome: Outcome) -> list[LoopEdge]:
-    return outcome.run.load_loops() if "global_ba" in outcome.records else []
+    return outcome.run.load(LOOPS) if "global_ba" in outcome.records else []
 
 
 def _figures(outcome: Outcome, views: RenderedViews | None) -> list[tuple[str, str]]:
@@ -124,7 +125,7 @@ def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[Loo
         ),
         ("scale", _scale_text(outcome)),
         *found_lengths(outcome),
-        ("depth", str(outcome.run.load_proxy_report().get("depth", ""))),
+        ("depth", str(outcome.run.load(FIGURES["proxy"]).get("depth", ""))),
         ("classes", f"{outcome.semantics}: {len(outcome.classes)}"),
     ]
     if sparse is not None:
@@ -164,7 +165,7 @@ def _piece_section(piece: Outcome, progress: Progress) -> str:
 
 def _path_section(outcome: Outcome) -> str:
     """In the axes of the exported files, where there are any."""
-    world = load_world(outcome.run) if "export" in outcome.records and outcome.move is None else None
+    world = outcome.run.find(WORLD) if "export" in outcome.records and outcome.move is None else None
     if world is not None:
         outcome = on_earth(outcome.moved(world.exported_from_run), world)
     upright = world is not None and world.axes == "up"
@@ -206,7 +207,7 @@ def _export_section(outcome: Outcome) -> str:
     sizes = [
         (name, f"{size / 1e6:.2f} MB") for name, size in files_of_export(outcome.run) if Path(name).parts[0] != IMAGES
     ]
-    notes = readme(load_world(outcome.run) or FIRST, outcome.metres, outcome.metric)
+    notes = readme(outcome.run.find(WORLD) or FIRST, outcome.metres, outcome.metric)
     return section("Files for other programs", f"<pre>{escape(notes)}</pre>", table(("in export/", "size"), sizes))
 
 

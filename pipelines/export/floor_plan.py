@@ -13,8 +13,9 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.pipelines.export.walls import Wall, find_walls
 from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.run.folder import MESH, RunFolder
-from msgs_slam.pipelines.upright.world import load_world
+from msgs_slam.pipelines.run.files import MESH
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.upright.world import WORLD
 
 Array = NDArray[np.float64]
 
@@ -37,7 +38,7 @@ def walls_of_run(run: RunFolder) -> list[Wall]:
         raise InputError(
             f"{run.root} has no mesh yet, and a floor plan is drawn from it: finish the run with msgs-slam resume"
         )
-    world = load_world(run)
+    world = run.find(WORLD)
     if world is None or world.axes != "up":
         raise InputError(
             f"{run.root}: a floor plan needs to know which way is up, and the exported files do not say so: film some "
@@ -51,7 +52,7 @@ def walls_of_run(run: RunFolder) -> list[Wall]:
 
 def write_floor_plan(outcome: Outcome, folder: Path) -> list[Path]:
     """floorplan.svg, of an outcome in the run's own world. Raises what `walls_of_run` raises."""
-    walls, world = walls_of_run(outcome.run), load_world(outcome.run)
+    walls, world = walls_of_run(outcome.run), outcome.run.find(WORLD)
     assert world is not None
     moved = outcome.moved(world.exported_from_run).trajectory
     per_unit, about = 1.0, ""

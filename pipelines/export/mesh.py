@@ -24,11 +24,11 @@ from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid
 from msgs_slam.pipelines.gaussians.render import get_threads
 from msgs_slam.pipelines.mapping.depth_views import DrawnView, Shown, drawn_view
 from msgs_slam.pipelines.outcome import Outcome, maps_around
-from msgs_slam.pipelines.run.folder import MESH
+from msgs_slam.pipelines.run.files import MESH
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps, SemanticMesh
-from msgs_slam.pipelines.upright.world import World, load_world
+from msgs_slam.pipelines.upright.world import WORLD, World
 
 TRUNCATION = 4.0
 """Voxels on either side of a surface that a depth speaks for."""
@@ -54,7 +54,7 @@ def mesh_of_run(outcome: Outcome, world: World) -> SemanticMesh:
     mesh = SemanticMesh(**vars(read_mesh_ply(run.file("export", MESH))))
     if len(mesh.faces) == 0:
         raise InputError(f"{run.root}: the mesh is empty, so there is nothing to write: film the scene again")
-    if (own := load_world(run)) is None:
+    if (own := run.find(WORLD)) is None:
         return mesh
     move = world.exported_from_run @ own.exported_from_run.inverse()
     return replace(mesh, vertices=move.apply(mesh.vertices.astype(np.float64)).astype(np.float32))

@@ -17,15 +17,19 @@ from msgs_slam.formats.atomic import copy_file
 from msgs_slam.formats.errors import InputError, RecoverableError
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import Stage, StageContext, run_stages
-from msgs_slam.pipelines.run.folder import (
-    RunFolder,
-    save_backbone,
-    save_calibration,
-    save_features,
+from msgs_slam.pipelines.run.files import (
+    BACKBONE,
+    CALIBRATION,
+    FEATURES,
+    FRAMES,
+    LEFT_OUT,
+    MATCHED_PAIRS,
+    SPARSE,
+    TRAJECTORY,
+    VOCABULARY,
     save_frames,
-    save_left_out,
-    save_matching,
 )
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.system.progress import WithinStage
 
@@ -63,21 +67,22 @@ def _settings(config: Config) -> Config:
 def take_frames(context: StageContext) -> dict[str, Any]:
     """The stage `frames` of a piece: its frames counted anew, and what the run around it knows of them."""
     around, name = RunFolder(context.run.root.parent), context.run.root.name
-    posed = np.flatnonzero(around.load_trajectory("tracking", name).is_posed).tolist()
-    frames, number = around.load_frames(), {old: new for new, old in enumerate(posed)}
+    posed = np.flatnonzero(around.load(TRAJECTORY, "tracking", piece=name).is_posed).tolist()
+    frames, number = around.load(FRAMES), {old: new for new, old in enumerate(posed)}
     for frame in (frames[i] for i in posed):
         copy_file(around.image_file(frame), context.folder / frame.name)
-        if (mask := around.mask(frame, "frames")) is not None:
-            save_left_out(context.folder / "masks", frame, mask)
+        if (mask := around.find(LEFT_OUT, of=frame.name)) is not None:
+            LEFT_OUT.save(context.folder, mask, frame.name)
     save_frames(context.folder, [replace(frames[old], id=new) for old, new in number.items()])
-    save_calibration(context.folder, around.load_calibration())
-    model = around.load_sparse("tracking", name)
-    save_backbone(context.folder, replace(model, frame_ids=np.array([number[i] for i in model.frame_ids.tolist()])))
+    CALIBRATION.save(context.folder, around.load(CALIBRATION))
+    model = around.load(SPARSE, "tracking", piece=name)
+    BACKBONE.save(context.folder, replace(model, frame_ids=np.array([number[i] for i in model.frame_ids.tolist()])))
     for old, new in number.items():
-        if (features := around.load_features(old)) is not None:
-            save_features(context.folder, new, features)
+        if (features := around.find(FEATURES, of=old)) is not None:
+            FEATURES.save(context.folder, features, of=new)
     tried = {
-        (number[i], number[j]): n for (i, j), n in around.load_matched_pairs().items() if i in number and j in number
+        (number[i], number[j]): n for (i, j), n in around.load(MATCHED_PAIRS).items() if i in number and j in number
     }
-    save_matching(context.folder, around.load_vocabulary(), tried)
+    VOCABULARY.save(context.folder, around.load(VOCABULARY))
+    MATCHED_PAIRS.save(context.folder, tried)
     return {"frames": len(posed), "keyframes": len(model.frame_ids), "of_the_run": [posed[0], posed[-1]]}

@@ -44,11 +44,11 @@ from msgs_slam.pipelines.export.writers import (
     write_world,
 )
 from msgs_slam.pipelines.mapping.depth_views import Shown
-from msgs_slam.pipelines.metres.files import save_metres
 from msgs_slam.pipelines.metres.find import Machine, find_metres
 from msgs_slam.pipelines.networks.identity import card_identity
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.proxy.selection import metric_card
+from msgs_slam.pipelines.run.files import METRES, SUBMAPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.journal import empty
 from msgs_slam.pipelines.run.records import load_records
@@ -57,7 +57,7 @@ from msgs_slam.pipelines.system.progress import Progress, SilentProgress
 from msgs_slam.pipelines.types import Metres, SemanticMesh
 from msgs_slam.pipelines.upright.find import find_upright
 from msgs_slam.pipelines.upright.places import AUTO, OFF, world_on_earth
-from msgs_slam.pipelines.upright.world import FIRST, World, load_world, upright_world, world_figures
+from msgs_slam.pipelines.upright.world import FIRST, WORLD, World, upright_world, world_figures
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -74,7 +74,7 @@ def run(context: StageContext) -> dict[str, Any]:
     write_pieces(context)
     write_all_but_mesh(outcome, world, settings, context.folder)
     if world.earth is not None:
-        save_metres(context.folder, metres)
+        METRES.save(context.folder, metres)
     gaussians = len(outcome.require_map())
     outcome = replace(outcome, gaussian_map=None)  # who draws it loads it
     release_free_memory()
@@ -226,7 +226,7 @@ def write_all_but_mesh(outcome: Outcome, world: World, settings: ExportConfig, f
     paths = write_colmap(outcome, folder) + write_ply(outcome, settings.sh_rest, folder)
     paths += write_spz_file(outcome, world, settings.spz_version, folder) if settings.spz else []
     paths += write_glb_file(outcome, world, folder) if settings.splat_glb else []
-    paths += write_tiles(outcome, world, folder) if outcome.run.load_submaps() else []
+    paths += write_tiles(outcome, world, folder) if outcome.run.load(SUBMAPS) else []
     return paths + write_trajectory(outcome, folder) + write_notes(outcome, world, folder)
 
 
@@ -284,7 +284,7 @@ def export_run(
 def _kept_world(outcome: Outcome, settings: ExportConfig) -> World | None:
     """That of the run's own export, so that what is written later or elsewhere fits; None for other axes."""
     own = outcome.config.export
-    return load_world(outcome.run) if (settings.axes, settings.gps) == (own.axes, own.gps) else None
+    return outcome.run.find(WORLD) if (settings.axes, settings.gps) == (own.axes, own.gps) else None
 
 
 STAGE = Stage(

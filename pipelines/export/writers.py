@@ -23,12 +23,11 @@ from msgs_slam.formats.trajectory import write_tum
 from msgs_slam.pipelines.export.readme import lengths, readme
 from msgs_slam.pipelines.geometry.rig import rig_of
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.metres.files import save_metres
 from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.run.folder import save_classes, save_left_out
+from msgs_slam.pipelines.run.files import CLASSES, LEFT_OUT, METRES
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.wording import stretches
-from msgs_slam.pipelines.upright.world import World, save_world
+from msgs_slam.pipelines.upright.world import WORLD, World
 
 IMAGES, SPARSE = "images", "sparse/0"
 """Folders of a COLMAP data set by the names that trainers expect."""
@@ -50,7 +49,7 @@ def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
     for frame in frames:
         copy_file(outcome.run.image_file(frame), folder / IMAGES / frame.name)
         if (left_out := outcome.run.left_out(frame)) is not None:
-            save_left_out(folder / "masks", frame, left_out)
+            LEFT_OUT.save(folder, left_out, frame.name)
     points = seen_points(outcome.load_sparse(), trajectory.frame_ids[posed])
     write_colmap_model(folder / SPARSE, *camera, names, trajectory.cam_from_world[posed], *points)
     start = write_start(folder, points[0], points[1])
@@ -174,13 +173,13 @@ def write_trajectory(outcome: Outcome, folder: Path) -> list[Path]:
 
 def write_world(outcome: Outcome, world: World, folder: Path) -> Path:
     """world.json: what the coordinates of the other files mean."""
-    return save_world(folder, world, "metre" if outcome.metric or world.earth else "free")
+    return WORLD.save(folder, replace(world, unit="metre" if outcome.metric or world.earth else "free"))
 
 
 def write_notes(outcome: Outcome, world: World, folder: Path) -> list[Path]:
     """The class table, the world, how long its unit is, and what each file is for."""
-    save_classes(folder, outcome.classes)
-    world_file, scale_file = write_world(outcome, world, folder), save_metres(folder, outcome.metres)
+    CLASSES.save(folder, outcome.classes)
+    world_file, scale_file = write_world(outcome, world, folder), METRES.save(folder, outcome.metres)
     return [folder / "classes.json", world_file, scale_file, write_readme(outcome, world, folder)]
 
 

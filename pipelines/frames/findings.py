@@ -11,9 +11,10 @@ import pycolmap
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.structure.backbone import pose_of
 from msgs_slam.pipelines.structure.candidates import GIVEN, GIVEN_ALONE
-from msgs_slam.pipelines.structure.given import GivenPoses, agreement
+from msgs_slam.pipelines.structure.given import agreement
 from msgs_slam.pipelines.structure.sfm import Structure
 from msgs_slam.pipelines.system.wording import stretches
+from msgs_slam.pipelines.types import GivenPoses
 
 _LEAST_PART = 3
 

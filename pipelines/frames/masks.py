@@ -15,7 +15,7 @@ from msgs_slam.pipelines.geometry.rig import ONE_CAMERA, Rig
 from msgs_slam.pipelines.masks.files import MaskFiles, open_masks
 from msgs_slam.pipelines.masks.people import PeopleCards, PeopleFinder, people_cards
 from msgs_slam.pipelines.networks.registry import ModelStore
-from msgs_slam.pipelines.run.folder import load_left_out, save_left_out
+from msgs_slam.pipelines.run.files import LEFT_OUT
 from msgs_slam.pipelines.source.faces import Faces
 from msgs_slam.pipelines.source.opening import Source, open_source
 from msgs_slam.pipelines.structure.lens import Lens
@@ -70,12 +70,12 @@ class FrameMasks:
         self._search(finder, [frames[k] for k in near], progress)
 
     def _search(self, finder: PeopleFinder, frames: Sequence[Frame], progress: Progress) -> None:
-        todo = [f for f in frames if load_left_out(self._folder, f) is None]
+        todo = [f for f in frames if LEFT_OUT.find(self._folder, f.name) is None]
         for frame in progress.track(todo, "people", len(todo)) if todo else ():
-            save_left_out(self._folder, frame, finder.left_out(read_rgb(self._picked / frame.name)))
+            LEFT_OUT.save(self._folder, finder.left_out(read_rgb(self._picked / frame.name)), frame.name)
 
     def _shows_people(self, frame: Frame) -> bool:
-        found = load_left_out(self._folder, frame)
+        found = LEFT_OUT.find(self._folder, frame.name)
         return found is not None and bool(found.any())
 
     def left_out(self, frame: Frame, width: int, height: int) -> NDArray[np.bool_] | None:
@@ -84,15 +84,15 @@ class FrameMasks:
         given = self._files.left_out(frame.source_index, *size)
         if given is not None and self._faces is not None:
             given = self._faces.cut_mask(given, frame.id // self._rig.stations)
-        both = any_of((given, load_left_out(self._folder, frame)))
+        both = any_of((given, LEFT_OUT.find(self._folder, frame.name)))
         return both if both is not None and both.any() else None
 
     def write(self, folder: Path, frames: Sequence[Frame], lens: Lens) -> dict[str, Any]:
-        """The masks of the undistorted frames that have any; how many these are, and how much they leave out."""
+        """Write the masks of the undistorted frames that have any; how many these are, and how much they leave out."""
         shares = []
         for frame in frames:
             left_out = self.left_out(frame, lens.pinhole.width, lens.pinhole.height)
             if left_out is not None:
-                save_left_out(folder, frame, lens.undistort_mask(left_out))
+                LEFT_OUT.save(folder, lens.undistort_mask(left_out), frame.name)
                 shares.append(float(left_out.mean()))
         return {"masked_frames": len(shares), "masked_share": round(float(np.mean(shares)), 4)} if shares else {}

@@ -38,15 +38,17 @@ from msgs_slam.pipelines.frames.tasks import (
 )
 from msgs_slam.pipelines.geometry.rig import Rig, rig_of
 from msgs_slam.pipelines.run.before import before_inputs, before_of
-from msgs_slam.pipelines.run.folder import (
-    RunFolder,
-    save_backbone,
-    save_calibration,
-    save_features,
+from msgs_slam.pipelines.run.files import (
+    BACKBONE,
+    CALIBRATION,
+    FEATURES,
+    GIVEN_POSES,
+    MATCHED_PAIRS,
+    SPARSE,
+    VOCABULARY,
     save_frames,
-    save_matching,
-    save_sparse,
 )
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
 from msgs_slam.pipelines.source.known_poses import check_poses, given_poses, pose_inputs
@@ -54,13 +56,12 @@ from msgs_slam.pipelines.source.opening import FolderSource, Source, open_source
 from msgs_slam.pipelines.source.sharpness import reduce_image
 from msgs_slam.pipelines.structure.backbone import to_sparse_model
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
-from msgs_slam.pipelines.structure.given import GivenPoses
 from msgs_slam.pipelines.structure.lens import Lens, distortion_of, make_lens
 from msgs_slam.pipelines.structure.parallax import require_motion
 from msgs_slam.pipelines.structure.rolling import read_readout
 from msgs_slam.pipelines.structure.sfm import Structure, parallel_map
 from msgs_slam.pipelines.structure.window_size import window_size, windows_of
-from msgs_slam.pipelines.types import Calibration, Frame
+from msgs_slam.pipelines.types import Calibration, Frame, GivenPoses
 
 _SIGNIFICANT_SHIFT_PX = 0.3
 _FEW_KEYFRAMES = 12
@@ -90,11 +91,11 @@ def run(context: StageContext) -> dict[str, Any]:
     _write_backbone(context, structure, keyframes, lens, frames)
     _write_correspondences(context, structure, keyframes, lens)
     _write_frames(context, source, frames, lens)
-    masked = masks.write(context.folder / "masks", frames, lens)
-    save_calibration(context.folder, calibration)
+    masked = masks.write(context.folder, frames, lens)
+    CALIBRATION.save(context.folder, calibration)
     save_frames(context.folder, frames)
     if given is not None:
-        given.save(context.folder)
+        GIVEN_POSES.save(context.folder, given)
     told = {} if given is None else warn_of_given(context, structure, given, keyframes)
     panoramas = {"panoramas": rig.stations} if len(rig) > 1 else {}
     return _figures(frames, structure, calibration) | told | panoramas | masked | places_figure(source, frames)
@@ -229,9 +230,9 @@ def _write_backbone(
 
     model = to_sparse_model(structure.model, keyframes, lens, load_rgb)
     before = before_of(context.source)
-    save_backbone(context.folder, model if before is None else in_world_of(before, model, frames))
+    BACKBONE.save(context.folder, model if before is None else in_world_of(before, model, frames))
     for number, piece in enumerate(structure.pieces, 2):
-        save_sparse(context.folder / f"piece_{number}", to_sparse_model(piece, keyframes, lens, load_rgb))
+        SPARSE.save(context.folder / f"piece_{number}", to_sparse_model(piece, keyframes, lens, load_rgb))
 
 
 def _write_correspondences(context: StageContext, structure: Structure, keyframes: list[int], lens: Lens) -> None:
@@ -240,10 +241,11 @@ def _write_correspondences(context: StageContext, structure: Structure, keyframe
         keypoints = features.keypoints.copy()
         # What a lens of much distortion cannot have seen lies nowhere in the picture.
         keypoints[:, :2] = np.nan_to_num(lens.undistort_points(features.xy), nan=-1.0, posinf=-1.0, neginf=-1.0)
-        save_features(context.folder, frame_id, replace(features, keypoints=keypoints))
+        FEATURES.save(context.folder, replace(features, keypoints=keypoints), of=frame_id)
     found = {(p.first, p.second): len(p.matches) for p in structure.pairs}
     tried = {(keyframes[i], keyframes[j]): found.get((i, j), 0) for i, j in structure.tried}
-    save_matching(context.folder, structure.vocabulary, tried)
+    VOCABULARY.save(context.folder, structure.vocabulary)
+    MATCHED_PAIRS.save(context.folder, tried)
 
 
 def _write_frames(context: StageContext, source: AnySource, frames: list[Frame], lens: Lens) -> None:
@@ -306,7 +308,7 @@ def _inputs(source: Path, config: Config) -> dict[str, str] | None:
 
 def _division(run: RunFolder, config: Config) -> list[range]:
     """The windows of structure from motion, which are smaller for less memory: other ones give other poses."""
-    calibration, figures = run.load_calibration(), load_records(run)["frames"].figures
+    calibration, figures = run.load(CALIBRATION), load_records(run)["frames"].figures
     pixels = calibration.intrinsics.width * calibration.intrinsics.height
     size = window_size(config.run.memory_mb, pixels)
     return windows_of(figures.get("keyframes", 0), size) if calibration.directions == 1 else []

@@ -27,12 +27,11 @@ from msgs_slam.pipelines.source.opening import FolderSource, VideoSource, open_s
 from msgs_slam.pipelines.source.recording import RecordingSource
 from msgs_slam.pipelines.source.sharpness import reduced_size
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
-from msgs_slam.pipelines.structure.given import GivenPoses
 from msgs_slam.pipelines.structure.lens import FOCAL_GUESS, calibrated_camera, to_pycolmap, unknown_camera
 from msgs_slam.pipelines.structure.sfm import Divide, StructureFromMotion, when_asked
 from msgs_slam.pipelines.structure.window_size import window_size
 from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.types import Features, Frame
+from msgs_slam.pipelines.types import Features, Frame, GivenPoses
 
 AnySource = VideoSource | FolderSource | RecordingSource
 

@@ -24,17 +24,20 @@ from msgs_slam.pipelines.mapping.build import Refined, refine_map
 from msgs_slam.pipelines.mapping.load import with_rigid_panoramas
 from msgs_slam.pipelines.mapping.move_map import follow_keyframes, move_map
 from msgs_slam.pipelines.mapping.poses import move_trajectory
-from msgs_slam.pipelines.run.folder import (
+from msgs_slam.pipelines.run.files import (
+    CALIBRATION,
+    CLASSES,
+    DEPTH_FIELDS,
+    DESCRIPTORS,
+    EXPOSURE,
+    FIGURES,
+    LOOPS,
     MAP,
-    RunFolder,
-    save_depth_fields,
-    save_exposure,
-    save_figures,
-    save_loops,
-    save_map,
-    save_sparse,
-    save_trajectory,
+    MATCHED_PAIRS,
+    SPARSE,
+    TRAJECTORY,
 )
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.structure.bundle import reprojection_errors
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.tracking.adjust import align_depths, without_dependent_depth
@@ -56,13 +59,13 @@ _VIEWS_ROOM = 100e6
 def run(context: StageContext) -> dict[str, Any]:
     """Find loops; where there are any, adjust everything with them and take the map along; refine both together."""
     context = with_rigid_panoramas(context)
-    model = context.run.load_sparse("tracking")
-    trajectory = context.run.load_trajectory("mapping")
-    fields = context.run.load_depth_fields("tracking")
+    model = context.run.load(SPARSE, "tracking")
+    trajectory = context.run.load(TRAJECTORY, "mapping")
+    fields = context.run.load(DEPTH_FIELDS, "tracking")
     settings = context.config.global_ba
 
     # Loops of panoramas are those that structure from motion closes: the pose graph knows no places.
-    is_rig = context.run.load_calibration().directions > 1
+    is_rig = context.run.load(CALIBRATION).directions > 1
     found = search(context, model) if settings.use_loops and not is_rig else FoundLoops([], 0, 0, 0, 0)
     closed = adjust(context, model, found)
     gaussian_map: GaussianMap | None = None  # as mapping left it
@@ -73,15 +76,15 @@ def run(context: StageContext) -> dict[str, Any]:
         moved_px = largest_motion(context, closed.state, model)
         trajectory = correct_trajectory(trajectory, closed.state, model, ratio)
         after = poses_of(trajectory, model.frame_ids)
-        gaussian_map = context.run.load_map("mapping", context.device)
+        gaussian_map = context.run.load(MAP, "mapping").to(context.device)
         gaussian_map = move_map(gaussian_map, model.frame_ids, before, after, ratio)
         model = to_sparse_model(closed.state)
-        fields = align_depths(model, closed.report, context.run.load_calibration().intrinsics, context.run.find_proxy)
-    save_depth_fields(context.folder, fields)
+        fields = align_depths(model, closed.report, context.run.load(CALIBRATION).intrinsics, context.run.find_proxy)
+    DEPTH_FIELDS.save(context.folder, fields)
     refined = None
     if settings.joint == "always" or (settings.joint == "moved" and moved_px >= JOINT_PX):
         if gaussian_map is None:
-            gaussian_map = context.run.load_map("mapping", context.device)
+            gaussian_map = context.run.load(MAP, "mapping").to(context.device)
         refined = refine_map(context, gaussian_map, trajectory, fields, settings.joint_passes)
     return save(context, model, trajectory, gaussian_map, found, closed, refined, moved_px)
 
@@ -97,14 +100,14 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
     ids = model.frame_ids.tolist()
     all_features = map(pictures.features, context.progress.track(ids, "features", len(ids)))
     kinds = [compute_global_descriptors(all_features, len(ids), pictures.vocabulary)]
-    learned = run.load_descriptors()
+    learned = run.find(DESCRIPTORS) or {}
     if all(i in learned for i in ids):  # the paper's DINOSim counts half
         seen = np.stack([learned[i] for i in ids])
         kinds.append(unit(seen - seen.mean(0)).astype(np.float32))
-    refused = {pair for pair, matches in run.load_matched_pairs().items() if matches == 0}
+    refused = {pair for pair, matches in run.load(MATCHED_PAIRS).items() if matches == 0}
     pairs = loop_candidates(model, GlobalDescriptors(tuple(kinds)), load_summaries(run, model), refused, settings)
     tracked = context.progress.track(pairs, "loops", len(pairs))
-    found = find_loops(tracked, views, model.cam_from_world, run.load_calibration().intrinsics, seed)
+    found = find_loops(tracked, views, model.cam_from_world, run.load(CALIBRATION).intrinsics, seed)
     save_found(snapshot, found)
     return found
 
@@ -112,16 +115,16 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
 def keyframe_views(context: StageContext, model: SparseModel, pictures: Pictures) -> LruSequence[KeyframeView]:
     """Features of every keyframe, with what is known of their depth; those asked for last are kept."""
     run = context.run
-    intrinsics = run.load_calibration().intrinsics
-    fields = run.load_depth_fields("tracking")
+    intrinsics = run.load(CALIBRATION).intrinsics
+    fields = run.load(DEPTH_FIELDS, "tracking")
     state = TrackState.from_backbone(model, 1.0)
 
     def load(k: int) -> KeyframeView:
         frame_id = int(model.frame_ids[k])
         features = pictures.features(frame_id)
         depth = np.zeros(len(features.xy))
-        if run.has_proxy(frame_id):
-            depth, _ = sample_proxy(fields.in_world(frame_id, run.load_proxy(frame_id)), features.xy, intrinsics)
+        if (maps := run.find_proxy(frame_id)) is not None:
+            depth, _ = sample_proxy(fields.in_world(frame_id, maps), features.xy, intrinsics)
         pose, seen = model.cam_from_world[k], state.sightings[frame_id]
         return make_view(frame_id, pose, features, seen, model.points_in_world, depth, intrinsics)
 
@@ -130,10 +133,11 @@ def keyframe_views(context: StageContext, model: SparseModel, pictures: Pictures
 
 def load_summaries(run: RunFolder, model: SparseModel) -> list[LabelSummary]:
     """What the labels say of every keyframe; nothing where it has none."""
-    classes = len(run.load_classes())
+    classes = len(run.load(CLASSES))
     unknown = np.full((2, 2), VOID, np.uint8)
     ids = model.frame_ids.tolist()
-    return [summarise_labels(run.load_proxy(i).labels if run.has_proxy(i) else unknown, classes) for i in ids]
+    all_maps = map(run.find_proxy, ids)
+    return [summarise_labels(unknown if maps is None else maps.labels, classes) for maps in all_maps]
 
 
 def adjust(context: StageContext, model: SparseModel, found: FoundLoops) -> Closed | None:
@@ -141,11 +145,11 @@ def adjust(context: StageContext, model: SparseModel, found: FoundLoops) -> Clos
     if not found.loops:
         return None
     run, config = context.run, context.config
-    intrinsics = run.load_calibration().intrinsics
+    intrinsics = run.load(CALIBRATION).intrinsics
     state = TrackState.from_backbone(model, FEATURE_SD, shutter=load_shutter(run))
     drift = max(loop_drift_px(loop, state, intrinsics) for loop in found.loops)
 
-    report = run.load_proxy_report()
+    report = run.load(FIGURES["proxy"])
     metric = bool(report.get("metric", False))
     tracking = without_dependent_depth(config.tracking, report)
     drifted = drift > DRIFT_PX
@@ -210,7 +214,7 @@ def largest_motion(context: StageContext, state: TrackState, model: SparseModel)
     centres = se3.inverse(model.cam_from_world)[:, :3, 3]
     shift = np.linalg.norm(np.einsum("nij,nj->ni", apart[:, :3, :3], centres) + apart[:, :3, 3] - centres, axis=1)
     depth = np.array([state.median_depth(i) for i in model.frame_ids.tolist()])
-    focal = context.run.load_calibration().intrinsics.fx
+    focal = context.run.load(CALIBRATION).intrinsics.fx
     return float((focal * (se3.rotation_angle(apart) + shift / depth)).max())
 
 
@@ -225,20 +229,20 @@ def save(
     moved_px: float,
 ) -> dict[str, Any]:
     """Write the result, with mapping's own map where there is no other; returns its key figures."""
-    exposure = context.run.load_exposure()
+    exposure = context.run.load(EXPOSURE)
     if refined is not None and refined.is_better:
         result = refined.result
         gaussian_map = result.gaussian_map
         trajectory = move_trajectory(trajectory, exposure["frame_ids"], result.cam_from_world)
         exposure |= {"log_gains": result.log_gains, "offsets": result.offsets}
-    save_trajectory(context.folder, trajectory)
-    save_sparse(context.folder, model)
+    TRAJECTORY.save(context.folder, trajectory)
+    SPARSE.save(context.folder, model)
     if gaussian_map is None:
-        copy_file(context.run.file("mapping", MAP), context.folder / MAP)
+        copy_file(context.run.file("mapping", MAP.name), MAP.path(context.folder))
     else:
-        save_map(context.folder, gaussian_map)
-    save_exposure(context.folder, exposure["frame_ids"], exposure["log_gains"], exposure["offsets"])
-    save_loops(context.folder, [loop.edge for loop in found.loops] if closed is not None else [])
+        MAP.save(context.folder, gaussian_map)
+    EXPOSURE.save(context.folder, exposure)
+    LOOPS.save(context.folder, [loop.edge for loop in found.loops] if closed is not None else [])
     figures = {
         "candidates": found.tried,
         "verified": len(found.loops) + found.unsupported + found.implausible,
@@ -251,7 +255,7 @@ def save(
         "joint_psnr_before": None if refined is None else round(refined.psnr_before, 3),
         "joint_psnr_after": None if refined is None else round(refined.psnr_after, 3),
     }
-    save_figures(context.folder, "global_ba", figures)
+    FIGURES["global_ba"].save(context.folder, figures)
     return figures
 
 

@@ -33,6 +33,7 @@ from msgs_slam.pipelines.mapping.submap_tasks import (
 )
 from msgs_slam.pipelines.mapping.submaps import Submap, divide, submap_count
 from msgs_slam.pipelines.run.before import Before
+from msgs_slam.pipelines.run.files import CALIBRATION, CLASS_IDS, DEPTH_FIELDS, EXPOSURE, SUBMAPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.memory import submap_size
 from msgs_slam.pipelines.types import Trajectory
@@ -72,7 +73,7 @@ def build_map(
     """The map of the keyframes; channel c of its classes is label class_ids[c]. `before`: the run that this one
     extends, whose map is kept and grown where one submap is all there is."""
     kept, _ = split_frames(trajectory, context.config.mapping.hold_out)
-    fields = context.run.load_depth_fields("tracking")
+    fields = context.run.load(DEPTH_FIELDS, "tracking")
     submaps = _submaps(context, trajectory, fields, kept)
     tasks = submap_tasks(context, submaps, trajectory, fields, class_ids)
     if before is not None and len(tasks) > 1:
@@ -91,11 +92,11 @@ def refine_map(
     context: StageContext, gaussian_map: GaussianMap, trajectory: Trajectory, fields: DepthFields, passes: float
 ) -> Refined:
     """A map that is there, and the poses of its keyframes, refined together: every view visited `passes` times."""
-    exposure = context.run.load_exposure()
+    exposure = context.run.load(EXPOSURE)
     ids, exposures = exposure["frame_ids"], (exposure["log_gains"], exposure["offsets"])
-    stored = [Submap(s["own"], s["border"], tuple(s["beside"].tolist())) for s in context.run.load_submaps()]
+    stored = [Submap(s["own"], s["border"], tuple(s["beside"].tolist())) for s in context.run.load(SUBMAPS)]
     submaps, anchors = stored or [Submap.alone(ids)], gaussian_map.anchor_frame_ids.cpu().numpy()
-    tasks = submap_tasks(context, submaps, trajectory, fields, context.run.load_class_ids())
+    tasks = submap_tasks(context, submaps, trajectory, fields, context.run.load(CLASS_IDS))
     tasks = [replace(task, passes=passes) for task in tasks]
     for task in tasks:
         rows = np.isin(ids, task.submap.own)
@@ -124,7 +125,7 @@ def _submaps(
     context: StageContext, trajectory: Trajectory, fields: DepthFields, keyframe_ids: Sequence[int]
 ) -> list[Submap]:
     run, ids = context.run, np.array(keyframe_ids)
-    size = submap_size(context.config, run.load_calibration().intrinsics)
+    size = submap_size(context.config, run.load(CALIBRATION).intrinsics)
     if submap_count(len(ids), size) == 1:  # what they share need not be known
         return [Submap.alone(ids)]
     return divide(ids, overlaps(_depths(run, trajectory, fields, keyframe_ids)), size)
@@ -143,7 +144,7 @@ def submap_tasks(
 ) -> list[SubmapTask]:
     """One for each submap, of its own and bordering keyframes."""
     # Parts of another size, as of a run that goes on with other memory, are others.
-    files, camera = context.snapshot / f"submaps_{len(submaps)}", context.run.load_calibration().intrinsics
+    files, camera = context.snapshot / f"submaps_{len(submaps)}", context.run.load(CALIBRATION).intrinsics
     return [
         SubmapTask(
             context.run, context.config, files, number, submap, rows_of(trajectory, submap.views),
@@ -157,7 +158,7 @@ def _depths(
     run: RunFolder, trajectory: Trajectory, fields: DepthFields, frame_ids: Sequence[int]
 ) -> Iterator[PosedDepth]:
     """The keyframes with their proxy depths, one at a time."""
-    camera = run.load_calibration().intrinsics
+    camera = run.load(CALIBRATION).intrinsics
     poses = dict(zip(trajectory.frame_ids.tolist(), trajectory.cam_from_world, strict=True))
     for i in frame_ids:
         if (maps := run.find_proxy(i)) is None:

@@ -19,6 +19,7 @@ from msgs_slam.pipelines.mapping.poses import rows_of
 from msgs_slam.pipelines.mapping.submap_tasks import SubmapResult, SubmapTask, pixels_filled, together
 from msgs_slam.pipelines.mapping.views import View
 from msgs_slam.pipelines.run.before import Before
+from msgs_slam.pipelines.run.files import FRAMES
 from msgs_slam.pipelines.structure.given import agreement
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Trajectory
@@ -60,7 +61,8 @@ def _start(
     views = task.views(task.trajectory).views
     ids, poses = np.array([v.frame_id for v in views]), np.stack([v.cam_from_world.cpu().numpy() for v in views])
     visited = _to_visit(views, np.array([int(i) in exposures for i in ids]))
-    known = before.poses_of(task.run.load_frames())
+    frames = task.run.load(FRAMES)
+    known = before.poses_of(frames)
     return ids, poses, visited, _kept_map(before, task.trajectory, known, views, len(task.class_ids), task.device)
 
 

@@ -15,6 +15,7 @@ from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.depth.see_through import contradicted
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes
+from msgs_slam.pipelines.run.files import CALIBRATION, DEPTH_FIELDS, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.memory import VIEWS_SHARE, room_on
@@ -46,10 +47,10 @@ def load_views(
     others are given; what other views see through is unknown. Without `class_ids` the channels are the classes that
     occur.
     """
-    frames = {f.id: f for f in run.load_frames()}
-    full = run.load_calibration().intrinsics
+    frames = {f.id: f for f in run.load(FRAMES)}
+    full = run.load(CALIBRATION).intrinsics
     intrinsics = full.at_most(settings.max_side)
-    fields = fields or run.load_depth_fields("tracking")
+    fields = fields or run.load(DEPTH_FIELDS, "tracking")
     kept, measured = split_frames(trajectory, settings.hold_out)
     channels = survey(run, kept)[0] if class_ids is None else class_ids
     poses = dict(zip(trajectory.frame_ids.tolist(), trajectory.cam_from_world, strict=True))
@@ -71,7 +72,7 @@ def load_views(
 
 def with_rigid_panoramas(context: StageContext) -> StageContext:
     """The six sides of a panorama stay one camera: its settings refine no pose."""
-    if context.run.load_calibration().directions == 1:
+    if context.run.load(CALIBRATION).directions == 1:
         return context
     mapping = replace(context.config.mapping, refine_poses=False)
     return replace(context, config=replace(context.config, mapping=mapping))

@@ -14,25 +14,26 @@ from msgs_slam.pipelines.mapping.load import split_frames, survey, with_rigid_pa
 from msgs_slam.pipelines.mapping.measure import mean_figures
 from msgs_slam.pipelines.mapping.submaps import submap_count
 from msgs_slam.pipelines.run.before import before_inputs, before_of
-from msgs_slam.pipelines.run.folder import RunFolder, save_exposure, save_figures, save_map, save_trajectory
+from msgs_slam.pipelines.run.files import CALIBRATION, EXPOSURE, FIGURES, MAP, TRAJECTORY
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.memory import submap_size
 
 
 def run(context: StageContext) -> dict[str, Any]:
     """The optimised map; poses and exposures refined with it."""
     context = with_rigid_panoramas(context)
-    trajectory = context.run.load_trajectory("tracking")
+    trajectory = context.run.load(TRAJECTORY, "tracking")
     kept, _ = split_frames(trajectory, context.config.mapping.hold_out)
     class_ids = _require_views(context, kept)
     mapped = build_map(context, trajectory, class_ids, before_of(context.source))
     result, ids = mapped.result, mapped.keyframe_ids
-    save_map(context.folder, result.gaussian_map)
-    save_trajectory(context.folder, mapped.moved)
-    save_exposure(context.folder, ids, result.log_gains, result.offsets)
+    MAP.save(context.folder, result.gaussian_map)
+    TRAJECTORY.save(context.folder, mapped.moved)
+    EXPOSURE.save(context.folder, {"frame_ids": ids, "log_gains": result.log_gains, "offsets": result.offsets})
     figures = _figures(mapped)
     rows = [{"own": s.own.tolist(), "border": s.border.tolist(), "beside": list(s.beside)} for s in mapped.submaps]
     submaps = rows if len(rows) > 1 else []  # one alone is all of the map
-    save_figures(context.folder, "mapping", {**figures, "class_ids": list(mapped.class_ids), "submaps": submaps})
+    FIGURES["mapping"].save(context.folder, {**figures, "class_ids": list(mapped.class_ids), "submaps": submaps})
     return figures
 
 
@@ -71,8 +72,8 @@ def _figures(mapped: Mapped) -> dict[str, Any]:
 
 def _division(run: RunFolder, config: Config) -> int:
     """Into how many submaps; more for less memory."""
-    kept, _ = split_frames(run.load_trajectory("tracking"), config.mapping.hold_out)
-    return submap_count(len(kept), submap_size(config, run.load_calibration().intrinsics))
+    kept, _ = split_frames(run.load(TRAJECTORY, "tracking"), config.mapping.hold_out)
+    return submap_count(len(kept), submap_size(config, run.load(CALIBRATION).intrinsics))
 
 
 def _inputs(source: Path, config: Config) -> dict[str, str] | None:

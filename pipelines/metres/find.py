@@ -10,7 +10,6 @@ import numpy as np
 
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.metres.evidence import Combined, Evidence, combine, independence
-from msgs_slam.pipelines.metres.files import load_scale_spreads
 from msgs_slam.pipelines.metres.heights import camera_height, ceiling_height, usual_distance
 from msgs_slam.pipelines.metres.known import MEASURED, known_scale
 from msgs_slam.pipelines.metres.network import network_scale
@@ -18,7 +17,8 @@ from msgs_slam.pipelines.metres.scene import Scene, SeenFrame, build_scene
 from msgs_slam.pipelines.metres.sizes import THINGS
 from msgs_slam.pipelines.metres.things import sizes_of_things
 from msgs_slam.pipelines.networks.card import Card
-from msgs_slam.pipelines.run.folder import DEPTH_FIELDS, RunFolder
+from msgs_slam.pipelines.run.files import CALIBRATION, CLASSES, DEPTH_FIELDS, FIGURES, FRAME_SCALES, FRAMES, PROXY_MAPS
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Intrinsics, Metres, MetresSource, Trajectory
 
 _MOST_FRAMES = 40
@@ -87,25 +87,29 @@ def scene_evidence(scene: Scene) -> list[Evidence]:
 
 def load_seen(run: RunFolder, trajectory: Trajectory) -> Seen:
     """Keyframes with maps, evenly spread."""
-    stage = next((s for s in ("global_ba", "tracking") if run.has(s, DEPTH_FIELDS)), None)
-    fields = run.load_depth_fields(stage) if stage else DepthFields({})
-    frame_of = {f.id: f for f in run.load_frames()}
+    stage = next((s for s in ("global_ba", "tracking") if run.holds(DEPTH_FIELDS, s)), None)
+    fields = run.load(DEPTH_FIELDS, stage) if stage else DepthFields({})
+    frame_of = {f.id: f for f in run.load(FRAMES)}
     keys = np.flatnonzero(trajectory.is_keyframe)
-    rows = [int(k) for k in keys if run.has_proxy(int(trajectory.frame_ids[k]))]
+    rows = [int(k) for k in keys if run.holds(PROXY_MAPS, of=int(trajectory.frame_ids[k]))]
     frames, frame_ids = [], []
     for row in rows[:: max(1, -(-len(rows) // _MOST_FRAMES))]:
         frame_id = int(trajectory.frame_ids[row])
-        maps = fields.in_world(frame_id, run.load_proxy(frame_id))
+        maps = fields.in_world(frame_id, run.load(PROXY_MAPS, of=frame_id))
         frames.append(SeenFrame(run.image(frame_of[frame_id]), maps, trajectory.world_from_cam[row]))
         frame_ids.append(frame_id)
-    is_named = run.load_proxy_report().get("semantics") != "segments"
-    return Seen(frames, frame_ids, run.load_calibration().intrinsics, run.load_classes().names, is_named)
+    is_named = run.load(FIGURES["proxy"]).get("semantics") != "segments"
+    return Seen(frames, frame_ids, run.load(CALIBRATION).intrinsics, run.load(CLASSES).names, is_named)
 
 
 def known_evidence(run: RunFolder) -> list[Evidence]:
     """Return evidence of whatever made the world metric; none where it is not."""
-    spreads, statistical = load_scale_spreads(run)
-    return known_scale(run.load_proxy_report(), spreads, statistical)
+    # How each frame's depth strays around its points, and how exactly tracking fitted metric depth, where it did.
+    spreads = [row["spread"] for row in run.find(FRAME_SCALES) or ()]
+    tracked = run.find(FIGURES["tracking"])
+    statistical = 0.0 if tracked is None else float(tracked.get("scale_relative_sd") or 0.0)
+    proxy = run.load(FIGURES["proxy"])
+    return known_scale(proxy, spreads, statistical)
 
 
 def describe(pieces: Sequence[Evidence]) -> Metres:

@@ -20,8 +20,8 @@ from msgs_slam.pipelines.proxy.scale_reference import (
     parse_reference,
 )
 from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.run.files import BACKBONE, GIVEN_POSES
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.source.known_poses import load_given
 from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.structure.given import agreement
 from msgs_slam.pipelines.types import Frame
@@ -68,7 +68,7 @@ def reference_scale(
 def given_scale(run: RunFolder, scale: DepthScale, is_said: bool) -> ReferenceScale | None:
     """Metres per unit of the depth by poses that the user gave in metres, by their kind or as it `is_said`; None where
     these tell none."""
-    given, backbone = load_given(run), run.load_backbone()
+    given, backbone = run.find(GIVEN_POSES), run.find(BACKBONE)
     if given is None or not (given.is_metric or is_said) or backbone is None:
         return None
     rows = np.flatnonzero(given.known[backbone.frame_ids])

@@ -24,14 +24,7 @@ from msgs_slam.pipelines.proxy.tasks import (
     make_depths,
     make_maps,
 )
-from msgs_slam.pipelines.run.folder import (
-    save_classes,
-    save_descriptors,
-    save_figures,
-    save_frame_scales,
-    save_left_out,
-)
-from msgs_slam.pipelines.run.proxy_files import load_proxy_maps, proxy_path
+from msgs_slam.pipelines.run.files import CLASSES, DESCRIPTORS, FIGURES, FRAME_SCALES, LEFT_OUT, PROXY_MAPS
 from msgs_slam.pipelines.system.progress import log
 from msgs_slam.pipelines.types import VOID, Frame
 
@@ -49,7 +42,7 @@ def run(context: StageContext) -> dict[str, Any]:
     agreements = _compute_maps(work, frames, scale, reference)
     figures = _figures(work, frames, agreements) | scale_figures(work.depths, scale, reference) | moving
     _warn_of_focal(work, figures.get("network_focal_px"))
-    save_figures(context.folder, "proxy", figures)
+    FIGURES["proxy"].save(context.folder, figures)
     return figures
 
 
@@ -97,11 +90,15 @@ def _compute_maps(
     semantics.prepare(frames, lambda frame: scale.in_backbone_unit(work.depth(frame)))
     for message in semantics.warnings():
         work.context.warn(message)
-    save_classes(folder, semantics.classes())
+    CLASSES.save(folder, semantics.classes())
     metres = reference.factor if reference else 1.0
     made = in_frames(work, make_maps, frames, scale=scale, metres=metres, semantics=prepared(semantics))
-    save_descriptors(folder, {i: looks for _, part in made for i, looks in part.items()})
-    save_frame_scales(folder, scale.of_frame, scale.spread_in)
+    if descriptors := {i: looks for _, part in made for i, looks in part.items()}:
+        DESCRIPTORS.save(folder, descriptors)
+    scales = scale.of_frame.items()
+    FRAME_SCALES.save(
+        folder, [{"frame_id": i, "scale": round(s, 6), "spread": round(scale.spread_in[i], 6)} for i, s in scales]
+    )
     return [m for part, _ in made for m in part]
 
 
@@ -127,7 +124,7 @@ def _leave_out_moving(work: ProxyWork, frames: list[Frame], scale: DepthScale) -
     full = work.sequence.calibration.intrinsics
     for k, moved in found.items():
         shown = cv2.resize(moved.astype(np.float32), (full.width, full.height), interpolation=cv2.INTER_LINEAR) > 0.5
-        save_left_out(work.context.folder / "masks", posed[k], shown)
+        LEFT_OUT.save(work.context.folder, shown, posed[k].name)
     share = round(float(np.mean([m.mean() for m in found.values()])), 4) if found else 0.0
     return {"moving_frames": len(found), "moving_share": share} if found else {}
 
@@ -137,9 +134,9 @@ def _figures(work: ProxyWork, frames: list[Frame], agreements: list[float]) -> d
     sizes, reliable, void = [], [], []
     invalid = 0
     for frame in frames:
-        path = proxy_path(work.context.folder, frame.id)
+        path = PROXY_MAPS.path(work.context.folder, frame.id)
         invalid += work.depth(frame).invalid
-        maps = load_proxy_maps(path)
+        maps = PROXY_MAPS.read(path)
         sizes.append(path.stat().st_size)
         reliable.append(float((maps.confidence > 0.35).mean()))
         void.append(float((maps.labels == VOID).mean()))

@@ -28,8 +28,7 @@ from msgs_slam.pipelines.proxy.scale import DepthScale
 from msgs_slam.pipelines.proxy.scratch import load_scratch, save_scratch
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth, open_semantics
 from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
-from msgs_slam.pipelines.run.folder import load_left_out
-from msgs_slam.pipelines.run.proxy_files import proxy_path, save_proxy_maps
+from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, LEFT_OUT, PROXY_MAPS
 from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Frame, Intrinsics, ProxyMaps, any_of
@@ -75,7 +74,7 @@ class ProxyWork:
     def depth(self, frame: Frame) -> DepthEstimate:
         """Unknown where something moved, once that has been looked for."""
         found = self.computed_depth(frame)
-        moved = load_left_out(self.context.folder / "masks", frame)
+        moved = LEFT_OUT.find(self.context.folder, frame.name)
         if moved is None:
             return found
         height, width = found.depth.shape
@@ -119,15 +118,15 @@ class ProxyWork:
 
 def load_sequence(context: StageContext) -> Sequence:
     """The frames, and what is known of their cameras."""
-    calibration = context.run.load_calibration()
+    calibration = context.run.load(CALIBRATION)
     camera = calibration.intrinsics.at_most(context.config.proxy.max_side)
     run = context.run
 
     def left_out(frame: Frame) -> NDArray[np.bool_] | None:
         """By the stage before this one, and by what of this one is done."""
-        return any_of((run.mask(frame, "frames"), load_left_out(context.folder / "masks", frame)))
+        return any_of((run.find(LEFT_OUT, of=frame.name), LEFT_OUT.find(context.folder, frame.name)))
 
-    return Sequence(run.load_frames(), calibration, camera, run.load_backbone(), run.image, left_out)
+    return Sequence(run.load(FRAMES), calibration, camera, run.find(BACKBONE), run.image, left_out)
 
 
 def in_frames(opened: ProxyWork, work: Callable[[Chunk, Progress], R], frames: list[Frame], **known: Any) -> list[R]:
@@ -188,10 +187,11 @@ def make_maps(task: Chunk, progress: Progress) -> MadeMaps:
         agreements.append(m)
         if labels.descriptor is not None:
             descriptors[frame.id] = labels.descriptor
-        if not (path := proxy_path(work.context.folder, frame.id)).exists():
+        if not PROXY_MAPS.path(work.context.folder, frame.id).exists():
             u = reliability(depth.depth, depth.confidence, theta(m))
             scaled = (depth.depth * metres).astype(np.float32)
-            save_proxy_maps(path, compact(ProxyMaps(scaled, u, labels.labels, labels.confidence)))
+            maps = compact(ProxyMaps(scaled, u, labels.labels, labels.confidence))
+            PROXY_MAPS.save(work.context.folder, maps, frame.id)
         previous, before = frame, labels.labels
     return agreements, descriptors
 

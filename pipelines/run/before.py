@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,9 @@ from msgs_slam.formats.atomic import copy_file
 from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.jsonfile import read_json_object, write_json
-from msgs_slam.formats.tensors import save_arrays
-from msgs_slam.pipelines.run import layouts
-from msgs_slam.pipelines.run.folder import EXPOSURE, MAP, RunFolder, read_map
-from msgs_slam.pipelines.run.layouts import dataclass_from_json, load_layout, reading
+from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, EXPOSURE, FRAMES, MAP, TRAJECTORY
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.layouts import RunFile, dataclass_from_json, reading
 from msgs_slam.pipelines.run.names import SOURCE_LIST
 from msgs_slam.pipelines.run.records import load_source
 from msgs_slam.pipelines.types import Calibration, Frame
@@ -30,7 +29,14 @@ from msgs_slam.pipelines.types import Calibration, Frame
 if TYPE_CHECKING:
     from msgs_slam.pipelines.gaussian_map import GaussianMap
 
-FRAMES, CONTENTS = "frames.npz", "before.json"
+T = TypeVar("T")
+
+CONTENTS = "before.json"
+POSES: RunFile[dict[str, NDArray]] = RunFile(
+    "frames.npz", (), "table of frames", dict, dict,
+    {"source_index": "i N", "cam_from_world": "f N 4 4", "is_placed": "b N", "was_chosen": "b N"},
+)  # fmt: skip
+"""What was known of the frames."""
 FINAL = "global_ba"
 """The stage whose poses and map are taken."""
 
@@ -46,18 +52,18 @@ class Before:
         """{"source": digest, "camera", "files": name → sha256}."""
         return read_json_object(self.folder / CONTENTS)
 
-    def _file(self, name: str) -> Path:
-        path = self.folder / name
-        if not path.is_file() or file_sha256(path) != self.contents["files"].get(name):
+    def _read(self, file: RunFile[T]) -> T:
+        path = self.folder / file.name
+        if not path.is_file() or file_sha256(path) != self.contents["files"].get(file.name):
             raise InputError(
                 f"{path} is gone or damaged: the run can no longer be extended from it. Reconstruct all videos into "
                 "another folder with --out NEW"
             )
-        return path
+        return file.read(path)
 
     @cached_property
     def _frames(self) -> Mapping[str, NDArray]:
-        return load_layout(self._file(FRAMES), layouts.BEFORE)
+        return self._read(POSES)
 
     @property
     def camera(self) -> Calibration:
@@ -89,11 +95,11 @@ class Before:
 
     def load_map(self, device: str = "cpu") -> GaussianMap:
         """Load the map onto a device."""
-        return read_map(self._file(MAP), device)
+        return self._read(MAP).to(device)
 
     def exposures(self) -> dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]]:
         """Frame id → log gain (3,) and offset (3,)."""
-        rows = load_layout(self._file(EXPOSURE), layouts.EXPOSURE)
+        rows = self._read(EXPOSURE)
         return dict(zip(rows["frame_ids"].tolist(), zip(rows["log_gains"], rows["offsets"], strict=True), strict=True))
 
 
@@ -111,7 +117,7 @@ def before_inputs(source: Path) -> dict[str, str]:
 
 def save_before(run: RunFolder, folder: Path) -> None:
     """Write that state into a folder, the table of contents last. Raises InputError where the run is damaged."""
-    frames, trajectory, backbone = run.load_frames(), run.load_trajectory(FINAL), run.load_backbone()
+    frames, trajectory, backbone = run.load(FRAMES), run.load(TRAJECTORY, FINAL), run.find(BACKBONE)
     ids = trajectory.frame_ids.tolist()
     chosen = set(trajectory.frame_ids[trajectory.is_keyframe].tolist())
     chosen |= set() if backbone is None else set(backbone.frame_ids.tolist())
@@ -121,9 +127,9 @@ def save_before(run: RunFolder, folder: Path) -> None:
         "is_placed": trajectory.is_placed,
         "was_chosen": np.array([i in chosen for i in ids], np.bool_),
     }
-    save_arrays(folder / FRAMES, arrays)
-    for name in (MAP, EXPOSURE):
+    POSES.save(folder, arrays)
+    for name in (MAP.name, EXPOSURE.name):
         copy_file(run.file(FINAL, name), folder / name)
-    files = {name: file_sha256(folder / name) for name in (FRAMES, MAP, EXPOSURE)}
-    source, camera = load_source(run).digest, asdict(run.load_calibration())
+    files = {file.name: file_sha256(folder / file.name) for file in (POSES, MAP, EXPOSURE)}
+    source, camera = load_source(run).digest, asdict(run.load(CALIBRATION))
     write_json(folder / CONTENTS, {"source": source, "camera": camera, "files": files})

@@ -1,4 +1,4 @@
-"""Layouts of a run's files: data read back must be what the program writes there, or it is refused.
+"""A run's files: data read back must be what the program writes there, or it is refused.
 
 A layout says what an .npz file holds: name → kind and axes, as in "f N 3": kinds are f (finite floats), i (integers),
 b (booleans), u (text); a letter is a length that is the same wherever it occurs; a name that ends in "?" may be
@@ -7,38 +7,24 @@ missing.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import MISSING, fields, is_dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, Generic, TypeVar, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import read_grey_png, write_grey_png
+from msgs_slam.formats.jsonfile import read_json, write_json
 from msgs_slam.formats.reading import parsing
-from msgs_slam.formats.tensors import load_arrays
+from msgs_slam.formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
 
 T = TypeVar("T")
 _KINDS = {"f": "f", "i": "iu", "b": "b", "u": "U"}
 _RIGID = 1e-4
-
-TRAJECTORY = {
-    "frame_ids": "i N", "timestamps": "f N", "cam_from_world": "f N 4 4", "is_keyframe": "b N", "lost_reasons": "u N",
-    "by_rotation?": "b N",
-}  # fmt: skip
-SPARSE_MODEL = {
-    "frame_ids": "i N", "cam_from_world": "f N 4 4", "points_in_world": "f P 3", "colors": "i P 3",
-    "obs_frame": "i O", "obs_point": "i O", "obs_xy": "f O 2",
-}  # fmt: skip
-FEATURES = {"keypoints": "f F 4", "descriptors": "i F 128"}
-VOCABULARY = {"words": "f W 128", "mean": "f D"}
-TRIED = {"rows": "i P 3"}
-PROXY_MAPS = {"inverse_depth": "f H W", "confidence": "i H W", "labels": "i H W", "label_confidence": "i H W"}
-EXPOSURE = {"frame_ids": "i N", "log_gains": "f N 3", "offsets": "f N 3"}
-DESCRIPTORS = {"frame_ids": "i N", "vectors": "f N F"}
-DEPTH_FIELDS = {"frame_ids": "i N", "log_scales": "f N R C"}
-BEFORE = {"source_index": "i N", "cam_from_world": "f N 4 4", "is_placed": "b N", "was_chosen": "b N"}
 
 
 def what_to_do(path: Path) -> str:
@@ -51,12 +37,52 @@ def reading(path: Path, what: str) -> Any:
     return parsing(path, what, what_to_do(path))
 
 
-def load_layout(path: Path, layout: Mapping[str, str]) -> dict[str, NDArray]:
-    """The arrays of an .npz file, every one of the layout and no other. Raises InputError for anything else."""
-    arrays = load_arrays(path, own=True)
-    with reading(path, "file of this program"):
-        _require_layout(arrays, layout)
-    return arrays
+@dataclass(frozen=True)
+class RunFile(Generic[T]):
+    """One kind of a run's files: its `name` in the folders of the `stages` that leave it, where {} stands for the frame
+    it is of, and `what` it is called in errors.
+
+    `pack` makes of a value what the file holds, `unpack` the value of that again, raising what it likes: by the name's
+    suffix plain values (.json), arrays of a `layout` (.npz), tensors (.safetensors), or an image (.png).
+    """
+
+    name: str
+    stages: tuple[str, ...]
+    what: str
+    unpack: Callable[[Any], T]
+    pack: Callable[[T], Any] = field(default=lambda value: value)
+    layout: Mapping[str, str] = field(default_factory=dict)
+
+    def path(self, folder: Path, of: int | str = "") -> Path:
+        """Return the file's path in a stage's folder."""
+        return folder / self.name.format(of)
+
+    def save(self, folder: Path, value: T, of: int | str = "") -> Path:
+        """Write the file into the folder of the running stage, whole or not at all; returns its path."""
+        path = self.path(folder, of)
+        _FORMATS[path.suffix][1](path, self.pack(value))
+        return path
+
+    def read(self, path: Path) -> T:
+        """Inverse of `save`. Raises InputError for a file that is missing, or not what the program writes there."""
+        held = _FORMATS[path.suffix][0](path)
+        with reading(path, self.what):
+            if self.layout:
+                _require_layout(held, self.layout)
+            return self.unpack(held)
+
+    def find(self, folder: Path, of: int | str = "") -> T | None:
+        """Read the file in a folder; None where there is none."""
+        path = self.path(folder, of)
+        return self.read(path) if path.exists() else None
+
+
+_FORMATS: dict[str, tuple[Callable[[Path], Any], Callable[[Path, Any], None]]] = {
+    ".json": (partial(read_json, most=None), write_json),
+    ".npz": (partial(load_arrays, own=True), save_arrays),
+    ".png": (read_grey_png, write_grey_png),
+    ".safetensors": (load_tensors, save_tensors),
+}
 
 
 def _require_layout(arrays: Mapping[str, NDArray], layout: Mapping[str, str]) -> None:

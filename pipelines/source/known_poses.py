@@ -14,11 +14,9 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.poses import PoseFile, read_poses, stem
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.source.opening import FolderSource, VideoSource
 from msgs_slam.pipelines.source.recording import RecordingSource
-from msgs_slam.pipelines.structure.given import FILE, GivenPoses
-from msgs_slam.pipelines.types import Frame
+from msgs_slam.pipelines.types import Frame, GivenPoses
 
 AnySource = VideoSource | FolderSource | RecordingSource
 LEAST = 3
@@ -50,11 +48,6 @@ def given_poses(config: FramesConfig, source: AnySource, frames: Sequence[Frame]
     cam_from_world = np.full_like(found, np.nan)
     cam_from_world[known] = se3.inverse(found[known])
     return GivenPoses(cam_from_world, file.is_metric, file.what)
-
-
-def load_given(run: RunFolder) -> GivenPoses | None:
-    """The poses that the user gave for the run's frames; None without any."""
-    return GivenPoses.load(run.file("frames", FILE)) if run.has("frames", FILE) else None
 
 
 def check_poses(config: FramesConfig, source: AnySource) -> None:

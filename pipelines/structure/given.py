@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.formats.tensors import load_arrays, save_arrays
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import Similarity, best_rotation
@@ -20,7 +18,6 @@ from msgs_slam.pipelines.structure.tracks import complete_tracks
 
 Array = NDArray[np.float64]
 
-FILE = "given_poses.npz"
 _TURNS = (8.0, 3.0, 1.0)
 """Degrees by which rays of one point may miss, round after round: poses that are 3 degrees off still make points, and
 what is off by more is left out once these have been adjusted."""
@@ -29,31 +26,6 @@ _ROUNDS = 20
 _FAR_OFF = 5.0
 """Standard deviations from which a given pose is wrong altogether."""
 _LEAST_SD = 1e-6
-
-
-@dataclass(frozen=True)
-class GivenPoses:
-    """cam_from_world (F, 4, 4) of all frames, NaN for a frame without; whether in metres; `what` they are."""
-
-    cam_from_world: Array
-    is_metric: bool
-    what: str
-
-    @property
-    def known(self) -> NDArray[np.bool_]:
-        """(F,) which frames have one."""
-        return np.asarray(np.isfinite(self.cam_from_world).all(axis=(1, 2)))
-
-    def save(self, folder: Path) -> None:
-        """One file in the folder of the running stage."""
-        rest = {"is_metric": np.array(self.is_metric), "what": np.array(self.what)}
-        save_arrays(folder / FILE, {"cam_from_world": self.cam_from_world, **rest})
-
-    @staticmethod
-    def load(path: Path) -> GivenPoses:
-        """Load what `save` wrote."""
-        a = load_arrays(path)
-        return GivenPoses(a["cam_from_world"], bool(a["is_metric"]), str(a["what"]))
 
 
 @dataclass(frozen=True)

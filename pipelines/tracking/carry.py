@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import Similarity
-from msgs_slam.pipelines.source.known_poses import load_given
-from msgs_slam.pipelines.structure.given import GivenPoses, agreement
+from msgs_slam.pipelines.run.files import GIVEN_POSES
+from msgs_slam.pipelines.structure.given import agreement
 from msgs_slam.pipelines.system.wording import stretches
 from msgs_slam.pipelines.tracking.segments import move_segment
 from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, TrackState
+from msgs_slam.pipelines.types import GivenPoses
 
 Array = NDArray[np.float64]
 
@@ -25,7 +26,7 @@ _MOST_SCALE_SD = 0.1
 
 def carry_given(context: StageContext, state: TrackState) -> dict[str, Any]:
     """Join the state's segments by the given poses, and pose lost frames by them, in place; figures of it."""
-    given = load_given(context.run)
+    given = context.run.find(GIVEN_POSES)
     if given is None:
         return {}
     joined = join_by_given(state, given)

@@ -11,6 +11,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.video import probe_video
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.run.before import FINAL, save_before
+from msgs_slam.pipelines.run.files import CALIBRATION
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import EXTENSION, SOURCE_LIST, STAGES
 from msgs_slam.pipelines.run.records import Manifest, Source, load_records, load_source, write_manifest
@@ -35,7 +36,7 @@ def require_extendable(run: RunFolder, videos: Sequence[Path], config: Config, p
     unfinished = [s for s in needed if s not in done or run.damaged(s)]
     if unfinished:
         raise InputError(f"{run.root}: {unfinished[0]} is not done. Run `msgs-slam resume {run.root}` first")
-    if run.load_calibration().directions > 1:
+    if run.load(CALIBRATION).directions > 1:
         raise InputError(
             f"{run.root} was made from panoramas, and only a run of ordinary videos can be extended: reconstruct "
             "all the recordings together, in a new run"

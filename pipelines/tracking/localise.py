@@ -13,6 +13,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.video import VideoFrame
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.frames.learned import open_learned, picture_features
+from msgs_slam.pipelines.run.files import CALIBRATION, SPARSE
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.source.opening import VideoSource
 from msgs_slam.pipelines.source.sharpness import reduce_image
@@ -38,7 +39,7 @@ def require_overlap(
 ) -> None:
     """Raise InputError for the first video in which fewer than two pictures are recognised, or whose pictures are
     recognised much better by another focal length than that of the run."""
-    state = TrackState.from_backbone(run.load_sparse("global_ba"), FEATURE_SD, shutter=load_shutter(run))
+    state = TrackState.from_backbone(run.load(SPARSE, "global_ba"), FEATURE_SD, shutter=load_shutter(run))
     pictures = _WithAdded(run, settings)
     lens = _lens_of(run, settings)
     for video in videos:
@@ -78,7 +79,7 @@ class _WithAdded(Pictures):
 
 
 def _lens_of(run: RunFolder, settings: FramesConfig) -> Lens:
-    known = run.load_calibration()
+    known = run.load(CALIBRATION)
     if not settings.intrinsics:
         return make_lens(calibrated_camera(known))
     size = known.intrinsics.width, known.intrinsics.height
@@ -104,7 +105,7 @@ def _require_same_focal(run: RunFolder, video: Path, seen: Sequence[Sightings], 
     best = sorted((s for s in seen if len(s) >= MIN_INLIERS), key=len)[-_ENOUGH:]
     if not best:
         return
-    camera = run.load_calibration().intrinsics
+    camera = run.load(CALIBRATION).intrinsics
 
     def agreeing(factor: float) -> int:
         lens = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)

@@ -13,6 +13,7 @@ from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.correspondence.features import to_grey
 from msgs_slam.pipelines.correspondence.retrieval import describe
 from msgs_slam.pipelines.frames.learned import open_learned, picture_features
+from msgs_slam.pipelines.run.files import CALIBRATION, FEATURES, FRAMES, VOCABULARY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.structure.rolling import Shutter
 from msgs_slam.pipelines.types import Features, ProxyMaps
@@ -38,7 +39,7 @@ class _Recent(Generic[T]):
 
 def load_shutter(run: RunFolder) -> Shutter:
     """Load the readout and the times of a run's frames."""
-    return Shutter(run.load_calibration().readout, np.array([f.timestamp for f in run.load_frames()]))
+    return Shutter(run.load(CALIBRATION).readout, np.array([f.timestamp for f in run.load(FRAMES)]))
 
 
 class Pictures:
@@ -46,9 +47,9 @@ class Pictures:
 
     def __init__(self, run: RunFolder, settings: FramesConfig, kept: int = 12) -> None:
         self.run, self.settings = run, settings
-        self.vocabulary = run.load_vocabulary()
-        self.frames = {f.id: f for f in run.load_frames()}
-        self.intrinsics = run.load_calibration().intrinsics
+        self.vocabulary = run.load(VOCABULARY)
+        self.frames = {f.id: f for f in run.load(FRAMES)}
+        self.intrinsics = run.load(CALIBRATION).intrinsics
         self._learned = open_learned(settings)
         self._grey = _Recent(lambda i: to_grey(self.color(i)), kept)
         self._left_out = _Recent(lambda i: run.left_out(self.frames[i]), kept)
@@ -82,7 +83,7 @@ class Pictures:
         return self._features(frame_id)
 
     def _load_features(self, frame_id: int) -> Features:
-        kept = self.run.load_features(frame_id)
+        kept = self.run.find(FEATURES, of=frame_id)
         if kept is not None:
             return kept
         return picture_features(self.color(frame_id), self.left_out(frame_id), self.settings, self._learned)

@@ -7,8 +7,16 @@ from typing import Any
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.geometry.rig import Rig, rig_of
-from msgs_slam.pipelines.run.folder import save_depth_fields, save_figures, save_sparse, save_trajectory
-from msgs_slam.pipelines.source.known_poses import load_given
+from msgs_slam.pipelines.run.files import (
+    BACKBONE,
+    CALIBRATION,
+    DEPTH_FIELDS,
+    FIGURES,
+    FRAMES,
+    GIVEN_POSES,
+    SPARSE,
+    TRAJECTORY,
+)
 from msgs_slam.pipelines.structure.rolling import Shutter
 from msgs_slam.pipelines.system.memory import release_free_memory
 from msgs_slam.pipelines.system.stopping import is_asked
@@ -30,15 +38,15 @@ SNAPSHOT_EVERY, SNAPSHOTS = 50, 20
 
 def run(context: StageContext) -> dict[str, Any]:
     """Keyframes from structure from motion, every other frame against them, then everything adjusted together."""
-    frames = context.run.load_frames()
-    proxy = context.run.load_proxy_report()
+    frames = context.run.load(FRAMES)
+    proxy = context.run.load(FIGURES["proxy"])
     settings = without_dependent_depth(context.config.tracking, proxy)
     metric = bool(proxy.get("metric", False))
     pictures = Pictures(context.run, context.config.frames)
     intrinsics = pictures.intrinsics
 
     state = track_frames(context, frames, pictures)
-    if len(state.poses) < 2 and load_given(context.run) is None:
+    if len(state.poses) < 2 and context.run.find(GIVEN_POSES) is None:
         raise InputError(
             f"{context.source}: no camera motion could be recovered from {len(frames)} frames. A still camera, pure "
             "rotation or images without texture give no parallax; film while walking, or choose another part"
@@ -56,15 +64,15 @@ def run(context: StageContext) -> dict[str, Any]:
     save_pieces(context, pieces, frames)
 
     trajectory = to_trajectory(state, frames)
-    save_trajectory(context.folder, trajectory)
+    TRAJECTORY.save(context.folder, trajectory)
     model = to_sparse_model(state)
-    save_sparse(context.folder, model)
-    save_depth_fields(context.folder, align_depths(model, report, intrinsics, pictures.proxy))
+    SPARSE.save(context.folder, model)
+    DEPTH_FIELDS.save(context.folder, align_depths(model, report, intrinsics, pictures.proxy))
     figures = {**describe(state, frames, report, metric), **carried}
     figures["pieces"] = [len(p.poses) for p in pieces]
     if "reference_relative_sd" in proxy:  # what the user's reference leaves open; depths agree far better
         figures["scale_relative_sd"] = proxy["reference_relative_sd"]
-    save_figures(context.folder, "tracking", figures)
+    FIGURES["tracking"].save(context.folder, figures)
     lost = set(state.lost).difference(*(p.poses for p in pieces))
     if lost:
         context.warn(f"{len(lost)} frames have no pose: {stretches(lost)}")
@@ -74,7 +82,7 @@ def run(context: StageContext) -> dict[str, Any]:
 def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures) -> TrackState:
     """Every frame visited once; goes on from the last snapshot."""
     snapshot = context.snapshot / "state.npz"
-    rig = rig_of(context.run.load_calibration().directions, len(frames))
+    rig = rig_of(context.run.load(CALIBRATION).directions, len(frames))
     shutter = load_shutter(context.run)
     state = TrackState.load(snapshot, rig, shutter) if snapshot.exists() else start_state(context, rig, shutter)
     front_end = FrontEnd(state, pictures, context.config.run.seed)
@@ -96,13 +104,13 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
 
 def start_state(context: StageContext, rig: Rig, shutter: Shutter) -> TrackState:
     """The backbone, its parts and what structure from motion could place only among itself as segments, or nothing."""
-    backbone = context.run.load_backbone()
+    backbone = context.run.find(BACKBONE)
     if backbone is None:
         return TrackState(rig=rig, shutter=shutter)
     state = TrackState.from_backbone(backbone, FEATURE_SD, rig, shutter)
     split_segments(state)
     for piece in context.run.pieces("frames"):
-        state.add_segment(TrackState.from_backbone(context.run.load_sparse("frames", piece), FEATURE_SD))
+        state.add_segment(TrackState.from_backbone(context.run.load(SPARSE, "frames", piece=piece), FEATURE_SD))
     return state
 
 
@@ -110,8 +118,8 @@ def save_pieces(context: StageContext, pieces: list[TrackState], frames: list[Fr
     """Write the disconnected components, each in a world and a unit of its own."""
     for number, piece in enumerate(pieces, 2):
         folder = context.folder / f"piece_{number}"
-        save_trajectory(folder, to_trajectory(piece, frames))
-        save_sparse(folder, to_sparse_model(piece))
+        TRAJECTORY.save(folder, to_trajectory(piece, frames))
+        SPARSE.save(folder, to_sparse_model(piece))
         context.warn(
             f"{len(piece.poses)} frames ({stretches(sorted(piece.poses))}) form a disconnected component: they are "
             f"exported separately, as piece_{number}"

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.jsonfile import read_json_object, write_json
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.run.folder import WORLD, RunFolder
-from msgs_slam.pipelines.run.layouts import reading
+from msgs_slam.pipelines.run.layouts import RunFile
 from msgs_slam.pipelines.upright.find import Upright, cameras_up
 from msgs_slam.pipelines.upright.georeference import Georeference
 
@@ -28,7 +25,8 @@ _Y_DOWN_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 @dataclass(frozen=True)
 class World:
     """axes "up" (z up) or "first" (the run's own); the source of up ("" without any), whether z = 0 is a floor, and
-    by how many degrees each other witness of up differs; `earth`: its place, if x is east and y is north."""
+    by how many degrees each other witness of up differs; `earth`: its place, if x is east and y is north; `unit`:
+    "metre" or "free"."""
 
     axes: str
     told_by: str
@@ -36,6 +34,7 @@ class World:
     exported_from_run: Similarity
     against: dict[str, float] = field(default_factory=dict)
     earth: Georeference | None = None
+    unit: str = "free"
 
     @property
     def gltf_from_exported(self) -> Array:
@@ -86,50 +85,35 @@ def world_figures(world: World) -> dict[str, Any]:
     return figures
 
 
-def save_world(folder: Path, world: World, unit: str) -> Path:
-    """world.json: what the axes mean, how sure, and exported = scale * rotation @ run + translation."""
+def _pack(world: World) -> dict[str, Any]:
+    """What the axes mean, how sure, and exported = scale * rotation @ run + translation."""
     move = world.exported_from_run
-    path = folder / WORLD
-    write_json(
-        path,
-        {
-            "axes": world.axes,
-            "up": "z" if world.axes == "up" else "unknown",
-            "up_told_by": world.told_by,
-            "floor_at_zero": world.has_floor,
-            "unit": unit,
-            "degrees_from_up": world.against,
-            **({} if world.earth is None else {"georeference": asdict(world.earth) | {"frame": "east north up"}}),
-            "exported_from_run": {
-                "scale": move.scale, "rotation": move.rotation.tolist(), "translation": move.translation.tolist()
-            },
+    return {
+        "axes": world.axes,
+        "up": "z" if world.axes == "up" else "unknown",
+        "up_told_by": world.told_by,
+        "floor_at_zero": world.has_floor,
+        "unit": world.unit,
+        "degrees_from_up": world.against,
+        **({} if world.earth is None else {"georeference": asdict(world.earth) | {"frame": "east north up"}}),
+        "exported_from_run": {
+            "scale": move.scale, "rotation": move.rotation.tolist(), "translation": move.translation.tolist()
         },
-    )  # fmt: skip
-    return path
+    }  # fmt: skip
 
 
-def load_world(run: RunFolder) -> World | None:
-    """The world of the files in the run's export; None where nothing, or an older version, has exported it."""
-    return read_world(run.file("export", WORLD)) if run.has("export", WORLD) else None
-
-
-def read_world(path: Path) -> World:
-    """Inverse of `save_world`. Raises InputError for a file that is missing or damaged."""
-    value = read_json_object(path)
-    with reading(path, "world of the exported files"):
-        move, earth = value["exported_from_run"], value.get("georeference")
-        return World(
-            axes=str(value["axes"]),
-            told_by=str(value["up_told_by"]),
-            has_floor=bool(value["floor_at_zero"]),
-            exported_from_run=Similarity(
-                float(move["scale"]),
-                np.array(move["rotation"], dtype=np.float64),
-                np.array(move["translation"], dtype=np.float64),
-            ),
-            against={str(name): float(v) for name, v in value["degrees_from_up"].items()},
-            earth=None if earth is None else _earth(earth),
-        )
+def _unpack(value: Any) -> World:
+    move, earth = value["exported_from_run"], value.get("georeference")
+    rotation, translation = (np.array(move[name], dtype=np.float64) for name in ("rotation", "translation"))
+    return World(
+        axes=str(value["axes"]),
+        told_by=str(value["up_told_by"]),
+        has_floor=bool(value["floor_at_zero"]),
+        exported_from_run=Similarity(float(move["scale"]), rotation, translation),
+        against={str(name): float(v) for name, v in value["degrees_from_up"].items()},
+        earth=None if earth is None else _earth(earth),
+        unit=str(value["unit"]),
+    )
 
 
 def _earth(value: dict[str, Any]) -> Georeference:
@@ -139,9 +123,13 @@ def _earth(value: dict[str, Any]) -> Georeference:
     return Georeference(origin, float(value["residual"]), used, fixes, float(value["scale_sd"]))
 
 
+WORLD: RunFile[World] = RunFile("world.json", ("export",), "world of the exported files", _unpack, _pack)
+"""The world of the files in the run's export; none where nothing, or an older version, has exported it."""
+
+
 def up_in_run(outcome: Outcome) -> Array:
     """(3,) up in the run's world: as it was exported, else as the cameras were held."""
-    world = load_world(outcome.run)
+    world = outcome.run.find(WORLD)
     if world is not None and world.axes == "up":
         return np.asarray(world.exported_from_run.rotation[2])
     trajectory = outcome.trajectory

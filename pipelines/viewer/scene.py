@@ -21,11 +21,12 @@ from msgs_slam.pipelines.gaussian_map import decided_channels
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.outcome import Outcome, evenly, labels_of_channels, load_outcome
 from msgs_slam.pipelines.proxy.palette import class_colors
-from msgs_slam.pipelines.run.folder import MESH, WORLD, RunFolder
+from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, MESH
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.types import Frame, Metres
 from msgs_slam.pipelines.upright.find import cameras_up
-from msgs_slam.pipelines.upright.world import load_world, read_world, up_in_run
+from msgs_slam.pipelines.upright.world import WORLD, up_in_run
 from msgs_slam.pipelines.viewer.camera_path import EXPORTED, RUN
 
 MODES = ("colour", "classes", "depth")
@@ -135,7 +136,7 @@ def load_scenes(path: Path) -> list[ViewerScene]:
 
 
 def _from_run(outcome: Outcome) -> ViewerScene:
-    world, up, run = load_world(outcome.run), up_in_run(outcome), outcome.run
+    world, up, run = outcome.run.find(WORLD), up_in_run(outcome), outcome.run
     outcome = outcome if world is None else on_earth(outcome.moved(world.exported_from_run), world)
     m, cloud = outcome.require_map(), map_cloud(outcome)
     t, k = outcome.trajectory, outcome.calibration.intrinsics
@@ -179,7 +180,7 @@ def _from_tracking(outcome: Outcome) -> ViewerScene:
 
 def _from_frames(run: RunFolder, is_done: bool) -> ViewerScene:
     """Keyframes and points of structure from motion, or nothing before they are found."""
-    model = run.load_backbone() if is_done else None
+    model = run.find(BACKBONE) if is_done else None
     if model is None or not len(model.frame_ids):
         return _of_points(run, None, [], np.array([0.0, -1, 0]))
     world_from_cam = np.asarray(np.linalg.inv(model.cam_from_world), np.float64)
@@ -206,7 +207,7 @@ def _of_points(
     shown = ViewerScene(run.root.name, cloud, scale, up, run=run, world=RUN, what=POINTS, is_empty=is_empty)
     if not cameras:
         return shown
-    frames, k = run.load_frames(), run.load_calibration().intrinsics
+    frames, k = run.load(FRAMES), run.load(CALIBRATION).intrinsics
     fov, aspect = 2 * float(np.arctan(k.height / 2 / k.fy)), k.width / k.height
     seen = [ViewerCamera(frames[i], pose, fov, aspect) for i, pose in evenly(cameras, MOST_CAMERAS)]
     return replace(shown, cameras=seen)
@@ -230,8 +231,8 @@ def _from_file(path: Path) -> ViewerScene:
 
 def up_of_file(path: Path) -> NDArray[np.float64]:
     """z in a PLY of this program's export, as world.json beside it says; else y points down, as in most splat files."""
-    world = path.with_name(WORLD)
-    stands = path.suffix == ".ply" and world.is_file() and read_world(world).axes == "up"
+    world = path.with_name(WORLD.name)
+    stands = path.suffix == ".ply" and world.is_file() and WORLD.read(world).axes == "up"
     return np.array([0.0, 0, 1] if stands else [0.0, -1, 0])
 
 

@@ -20,7 +20,7 @@ from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.evaluation.pictures import label_picture
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.world import read_world
+from msgs_slam.pipelines.upright.world import WORLD
 from tests.benchmarks.textured_mesh import VertexColours
 
 WIDTH = 400
@@ -50,7 +50,7 @@ def drawn(outcome: Outcome, row: int) -> dict[str, NDArray[np.uint8]]:
     """Map, classes and mesh as the camera of that frame sees them."""
     cam_from_world = outcome.trajectory.cam_from_world[row]
     view = render_outcome(outcome, cam_from_world)
-    world = read_world(outcome.run.file("export", "world.json"))
+    world = WORLD.read(outcome.run.file("export", "world.json"))
     mesh = read_mesh_ply(outcome.run.file("export", "mesh.ply"))
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     normals = np.zeros_like(mesh.vertices, dtype=np.float64)

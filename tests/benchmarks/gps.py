@@ -26,7 +26,7 @@ from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_source
 from msgs_slam.pipelines.source.opening import FolderSource, open_source
 from msgs_slam.pipelines.upright.georeference import georeference
-from msgs_slam.pipelines.upright.world import load_world
+from msgs_slam.pipelines.upright.world import WORLD
 
 Array = NDArray[np.float64]
 WRONG, OFF = 12, np.array([500.0, 0, 0])
@@ -98,7 +98,7 @@ def main() -> None:
     arguments = parser.parse_args()
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     run = RunFolder(arguments.run)
-    outcome, world = load_outcome(run), load_world(run)
+    outcome, world = load_outcome(run), run.find(WORLD)
     if world is None or world.earth is None:
         sys.exit(f"{run.root}: its export has no place on the Earth")
     source = open_source(Path(load_source(run).path), outcome.config.run.format)

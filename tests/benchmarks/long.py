@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.run.files import BACKBONE, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import STAGES
 from tests.world import ClipOptions, write_sequence
@@ -88,7 +89,7 @@ def poses_of(name: str, work: Path, camera: dict[str, Any], settings: list[str])
     """One row of `frames` alone: how far its keyframes are off."""
     video, truth, run = prepared(name, work, camera)
     msgs_slam("reconstruct", video, "--out", run, "--until", STAGES[0], "-q", *settings)
-    backbone, frames = RunFolder(run).load_backbone(), RunFolder(run).load_frames()
+    backbone, frames = RunFolder(run).find(BACKBONE), RunFolder(run).load(FRAMES)
     assert backbone is not None
     stage = json.loads((run / "manifest.json").read_text())["stages"][STAGES[0]]
     centers, path = true_path(truth)

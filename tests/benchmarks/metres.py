@@ -32,6 +32,7 @@ from msgs_slam.pipelines.proxy.learned.labels import OnnxLabels
 from msgs_slam.pipelines.proxy.learned.network_pass import ResultCache, Workplace
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, PROXY_MAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Trajectory
@@ -71,7 +72,7 @@ def reconstruct(name: str, work: Path) -> RunFolder:
 
 def true_scale(run: RunFolder, trajectory: Trajectory, truth: Path) -> float:
     """Metres per unit of the run by Sim(3) alignment of its camera centres."""
-    frames = run.load_frames()
+    frames = run.load(FRAMES)
     if truth.suffix == ".txt":  # a pose for every frame of the video
         true = read_matrices(truth)[[f.source_index for f in frames]]
     else:
@@ -87,13 +88,13 @@ def with_names(run: RunFolder, seen: Seen, store: ModelStore) -> Seen:
     model = store.first_here("segmentation")
     if seen.is_named or model is None:
         return seen
-    calibration, backbone = run.load_calibration(), run.load_backbone()
+    calibration, backbone = run.load(CALIBRATION), run.find(BACKBONE)
     camera = calibration.intrinsics.at_most(640)
-    sequence = Sequence(run.load_frames(), calibration, camera, backbone, run.image)
+    sequence = Sequence(run.load(FRAMES), calibration, camera, backbone, run.image)
     frames = [f for f in sequence.frames if f.id in set(seen.frame_ids)]
     depths = {}
     for frame in frames:
-        maps = run.load_proxy(frame.id)
+        maps = run.load(PROXY_MAPS, of=frame.id)
         depths[frame.id] = DepthEstimate(maps.depth, maps.confidence)
     with tempfile.TemporaryDirectory() as scratch:
         place = Workplace(
@@ -114,7 +115,7 @@ def with_names(run: RunFolder, seen: Seen, store: ModelStore) -> Seen:
 def measure(name: str, work: Path, store: ModelStore) -> list[dict[str, Any]]:
     """One row for each source, for all without networks, and for all."""
     run = reconstruct(name, work)
-    trajectory = run.load_trajectory("tracking")
+    trajectory = run.load(TRAJECTORY, "tracking")
     true = true_scale(run, trajectory, DATA / JOBS[name].truth)
     seen = load_seen(run, trajectory)
     model = store.first_here("depth", metres_only=True)

@@ -52,10 +52,11 @@ from msgs_slam.pipelines.proxy.palette import class_colors
 from msgs_slam.pipelines.proxy.selection import choose_semantics
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
+from msgs_slam.pipelines.run.files import PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.source.source_pixels import FramePixels
 from msgs_slam.pipelines.types import VOID, ClassTable
-from msgs_slam.pipelines.upright.world import FIRST, load_world
+from msgs_slam.pipelines.upright.world import FIRST, WORLD
 
 DATA = ROOT.parent / "shared" / "data"
 SOURCES = {
@@ -136,7 +137,7 @@ class Labelled:
         place = {n: i for i, n in enumerate(self.names)}
         self._of_network = np.array([*(place[n] for n in card.labels), VOID], np.uint8)
         mesh = read_mesh_ply(run.stage("export") / "mesh.ply")
-        world = load_world(run) or FIRST
+        world = run.find(WORLD) or FIRST
         vertices = world.exported_from_run.inverse().apply(mesh.vertices.astype(np.float64))
         self._mesh, self._mesh_labels = cKDTree(vertices), mesh.labels
 
@@ -151,7 +152,7 @@ class Labelled:
         view = render_outcome(outcome, pose)
         return {
             "network": self._of_network[network_labels(self._network, output, width, height)[0]],
-            "fused": resample_nearest(outcome.run.load_proxy(frame_id).labels, height, width),
+            "fused": resample_nearest(outcome.run.load(PROXY_MAPS, of=frame_id).labels, height, width),
             "map": view.labels,
             "mesh": self._at_surface(view.depth, pose),
         }

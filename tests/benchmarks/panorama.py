@@ -26,8 +26,9 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
 from msgs_slam.pipelines.geometry.rig import CUBE, rig_of
 from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run.files import CALIBRATION, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.world import load_world
+from msgs_slam.pipelines.upright.world import WORLD
 from tests.world.build import World
 from tests.world.clip import ClipOptions, make_world, render_frame, render_view, walk
 from tests.world.panorama import render_panorama
@@ -55,8 +56,8 @@ def reconstruct(source: Path, run: Path, more: list[str]) -> None:
 
 def path_error(run: RunFolder, stage: str, truth: Array) -> tuple[Similarity, float, int]:
     """truth_from_run, root mean square error of the places in metres, and how many are posed."""
-    trajectory = run.load_trajectory(stage)
-    places = rig_of(run.load_calibration().directions, len(trajectory.frame_ids)).stations
+    trajectory = run.load(TRAJECTORY, stage)
+    places = rig_of(run.load(CALIBRATION).directions, len(trajectory.frame_ids)).stations
     posed = trajectory.is_posed & (trajectory.frame_ids < places)
     found, true = trajectory.centers[posed], truth[trajectory.frame_ids[posed], :3, 3]
     move = align_points(found, true)
@@ -110,7 +111,7 @@ def main() -> None:
             move, error, posed = path_error(run, stage, truth)
             print(f"{name}, {stage}: {posed} of {len(truth)} places, ATE {100 * error:.3f} cm", flush=True)
         if arguments.until == "export":
-            outcome, exported = load_outcome(run), load_world(run)
+            outcome, exported = load_outcome(run), run.find(WORLD)
             assert exported is not None
             gaussians = outcome.require_map()
             solid = gaussians.means[gaussians.opacity_logits > 0].numpy().astype(np.float64)

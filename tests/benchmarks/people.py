@@ -41,6 +41,7 @@ from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
+from msgs_slam.pipelines.run.files import CALIBRATION, FRAMES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.source.source_pixels import FramePixels
 from msgs_slam.pipelines.system.progress import SilentProgress
@@ -137,12 +138,12 @@ def run_case(case: str, folder: Path, threads: int, poses: bool, extra: list[str
 
 def measure_path(case: str, run: RunFolder, clip: Clip) -> tuple[dict[str, Any], Similarity]:
     """Error of the camera's path, what was masked, and the truth's world from the run's."""
-    frames, trajectory = run.load_frames(), run.load_trajectory("tracking")
+    frames, trajectory = run.load(FRAMES), run.load(TRAJECTORY, "tracking")
     rows = [clip.names.index(f.name) for f in frames]
     posed, truth = trajectory.is_posed, clip.world_from_cam[rows][:, :3, 3]
     true_from_ours = align_points(trajectory.centers[posed], truth[posed])
     error = np.linalg.norm(true_from_ours.apply(trajectory.centers[posed]) - truth[posed], axis=1)
-    pixels = FramePixels(run.load_calibration())
+    pixels = FramePixels(run.load(CALIBRATION))
     person = [pixels.sample(clip.person[r]) for r in rows]
     row = {
         "case": case,

@@ -23,6 +23,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from msgs_slam.pipelines.run.files import BACKBONE, FRAMES, TRAJECTORY
+
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
@@ -147,7 +149,7 @@ def measure(name: str, form: str, work: Path, settings: list[str], until: str) -
     acting: set[str] = set()
     with watched(acting):
         records, seconds = run_stages_timed(source, run, config, until)
-    frames = run.load_frames()
+    frames = run.load(FRAMES)
     figures = records["frames"].figures
     row = {
         "frames": len(frames), "keyframes": figures["keyframes"], "placed": figures["keyframes_placed"],
@@ -165,9 +167,9 @@ def measure(name: str, form: str, work: Path, settings: list[str], until: str) -
 def _poses(run: Any, until: str) -> tuple[list[int], Array]:
     """Frame ids and cam_from_world of what is posed: keyframes after structure from motion, every frame after that."""
     if until == "frames":
-        backbone = run.load_backbone()
+        backbone = run.find(BACKBONE)
         return [int(i) for i in backbone.frame_ids], backbone.cam_from_world
-    trajectory = run.load_trajectory(until)
+    trajectory = run.load(TRAJECTORY, until)
     return np.flatnonzero(trajectory.is_placed).tolist(), trajectory.cam_from_world[trajectory.is_placed]
 
 

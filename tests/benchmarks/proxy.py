@@ -40,6 +40,7 @@ from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.geometry.camera import project, unproject_depth
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
+from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, CLASSES, FIGURES, FRAMES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame, ProxyMaps
@@ -123,7 +124,7 @@ def run_proxy(source: Path, run: RunFolder, *settings: str) -> TimedProgress:
 
 def keyframes(run: RunFolder) -> list[Frame]:
     """The frames that have maps."""
-    return [f for f in run.load_frames() if run.has_proxy(f.id)]
+    return [f for f in run.load(FRAMES) if run.holds(PROXY_MAPS, of=f.id)]
 
 
 # depth ----------------------------------------------------------------------------------------------------------
@@ -134,7 +135,7 @@ def measure_depth(case: Case, run: RunFolder) -> dict[str, Any]:
     ratios, reliabilities = [], []
     names = sorted((p.name for p in case.pictures.glob(case.glob)), key=natural_key)
     for frame in keyframes(run):
-        maps = run.load_proxy(frame.id)
+        maps = run.load(PROXY_MAPS, of=frame.id)
         truth = case.truth(names[frame.source_index], maps.depth.shape[1], maps.depth.shape[0])
         known = truth > 0
         ratio = np.where(maps.depth > 0, np.log(np.maximum(maps.depth, 1e-9) / np.where(known, truth, 1)), np.inf)
@@ -142,7 +143,7 @@ def measure_depth(case: Case, run: RunFolder) -> dict[str, Any]:
         ratios.append(ratio[known][::7].astype(np.float32))
         reliabilities.append(maps.confidence[known][::7])
     ratio, u = np.concatenate(ratios), np.concatenate(reliabilities)
-    metric = bool(run.load_proxy_report()["metric"])
+    metric = bool(run.load(FIGURES["proxy"])["metric"])
     scale = float(np.median(ratio[u > RELIABLE]))
     error = np.abs(np.expm1(ratio - (0 if metric else scale)))
     order = np.argsort(u, kind="stable")
@@ -168,7 +169,7 @@ def run_scale(case: Case, run: RunFolder) -> float:
     names = sorted((p.name for p in case.pictures.glob(case.glob)), key=natural_key)
     ratios = []
     for frame in keyframes(run):
-        maps = run.load_proxy(frame.id)
+        maps = run.load(PROXY_MAPS, of=frame.id)
         truth = case.truth(names[frame.source_index], maps.depth.shape[1], maps.depth.shape[0])
         use = (truth > 0) & (maps.confidence > RELIABLE)
         ratios.append((maps.depth[use] / truth[use])[::7])
@@ -180,15 +181,15 @@ def run_scale(case: Case, run: RunFolder) -> float:
 
 def flicker(run: RunFolder, labels_of: dict[int, NDArray[np.uint8]] | None = None) -> float:
     """Share of pixels that change their label to the next keyframe, through reliable depth and the backbone's poses."""
-    calibration, model = run.load_calibration(), run.load_backbone()
+    calibration, model = run.load(CALIBRATION), run.find(BACKBONE)
     assert model is not None
-    report = run.load_proxy_report()
+    report = run.load(FIGURES["proxy"])
     unit = report.get("metres_per_unit", 1.0)
     poses = dict(zip(model.frame_ids.tolist(), model.cam_from_world, strict=True))
     frames = [f for f in keyframes(run) if f.id in poses]
     changed = compared = 0
     for first, second in pairwise(frames):
-        a, b = run.load_proxy(first.id), run.load_proxy(second.id)
+        a, b = run.load(PROXY_MAPS, of=first.id), run.load(PROXY_MAPS, of=second.id)
         camera = calibration.intrinsics.at_most(max(a.depth.shape))
         second_from_first = poses[second.id] @ np.linalg.inv(poses[first.id])
         points = unproject_depth(a.depth / unit, camera) @ second_from_first[:3, :3].T + second_from_first[:3, 3]
@@ -218,7 +219,7 @@ def measure_network(name: str, work: Path) -> dict[str, Any]:
     raw: dict[int, NDArray[np.uint8]] = {}
     seconds = cpu_seconds = 0.0
     for frame in keyframes(run):
-        maps = run.load_proxy(frame.id)
+        maps = run.load(PROXY_MAPS, of=frame.id)
         image = cv2.resize(run.image(frame), maps.depth.shape[::-1], interpolation=cv2.INTER_AREA)
         started, cpu_started = time.monotonic(), time.process_time()
         output = network.run(np.asarray(image, np.uint8), network.box(image.shape[1], image.shape[0]))["output"]
@@ -230,7 +231,7 @@ def measure_network(name: str, work: Path) -> dict[str, Any]:
         "keyframes": len(raw),
         "frames_a_second": round(len(raw) / seconds, 1),
         "cpu_seconds_a_frame": round(cpu_seconds / len(raw), 3),
-        "classes": list(run.load_classes().names),
+        "classes": list(run.load(CLASSES).names),
         "flicker_network": flicker(run, raw),
         "flicker": flicker(run),
     }
@@ -254,10 +255,10 @@ def write_deeplab_card(work: Path) -> Path:
 def write_sheet(run: RunFolder, target: Path, count: int = 4) -> None:
     """Picture, depth, reliability and labels of a few keyframes."""
     frames = keyframes(run)
-    colors = np.array([*run.load_classes().colors], np.uint8)
+    colors = np.array([*run.load(CLASSES).colors], np.uint8)
     rows = []
     for frame in frames[:: max(1, len(frames) // count)][:count]:
-        maps = run.load_proxy(frame.id)
+        maps = run.load(PROXY_MAPS, of=frame.id)
         image = cv2.resize(run.image(frame), maps.depth.shape[::-1], interpolation=cv2.INTER_AREA)
         mixed = (image // 2 + colored_labels(maps, colors) // 2).astype(np.uint8)
         rows.append(np.concatenate([image, colored_depth(maps), grey(maps.confidence), mixed], 1))
@@ -300,7 +301,7 @@ def measure_embedded(name: str, work: Path, first: int) -> dict[str, Any]:
     run = run_of(name, work, first)
     progress = run_proxy(pictures_of(name, work, first), run)
     seconds = progress.seconds
-    report = run.load_proxy_report()
+    report = run.load(FIGURES["proxy"])
     row = {
         **measure_depth(CASES[name], run),
         "flicker": flicker(run),

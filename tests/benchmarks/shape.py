@@ -36,6 +36,7 @@ from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
 from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run.files import CALIBRATION, FRAMES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.source.source_pixels import FramePixels
 from msgs_slam.pipelines.types import Frame
@@ -69,18 +70,18 @@ class Pixels:
 
 def true_depths(run: RunFolder, truth: Path) -> dict[int, NDArray[np.float32]]:
     """True depth of the run's frames that have any, by id, as their undistorted pictures would show it."""
-    sequence, frames = open_sequence(truth), run.load_frames()
+    sequence, frames = open_sequence(truth), run.load(FRAMES)
     by_name = all(f.name for f in frames) and len({f.name for f in frames}) == len(frames)
-    matched, pixels = match_truth(frames, by_name, sequence), FramePixels(run.load_calibration())
+    matched, pixels = match_truth(frames, by_name, sequence), FramePixels(run.load(CALIBRATION))
     depths = {f.id: sequence.depth(int(k)) for f, k in zip(frames, matched.image, strict=True) if k >= 0}
     return {i: pixels.sample(d) for i, d in depths.items() if d is not None}
 
 
 def proxy_views(run: RunFolder, truths: dict[int, NDArray[np.float32]]) -> Iterator[View]:
     """The proxies of the keyframes with truth."""
-    for frame in run.load_frames():
-        if frame.id in truths and run.has_proxy(frame.id):
-            maps = run.load_proxy(frame.id)
+    for frame in run.load(FRAMES):
+        if frame.id in truths and run.holds(PROXY_MAPS, of=frame.id):
+            maps = run.load(PROXY_MAPS, of=frame.id)
             yield make_view(run, frame, maps.depth, maps.confidence, truths[frame.id])
 
 
@@ -88,11 +89,11 @@ def map_views(run: RunFolder, truths: dict[int, NDArray[np.float32]]) -> Iterato
     """The map's depth at the same keyframes, by the proxies' reliability."""
     outcome = load_outcome(run)
     poses = dict(zip(outcome.trajectory.frame_ids.tolist(), outcome.trajectory.cam_from_world, strict=True))
-    for frame in run.load_frames():
-        if frame.id in truths and frame.id in poses and run.has_proxy(frame.id):
+    for frame in run.load(FRAMES):
+        if frame.id in truths and frame.id in poses and run.holds(PROXY_MAPS, of=frame.id):
             depth = render_outcome(outcome, poses[frame.id]).depth
             height, width = depth.shape
-            trust = resample_nearest(run.load_proxy(frame.id).confidence, height, width)
+            trust = resample_nearest(run.load(PROXY_MAPS, of=frame.id).confidence, height, width)
             yield make_view(run, frame, depth, trust, truths[frame.id])
 
 

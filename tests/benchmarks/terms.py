@@ -28,6 +28,7 @@ from msgs_slam.pipelines.mapping.load import MappingInput, load_views
 from msgs_slam.pipelines.mapping.measure import mean_figures, measure_view
 from msgs_slam.pipelines.mapping.optimise import optimise_map
 from msgs_slam.pipelines.proxy.reliability import GAMMA, theta
+from msgs_slam.pipelines.run.files import FIGURES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -65,7 +66,7 @@ def trial(given: MappingInput, change: dict[str, Any]) -> dict[str, float]:
 def stretch(run: RunFolder, count: int) -> MappingInput:
     """The views of the first keyframes, and the held-out frames between them."""
     settings = MappingConfig(max_side=320, hold_out=8)
-    given = load_views(run, run.load_trajectory("tracking"), settings)
+    given = load_views(run, run.load(TRAJECTORY, "tracking"), settings)
     views = given.views[:count]
     held = [v for v in given.held_out if v.frame_id < views[-1].frame_id]
     return MappingInput(views, held, given.class_ids)
@@ -80,7 +81,7 @@ def main() -> None:
     found: dict[str, Any] = {}
     for path in given.runs:
         run = RunFolder(path)
-        agreement = run.load_proxy_report().get("label_agreement", 0.0)
+        agreement = run.load(FIGURES["proxy"]).get("label_agreement", 0.0)
         found[path.stem] = {"theta^gamma at the mean agreement": round(theta(agreement) ** GAMMA, 4)}
         print(path.stem, json.dumps(found[path.stem]), flush=True)
         views = stretch(run, given.keyframes) if given.keyframes else None

@@ -27,7 +27,7 @@ from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.jit import kernel
 from msgs_slam.pipelines.types import Intrinsics
-from msgs_slam.pipelines.upright.world import read_world
+from msgs_slam.pipelines.upright.world import WORLD
 
 SAMPLES = 2
 """A side of a pixel."""
@@ -46,7 +46,7 @@ def main() -> None:
 def measure(root: Path, folder: Path, every: int, picture: Path | None) -> None:
     """One line for the keyframes, one for the frames between."""
     outcome = load_outcome(RunFolder(root))
-    outcome = outcome.moved(read_world(folder / "world.json").exported_from_run)
+    outcome = outcome.moved(WORLD.read(folder / "world.json").exported_from_run)
     trajectory, camera = outcome.trajectory, outcome.calibration.intrinsics
     plain = read_mesh_ply(folder / "mesh.ply")
     drawers = [

@@ -32,6 +32,7 @@ from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
+from msgs_slam.pipelines.run.files import FRAMES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.world import ClipOptions, make_world, write_sequence
@@ -46,9 +47,9 @@ Depths = Iterator[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.flo
 
 def proxy_depths(run: RunFolder, truth: Sequence) -> Depths:
     """Of the proxy stage, weighted by its reliability."""
-    for frame in run.load_frames():
-        if run.has_proxy(frame.id):
-            maps = run.load_proxy(frame.id)
+    for frame in run.load(FRAMES):
+        if run.holds(PROXY_MAPS, of=frame.id):
+            maps = run.load(PROXY_MAPS, of=frame.id)
             yield maps.depth, maps.confidence, *_true(truth, frame.source_index, *maps.depth.shape)
 
 
@@ -58,7 +59,7 @@ def map_depths(run: RunFolder, truth: Sequence) -> Depths:
     index = {f.id: f.source_index for f in outcome.frames}
     poses = outcome.trajectory
     for frame_id, pose in zip(poses.frame_ids.tolist(), poses.cam_from_world, strict=True):
-        if run.has_proxy(frame_id):
+        if run.holds(PROXY_MAPS, of=frame_id):
             depth = render_outcome(outcome, pose).depth
             yield depth, np.ones_like(depth), *_true(truth, index[frame_id], *depth.shape)
 

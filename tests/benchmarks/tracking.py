@@ -30,6 +30,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from msgs_slam.pipelines.run.files import FIGURES, FRAMES, TRAJECTORY
+
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
@@ -165,11 +167,11 @@ def measure_ours(name: str, work: Path, settings: Sequence[str], until: str) -> 
     config = load_config(overrides=[*case.settings, *settings])
     with adjustment_timed() as adjusting:
         records, seconds = run_stages_timed(source, run, config, until)
-    trajectory, frames = run.load_trajectory(until), run.load_frames()
-    pieces = {piece: run.load_trajectory("tracking", piece) for piece in run.pieces("tracking")}
+    trajectory, frames = run.load(TRAJECTORY, until), run.load(FRAMES)
+    pieces = {piece: run.load(TRAJECTORY, "tracking", piece=piece) for piece in run.pieces("tracking")}
     originals = original_names(source, frames)
     truth = [case.truth(n, f.source_index) for n, f in zip(originals, frames, strict=True)]
-    metric = bool(run.load_proxy_report().get("metric", False))
+    metric = bool(run.load(FIGURES["proxy"]).get("metric", False))
     return {
         **errors(trajectory.cam_from_world, trajectory.is_placed, truth, metric),
         "pieces": {name: errors(t.cam_from_world, t.is_placed, truth, False) for name, t in pieces.items()},
@@ -294,7 +296,7 @@ def measure_colmap(name: str, work: Path, mapper: str) -> dict[str, Any]:
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     case = cases(work)[name]
     run = RunFolder(work / f"{name}.msgs")
-    frames = run.load_frames()
+    frames = run.load(FRAMES)
     source = prepare(name, case, work)
     folder = run.stage("frames") if source.is_file() else source
     names = [f.name for f in frames] if source.is_file() else original_names(source, frames)

@@ -33,6 +33,7 @@ from msgs_slam.pipelines.evaluation.surface_error import SurfaceError, depth_poi
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Intrinsics
 
@@ -46,7 +47,7 @@ class Sights:
     """Observations of a sample of points in the usable (K,) views: point and view (O,), pixels (O, 2)."""
 
     def __init__(self, run: RunFolder, usable: NDArray[np.bool_]) -> None:
-        model = run.load_backbone()
+        model = run.find(BACKBONE)
         order = np.argsort(model.obs_point, kind="stable")
         order = order[usable[model.obs_frame[order]]]
         point, view, xy = model.obs_point[order], model.obs_frame[order], model.obs_xy[order]
@@ -82,7 +83,7 @@ class Sights:
 
 def true_poses(run: RunFolder, truth: Path) -> Array:
     """(K, 4, 4) world from camera of the run's keyframes that are placed in `frames`, NaN where there is no truth."""
-    frames, placed = run.load_frames(), run.load_backbone().frame_ids
+    frames, placed = run.load(FRAMES), run.find(BACKBONE).frame_ids
     if truth.is_file():
         rows = np.loadtxt(truth).reshape(-1, 4, 4)
         poses = np.array([rows[f.source_index] for f in frames])[placed]
@@ -122,7 +123,7 @@ def main() -> None:
     for case in parser.parse_args().cases:
         folder, _, truth = case.partition("=")
         run = RunFolder(Path(folder))
-        camera, poses = run.load_calibration().intrinsics, true_poses(run, Path(truth))
+        camera, poses = run.load(CALIBRATION).intrinsics, true_poses(run, Path(truth))
         sights = Sights(run, np.isfinite(poses).all((1, 2)))
 
         def errors(p: Array, sights=sights, camera=camera, poses=poses) -> Array:  # type: ignore[no-untyped-def]
@@ -130,7 +131,7 @@ def main() -> None:
             return sights.errors(poses @ se3.exp(p[[3, 4, 5, 0, 1, 2]]), camera, camera.fx * np.exp(p[6]), p[7])
 
         best = least_squares(lambda p: np.sqrt(np.log1p((errors(p) / NOISE) ** 2)), np.zeros(8), max_nfev=25).x
-        ours = sights.errors(se3.inverse(run.load_backbone().cam_from_world), camera, camera.fx, 0.0)
+        ours = sights.errors(se3.inverse(run.find(BACKBONE).cam_from_world), camera, camera.fx, 0.0)
         for name, found in (("ours", ours), ("truth", errors(np.zeros(8))), ("truth, best arm and lens", errors(best))):
             shares = [found[(sights.span >= a) & (sights.span < b)] for a, b in pairwise(SPANS)]
             medians = [f"{np.median(s):.2f}" if len(s) else "" for s in (found, *shares)]

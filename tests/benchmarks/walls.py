@@ -15,7 +15,7 @@ from msgs_slam.pipelines.export.walls import Wall, find_walls
 from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.world import load_world
+from msgs_slam.pipelines.upright.world import WORLD
 
 STEP, VIEWS, JUMP = 4, 30, 1.06
 """Every so many pixels, of so many views; a depth that many times another's lies on another surface."""
@@ -51,7 +51,7 @@ def grid_faces(depth: NDArray) -> NDArray[np.int64]:
 def main() -> None:
     """Both lists of walls, in metres of the data set."""
     run, truth = RunFolder(Path(sys.argv[1])), open_sequence(Path(sys.argv[2]))
-    outcome, world = load_outcome(run, "cpu"), load_world(run)
+    outcome, world = load_outcome(run, "cpu"), run.find(WORLD)
     assert world is not None
     t, matched = outcome.moved(world.exported_from_run).trajectory, match_truth(outcome.frames, False, truth)
     rows = np.flatnonzero(t.is_posed & matched.has_pose)

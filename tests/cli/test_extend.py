@@ -16,6 +16,7 @@ from test_kill_and_resume import digests, finish, kill_when, start, written
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.se3 import inverse
+from msgs_slam.pipelines.run.files import MAP, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import locked
 from msgs_slam.pipelines.run.names import STAGES
@@ -70,13 +71,13 @@ def copied(videos: Videos, tmp_path: Path) -> Callable[[str], Path]:
 
 
 def centers_of(run: Path) -> np.ndarray:
-    trajectory = RunFolder(run).load_trajectory("global_ba")
+    trajectory = RunFolder(run).load(TRAJECTORY, "global_ba")
     assert trajectory.is_placed.all()
     return inverse(trajectory.cam_from_world)[:, :3, 3]
 
 
 def test_the_path_goes_on_in_the_world_that_was_there_and_the_map_grows(videos: Videos, extended: Path) -> None:
-    before, old_map = centers_of(videos.run), RunFolder(videos.run).load_map("global_ba")
+    before, old_map = centers_of(videos.run), RunFolder(videos.run).load(MAP, "global_ba")
     run, after = extended, centers_of(extended)
     assert len(after) == len(videos.centers)
     # Where the old frames were, to a fiftieth of what the path spans (160 x 120 pixels); not to the last bit, as all
@@ -87,7 +88,7 @@ def test_the_path_goes_on_in_the_world_that_was_there_and_the_map_grows(videos: 
     fit = align_points(after, videos.centers)
     error = np.sqrt(((fit.apply(after) - videos.centers) ** 2).sum(1).mean())
     assert 0 < error < 0.03
-    new_map = RunFolder(run).load_map("global_ba")
+    new_map = RunFolder(run).load(MAP, "global_ba")
     assert len(new_map) > 1.1 * len(old_map)
     # Added keyframes have seeded Gaussians, and those of before are still anchored where they were.
     anchors, old_anchors = (set(m.anchor_frame_ids.tolist()) for m in (new_map, old_map))
@@ -105,7 +106,7 @@ def test_the_path_goes_on_in_the_world_that_was_there_and_the_map_grows(videos: 
 
 def test_an_extended_run_is_extended_again_elsewhere(videos: Videos, extended: Path, tmp_path: Path) -> None:
     run = RunFolder(shutil.copytree(extended, tmp_path / "elsewhere.msgs"))
-    before, old_map = run.load_trajectory("global_ba"), run.load_map("global_ba")
+    before, old_map = run.load(TRAJECTORY, "global_ba"), run.load(MAP, "global_ba")
     done = invoke("extend", run.root, videos.third)
     assert done.exit_code == 0, done.output
     assert [p.name for p in run.root.glob("extension_*")] == ["extension_2"]
@@ -117,7 +118,7 @@ def test_an_extended_run_is_extended_again_elsewhere(videos: Videos, extended: P
     # The third video shows frames of the second again: they are where they were.
     again = known[FIRST.stop + THIRD.start - SECOND.start :]
     assert np.linalg.norm(after[len(known) :] - again, axis=1).max() < 0.04 * span
-    assert len(run.load_map("global_ba")) > 0.9 * len(old_map)
+    assert len(run.load(MAP, "global_ba")) > 0.9 * len(old_map)
 
 
 @pytest.mark.parametrize("made", [False, True], ids=["before", "after"])

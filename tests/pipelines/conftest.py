@@ -12,19 +12,12 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.images import write_rgb
+from msgs_slam.formats.jsonfile import write_json
 from msgs_slam.pipelines.config import Config, MappingConfig
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry.alignment import Similarity
-from msgs_slam.pipelines.run.folder import (
-    RunFolder,
-    save_calibration,
-    save_classes,
-    save_frames,
-    save_map,
-    save_trajectory,
-    write_json,
-)
-from msgs_slam.pipelines.run.proxy_files import proxy_path, save_proxy_maps
+from msgs_slam.pipelines.run.files import CALIBRATION, CLASSES, MAP, PROXY_MAPS, TRAJECTORY, save_frames
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import VOID, Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, Trajectory
 
 KEYFRAME_EVERY = 4
@@ -59,10 +52,10 @@ def oracle_run(truth: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Ora
         frames = _write_frames(run, truth, video)
         _write_proxy(run, truth, frames, metric, rename)
         trajectory = _trajectory(truth, frames, move, wrong_centers)
-        save_trajectory(run.stage("tracking"), trajectory)
+        TRAJECTORY.save(run.stage("tracking"), trajectory)
         gaussian_map, class_ids = _seeded_map(truth, move, pixel_stride)
-        save_map(run.stage("mapping"), gaussian_map)
-        save_trajectory(run.stage("mapping"), trajectory)
+        MAP.save(run.stage("mapping"), gaussian_map)
+        TRAJECTORY.save(run.stage("mapping"), trajectory)
         write_json(run.stage("mapping") / "mapping.json", {"class_ids": class_ids})
         if mesh:
             _write_mesh(run.stage("export") / "mesh.ply", gaussian_map)
@@ -84,7 +77,7 @@ def _write_frames(run: RunFolder, truth: Sequence, video: bool) -> list[Frame]:
     c = truth.camera
     assert c is not None
     intrinsics = Intrinsics(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
-    save_calibration(folder, Calibration(intrinsics, "given", 0.0, (0.0, 0.0, 0.0, 0.0)))
+    CALIBRATION.save(folder, Calibration(intrinsics, "given", 0.0, (0.0, 0.0, 0.0, 0.0)))
     return frames
 
 
@@ -92,7 +85,7 @@ def _write_proxy(run: RunFolder, truth: Sequence, frames: list[Frame], metric: b
     folder = run.stage("proxy")
     names = tuple(f"segment {i}" for i in range(len(truth.classes))) if rename else truth.class_names
     classes = ClassTable(names, tuple(c.color or (9, 9, 9) for c in truth.classes))
-    save_classes(folder, classes)
+    CLASSES.save(folder, classes)
     write_json(
         folder / "proxy.json", {"depth": "files:x", "semantics": "segments" if rename else "files:x", "metric": metric}
     )
@@ -101,7 +94,7 @@ def _write_proxy(run: RunFolder, truth: Sequence, frames: list[Frame], metric: b
         assert depth is not None
         assert labels is not None
         maps = ProxyMaps(depth, np.ones_like(depth), labels, np.ones_like(depth))
-        save_proxy_maps(proxy_path(folder, frame.id), maps)
+        PROXY_MAPS.save(folder, maps, frame.id)
     return classes
 
 

@@ -9,12 +9,13 @@ import numpy as np
 
 from msgs_slam.pipelines.correspondence.features import extract_features, to_grey
 from msgs_slam.pipelines.correspondence.retrieval import learn_vocabulary
-from msgs_slam.pipelines.run.folder import save_features, save_matching
+from msgs_slam.pipelines.run.files import FEATURES, MATCHED_PAIRS, VOCABULARY
 
 
 def keep_correspondences(folder: Path, pictures: Mapping[int, np.ndarray]) -> None:
     """Features of these keyframes (RGB), their vocabulary, and that no pair of them was tried."""
     features = {i: extract_features(to_grey(rgb), 1500, threshold=0.005) for i, rgb in pictures.items()}
     for frame_id, found in features.items():
-        save_features(folder, frame_id, found)
-    save_matching(folder, learn_vocabulary(list(features.values()), 0), {})
+        FEATURES.save(folder, found, of=frame_id)
+    VOCABULARY.save(folder, learn_vocabulary(list(features.values()), 0))
+    MATCHED_PAIRS.save(folder, {})

@@ -18,6 +18,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.trajectory import read_tum
 from msgs_slam.pipelines.export.stage import export_run
+from msgs_slam.pipelines.run.files import FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.run.settings_file import load_settings
@@ -36,7 +37,7 @@ def test_a_run_is_opened_and_drawn(oracle_run: OracleRun, tmp_path: Path) -> Non
     assert run.classes
     view = run.draw(run.world_from_cam[0])
     assert view.color.shape == (run.intrinsics.height, run.intrinsics.width, 3)
-    photo = folder.image(folder.load_frames()[0]) / 255
+    photo = folder.image(folder.load(FRAMES)[0]) / 255
     assert 0 < np.abs(view.color - photo)[view.coverage > 0.9].mean() < 0.1
     with pytest.raises(ValueError, match=r"\(4, 4\)"):
         run.draw(np.eye(3))

@@ -15,7 +15,8 @@ from msgs_slam.pipelines.depth.posed import CANDIDATES, PosedDepth, overlaps
 from msgs_slam.pipelines.depth.see_through import contradicted
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.mapping.load import MappingInput
-from msgs_slam.pipelines.run.folder import RunFolder, save_depth_fields
+from msgs_slam.pipelines.run.files import CALIBRATION, DEPTH_FIELDS, PROXY_MAPS, SPARSE
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 
 Maps = dict[int, ProxyMaps]
@@ -23,12 +24,12 @@ Maps = dict[int, ProxyMaps]
 
 @pytest.fixture(scope="module")
 def truth(small_run: RunFolder) -> Maps:
-    return {i: small_run.load_proxy(i) for i in small_run.load_sparse("tracking").frame_ids.tolist()}
+    return {i: small_run.load(PROXY_MAPS, of=i) for i in small_run.load(SPARSE, "tracking").frame_ids.tolist()}
 
 
 @pytest.fixture(scope="module")
 def align(small_run: RunFolder) -> Callable[..., DepthFields]:
-    model, intrinsics = small_run.load_sparse("tracking"), small_run.load_calibration().intrinsics
+    model, intrinsics = small_run.load(SPARSE, "tracking"), small_run.load(CALIBRATION).intrinsics
 
     def run(maps: Maps, points: bool = True, expected: Mapping[int, NDArray] | None = None) -> DepthFields:
         return align_keyframes(model if points else without_points(model), intrinsics, maps.get, expected or {})
@@ -103,11 +104,11 @@ def test_pixels_left_out_do_not_move_the_others() -> None:
 
 def test_wild_points_do_not_drag_the_depth(truth: Maps, small_run: RunFolder) -> None:
     rng = np.random.default_rng(1)
-    model = small_run.load_sparse("tracking")
+    model = small_run.load(SPARSE, "tracking")
     center = model.points_in_world.mean(0)
     wild = rng.random(len(model.points_in_world)) < 0.2
     points = np.where(wild[:, None], center + 3 * (model.points_in_world - center), model.points_in_world)
-    camera = small_run.load_calibration().intrinsics
+    camera = small_run.load(CALIBRATION).intrinsics
     fields = align_keyframes(replace(model, points_in_world=points), camera, truth.get, {})
     assert relative_error(truth, truth, fields) < 0.01
 
@@ -115,8 +116,8 @@ def test_wild_points_do_not_drag_the_depth(truth: Maps, small_run: RunFolder) ->
 def test_fields_come_back_from_disk(tmp_path, truth: Maps, align: Callable[..., DepthFields]) -> None:  # type: ignore[no-untyped-def]
     run, fields = RunFolder(tmp_path), align(with_scaled_depth(truth, smooth_noise()))
     for some in (fields, DepthFields({})):
-        save_depth_fields(run.stage("tracking"), some)
-        back = run.load_depth_fields("tracking")
+        DEPTH_FIELDS.save(run.stage("tracking"), some)
+        back = run.load(DEPTH_FIELDS, "tracking")
         assert list(back.of_frame) == list(some.of_frame)
         assert all(np.array_equal(back.of_frame[i], f) for i, f in some.of_frame.items())
     maps = truth[0]

@@ -21,7 +21,7 @@ from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Frame
-from msgs_slam.pipelines.upright.world import World, save_world
+from msgs_slam.pipelines.upright.world import WORLD, World
 from tests.pipelines.part_of_sequence import part_of
 
 OracleRun = Callable[..., RunFolder]
@@ -147,7 +147,7 @@ def test_a_mesh_exported_into_another_world_is_brought_back(oracle_run: OracleRu
     mesh = trimesh.load(file, force="mesh", process=False)
     mesh.vertices = MOVE.apply(mesh.vertices)
     mesh.export(file)
-    save_world(run.stage("export"), World("up", "floor", True, MOVE), "free")
+    WORLD.save(run.stage("export"), World("up", "floor", True, MOVE))
     note_finished(run, outcome.records)
     moved = mesh_cells(load_outcome(run), matched, alignment)
     assert moved["accuracy"] == pytest.approx(plain["accuracy"], rel=0.05)

@@ -16,9 +16,10 @@ from msgs_slam.pipelines.evaluation.lengths import camera_height, extents, found
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.geometry.tape import tape_text
 from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Metres
-from msgs_slam.pipelines.upright.world import World, save_world
+from msgs_slam.pipelines.upright.world import WORLD, World
 from tests.world.room import HEIGHT, LENGTH, WIDTH
 
 OracleRun = Callable[..., RunFolder]
@@ -27,7 +28,7 @@ TURNED = Similarity(0.5, np.array([[0.8, -0.6, 0], [0, 0, -1], [0.6, 0.8, 0]]), 
 
 def _exported(run: RunFolder, move: Similarity, floor: bool = True) -> RunFolder:
     (run.stage("export")).mkdir(exist_ok=True)
-    save_world(run.stage("export"), World("up", "floor", floor, move), "free")
+    WORLD.save(run.stage("export"), World("up", "floor", floor, move))
     note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
     return run
 
@@ -80,7 +81,7 @@ def test_what_is_not_known_is_not_told(oracle_run: OracleRun) -> None:
     assert found_lengths(load_outcome(run)) == []
     rows = dict(found_lengths(load_outcome(_exported(run, TURNED, floor=False))))
     assert "height of the camera over the floor" not in rows
-    t = run.load_trajectory("tracking")
+    t = run.load(TRAJECTORY, "tracking")
     lost = tuple("lost" if i > 3 else "" for i in range(len(t.lost_reasons)))
     few = load_outcome(run)
     assert path_length(replace(few, trajectory=replace(t, is_keyframe=t.frame_ids == 0, lost_reasons=lost))) is None

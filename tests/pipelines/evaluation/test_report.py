@@ -19,9 +19,10 @@ from msgs_slam.pipelines.evaluation.report import write_report
 from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, write_evaluation
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.run.folder import RunFolder, save_trajectory
+from msgs_slam.pipelines.run.files import TRAJECTORY
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import LoopEdge
-from msgs_slam.pipelines.upright.world import SAME, World, save_world
+from msgs_slam.pipelines.upright.world import SAME, WORLD, World
 
 OracleRun = Callable[..., RunFolder]
 VOID_TAGS = {"img", "meta", "rect", "line", "path", "circle"}
@@ -60,7 +61,7 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
     classes[0]["name"] = "<script>alert(1)</script>"
     (run.stage("proxy") / "classes.json").write_text(json.dumps(classes))
     run.stage("export").mkdir(exist_ok=True)
-    save_world(run.stage("export"), World("up", "floor", True, SAME), "metre")
+    WORLD.save(run.stage("export"), World("up", "floor", True, SAME))
     note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
     (run.stage("export") / "point_cloud.spz").write_bytes(bytes(30_000))  # by `export --only`, later than the stage
     html = write_report(run).read_text()
@@ -99,10 +100,10 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
 
 def test_report_of_a_run_without_a_map_and_with_lost_frames(oracle_run: OracleRun) -> None:
     run = oracle_run()
-    t = run.load_trajectory("tracking")
+    t = run.load(TRAJECTORY, "tracking")
     reasons = tuple("too few matches" if 5 <= i < 8 else ("blurred" if i == 8 else "") for i in range(32))
     lost = replace(t, is_keyframe=t.is_keyframe & ~np.array([bool(r) for r in reasons]), lost_reasons=reasons)
-    save_trajectory(run.stage("tracking"), lost)
+    TRAJECTORY.save(run.stage("tracking"), lost)
     note_finished(run, ("frames", "proxy", "tracking"))
     outcome = load_outcome(run)
     assert [(s.first, s.last, s.reason) for s in lost_stretches(outcome)] == [

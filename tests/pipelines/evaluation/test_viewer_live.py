@@ -10,7 +10,8 @@ from finished import note_finished
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.run.folder import RunFolder, save_backbone
+from msgs_slam.pipelines.run.files import BACKBONE, FRAMES, MAP, TRAJECTORY
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import locked
 from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.run.running import NotedProgress
@@ -26,14 +27,14 @@ OracleRun = Callable[..., RunFolder]
 def run(oracle_run: OracleRun) -> RunFolder:
     """A run whose `frames` has left its keyframes and points, of which nothing else is noted as done."""
     made = oracle_run(pixel_stride=8)
-    trajectory, found = made.load_trajectory("tracking"), made.load_map("mapping")
+    trajectory, found = made.load(TRAJECTORY, "tracking"), made.load(MAP, "mapping")
     rows, none = trajectory.is_keyframe, np.zeros(0, np.int64)
     colors = (255 * found.colors.clamp(0, 1)).byte().numpy()
     model = SparseModel(
         trajectory.frame_ids[rows], trajectory.cam_from_world[rows], found.means.double().numpy(), colors, none, none,
         np.zeros((0, 2)),
     )  # fmt: skip
-    save_backbone(made.stage("frames"), model)
+    BACKBONE.save(made.stage("frames"), model)
     note_finished(made, ())
     return made
 
@@ -46,14 +47,14 @@ def test_each_stage_brings_its_share(run: RunFolder, tmp_path: Path) -> None:
     note_finished(run, STAGES[:2])
     points = load_scenes(run.root)[0]
     assert (points.what, points.is_empty, points.world) == ("points", False, "run")
-    model = run.load_backbone()
+    model = run.find(BACKBONE)
     assert model is not None
     assert len(points.cameras) == len(model.frame_ids) == 8
     np.testing.assert_allclose(points.cloud.means, model.points_in_world, atol=1e-6)
     np.testing.assert_array_equal(points.colors["colour"], model.colors)
     note_finished(run, STAGES[:3])
     tracked = load_scenes(run.root)[0]
-    assert len(tracked.path) == len(run.load_frames())  # every frame has a pose by now
+    assert len(tracked.path) == len(run.load(FRAMES))  # every frame has a pose by now
     assert len(tracked.cameras) == 8
     note_finished(run, STAGES[:4])
     assert load_scenes(run.root)[0].what == "Gaussians"

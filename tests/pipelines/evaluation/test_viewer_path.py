@@ -20,7 +20,7 @@ from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.render_run import render_file, render_run
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.world import World, save_world
+from msgs_slam.pipelines.upright.world import WORLD, World
 from msgs_slam.pipelines.viewer.camera_path import EXPORTED, RUN, CameraPath, Keyframe, read_camera_path
 from tests.browser import BROWSER, browser
 
@@ -114,7 +114,7 @@ def test_a_run_is_drawn_from_the_keyframes_of_either_world(
     with pytest.raises(InputError, match=r"has none: run `msgs-slam resume"):
         render_run(run, tmp_path / "none", path=exported)
     move = Similarity(2.5, Rotation.from_euler("xyz", (20, 30, 40), degrees=True).as_matrix(), np.array([1.0, 2, 3]))
-    save_world(run.stage("export"), World("up", "cameras", False, move), "unit")
+    WORLD.save(run.stage("export"), World("up", "cameras", False, move))
     note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
     moved = np.linalg.inv(move.apply_to_poses(np.linalg.inv(truth.world_from_cam[[0, 28]])))
     exported = written(tmp_path, CameraPath(tuple(Keyframe(p, fov) for p in moved), 1.0, 2.0, EXPORTED))

@@ -13,7 +13,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.export.collision import MOST_FACES, with_floor
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.world import SAME, World, save_world
+from msgs_slam.pipelines.upright.world import SAME, WORLD, World
 
 OracleRun = Callable[..., RunFolder]
 
@@ -30,7 +30,7 @@ def test_nobody_falls_through_the_floor(oracle_run: OracleRun, tmp_path: Path) -
     room.visual.vertex_colors = np.full((len(room.vertices), 4), 200, np.uint8)
     assert len(room.faces) > MOST_FACES
     room.export(run.stage("export") / "mesh.ply")
-    save_world(run.stage("export"), World("up", "floor", True, SAME), "metre")
+    WORLD.save(run.stage("export"), World("up", "floor", True, SAME))
     note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
     path = export_run(run, tmp_path, "collision")[0]
     light = trimesh.load(path, force="mesh")

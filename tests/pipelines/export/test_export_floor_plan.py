@@ -16,7 +16,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.export.walls import Wall, find_walls
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.world import SAME, World, save_world
+from msgs_slam.pipelines.upright.world import SAME, WORLD, World
 
 OracleRun = Callable[..., RunFolder]
 ROOM = np.array([[0.0, 0], [6.4, 0], [6.4, 3.1], [4.2, 3.1], [4.2, 5.2], [0, 5.2]])
@@ -98,11 +98,11 @@ def test_the_plan_of_a_run(oracle_run: OracleRun, tmp_path: Path) -> None:
     mesh = room(0.005)
     mesh.visual.vertex_colors = np.full((len(mesh.vertices), 4), 200, np.uint8)
     mesh.export(run.stage("export") / "mesh.ply")
-    save_world(run.stage("export"), World("first", "", False, SAME), "metre")
+    WORLD.save(run.stage("export"), World("first", "", False, SAME))
     note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
     with pytest.raises(InputError, match="which way is up"):
         export_run(run, tmp_path, "floorplan")
-    save_world(run.stage("export"), World("up", "floor", True, SAME), "metre")
+    WORLD.save(run.stage("export"), World("up", "floor", True, SAME))
     note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
     path = export_run(run, tmp_path, "floorplan")[0]
     svg = ET.parse(path).getroot()

@@ -22,7 +22,8 @@ from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.run.folder import RunFolder, save_sparse
+from msgs_slam.pipelines.run.files import SPARSE
+from msgs_slam.pipelines.run.folder import RunFolder
 
 OracleRun = Callable[..., RunFolder]
 
@@ -31,7 +32,7 @@ OracleRun = Callable[..., RunFolder]
 def folder(oracle_run: OracleRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Cameras, pictures, points and Gaussians as in any export."""
     run, folder = oracle_run(video=True), tmp_path_factory.mktemp("opened") / "export"
-    save_sparse(run.stage("tracking"), sparse_model(load_outcome(run)))
+    SPARSE.save(run.stage("tracking"), sparse_model(load_outcome(run)))
     note_finished(run, ("frames", "proxy", "tracking", "mapping"))
     for kind in ("colmap", "ply"):
         export_run(run, folder, kind, settings=ExportConfig())

@@ -21,9 +21,10 @@ from msgs_slam.pipelines.export import textured
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.run.files import FRAMES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import EXPORTS
-from msgs_slam.pipelines.upright.world import read_world
+from msgs_slam.pipelines.upright.world import WORLD
 
 OracleRun = Callable[..., RunFolder]
 SETTINGS = ExportConfig(spz=True, splat_glb=True, texture=True, voxel=0.03)
@@ -47,7 +48,7 @@ def folder(run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def exported(run: RunFolder, folder: Path) -> Outcome:
     """What the run ended with, in the world of the files."""
-    world = read_world(folder / "world.json")
+    world = WORLD.read(folder / "world.json")
     assert world.axes == "up"
     return load_outcome(run).moved(world.exported_from_run)
 
@@ -57,7 +58,7 @@ def test_poses_are_the_same_everywhere(run: RunFolder, folder: Path, exported: O
     model = pycolmap.Reconstruction(folder / "sparse" / "0")
     names = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
     assert len(names) == len(t.frame_ids)
-    for frame, pose in zip(run.load_frames(), t.cam_from_world, strict=True):
+    for frame, pose in zip(run.load(FRAMES), t.cam_from_world, strict=True):
         np.testing.assert_allclose(names[frame.name], pose[:3], atol=1e-9)
         given, kept = folder / "images" / frame.name, run.stage("frames") / frame.name
         assert given.read_bytes() == kept.read_bytes()
@@ -114,7 +115,7 @@ def test_texture_shows_the_photographs(run: RunFolder, folder: Path, exported: O
     xy, z = project(mesh.vertices @ pose[:3, :3].T + pose[:3, 3], k)
     inside = (z > 0) & (xy > 0).all(1) & (xy < (k.width, k.height)).all(1)
     place = np.where(inside[:, None], xy, 0).astype(int)
-    depth = cv2.resize(run.load_proxy(frame.id).depth, (k.width, k.height), interpolation=cv2.INTER_NEAREST)
+    depth = cv2.resize(run.load(PROXY_MAPS, of=frame.id).depth, (k.width, k.height), interpolation=cv2.INTER_NEAREST)
     seen = inside & (np.abs(depth[place[:, 1], place[:, 0]] - z) < 0.02 * z)
     difference = np.abs(colors - run.image(frame)[place[:, 1], place[:, 0]])[seen].mean(axis=1)
     assert seen.sum() > 50

@@ -13,8 +13,9 @@ from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.stage import export_run, find_world
 from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run.files import CLASSES
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.world import save_world
+from msgs_slam.pipelines.upright.world import WORLD
 
 OracleRun = Callable[..., RunFolder]
 
@@ -25,7 +26,7 @@ def run(oracle_run: OracleRun) -> RunFolder:
     run = oracle_run(mesh=True)
     world, _ = find_world(load_outcome(run), ExportConfig())
     assert world.axes == "up"
-    save_world(run.stage("export"), world, "metre")
+    WORLD.save(run.stage("export"), world)
     note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
     return run
 
@@ -48,7 +49,7 @@ def test_usd_reads_the_mesh_with_its_colours_and_classes(run: RunFolder, tmp_pat
     np.testing.assert_array_equal(np.array(shape.GetFaceVertexIndicesAttr().Get()), mesh.faces.ravel())
     labels = UsdGeom.PrimvarsAPI(shape).GetPrimvar("label")
     np.testing.assert_array_equal(np.array(labels.Get()), mesh.labels)
-    assert list(shape.GetPrim().GetCustomDataByKey("classes")) == list(run.load_classes().names)
+    assert list(shape.GetPrim().GetCustomDataByKey("classes")) == list(run.load(CLASSES).names)
     linear = np.array(shape.GetDisplayColorPrimvar().Get())
     shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     np.testing.assert_allclose(255 * shown, mesh.colors, atol=0.01)

@@ -25,7 +25,7 @@ from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.export.writers import map_cloud
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.world import FIRST, read_world
+from msgs_slam.pipelines.upright.world import FIRST, WORLD
 from tests.browser import browser
 
 OracleRun = Callable[..., RunFolder]
@@ -38,7 +38,7 @@ def page(oracle_run: OracleRun, tmp_path_factory: pytest.TempPathFactory) -> tup
     """The page, and the outcome in its world."""
     run, folder = oracle_run(), tmp_path_factory.mktemp("web")
     assert [p.name for p in export_run(run, folder, "html")] == ["map.html", "world.json", "README.txt"]
-    world = read_world(folder / "world.json")
+    world = WORLD.read(folder / "world.json")
     return folder / "map.html", load_outcome(run).moved(world.exported_from_run)
 
 

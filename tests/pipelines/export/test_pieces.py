@@ -15,6 +15,7 @@ from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.evaluation.report import write_report
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.viewer.scene import load_scenes
 from tests.pipelines.frames.conftest import WALK_FRAMES, render, sideways, write_walk
@@ -58,7 +59,7 @@ def test_a_piece_has_all_that_a_run_has(whole: RunFolder) -> None:
     assert [f.name for f in piece.frames] == [f"view_{WALK_FRAMES + i:03d}.png" for i in range(APART)]
     assert len(piece.require_map()) > 500
     assert (
-        whole.load_trajectory("tracking").lost_reasons[WALK_FRAMES + 3]
+        whole.load(TRAJECTORY, "tracking").lost_reasons[WALK_FRAMES + 3]
         == "in piece_2, which is not connected to the rest"
     )
     centres, truth = piece.trajectory.centers, np.array([c for c, _ in sideways(APART)]) * [-1, 1, 1]

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets.camera import Camera
 from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.run.files import GIVEN_POSES
 from msgs_slam.pipelines.structure.candidates import GIVEN
-from msgs_slam.pipelines.structure.given import GivenPoses, agreement, posed_model
+from msgs_slam.pipelines.structure.given import agreement, posed_model
 from msgs_slam.pipelines.structure.lens import to_pycolmap, unknown_camera
+from msgs_slam.pipelines.types import GivenPoses
 from tests.pipelines.frames.made_views import structure_of, walk_round
 
 CAMERA = to_pycolmap(Camera(640, 480, 520.0, 520.0, 320.0, 240.0))
@@ -78,8 +80,7 @@ def test_given_poses_cost_nothing_where_the_pictures_are_enough(tmp_path: Path) 
 
 def test_they_are_kept_for_the_stages_behind(tmp_path: Path) -> None:
     given = GivenPoses(disturbed(walk_round(CAMERA).cam_from_world), True, "made up")
-    given.save(tmp_path)
-    again = GivenPoses.load(tmp_path / "given_poses.npz")
+    again = GIVEN_POSES.read(GIVEN_POSES.save(tmp_path, given))
     np.testing.assert_array_equal(again.cam_from_world, given.cam_from_world)
     assert (again.is_metric, again.what) == (True, "made up")
     assert given.known.sum() == 18

@@ -10,7 +10,7 @@ from msgs_slam.formats.images import read_grey_png, read_rgb, write_grey_png, wr
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.geometry.alignment import align_points
-from msgs_slam.pipelines.run.sparse_files import load_sparse_model
+from msgs_slam.pipelines.run.files import SPARSE
 from tests.pipelines.frames.conftest import HEIGHT, WIDTH, Walk
 
 Moving = tuple[Path, Path, list[np.ndarray]]
@@ -42,7 +42,7 @@ def test_a_board_that_crosses_the_picture_leaves_no_trace(
     figures = run(context)
     assert figures["masked_frames"] == len(covered)
     assert 0.2 < figures["masked_share"] < 0.3
-    model = load_sparse_model(context.folder / "backbone" / "model.npz")
+    model = SPARSE.read(context.folder / "backbone" / "model.npz")
     assert len(model.frame_ids) == len(covered)
     centres = np.linalg.inv(model.cam_from_world)[:, :3, 3]
     aligned = align_points(centres, bent_walk.centers[model.frame_ids])

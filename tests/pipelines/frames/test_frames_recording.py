@@ -22,6 +22,7 @@ from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth_file
 from msgs_slam.pipelines.proxy.sequence import Sequence as ProxySequence
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
+from msgs_slam.pipelines.run.files import CALIBRATION, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.source.opening import FolderSource, open_source
 from msgs_slam.pipelines.source.recording import RecordingSource
@@ -168,13 +169,13 @@ def test_a_data_set_is_reconstructed_with_what_it_knows(truth: Sequence, tmp_pat
     path, run = tum(truth, tmp_path / "set"), RunFolder(tmp_path / "set.msgs")
     config = load_config(overrides=["proxy.depth=files", "frames.rate=4", "run.threads=2"])
     reconstruct(path, run, config, SilentProgress(), until="tracking")
-    calibration = run.load_calibration()
+    calibration = run.load(CALIBRATION)
     assert calibration.origin == "given"
     assert truth.camera is not None
     assert calibration.intrinsics.fx == pytest.approx(truth.camera.fx)
-    assert run.load_frames()[0].timestamp > START - 1
+    assert run.load(FRAMES)[0].timestamp > START - 1
     result = evaluate_run(run, open_sequence(path))
-    assert result["frames"]["with true pose"] == result["frames"]["posed"] == len(run.load_frames())
+    assert result["frames"]["with true pose"] == result["frames"]["posed"] == len(run.load(FRAMES))
     assert 0 < result["trajectory"]["se3 all"]["rmse"] < 0.03
     # The same pictures under another name are another source.
     with pytest.raises(InputError, match="another source"):

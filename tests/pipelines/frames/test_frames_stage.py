@@ -21,9 +21,9 @@ from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.read_config import load_config
-from msgs_slam.pipelines.run.folder import BACKBONE, SPARSE, RunFolder, save_sparse
+from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, SPARSE
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.layouts import dataclass_from_json
-from msgs_slam.pipelines.run.sparse_files import load_sparse_model
 from msgs_slam.pipelines.source.opening import source_digest
 from msgs_slam.pipelines.structure import sfm
 from msgs_slam.pipelines.structure.window_size import windows_of
@@ -69,13 +69,13 @@ def finished(bent_walk: Walk, tmp_path_factory: pytest.TempPathFactory) -> tuple
 
 def test_the_walk_is_recovered(finished: tuple[StageContext, dict], bent_walk: Walk) -> None:
     context, figures = finished
-    calibration = context.run.load_calibration()
+    calibration = context.run.load(CALIBRATION)
     assert calibration.origin == "self-calibrated"
     error = abs(calibration.intrinsics.fx / bent_walk.focal - 1)
     assert 0 < error < 0.02
     assert 0 < calibration.focal_sd < 0.1 * bent_walk.focal
     assert abs(calibration.distortion[0] - bent_walk.k1) < 0.03
-    model = context.run.load_backbone()
+    model = context.run.find(BACKBONE)
     assert model is not None
     assert len(model.frame_ids) == figures["keyframes"] >= 8
     centers = -np.einsum("nji,nj->ni", model.cam_from_world[:, :3, :3], model.cam_from_world[:, :3, 3])
@@ -100,7 +100,7 @@ def test_workers_leave_the_same_bytes(
 
 def test_points_reproject_into_the_undistorted_frames(finished: tuple[StageContext, dict]) -> None:
     context, _ = finished
-    model, matrix = context.run.load_backbone(), context.run.load_calibration().intrinsics.matrix
+    model, matrix = context.run.find(BACKBONE), context.run.load(CALIBRATION).intrinsics.matrix
     assert model is not None
     np.testing.assert_array_equal(model.cam_from_world[0], np.eye(4))
     poses = model.cam_from_world[model.obs_frame]
@@ -111,7 +111,7 @@ def test_points_reproject_into_the_undistorted_frames(finished: tuple[StageConte
     error = np.linalg.norm(projected[:, :2] / projected[:, 2:] - model.obs_xy, axis=1)
     assert 0 < np.median(error) < 0.5
     assert error.max() < 6
-    frames = context.run.load_frames()
+    frames = context.run.load(FRAMES)
     first = model.obs_frame == 0
     rgb = context.run.image(frames[model.frame_ids[0]])
     x, y = model.obs_xy[first].astype(int).clip(0, [rgb.shape[1] - 1, rgb.shape[0] - 1]).T
@@ -121,17 +121,16 @@ def test_points_reproject_into_the_undistorted_frames(finished: tuple[StageConte
 
 def test_what_was_asked_of_a_model_is_not_saved_with_it(finished: tuple[StageContext, dict], tmp_path: Path) -> None:
     context, _ = finished
-    model = context.run.load_backbone()
+    model = context.run.find(BACKBONE)
     assert model is not None
     assert model.tree.n == model.seen.shape[0] == len(model.centers)
-    save_sparse(tmp_path, model)
-    assert (tmp_path / SPARSE).read_bytes() == (context.folder / BACKBONE).read_bytes()
+    assert SPARSE.save(tmp_path, model).read_bytes() == BACKBONE.path(context.folder).read_bytes()
 
 
 def test_frames_are_undistorted(finished: tuple[StageContext, dict], bent_walk: Walk) -> None:
     context, _ = finished
     center, rotation = list(sideways(WALK_FRAMES))[5]
-    frame = context.run.load_frames()[5]
+    frame = context.run.load(FRAMES)[5]
     straight = render(center, rotation, bent_walk.focal).astype(float)
     ours = context.run.image(frame).astype(float)
     bent = read_rgb(bent_walk.folder / frame.name).astype(float)
@@ -235,7 +234,7 @@ def test_given_intrinsics_are_kept(bent_walk: Walk, make_context: Callable[..., 
     assert calibration.distortion == (bent_walk.k1, 0.0, 0.0, 0.0)
     assert calibration.intrinsics.fx == pytest.approx(bent_walk.focal)  # barrel distortion needs no zoom
     assert figures["keyframes_placed"] == figures["keyframes"]
-    model = load_sparse_model(context.folder / "backbone" / "model.npz")
+    model = SPARSE.read(context.folder / "backbone" / "model.npz")
     centers = -np.einsum("nji,nj->ni", model.cam_from_world[:, :3, :3], model.cam_from_world[:, :3, 3])
     truth = bent_walk.centers[model.frame_ids]
     assert np.linalg.norm(align_points(centers, truth).apply(centers) - truth, axis=1).max() < 0.01
@@ -305,10 +304,10 @@ def test_what_shows_another_place_is_a_piece_of_its_own(
     context = make_context(folder, "frames.least_piece=5")
     run(context)
     context.folder.rename(context.run.stage("frames"))
-    backbone, pieces = context.run.load_backbone(), context.run.pieces("frames")
+    backbone, pieces = context.run.find(BACKBONE), context.run.pieces("frames")
     assert backbone is not None
     assert len(pieces) == 1
-    piece = context.run.load_sparse("frames", pieces[0])
+    piece = context.run.load(SPARSE, "frames", piece=pieces[0])
     assert backbone.frame_ids.max() < WALK_FRAMES <= piece.frame_ids.min()
     assert len(backbone.frame_ids) >= 10
     assert len(piece.frame_ids) >= 6

@@ -16,7 +16,8 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.read_config import load_config
-from msgs_slam.pipelines.run.folder import RunFolder, save_calibration
+from msgs_slam.pipelines.run.files import CALIBRATION
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import Manifest, Source, StageRecord, checksums, write_manifest
 from msgs_slam.pipelines.structure.adjust import adjust, reprojection_errors
 from msgs_slam.pipelines.structure.consistency import judge
@@ -228,7 +229,7 @@ def test_points_a_pixel_off_have_no_say_in_a_narrow_adjustment() -> None:
 @pytest.mark.parametrize(("keyframes", "differs"), [(100, False), (750, True)])
 def test_memory_makes_only_frames_of_long_recordings_again(keyframes: int, differs: bool, tmp_path: Path) -> None:
     run = RunFolder(tmp_path)
-    save_calibration(run.stage("frames"), Calibration(CAMERA, "given", 0.0, (0, 0, 0, 0)))
+    CALIBRATION.save(run.stage("frames"), Calibration(CAMERA, "given", 0.0, (0, 0, 0, 0)))
     files = checksums(run.stage("frames"))
     record = StageRecord("", files, 0, 0, {"keyframes": keyframes}, [], "")
     write_manifest(run.manifest_file, Manifest(Source("", ""), {"frames": record}))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from msgs_slam.formats.jsonfile import write_json
 from msgs_slam.pipelines.depth.fields import FINE, DepthFields
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.depth_error import DepthErrorSum
@@ -21,15 +22,17 @@ from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.stage import STAGE
 from msgs_slam.pipelines.mapping.views import occurring_classes
 from msgs_slam.pipelines.read_config import load_config
-from msgs_slam.pipelines.run.folder import (
-    RunFolder,
-    save_depth_fields,
-    save_exposure,
-    save_map,
-    save_trajectory,
-    write_json,
+from msgs_slam.pipelines.run.files import (
+    BACKBONE,
+    CALIBRATION,
+    DEPTH_FIELDS,
+    EXPOSURE,
+    MAP,
+    PROXY_MAPS,
+    SPARSE,
+    TRAJECTORY,
 )
-from msgs_slam.pipelines.run.sparse_files import save_sparse_model
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Trajectory
 from tests.pipelines.global_ba.test_global_ba_stage import FIRST_AGAIN, seeded_map
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames
@@ -61,32 +64,32 @@ def finish_mapping(made: MadeRun, frames: list[WorldFrame]) -> None:
     run = made.run
     for stage in ("tracking", "mapping"):
         run.stage(stage).mkdir()
-    backbone = run.load_backbone()
+    backbone = run.find(BACKBONE)
     assert backbone is not None
     grown = grown_about(se3.inverse(made.cam_from_world)[FIRST_AGAIN, :3, 3])
     model = drifted(replace(backbone, cam_from_world=made.cam_from_world[backbone.frame_ids]), grown)
     keyframes = model.frame_ids.tolist()
-    save_sparse_model(run.stage("tracking") / "sparse.npz", model)
+    SPARSE.save(run.stage("tracking"), model)
     scale = {k: GROWTH if k >= FIRST_AGAIN else 1.0 for k in keyframes}
     fields = {k: np.full((FINE.rows, FINE.columns), np.log(s)) for k, s in scale.items()}
-    save_depth_fields(run.stage("tracking"), DepthFields(fields))
+    DEPTH_FIELDS.save(run.stage("tracking"), DepthFields(fields))
     poses = made.cam_from_world.copy()
     poses[FIRST_AGAIN:] = grown.apply_to_poses(poses[FIRST_AGAIN:])
     ids = np.arange(len(frames))
     trajectory = Trajectory(ids, ids / 10, poses, np.isin(ids, keyframes), ("",) * len(frames))
-    save_trajectory(run.stage("mapping"), trajectory)
-    class_ids = occurring_classes([run.load_proxy(k).labels for k in keyframes])
+    TRAJECTORY.save(run.stage("mapping"), trajectory)
+    class_ids = occurring_classes([run.load(PROXY_MAPS, of=k).labels for k in keyframes])
     scaled = [replace(f, depth=f.depth * scale.get(i, 1.0)) for i, f in enumerate(frames)]
-    save_map(run.stage("mapping"), seeded_map(scaled, poses, keyframes, run, len(class_ids)))
+    MAP.save(run.stage("mapping"), seeded_map(scaled, poses, keyframes, run, len(class_ids)))
     nothing = np.zeros((len(keyframes), 3), np.float32)
-    save_exposure(run.stage("mapping"), model.frame_ids, nothing, nothing)
+    EXPOSURE.save(run.stage("mapping"), {"frame_ids": model.frame_ids, "log_gains": nothing, "offsets": nothing})
     write_json(run.stage("mapping") / "mapping.json", {"class_ids": list(class_ids)})
 
 
 def depth_error(run: RunFolder, stage: str, frames: list[WorldFrame]) -> float:
     """Mean error of the map's depth at the keyframes, metres after one scale."""
-    trajectory, gaussian_map = run.load_trajectory(stage), run.load_map(stage)
-    camera = run.load_calibration().intrinsics.resized(160, 120)
+    trajectory, gaussian_map = run.load(TRAJECTORY, stage), run.load(MAP, stage)
+    camera = run.load(CALIBRATION).intrinsics.resized(160, 120)
     total = DepthErrorSum()
     for row in np.flatnonzero(trajectory.is_keyframe):
         shown = view_map(gaussian_map, np.zeros(64, np.uint8), camera, trajectory.cam_from_world[row])
@@ -134,6 +137,6 @@ def test_refining_after_a_loop_does_not_bring_back_its_drift(
     assert before < 0.75 * open_loop
     assert after < before
     # The depths that it was refined by are in the world that the loop has made: one scale for both halves.
-    scales = {i: np.median(refined.load_depth_fields("global_ba").scales(i, 6, 8)) for i in range(0, 24, 2)}
+    scales = {i: np.median(refined.load(DEPTH_FIELDS, "global_ba").scales(i, 6, 8)) for i in range(0, 24, 2)}
     late, early = (np.median([s for i, s in scales.items() if (i >= FIRST_AGAIN) == x]) for x in (True, False))
     assert 0 < abs(late / early - 1) < 0.25 * (GROWTH - 1)

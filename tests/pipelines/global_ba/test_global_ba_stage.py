@@ -12,6 +12,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from msgs_slam.formats.jsonfile import write_json
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.engine.stages import StageContext
@@ -23,15 +24,18 @@ from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.stage import STAGE
 from msgs_slam.pipelines.mapping.views import occurring_classes
 from msgs_slam.pipelines.read_config import load_config
-from msgs_slam.pipelines.run.folder import (
-    RunFolder,
-    save_depth_fields,
-    save_exposure,
-    save_map,
-    save_trajectory,
-    write_json,
+from msgs_slam.pipelines.run.files import (
+    BACKBONE,
+    CALIBRATION,
+    DEPTH_FIELDS,
+    EXPOSURE,
+    LOOPS,
+    MAP,
+    PROXY_MAPS,
+    SPARSE,
+    TRAJECTORY,
 )
-from msgs_slam.pipelines.run.sparse_files import save_sparse_model
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Trajectory
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames, small_motion
 from tests.world.clip import WorldFrame
@@ -53,7 +57,7 @@ CONFIG = load_config(
 def finish_mapping(made: MadeRun, frames: list[WorldFrame]) -> None:
     """What tracking and mapping would have left: a drifted second half, and a map of one Gaussian a sample."""
     run = made.run
-    backbone = run.load_backbone()
+    backbone = run.find(BACKBONE)
     assert backbone is not None
     tracking, mapping = run.stage("tracking"), run.stage("mapping")
     tracking.mkdir()
@@ -62,18 +66,23 @@ def finish_mapping(made: MadeRun, frames: list[WorldFrame]) -> None:
     slip = small_motion(rng, 0.006, 0.03)
     # As after an adjustment: keyframes where they belong, but for the slip.
     model = doubled(replace(backbone, cam_from_world=made.cam_from_world[backbone.frame_ids]), slip)
-    save_sparse_model(tracking / "sparse.npz", model)
-    save_depth_fields(tracking, DepthFields({}))
+    SPARSE.save(tracking, model)
+    DEPTH_FIELDS.save(tracking, DepthFields({}))
     poses = made.cam_from_world.copy()
     poses[FIRST_AGAIN:] = poses[FIRST_AGAIN:] @ se3.inverse(slip)
     ids = np.arange(len(frames))
     trajectory = Trajectory(ids, ids / 10, poses, np.isin(ids, model.frame_ids), ("",) * len(frames))
-    save_trajectory(mapping, trajectory)
+    TRAJECTORY.save(mapping, trajectory)
     keyframes = model.frame_ids.tolist()
-    class_ids = occurring_classes([run.load_proxy(k).labels for k in keyframes])
-    save_map(mapping, seeded_map(frames, poses, keyframes, run, len(class_ids)))
-    save_exposure(
-        mapping, model.frame_ids, np.zeros((len(keyframes), 3), np.float32), np.zeros((len(keyframes), 3), np.float32)
+    class_ids = occurring_classes([run.load(PROXY_MAPS, of=k).labels for k in keyframes])
+    MAP.save(mapping, seeded_map(frames, poses, keyframes, run, len(class_ids)))
+    EXPOSURE.save(
+        mapping,
+        {
+            "frame_ids": model.frame_ids,
+            "log_gains": np.zeros((len(keyframes), 3), np.float32),
+            "offsets": np.zeros((len(keyframes), 3), np.float32),
+        },
     )
     write_json(mapping / "mapping.json", {"class_ids": list(class_ids)})
 
@@ -93,7 +102,7 @@ def doubled(model: SparseModel, slip: Array) -> SparseModel:
 def seeded_map(
     frames: list[WorldFrame], poses: Array, keyframes: list[int], run: RunFolder, classes: int
 ) -> GaussianMap:
-    intrinsics = run.load_calibration().intrinsics
+    intrinsics = run.load(CALIBRATION).intrinsics
     means, colors, anchors = [], [], []
     for k in keyframes:
         rows, columns = (x.ravel() for x in np.mgrid[4:240:8, 4:320:8])
@@ -145,16 +154,16 @@ def test_a_loop_is_closed_and_the_map_goes_along(
 ) -> None:
     monkeypatch.setattr("msgs_slam.pipelines.global_ba.candidates.LEAST_ALIKE", -1.0)
     made = mapped("run")
-    before = error(made.run.load_trajectory("mapping").cam_from_world, made.cam_from_world)
+    before = error(made.run.load(TRAJECTORY, "mapping").cam_from_world, made.cam_from_world)
     config = load_config(overrides=["global_ba.loop_gap=2", "global_ba.joint=never"])
     figures = finish(open_stage(made.run, "global_ba", config))
     assert figures["loops"] >= 1
     assert figures["moved_px"] > 0.5
-    after = made.run.load_trajectory("global_ba")
+    after = made.run.load(TRAJECTORY, "global_ba")
     assert 0 < error(after.cam_from_world, made.cam_from_world) < 0.5 * before
-    assert all(e.inliers >= 25 for e in made.run.load_loops())
+    assert all(e.inliers >= 25 for e in made.run.load(LOOPS))
     # The late keyframes' Gaussians are again where the early ones see the same surfaces.
-    old, new = made.run.load_map("mapping"), made.run.load_map("global_ba")
+    old, new = made.run.load(MAP, "mapping"), made.run.load(MAP, "global_ba")
     late = old.anchor_frame_ids >= FIRST_AGAIN
     early_shift, late_shift = ((new.means - old.means)[x].norm(dim=1).median() for x in (~late, late))
     assert abs(float(early_shift) - float(late_shift)) > 0.002
@@ -183,7 +192,7 @@ def test_joint_refinement_is_kept_only_where_it_helps_and_survives_interruption(
     assert figures["joint"] in ("kept", "thrown away")
     assert (figures["joint"] == "kept") == (figures["joint_psnr_after"] >= figures["joint_psnr_before"])
     context = open_stage(broken.run, "global_ba", config)
-    keyframes = int(broken.run.load_trajectory("mapping").is_keyframe.sum())  # a snapshot comes once a pass at most
+    keyframes = int(broken.run.load(TRAJECTORY, "mapping").is_keyframe.sum())  # a snapshot comes once a pass at most
     with pytest.raises(KeyboardInterrupt):
         STAGE.run(
             StageContext(context.run, context.source, config, context.folder, BreakOff("refining", keyframes + 3))

@@ -6,6 +6,7 @@ import pytest
 
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.mapping.load import MappingInput, load_views
+from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from tests.pipelines.mapping.small_run import make_run
 
@@ -19,4 +20,4 @@ def small_run(tmp_path_factory: pytest.TempPathFactory, world_sequence: Path) ->
 @pytest.fixture(scope="session")
 def room(small_run: RunFolder) -> MappingInput:
     """Its views, with every eighth frame held out."""
-    return load_views(small_run, small_run.load_trajectory("tracking"), MappingConfig(hold_out=8))
+    return load_views(small_run, small_run.load(TRAJECTORY, "tracking"), MappingConfig(hold_out=8))

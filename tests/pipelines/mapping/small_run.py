@@ -9,19 +9,19 @@ from finished import note_finished
 from numpy.typing import NDArray
 
 from msgs_slam.formats.images import read_rgb
+from msgs_slam.formats.jsonfile import write_json
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.run.folder import (
-    RunFolder,
-    save_calibration,
-    save_classes,
-    save_depth_fields,
+from msgs_slam.pipelines.run.files import (
+    CALIBRATION,
+    CLASSES,
+    DEPTH_FIELDS,
+    PROXY_MAPS,
+    SPARSE,
+    TRAJECTORY,
     save_frames,
-    save_trajectory,
-    write_json,
 )
-from msgs_slam.pipelines.run.proxy_files import proxy_path, save_proxy_maps
-from msgs_slam.pipelines.run.sparse_files import save_sparse_model
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import VOID, Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, Trajectory
 
 SIZE = (80, 60)
@@ -46,21 +46,19 @@ def make_run(root: Path, sequence: Path, every: int = 2) -> RunFolder:
         depth = grey(sequence / "depth" / frame.name).astype(np.float32) / 1000
         labels = grey(sequence / "labels" / frame.name)
         labels = np.where(labels == 0, VOID, labels).astype(np.uint8)
-        save_proxy_maps(
-            proxy_path(root / "proxy", frame.id),
-            ProxyMaps(depth, (depth > 0).astype(np.float32), labels, np.ones_like(depth)),
-        )
+        maps = ProxyMaps(depth, (depth > 0).astype(np.float32), labels, np.ones_like(depth))
+        PROXY_MAPS.save(root / "proxy", maps, frame.id)
         depths.append(depth)
     save_frames(root / "frames", frames)
-    save_calibration(root / "frames", Calibration(k, "given", 0.0, (0, 0, 0, 0)))
-    save_classes(root / "proxy", ClassTable(tuple(r["name"] for r in rows), tuple(tuple(r["color"]) for r in rows)))
+    CALIBRATION.save(root / "frames", Calibration(k, "given", 0.0, (0, 0, 0, 0)))
+    CLASSES.save(root / "proxy", ClassTable(tuple(r["name"] for r in rows), tuple(tuple(r["color"]) for r in rows)))
     write_json(root / "proxy" / "proxy.json", {"depth": "files", "semantics": "files", "metric": True})
     cam_from_world = np.linalg.inv(world_from_cam)
     n = len(frames)
     trajectory = Trajectory(np.arange(n), times, cam_from_world, np.ones(n, bool), ("",) * n)
-    save_trajectory(root / "tracking", trajectory)
-    save_depth_fields(root / "tracking", DepthFields({}))
-    save_sparse_model(root / "tracking" / "sparse.npz", points_seen_twice(k, cam_from_world, depths))
+    TRAJECTORY.save(root / "tracking", trajectory)
+    DEPTH_FIELDS.save(root / "tracking", DepthFields({}))
+    SPARSE.save(root / "tracking", points_seen_twice(k, cam_from_world, depths))
     note_finished(run, ("frames", "proxy", "tracking"), source=str(root))
     return run
 

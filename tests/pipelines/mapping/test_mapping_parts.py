@@ -16,6 +16,7 @@ from msgs_slam.pipelines.mapping.load import MappingInput, load_views, split_fra
 from msgs_slam.pipelines.mapping.poses import interpolate_rows, move_trajectory
 from msgs_slam.pipelines.mapping.schedule import RATE_DECAY, Schedule, Seeding
 from msgs_slam.pipelines.mapping.views import channel_table, halved, occurring_classes
+from msgs_slam.pipelines.run.files import CALIBRATION, CLASSES, PROXY_MAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import VOID, Intrinsics, Trajectory
 
@@ -31,7 +32,7 @@ def walk(count: int = 6) -> Trajectory:
 
 def test_views_without_room_are_the_same_views(small_run: RunFolder, room: MappingInput) -> None:
     """Read again at every use, those that others contradict left out as ever."""
-    trajectory, settings = small_run.load_trajectory("tracking"), MappingConfig(hold_out=8)
+    trajectory, settings = small_run.load(TRAJECTORY, "tracking"), MappingConfig(hold_out=8)
     given = load_views(small_run, trajectory, settings, memory=0)
     assert [len(given.views), len(given.held_out)] == [len(room.views), len(room.held_out)]
     assert given.class_ids == room.class_ids
@@ -48,22 +49,22 @@ def test_views_hold_what_the_run_says(small_run: RunFolder, room: MappingInput) 
     assert len(room.views) == 14
     assert [v.frame_id for v in room.held_out] == [4, 12]
     assert not {v.frame_id for v in room.views} & {4, 12}
-    view, maps = room.views[3], small_run.load_proxy(room.views[3].frame_id)
+    view, maps = room.views[3], small_run.load(PROXY_MAPS, of=room.views[3].frame_id)
     kept = view.depth.numpy() > 0
     assert kept.mean() > 0.97 * (maps.depth > 0).mean()
     assert np.array_equal(view.depth.numpy()[kept], maps.depth[kept])
     labels = np.array([*room.class_ids, *[VOID] * (256 - len(room.class_ids))])[view.channels.numpy()]
     assert (labels == maps.labels).mean() > 0.999
     assert VOID not in room.class_ids
-    assert 0 < len(room.class_ids) < len(small_run.load_classes())
+    assert 0 < len(room.class_ids) < len(small_run.load(CLASSES))
 
 
 def test_views_are_reduced_to_the_working_size(small_run: RunFolder) -> None:
-    loaded = load_views(small_run, small_run.load_trajectory("tracking"), MappingConfig(max_side=60))
+    loaded = load_views(small_run, small_run.load(TRAJECTORY, "tracking"), MappingConfig(max_side=60))
     view = loaded.views[0]
     assert view.depth.shape == (45, 60)
     assert view.image.shape == (45, 60, 3)
-    assert view.intrinsics.fx == pytest.approx(small_run.load_calibration().intrinsics.fx * 0.75)
+    assert view.intrinsics.fx == pytest.approx(small_run.load(CALIBRATION).intrinsics.fx * 0.75)
 
 
 def test_half_a_view_sees_the_same(room: MappingInput) -> None:
@@ -192,9 +193,8 @@ def test_a_view_without_proxy_counts_by_its_colours(small_run: RunFolder) -> Non
         **{n: getattr(small_run, n) for n in dir(small_run) if n.startswith("load")},
         image=small_run.image, left_out=small_run.left_out,
     )  # fmt: skip
-    run.has_proxy = lambda i: i != 2
     run.find_proxy = lambda i: small_run.find_proxy(i) if i != 2 else None
-    loaded = load_views(run, small_run.load_trajectory("tracking"), MappingConfig())  # type: ignore[arg-type]
+    loaded = load_views(run, small_run.load(TRAJECTORY, "tracking"), MappingConfig())  # type: ignore[arg-type]
     assert loaded.views[2].depth.max() == 0
     assert loaded.views[2].trust.max() == 0
     assert (loaded.views[2].channels == VOID).all()

@@ -22,11 +22,12 @@ from msgs_slam.pipelines.export.volume import Grid
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.mapping import stage as mapping_stage
 from msgs_slam.pipelines.mapping.load import load_views
+from msgs_slam.pipelines.run.files import CLASSES, EXPOSURE, MAP, SPARSE, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.memory import room_on
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID
-from msgs_slam.pipelines.upright.world import read_world
+from msgs_slam.pipelines.upright.world import WORLD
 from tests.pipelines.mapping.small_run import make_run
 from tests.pipelines.travelling import Travelling
 
@@ -56,13 +57,13 @@ def finished(tmp_path_factory: pytest.TempPathFactory, world_sequence: Path) -> 
 def test_mapping_says_how_good_it_is(finished: tuple[RunFolder, dict, dict]) -> None:
     run, figures, _ = finished
     assert 22 < figures["held_out_psnr"] < figures["keyframe_psnr"] < 60
-    assert figures["gaussians"] == len(run.load_map("mapping"))
+    assert figures["gaussians"] == len(run.load(MAP, "mapping"))
     assert figures["keyframes"] == 14
     stored = json.loads((run.stage("mapping") / "mapping.json").read_text())
-    assert len(stored["class_ids"]) == figures["classes"] == run.load_map("mapping").class_logits.shape[1]
-    before, after = run.load_trajectory("tracking"), run.load_trajectory("mapping")
+    assert len(stored["class_ids"]) == figures["classes"] == run.load(MAP, "mapping").class_logits.shape[1]
+    before, after = run.load(TRAJECTORY, "tracking"), run.load(TRAJECTORY, "mapping")
     assert 0 < np.abs(before.cam_from_world - after.cam_from_world).max() < 0.02
-    exposure = run.load_exposure()
+    exposure = run.load(EXPOSURE)
     assert exposure["log_gains"].shape == (14, 3)
 
 
@@ -95,7 +96,7 @@ def test_workers_leave_the_same_export(
 
 
 def exported_from_run(run: RunFolder) -> Similarity:
-    return read_world(run.stage("export") / "world.json").exported_from_run
+    return WORLD.read(run.stage("export") / "world.json").exported_from_run
 
 
 def test_splat_viewers_take_the_map(finished: tuple[RunFolder, dict, dict]) -> None:
@@ -104,7 +105,7 @@ def test_splat_viewers_take_the_map(finished: tuple[RunFolder, dict, dict]) -> N
     names = [p.name for p in vertex.properties]
     assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     assert names[9:18] == ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "class_id"]
-    gaussian_map = run.load_map("mapping").moved(exported_from_run(run))
+    gaussian_map = run.load(MAP, "mapping").moved(exported_from_run(run))
     assert len(vertex) == len(gaussian_map)
     assert np.allclose(vertex["x"], gaussian_map.means[:, 0], atol=1e-6)
     assert np.allclose(vertex["scale_2"], gaussian_map.log_radii)
@@ -117,12 +118,12 @@ def test_the_mesh_is_the_room(finished: tuple[RunFolder, dict, dict]) -> None:
     mesh = trimesh.load(run.stage("export") / "mesh.ply", process=False)
     assert len(mesh.vertices) == figures["vertices"] > 1000
     labels = mesh.metadata["_ply_raw"]["vertex"]["data"]["label"]
-    assert set(np.unique(labels)) <= {*range(len(run.load_classes())), VOID}
+    assert set(np.unique(labels)) <= {*range(len(run.load(CLASSES))), VOID}
     assert (labels != VOID).mean() > 0.9
     glb = trimesh.load(run.stage("export") / "mesh.glb", force="mesh")
     assert len(glb.faces) == len(mesh.faces)
     # Every triangulated point is exact and lies on a surface that two keyframes see.
-    points = exported_from_run(run).apply(run.load_sparse("tracking").points_in_world[::9])
+    points = exported_from_run(run).apply(run.load(SPARSE, "tracking").points_in_world[::9])
     distance = np.linalg.norm(points[:, None] - np.asarray(mesh.vertices)[None], axis=2).min(1)
     assert 0 < np.median(distance) < 0.06
 
@@ -162,7 +163,7 @@ def test_views_on_a_card_are_planned_by_its_own_memory(small_run: RunFolder, mon
     assert room_on("cuda", 64e9) == room_on(torch.device("cuda:0"), 64e9) == 1000
     assert room_on("cpu", 64e9) == 64e9
     monkeypatch.setattr("msgs_slam.pipelines.mapping.load.room_on", lambda device, host: room_on("cuda", host))
-    views = load_views(small_run, small_run.load_trajectory("tracking"), MappingConfig(), memory=64e9).views
+    views = load_views(small_run, small_run.load(TRAJECTORY, "tracking"), MappingConfig(), memory=64e9).views
     first = views[0]
     assert views[1] is not first
     assert views[0] is not first  # read again: a thousand bytes hold no two of them

@@ -4,12 +4,12 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from finished import note_finished
-from numpy.typing import NDArray
 from scipy import sparse
 
 from msgs_slam.formats.tensors import load_tensors
@@ -23,7 +23,9 @@ from msgs_slam.pipelines.mapping.build import refine_map
 from msgs_slam.pipelines.mapping.gauge import SeenExposures, common_exposure
 from msgs_slam.pipelines.mapping.submaps import BORDER, divide, nearest_seeing
 from msgs_slam.pipelines.outcome import load_outcome, maps_around
+from msgs_slam.pipelines.run.files import DEPTH_FIELDS, MAP, SUBMAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.layouts import RunFile
 from msgs_slam.pipelines.system.memory import LEAST_SUBMAP, submap_size
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Intrinsics
@@ -205,11 +207,11 @@ def finished(small_run: RunFolder, divided: tuple[Path, dict], tmp_path_factory:
 
 
 def test_a_shaken_map_is_refined_in_its_parts(finished: RunFolder, tmp_path: Path) -> None:
-    gaussian_map = finished.load_map("mapping")
+    gaussian_map = finished.load(MAP, "mapping")
     noise = torch.randn(gaussian_map.colors.shape, generator=torch.Generator().manual_seed(0))
     shaken = replace(gaussian_map, colors=gaussian_map.colors + 0.05 * noise)
     context = StageContext(finished, finished.root, CONFIG, tmp_path, SilentProgress())
-    poses, fields = finished.load_trajectory("mapping"), finished.load_depth_fields("tracking")
+    poses, fields = finished.load(TRAJECTORY, "mapping"), finished.load(DEPTH_FIELDS, "tracking")
     refined = refine_map(context, shaken, poses, fields, 2.0)
     assert refined.is_better
     assert refined.psnr_after > refined.psnr_before + 1
@@ -219,12 +221,12 @@ def test_a_shaken_map_is_refined_in_its_parts(finished: RunFolder, tmp_path: Pat
 
 def test_a_view_is_drawn_from_its_submap_and_those_beside_it(finished: RunFolder) -> None:
     class NothingBeside(RunFolder):
-        def load_submaps(self) -> list[dict[str, NDArray[np.int64]]]:
-            return [{**submap, "beside": np.zeros(0, np.int64)} for submap in super().load_submaps()]
+        def load(self, file: RunFile[Any], *where: str, **more: Any) -> Any:
+            return [{**submap, "beside": np.zeros(0, np.int64)} for submap in super().load(file, *where, **more)]
 
     outcome = load_outcome(finished, "cpu")
     near, own_alone = maps_around(outcome), maps_around(replace(outcome, run=NothingBeside(finished.root)))
-    anchors, submaps = outcome.require_map().anchor_frame_ids.numpy(), finished.load_submaps()
+    anchors, submaps = outcome.require_map().anchor_frame_ids.numpy(), finished.load(SUBMAPS)
     for submap in submaps:
         around = np.concatenate([submap["own"], *(submaps[n]["own"] for n in submap["beside"])])
         for frame_id in submap["own"].tolist():

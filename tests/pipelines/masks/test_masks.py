@@ -206,7 +206,7 @@ def test_frames_between_are_searched_where_a_keyframe_shows_people(
         write_rgb(tmp_path / "picked" / frame.name, image)
     masks = FrameMasks(load_config(), open_source(tmp_path / "picked"), tmp_path / "people", tmp_path / "picked", 1)
     masks.find_people(frames, [0, 3, 6, 9], SilentProgress())
-    searched = sorted(int(p.name[:6]) for p in (tmp_path / "people").iterdir())
+    searched = sorted(int(p.name[:6]) for p in (tmp_path / "people" / "masks").iterdir())
     assert searched == [0, *range(3, 10)]
     assert [f.id for f in frames if masks.left_out(f, WIDTH, HEIGHT) is not None] == [5, 6, 7]
 

@@ -8,8 +8,8 @@ import pytest
 from msgs_slam.formats.errors import InputError
 from msgs_slam.msgs_cli.tables import scale_lines
 from msgs_slam.pipelines.metres.evidence import Evidence, Mode, combine, measured
-from msgs_slam.pipelines.metres.files import load_metres, save_metres
 from msgs_slam.pipelines.metres.find import describe
+from msgs_slam.pipelines.run.files import METRES
 from msgs_slam.pipelines.run.folder import RunFolder
 
 
@@ -84,14 +84,14 @@ def test_what_is_stated_survives_the_disk_and_stands_in_status(tmp_path: Path) -
         measured("floor height", "camera height", 1.8, ((1.45, 0.2, 1.0),)),
     ])  # fmt: skip
     run = RunFolder(tmp_path)
-    save_metres(run.stage("export"), metres)
-    assert load_metres(run) == metres
+    METRES.save(run.stage("export"), metres)
+    assert run.find(METRES) == metres
     (line,) = scale_lines(tmp_path, {"export": None})  # type: ignore[dict-item]
     assert "1 unit = about 0.8" in line
     assert line.endswith("(estimated from 2 doors and floor height)")
     assert scale_lines(tmp_path, {}) == []
-    save_metres(run.stage("export"), None)
-    assert load_metres(run) is None
+    METRES.save(run.stage("export"), None)
+    assert run.find(METRES) is None
     (run.stage("export") / "scale.json").write_text('{"per_unit": "long"}')
     with pytest.raises(InputError, match=r"scale.json"):
-        load_metres(run)
+        run.find(METRES)

@@ -27,7 +27,8 @@ from msgs_slam.pipelines.metres.find import (
 from msgs_slam.pipelines.metres.heights import camera_height, floor_trust
 from msgs_slam.pipelines.metres.scene import Scene
 from msgs_slam.pipelines.metres.things import sizes_of_things
-from msgs_slam.pipelines.run.folder import RunFolder, save_depth_fields
+from msgs_slam.pipelines.run.files import DEPTH_FIELDS, FIGURES, TRAJECTORY
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.voxels.layout import FLOOR, OTHER, Gravity
 from msgs_slam.pipelines.voxels.voxels import Voxels
@@ -49,14 +50,14 @@ def run(oracle_run: OracleRun) -> RunFolder:
 
 def rescale_depth(run: RunFolder, factor: float) -> None:
     """What tracking says of proxy depth in a world of another unit."""
-    t = run.load_trajectory("tracking")
+    t = run.load(TRAJECTORY, "tracking")
     ids = t.frame_ids[t.is_keyframe]
-    save_depth_fields(run.stage("tracking"), DepthFields({int(i): np.full((9, 12), np.log(factor)) for i in ids}))
+    DEPTH_FIELDS.save(run.stage("tracking"), DepthFields({int(i): np.full((9, 12), np.log(factor)) for i in ids}))
     note_finished(run, STAGES_DONE)
 
 
 def found_in(run: RunFolder, guess: bool = True) -> Found:
-    return find_metres(run, run.load_trajectory("mapping"), None, Machine(), guess)
+    return find_metres(run, run.load(TRAJECTORY, "mapping"), None, Machine(), guess)
 
 
 def test_the_scale_is_found_within_its_sigmas_and_says_from_what(run: RunFolder) -> None:
@@ -96,13 +97,13 @@ def test_depth_in_a_wrong_unit_is_doubted(oracle_run: OracleRun) -> None:
     found = found_in(run)
     assert found.warning is not None
     assert "Check its unit" in found.warning
-    seen = load_seen(run, run.load_trajectory("mapping"))
+    seen = load_seen(run, run.load(TRAJECTORY, "mapping"))
     assert contradiction(known_evidence(run), usual_evidence(seen, None, Machine())) == found.warning
     assert found_in(oracle_run(pixel_stride=6)).warning is None
 
 
 def test_a_reference_wins_over_what_is_usual(run: RunFolder) -> None:
-    report = run.load_proxy_report()
+    report = run.load(FIGURES["proxy"])
     given = {"metric": True, "scale_from": "reference", "reference_relative_sd": 0.01}
     try:
         write_json(run.stage("proxy") / "proxy.json", report | given)

@@ -9,8 +9,8 @@ from proxy_room import Room, perfect_backbone, write_source
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.read_config import load_config
-from msgs_slam.pipelines.run.folder import RunFolder, save_calibration, save_frames
-from msgs_slam.pipelines.run.sparse_files import save_sparse_model
+from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, save_frames
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, Frame
 from tests.pipelines.kept import keep_correspondences
@@ -36,9 +36,9 @@ def make_context(room: Room, tmp_path: Path) -> Callable[..., StageContext]:
         run = RunFolder(tmp_path / name)
         folder = run.stage("frames")
         save_frames(folder, room.frames)
-        save_calibration(folder, room.calibration)
+        CALIBRATION.save(folder, room.calibration)
         if backbone:
-            save_sparse_model(folder / "backbone" / "model.npz", room.backbone)
+            BACKBONE.save(folder, room.backbone)
             keep_correspondences(folder, {i: room.views[i].rgb for i in room.backbone.frame_ids.tolist()})
         for frame in room.frames:
             write_rgb(folder / frame.name, room.views[frame.id].rgb)

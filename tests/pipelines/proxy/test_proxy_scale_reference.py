@@ -17,6 +17,7 @@ from msgs_slam.pipelines.proxy.scale_reference import Reference, parse_reference
 from msgs_slam.pipelines.proxy.stage import run
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
+from msgs_slam.pipelines.run.files import FRAMES, PROXY_MAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.tracking.stage import run as track
@@ -82,7 +83,7 @@ def test_a_known_distance_gives_metres(room: Room, make_context: Make) -> None:
     assert report["metres_per_unit"] != pytest.approx(1 / UNIT, rel=1e-7)
     assert report["reference_keyframes"] > 1  # not the named picture alone
     assert 0 < report["reference_relative_sd"] < 0.05
-    maps, view = context.run.load_proxy(5), room.views[5]
+    maps, view = context.run.load(PROXY_MAPS, of=5), room.views[5]
     ratio = maps.depth / view.depth
     assert np.median(ratio[maps.confidence > 0.35]) == pytest.approx(1, rel=0.02)
 
@@ -101,7 +102,7 @@ def test_tracking_makes_the_world_metric_by_it_without_taking_the_depth_for_news
     figures = track(tracking)
     assert figures["scale"] == "metric"
     assert figures["scale_relative_sd"] == reference["reference_relative_sd"]
-    centres = np.linalg.inv(context.run.load_trajectory("tracking").cam_from_world)[:, :3, 3]
+    centres = np.linalg.inv(context.run.load(TRAJECTORY, "tracking").cam_from_world)[:, :3, 3]
     truth = np.array([v.world_from_cam[:3, 3] for v in room.views])
     walked = np.linalg.norm(centres[-1] - centres[0]) / np.linalg.norm(truth[-1] - truth[0])
     assert walked == pytest.approx(1, rel=0.02)
@@ -137,7 +138,7 @@ def test_a_picture_whose_points_are_lost_says_what_to_choose(make_context: Make)
     context = make_context(*unfused, setting("000005:2.5,3.5,60.5,3.5=1"))
     for path in (context.source.parent / "depth").iterdir():
         path.unlink()
-    for frame in context.run.load_frames():
+    for frame in context.run.load(FRAMES):
         write_grey_png(context.source.parent / "depth" / frame.name, np.eye(192, 256, dtype=np.uint16) * 1000)
     with pytest.raises(InputError, match="reliable depth at both points"):
         run(context)

@@ -10,13 +10,13 @@ import pytest
 from proxy_room import UNIT, Room
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.jsonfile import read_json
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.proxy.files.depth import FilesDepth
 from msgs_slam.pipelines.proxy.files.labels import FilesLabels
 from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
 from msgs_slam.pipelines.proxy.stage import run
-from msgs_slam.pipelines.run.folder import read_json, save_calibration
-from msgs_slam.pipelines.run.proxy_files import load_proxy_maps, proxy_path
+from msgs_slam.pipelines.run.files import CALIBRATION, CLASSES, DESCRIPTORS, PROXY_MAPS
 from msgs_slam.pipelines.types import VOID, Frame
 
 Make = Callable[..., StageContext]
@@ -36,9 +36,9 @@ def test_files_become_maps_with_reliability(room: Room, make_context: Make) -> N
     assert report["metric"] is True
     assert report["frames"] == len(room.frames)
     assert context.warnings == []
-    classes = context.run.load_classes()
+    classes = context.run.load(CLASSES)
     for frame in room.frames[::4]:
-        maps, view = context.run.load_proxy(frame.id), room.views[frame.id]
+        maps, view = context.run.load(PROXY_MAPS, of=frame.id), room.views[frame.id]
         error = np.abs(maps.depth / view.depth - 1)
         assert 0 < error[maps.confidence > 0.36].max() < 2e-3
         assert error.max() < 6e-3
@@ -59,7 +59,7 @@ def test_embedded_providers_go_end_to_end(room: Room, make_context: Make) -> Non
     assert report["label_agreement"] > 0.6
     errors = []
     for frame in room.frames[2:9]:
-        maps = context.run.load_proxy(frame.id)
+        maps = context.run.load(PROXY_MAPS, of=frame.id)
         assert maps.depth.shape == (192, 256)
         error = np.abs(maps.depth / (room.views[frame.id].depth * UNIT) - 1)
         errors.append(np.median(error[maps.confidence > 0.35]))
@@ -114,7 +114,7 @@ def test_missing_files_are_warned_of_and_leave_unknown_depth(room: Room, make_co
     (context.source.parent / "depth" / room.frames[3].name).unlink()
     run(context)
     assert "1 of 11 frames have no depth map" in context.warnings[0]
-    maps = load_proxy_maps(proxy_path(context.folder, 3))
+    maps = PROXY_MAPS.read(PROXY_MAPS.path(context.folder, 3))
     assert maps.depth.max() == maps.confidence.max() == 0
 
 
@@ -148,7 +148,7 @@ def test_what_a_network_says_of_normals_and_looks_reaches_the_run(
     context = make_context(*FILES)
     run(context)
     assert seen == [f.id for f in room.frames]
-    found = context.run.load_descriptors()
+    found = context.run.find(DESCRIPTORS)
     assert sorted(found) == [f.id for f in room.frames]
     np.testing.assert_array_equal(found[5], np.eye(4)[1])
 
@@ -162,6 +162,6 @@ def test_a_network_that_sees_another_camera_is_told(
     intrinsics = room.calibration.intrinsics
     monkeypatch.setattr(FilesDepth, "figures", lambda self: {"network_focal_px": focal * intrinsics.fx})
     context = make_context(*FILES)
-    save_calibration(context.run.stage("frames"), replace(room.calibration, origin=origin, focal_sd=3.0))
+    CALIBRATION.save(context.run.stage("frames"), replace(room.calibration, origin=origin, focal_sd=3.0))
     run(context)
     assert any("focal length of" in w for w in context.warnings) == doubted

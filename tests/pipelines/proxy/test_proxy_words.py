@@ -28,8 +28,9 @@ from msgs_slam.pipelines.networks.words import MOST_WORDS, with_words
 from msgs_slam.pipelines.proxy.inputs import check_proxy, proxy_inputs
 from msgs_slam.pipelines.proxy.stage import run
 from msgs_slam.pipelines.read_config import load_config
+from msgs_slam.pipelines.run.files import CLASSES, PROXY_MAPS
 from msgs_slam.pipelines.types import VOID
-from tests.world.room import CLASSES
+from tests.world.room import CLASSES as ROOM_CLASSES
 
 WORDS = ("wall", "floor", "side table")
 COLOURS = {"wall": (1, -1, -1), "floor": (-1, 1, -1), "side": (-1, -1, 1), "table": (-1, -1, 1)}
@@ -122,7 +123,7 @@ def card(tmp_path: Path) -> Path:
 
 def painted(room: Room) -> Room:
     """The room in the words' colours, what has no word white, with forty mistakes that are others in every frame."""
-    kinds = np.array([{"wall": 0, "floor": 1, "table": 2}.get(name, 3) for name, _ in CLASSES] + [3] * 256)
+    kinds = np.array([{"wall": 0, "floor": 1, "table": 2}.get(name, 3) for name, _ in ROOM_CLASSES] + [3] * 256)
     palette = np.array([(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)], np.uint8)
     views = []
     for number, view in enumerate(room.views):
@@ -139,19 +140,21 @@ def test_words_name_the_places_of_the_room(room: Room, make_context: Callable[..
     context = make_context("proxy.depth=files", f"proxy.semantics=onnx:{card}", words, room=painted(room))
     check_proxy(context.source, context.config)
     report = run(context)
-    names = context.run.load_classes().names
+    names = context.run.load(CLASSES).names
     assert names[:3] == ("Floor", "wall", "side table")
     assert len(names) > 3
     assert all(name.startswith("object ") for name in names[3:])
     assert report["vocabulary"] == ["Floor", "wall", "side table"]
     index = np.array([names.index(n) for n in ("wall", "Floor", "side table")])
     truth_of = {"wall": 0, "floor": 1, "table": 2}
-    truth = np.array([truth_of.get(name, 3) for name, _ in CLASSES] + [VOID] * 256)[:256].astype(np.uint8)
+    truth = np.array([truth_of.get(name, 3) for name, _ in ROOM_CLASSES] + [VOID] * 256)[:256].astype(np.uint8)
     place = np.full(256, 3, np.uint8)
     place[index] = range(3)
     total = np.zeros((4, 5), np.int64)
     for frame in room.frames:
-        total += count_labels(place[context.run.load_proxy(frame.id).labels], truth[room.views[frame.id].labels], 4, 4)
+        total += count_labels(
+            place[context.run.load(PROXY_MAPS, of=frame.id).labels], truth[room.views[frame.id].labels], 4, 4
+        )
     found = score(total)
     assert found is not None
     assert 0.85 < found.mean_iou < 0.999

@@ -22,6 +22,7 @@ from msgs_slam.pipelines.mapping.move_map import move_map
 from msgs_slam.pipelines.mapping.parameters import MapParameters, empty_map
 from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.render_run import render_run
+from msgs_slam.pipelines.run.files import MAP, SPARSE, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.system.progress import SilentProgress
@@ -63,16 +64,16 @@ def run(device: None, tmp_path_factory: pytest.TempPathFactory, world_sequence: 
 
 
 def test_a_frame_is_compared_with_gaussians_there(run: RunFolder) -> None:
-    state = TrackState.from_backbone(run.load_sparse("tracking"), FEATURE_SD)
+    state = TrackState.from_backbone(run.load(SPARSE, "tracking"), FEATURE_SD)
     found = compare_frame(5, state.poses[5], [4, 6], state, Pictures(run, CONFIG.frames))
     assert found is not None
     assert found.unexplained < 0.5
 
 
 def test_a_map_can_be_moved_there(run: RunFolder) -> None:
-    gaussian_map = run.load_map("mapping", DEVICE)
+    gaussian_map = run.load(MAP, "mapping").to(DEVICE)
     assert isinstance(gaussian_map.means, PretendTensor)
-    trajectory = run.load_trajectory("mapping")
+    trajectory = run.load(TRAJECTORY, "mapping")
     poses = trajectory.cam_from_world
     moved = move_map(gaussian_map, trajectory.frame_ids, poses, poses, np.full(len(poses), 2.0))
     assert isinstance(moved.means, PretendTensor)

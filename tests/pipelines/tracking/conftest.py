@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.images import write_rgb
+from msgs_slam.formats.jsonfile import write_json
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.correspondence.features import to_grey
 from msgs_slam.pipelines.correspondence.flow import corners
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry.camera import project, unproject
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.run.folder import RunFolder, save_calibration, save_classes, save_frames, write_json
-from msgs_slam.pipelines.run.proxy_files import proxy_path, save_proxy_maps
-from msgs_slam.pipelines.run.sparse_files import save_sparse_model
+from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, CLASSES, PROXY_MAPS, save_frames
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.structure.bundle import Bundle
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, ClassTable, Frame, Intrinsics, ProxyMaps
@@ -111,15 +111,15 @@ def make_run(room_frames: tuple[Intrinsics, list[WorldFrame]]) -> Callable[..., 
             picture = np.full_like(frame.rgb, 128) if row.id in blank else frame.rgb
             write_rgb(folder / "frames" / row.name, picture)
             if all_proxies or row.id in keyframes:
-                save_proxy_maps(proxy_path(folder / "proxy", row.id), _maps(frame, depth_factor))
+                PROXY_MAPS.save(folder / "proxy", _maps(frame, depth_factor), row.id)
         save_frames(folder / "frames", rows)
-        save_calibration(folder / "frames", Calibration(intrinsics, "given", 0.0, (0, 0, 0, 0)))
-        save_classes(folder / "proxy", ClassTable(tuple(f"c{i}" for i in range(32)), ((0, 0, 0),) * 32))
+        CALIBRATION.save(folder / "frames", Calibration(intrinsics, "given", 0.0, (0, 0, 0, 0)))
+        CLASSES.save(folder / "proxy", ClassTable(tuple(f"c{i}" for i in range(32)), ((0, 0, 0),) * 32))
         write_json(folder / "proxy" / "proxy.json", {"depth": "files", "semantics": "files", "metric": metric})
         keep_correspondences(folder / "frames", {i: frames[i].rgb for i in keyframes or (0, 12)})
         if keyframes:
             model = _backbone(frames, truth, intrinsics, keyframes, backbone_scale)
-            save_sparse_model(folder / "frames" / "backbone" / "model.npz", model)
+            BACKBONE.save(folder / "frames", model)
         return MadeRun(RunFolder(folder), truth)
 
     return make

@@ -14,6 +14,7 @@ from msgs_slam.formats.trajectory import write_matrices
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
+from msgs_slam.pipelines.run.files import BACKBONE, FIGURES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.pipelines.frames.conftest import FOCAL, HEIGHT, QUICK, WIDTH, render, sideways
@@ -50,7 +51,7 @@ def test_a_blank_stretch_is_carried_and_the_rest_is_metric(tmp_path: Path) -> No
     config = load_config(overrides=[*SETTINGS, f'frames.poses="{given}"', "proxy.scale_ref=poses"])
     run = RunFolder(tmp_path / "run")
     records = reconstruct(tmp_path / "pictures", run, config, SilentProgress(), "tracking")
-    trajectory = run.load_trajectory("tracking")
+    trajectory = run.load(TRAJECTORY, "tracking")
     assert trajectory.is_placed.all()
     told = " ".join(w for r in records.values() for w in r.warnings)
     assert "posed by --poses alone" in told
@@ -59,7 +60,7 @@ def test_a_blank_stretch_is_carried_and_the_rest_is_metric(tmp_path: Path) -> No
     placed = trajectory.world_from_cam[:, :3, 3]
     similarity = align_points(placed, true[:, :3, 3], with_scale=True)
     assert np.linalg.norm(similarity.apply(placed) - true[:, :3, 3], axis=1).max() < 0.02
-    assert run.load_proxy_report()["metric"]
+    assert run.load(FIGURES["proxy"])["metric"]
     assert similarity.scale == pytest.approx(1.0, abs=0.02)
 
 
@@ -69,7 +70,7 @@ def test_pictures_that_show_nothing_stand_where_the_poses_say(tmp_path: Path) ->
     config = load_config(overrides=[*SETTINGS, f'frames.poses="{given}"'])
     run = RunFolder(tmp_path / "run")
     records = reconstruct(tmp_path / "pictures", run, config, SilentProgress(), "frames")
-    backbone = run.load_backbone()
+    backbone = run.find(BACKBONE)
     assert backbone is not None
     assert len(backbone.frame_ids) >= 12
     relative = true[0, :3, :3].T @ (true[backbone.frame_ids, :3, 3] - true[0, :3, 3]).T

@@ -7,6 +7,7 @@ import numpy as np
 
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.run.files import BACKBONE
 from msgs_slam.pipelines.tracking.front_end import RENDER_LOSS
 from msgs_slam.pipelines.tracking.pictures import Pictures
 from msgs_slam.pipelines.tracking.refine import compare_frame
@@ -16,7 +17,7 @@ from tests.pipelines.tracking.conftest import MadeRun
 
 def test_comparison_brings_a_pose_nearer(tmp_path: Path, make_run: Callable[..., MadeRun]) -> None:
     made = make_run(tmp_path / "run", keyframes=(9, 12), backbone_scale=1.0, blank=(11,))
-    backbone = made.run.load_backbone()
+    backbone = made.run.find(BACKBONE)
     assert backbone is not None
     state = TrackState.from_backbone(backbone, 0.5)
     for k in (9, 12):

@@ -15,7 +15,7 @@ from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.run.sparse_files import load_sparse_model, save_sparse_model
+from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, DEPTH_FIELDS, FRAMES, SPARSE, TRAJECTORY
 from msgs_slam.pipelines.tracking import adjust, stage
 from msgs_slam.pipelines.tracking.stage import STAGE, stretches
 from tests.pipelines.tracking.conftest import MadeRun
@@ -30,7 +30,7 @@ def finish(context: StageContext) -> dict:
 
 
 def trajectory_error(made: MadeRun, scale: bool) -> float:
-    found = made.run.load_trajectory("tracking")
+    found = made.run.load(TRAJECTORY, "tracking")
     posed = found.is_posed
     centres, truth = found.centers[posed], se3.inverse(made.cam_from_world)[posed, :3, 3]
     moved = align_points(centres, truth, with_scale=scale).apply(centres)
@@ -46,7 +46,7 @@ def test_poses_every_frame_in_metres(
     assert figures["scale"] == "metric"
     # Frames of 320 x 240 in a room of metres: millimetres, but never exact.
     assert 0 < trajectory_error(made, scale=False) < 0.01
-    trajectory = made.run.load_trajectory("tracking")
+    trajectory = made.run.load(TRAJECTORY, "tracking")
     assert np.allclose(trajectory.cam_from_world[0], np.eye(4), atol=1e-9)
     assert trajectory.is_keyframe.sum() == 9
 
@@ -56,8 +56,8 @@ def test_sparse_model_reprojects_and_scales_are_right(
 ) -> None:
     made = make_run(tmp_path / "run", depth_factor=1.25)
     finish(open_stage(made.run, "tracking"))
-    model = load_sparse_model(made.run.stage("tracking") / "sparse.npz")
-    camera = made.run.load_calibration().intrinsics
+    model = SPARSE.read(made.run.stage("tracking") / "sparse.npz")
+    camera = made.run.load(CALIBRATION).intrinsics
     pose, point = model.cam_from_world[model.obs_frame], model.points_in_world[model.obs_point]
     in_cam = np.einsum("oij,oj->oi", pose[:, :3, :3], point) + pose[:, :3, 3]
     xy = (in_cam @ camera.matrix.T)[:, :2] / in_cam[:, 2:]
@@ -71,8 +71,8 @@ def test_sparse_model_reprojects_and_scales_are_right(
 
 def scale_error(made: MadeRun, expected: float) -> float:
     """Mean relative error of the scales that bring the keyframes' proxy depths into the world."""
-    fields = made.run.load_depth_fields("tracking")
-    assert list(fields.of_frame) == made.run.load_sparse("tracking").frame_ids.tolist()
+    fields = made.run.load(DEPTH_FIELDS, "tracking")
+    assert list(fields.of_frame) == made.run.load(SPARSE, "tracking").frame_ids.tolist()
     return float(np.mean([np.abs(fields.scales(i, 24, 32) / expected - 1) for i in fields.of_frame]))
 
 
@@ -185,9 +185,9 @@ def test_parts_of_structure_from_motion_are_joined_where_they_recognise_each_oth
     tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
 ) -> None:
     made = make_run(tmp_path / "run", metric=False)
-    model = made.run.load_backbone()
+    model = made.run.find(BACKBONE)
     assert model is not None
-    save_sparse_model(made.run.stage("frames") / "backbone" / "model.npz", in_two_parts(model, 12))
+    BACKBONE.save(made.run.stage("frames"), in_two_parts(model, 12))
     context = open_stage(made.run, "tracking")
     figures = finish(context)
     assert figures["posed"] == 24
@@ -199,10 +199,10 @@ def test_a_part_that_shows_another_place_is_not_glued_on(
     tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
 ) -> None:
     made = make_run(tmp_path / "run", metric=False)
-    model = made.run.load_backbone()
+    model = made.run.find(BACKBONE)
     assert model is not None
-    save_sparse_model(made.run.stage("frames") / "backbone" / "model.npz", in_two_parts(model, 15))
-    for frame in made.run.load_frames()[14:]:  # upside down and mirrored, as good as another room
+    BACKBONE.save(made.run.stage("frames"), in_two_parts(model, 15))
+    for frame in made.run.load(FRAMES)[14:]:  # upside down and mirrored, as good as another room
         path = made.run.stage("frames") / frame.name
         write_rgb(path, np.ascontiguousarray(read_rgb(path)[::-1]))
     context = open_stage(made.run, "tracking")

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.tracking.pictures import Pictures
 from msgs_slam.pipelines.tracking.rotation_only import fit_rotation, turn_between
 from msgs_slam.pipelines.tracking.stage import STAGE
@@ -60,7 +61,7 @@ def test_a_turn_away_keeps_its_frames_and_says_so(
     figures = STAGE.run(context)
     context.folder.rename(made.run.stage("tracking"))
 
-    found = made.run.load_trajectory("tracking")
+    found = made.run.load(TRAJECTORY, "tracking")
     turned = np.flatnonzero(found.by_rotation)
     assert found.is_posed.all()
     assert turned.min() > LAST, "frames of the walk are placed by what they see"

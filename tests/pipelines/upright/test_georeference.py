@@ -17,7 +17,7 @@ from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.upright.georeference import georeference
-from msgs_slam.pipelines.upright.world import read_world
+from msgs_slam.pipelines.upright.world import WORLD
 
 OracleRun = Callable[..., RunFolder]
 ORIGIN = np.array([55.698, 13.195, 37.0])
@@ -123,7 +123,7 @@ def test_files_of_a_run_with_a_track_lie_on_the_earth(oracle_run: OracleRun, tmp
     ]
     (tmp_path / "track.csv").write_text("\n".join(["time,lat,lon,alt", *rows]))
     export_run(run, tmp_path / "out", "tum", settings=ExportConfig(gps=str(tmp_path / "track.csv")))
-    world = read_world(tmp_path / "out" / "world.json")
+    world = WORLD.read(tmp_path / "out" / "world.json")
     assert world.earth is not None
     assert world.exported_from_run.scale == pytest.approx(20, rel=1e-3)
     positions = np.loadtxt(tmp_path / "out" / "trajectory.txt")[:, 1:4]

@@ -17,11 +17,12 @@ from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.stage import export_run, find_world
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.run.folder import RunFolder, save_map
+from msgs_slam.pipelines.run.files import MAP
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Intrinsics
 from msgs_slam.pipelines.upright.find import find_upright
 from msgs_slam.pipelines.upright.lines import common_direction, line_planes
-from msgs_slam.pipelines.upright.world import FIRST, World, load_world, read_world, save_world, upright_world
+from msgs_slam.pipelines.upright.world import FIRST, WORLD, World, upright_world
 
 OracleRun = Callable[..., RunFolder]
 MOVE = Similarity(1.0, Rotation.from_euler("xyz", [130, 25, -50], degrees=True).as_matrix(), np.array([3.0, -2, 5]))
@@ -98,7 +99,7 @@ def shapeless(oracle_run: OracleRun) -> RunFolder:
     m = outcome.require_map()
     center = m.means.mean(0)
     ball = torch.nn.functional.normalize(torch.randn(len(m), 3, generator=torch.Generator().manual_seed(0)), dim=1)
-    save_map(run.stage("mapping"), type(m)(**{**vars(m), "means": center + 0.7 * ball}))
+    MAP.save(run.stage("mapping"), type(m)(**{**vars(m), "means": center + 0.7 * ball}))
     note_finished(run, ("frames", "proxy", "tracking", "mapping"))
     return run
 
@@ -120,10 +121,10 @@ def test_first_axes_on_request(run: RunFolder) -> None:
 
 def test_world_file_round_trip(run: RunFolder) -> None:
     world = World("up", "floor", True, MOVE, {"cameras": 1.5})
-    read = read_world(save_world(run.root, world, "metre"))
+    read = WORLD.read(WORLD.save(run.root, world))
     assert (read.axes, read.told_by, read.has_floor, read.against) == ("up", "floor", True, {"cameras": 1.5})
     np.testing.assert_array_equal(read.exported_from_run.rotation, MOVE.rotation)
-    assert load_world(run) is None, "nothing is exported yet"
+    assert run.find(WORLD) is None, "nothing is exported yet"
     (run.root / "world.json").write_text('{"axes": "up", "exported_from_run": 3}')
     with pytest.raises(InputError, match="world"):
-        read_world(run.root / "world.json")
+        WORLD.read(run.root / "world.json")
