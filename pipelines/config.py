@@ -10,14 +10,13 @@ def setting(
     default: Any,
     help: str,
     choices: tuple[str, ...] = (),
-    stages: tuple[str, ...] = (),
     within: tuple[float, float] | None = None,
     or_zero: bool = False,
 ) -> Any:
     """A dataclass field that carries its own help text and what it may be: one of `choices`, or a number `within` two
-    (both allowed) `or_zero`; `stages`: who reads it, where its section is no stage's."""
+    (both allowed) `or_zero`."""
     allowed = {"choices": choices, "within": within, "or_zero": or_zero}
-    return field(default=default, metadata={"help": help, "stages": stages, **allowed})
+    return field(default=default, metadata={"help": help, **allowed})
 
 
 @dataclass(frozen=True)
@@ -198,21 +197,6 @@ class ExportConfig:
     texture: bool = setting(False, "write a lighter mesh with a texture of photographs too: mesh_textured.*")
 
 
-_MAPPING = ("mapping",)
-
-
-@dataclass(frozen=True)
-class PaperConfig:
-    """The term of the paper whose work something cheaper does."""
-
-    label_weight: float = setting(
-        0.0,
-        "λ_S of eq. (18), 0.1 in the paper; 0 = no semantic loss: classes are counted when the map is done",
-        stages=_MAPPING,
-        within=(0, 1000),
-    )
-
-
 @dataclass(frozen=True)
 class Config:
     """The complete settings of a run; one section a stage."""
@@ -224,7 +208,6 @@ class Config:
     mapping: MappingConfig = field(default_factory=MappingConfig)
     global_ba: GlobalBaConfig = field(default_factory=GlobalBaConfig)
     export: ExportConfig = field(default_factory=ExportConfig)
-    paper: PaperConfig = field(default_factory=PaperConfig)
 
 
 def allowed_values(known: Field[Any]) -> str:
@@ -244,11 +227,3 @@ def config_to_dict(config: Any) -> dict[str, Any]:
         f.name: config_to_dict(value) if is_dataclass(value := getattr(config, f.name)) else value
         for f in fields(config)
     }
-
-
-def settings_of_stage(config: Config, stage: str) -> dict[str, Any]:
-    """The settings that a stage reads: its own section, and those beside it that name it."""
-    beside = {
-        f"paper.{f.name}": getattr(config.paper, f.name) for f in fields(config.paper) if stage in f.metadata["stages"]
-    }
-    return config_to_dict(getattr(config, stage)) | beside

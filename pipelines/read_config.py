@@ -133,9 +133,6 @@ def _toml_value(value: Any) -> str:
     return json.dumps(value) if isinstance(value, str) else repr(value)
 
 
-MOVED = {key: "paper.label_weight" for key in ("mapping.label_loss", "mapping.label_weight", "paper.label_image")}
-"""Old name → the one that decides it now."""
-
 _FIXED = {
     "frames": "max_match_error peak_threshold",
     "proxy": "alpha beta gamma theta_slope theta_middle",
@@ -161,6 +158,10 @@ GONE = {
     "frames.max_frames": "however many frames there are, they are taken",
     "tracking.new_segments": "after a loss tracking begins anew, and the segments are joined later",
     "tracking.render": "frames that are lost otherwise are compared with Gaussians, no others",
+    **dict.fromkeys(
+        ("mapping.label_loss", "mapping.label_weight", "paper.label_image", "paper.label_weight"),
+        "classes are counted when the map is done, which is as good as learning them",
+    ),
     "paper.symmetry_weight": "pulling mirror-symmetric halves together cost 0.1 dB",
     **dict.fromkeys(
         (
@@ -177,13 +178,12 @@ def explain_retired(keys: Iterable[str]) -> str:
     """Explain what became of the retired settings among `keys` (section.name); "" where there are none."""
     keys = list(keys)
     told = [f"{k} is no more: {GONE[k]}" for k in keys if k in GONE]
-    told += [f"{k} is {MOVED[k]} now (off unless set)" for k in keys if k in MOVED]
     if fixed := [k for k in keys if k in FIXED]:
         told.append(f"{', '.join(fixed)}: fixed at what was the default")
     return "; ".join(told)
 
 
-_SAME_AS = {"article": "paper", "gpu": "cuda", "nvidia": "cuda", "cuda:0": "cuda", "video": "images", "mp4": "images"}
+_SAME_AS = {"gpu": "cuda", "nvidia": "cuda", "cuda:0": "cuda", "video": "images", "mp4": "images"}
 """What people type for a choice that has another name."""
 
 

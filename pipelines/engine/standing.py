@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from msgs_slam.pipelines.config import Config, settings_of_stage
+from msgs_slam.pipelines.config import Config, config_to_dict
 from msgs_slam.pipelines.run.records import StageRecord, differing_settings, recorded_config
 from msgs_slam.pipelines.system.identity import stage_identity
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) -> str:
     """Digest of what a stage's result depends on: its code, its settings, the seed, its inputs, what is before."""
-    own = settings_of_stage(config, stage.name)
+    own = config_to_dict(getattr(config, stage.name))
     beside = [] if inputs is None else [inputs]
     text = json.dumps(
         [stage.name, stage_identity(stage.name, stage.file), own, config.run.seed, upstream, *beside], sort_keys=True

@@ -83,8 +83,7 @@ class _CardLoss(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> Tensor:
         features, depth, silhouette, log_radii = (x.detach().contiguous() for x in arguments[:4])
         view, exposure, in_view, weights = arguments[4:]
-        empty = torch.zeros_like if features.shape[-1] > 3 else torch.empty_like  # classes have no gradient here
-        loss, d_features = features.new_zeros(()), empty(features)
+        loss, d_features = features.new_zeros(()), torch.empty_like(features)
         _add_photo(features, exposure, view, loss, d_features)
         d_depth, d_silhouette = _add_maps(depth, silhouette, view, weights, loss)
         d_log_radii = _add_sizes(log_radii, in_view, weights.unit, loss)

@@ -46,7 +46,7 @@ def grow_submap(task: SubmapTask, progress: Progress) -> None:
         views, len(task.class_ids),
         replace(settings, hold_out=0, max_gaussians=settings.max_gaussians - int((~shown).sum())), task.config.run.seed,
         initial=kept.only(shown), progress=progress, snapshot=task.file(f"{GROWN}_state"),
-        exposure=(gains[visited], offsets[visited]), paper=task.config.paper, seeding=True,
+        exposure=(gains[visited], offsets[visited]), seeding=True,
     )  # fmt: skip
     poses[visited], gains[visited], offsets[visited] = made.cam_from_world, made.log_gains, made.offsets
     grown = together([kept.only(~shown), made.gaussian_map])

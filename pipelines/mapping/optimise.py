@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import msgs_slam.pipelines.gaussians.render.cards as cards
-from msgs_slam.pipelines.config import MappingConfig, PaperConfig
+from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.gaussians.adam import gradients_of
 from msgs_slam.pipelines.gaussians.render import Rendering, blending_weights, in_view, marked_in_view, render
@@ -20,7 +20,7 @@ from msgs_slam.pipelines.mapping.exposure import SOLID, expose, fit_exposure
 from msgs_slam.pipelines.mapping.growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
 from msgs_slam.pipelines.mapping.label_votes import voted_logits
 from msgs_slam.pipelines.mapping.objective import Objective
-from msgs_slam.pipelines.mapping.parameters import COLOR_KEYS, KEYS
+from msgs_slam.pipelines.mapping.parameters import KEYS
 from msgs_slam.pipelines.mapping.schedule import Schedule, Seeding, Step
 from msgs_slam.pipelines.mapping.splitting import DensificationError, densification_error
 from msgs_slam.pipelines.mapping.state import Exposures, OptimisedMap, OptimiserState
@@ -29,7 +29,7 @@ from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress
 from msgs_slam.pipelines.system.stopping import is_asked
 
-MAP_RATES = {"means": 0.1, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2, "class_logits": 6e-2}
+MAP_RATES = {"means": 0.1, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2}
 """Learning rates of Adam, of positions in radii of the Gaussian: what is small has to be placed finely."""
 HALVES_ROOM = 250e6
 """Bytes of views at half the size that are kept; to halve one takes a hundredth of a visit."""
@@ -50,7 +50,6 @@ def optimise_map(
     snapshot: Path | None = None,
     label: str = "mapping",
     exposure: Exposures | None = None,
-    paper: PaperConfig | None = None,
     first_rate: float = 1.0,
     seeding: bool | None = None,
 ) -> OptimisedMap:
@@ -62,10 +61,9 @@ def optimise_map(
     of the first visit, as a share.
     """
     state = OptimiserState.load(snapshot, views) or OptimiserState.fresh(views, classes, initial, exposure)
-    paper = paper or PaperConfig()
     seeding = initial is None if seeding is None else seeding
     schedule = Schedule.plan(views, settings, seed, seeding, passes, first_rate)
-    optimiser = MapOptimiser(views, classes, settings, paper, state)
+    optimiser = MapOptimiser(views, classes, settings, state)
     # A map and its visits grow together: were it written every so many visits, all of it would be written ever longer.
     every = max(settings.snapshot_every, len(views))
     remaining = range(state.iteration, schedule.total)
@@ -78,7 +76,7 @@ def optimise_map(
             state.save(snapshot)
     if schedule.grows:
         optimiser.growth.prune()
-    if optimiser.objective.counts_labels:
+    if classes > 0:
         optimiser.count_labels()
     return state.result(views, schedule.total)
 
@@ -91,13 +89,12 @@ class MapOptimiser:
         views: Sequence[View],
         classes: int,
         settings: MappingConfig,
-        paper: PaperConfig,
         state: OptimiserState,
     ) -> None:
-        self.views, self.settings, self.paper, self.state = views, settings, paper, state
+        self.views, self.settings, self.state = views, settings, state
         self.halves = LruSequence(len(views), lambda i: halved(views[i]), lambda v: v.nbytes, HALVES_ROOM)
         self.unit = scene_depth(views)
-        self.objective = Objective(settings, paper, classes, self.unit)
+        self.objective = Objective(settings, self.unit)
         self.growth = Growth(views, classes, settings, state, self.unit)
 
     def visit(self, step: Step) -> None:
@@ -118,23 +115,21 @@ class MapOptimiser:
     def _step(self, step: Step, view: View) -> Rendering:
         """Compare and move the map, the view's pose and its exposure; returns what the view showed before."""
         parameters, on_card = self.state.parameters, cards.takes_kernels(self.state.parameters["means"])
-        with_labels = self.objective.uses_labels(step.iteration)
-        keys = KEYS if with_labels else COLOR_KEYS
         pose, radii = self.state.cam_from_world(step.view, view), torch.exp(parameters["log_radii"].detach())
         seeing = (parameters["means"].detach(), radii, pose, view.intrinsics)
         rows, seen = None, None
         if on_card:  # a list of rows would keep the host waiting for its length
             seen, pose = marked_in_view(*seeing), pose.to(radii)
-            values = {k: parameters[k] for k in keys}
+            values = {k: parameters[k] for k in KEYS}
         else:  # what the view does not show has no gradient and would wait anyway
             rows = in_view(*seeing)
-            values = {k: parameters[k].detach()[rows].requires_grad_() for k in keys}
+            values = {k: parameters[k].detach()[rows].requires_grad_() for k in KEYS}
         refines = self.settings.refine_poses and step.refine_pose
         rendering = self.draw(view, pose.requires_grad_(refines), values)
         if self.settings.exposure:
             self._expose(step.view, view, rendering)
         exposure = self.state.exposures[step.view]
-        loss = self.objective.of(view, exposure, rendering, values["log_radii"], with_labels, seen) * step.weight
+        loss = self.objective.of(view, exposure, rendering, values["log_radii"], seen) * step.weight
         of_map, of_view = gradients_of(loss, (values, {"pose": pose} if refines else {}))
         rates = {key: rate * step.rate for key, rate in MAP_RATES.items()}
         parameters.table.step(of_map, rates, self._shares(rows, values["log_radii"].detach()), rows)
@@ -146,13 +141,13 @@ class MapOptimiser:
         """The classes of all Gaussians by the labels of all views."""
         posed = ((view, self.state.cam_from_world(i, view)) for i, view in enumerate(self.views))
         parameters = self.state.parameters
-        parameters["class_logits"].copy_(voted_logits(parameters.to_map(), posed))
+        parameters.class_logits = voted_logits(parameters.to_map(), posed)
 
     @torch.no_grad()
     def _seed(self, index: int, what: Seeding) -> None:
         known = len(self.state.parameters) > 0
         view = self.views[index]
-        pose, values = self.state.cam_from_world(index, view), {k: self.state.parameters[k] for k in COLOR_KEYS}
+        pose, values = self.state.cam_from_world(index, view), {k: self.state.parameters[k] for k in KEYS}
         self.growth.seed(index, what, self.draw(view, pose, values) if known else None)
 
     def _blame(self) -> DensificationError:
@@ -196,13 +191,12 @@ class MapOptimiser:
         return largest
 
     def draw(self, view: View, cam_from_world: Tensor, values: Mapping[str, Tensor]) -> Rendering:
-        """Gaussians of raw parameters as the view sees them from (4, 4), with class logits where they have any."""
-        colors = values["colors"]
+        """Gaussians of raw parameters as the view sees them from (4, 4)."""
         return render(
             values["means"],
             torch.exp(values["log_radii"]),
             torch.sigmoid(values["opacity_logits"]),
-            torch.cat([colors, values["class_logits"]], dim=1) if "class_logits" in values else colors,
+            values["colors"],
             cam_from_world,
             view.intrinsics,
         )

@@ -12,15 +12,18 @@ from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.gaussians.adam import AdamTable
 from msgs_slam.pipelines.gaussians.render.compositing import require_all_finite
 
-COLOR_KEYS = ("means", "log_radii", "opacity_logits", "colors")
-KEYS = (*COLOR_KEYS, "class_logits")
+KEYS = ("means", "log_radii", "opacity_logits", "colors")
+"""What is optimised."""
+_BESIDE = ("class_logits", "anchor_frame_ids", "trust")
 
 
 @dataclass
 class MapParameters:
-    """A Gaussian map being optimised; `anchor_frame_ids` (M,) and `trust` (M,) 0..1 of the depth it was seeded at."""
+    """A Gaussian map being optimised; beside it `class_logits` (M, C), `anchor_frame_ids` (M,) and `trust` (M,) 0..1 of
+    the depth it was seeded at."""
 
     table: AdamTable
+    class_logits: Tensor
     anchor_frame_ids: Tensor
     trust: Tensor
 
@@ -28,11 +31,13 @@ class MapParameters:
     def from_map(gaussian_map: GaussianMap) -> MapParameters:
         """Fresh moments, full trust."""
         values = {k: getattr(gaussian_map, k) for k in KEYS}
-        return MapParameters(AdamTable(values), gaussian_map.anchor_frame_ids, torch.ones_like(gaussian_map.log_radii))
+        m = gaussian_map
+        return MapParameters(AdamTable(values), m.class_logits, m.anchor_frame_ids, torch.ones_like(m.log_radii))
 
     def to_map(self) -> GaussianMap:
         """Return a copy of the current map."""
-        return GaussianMap(**{k: self[k].detach().clone() for k in KEYS}, anchor_frame_ids=self.anchor_frame_ids)
+        values = {k: self[k].detach().clone() for k in KEYS}
+        return GaussianMap(**values, class_logits=self.class_logits, anchor_frame_ids=self.anchor_frame_ids)
 
     def __getitem__(self, key: str) -> Tensor:
         return self.table.values[key]
@@ -48,23 +53,26 @@ class MapParameters:
     def keep(self, rows: Tensor) -> None:
         """Keep only the given rows everywhere."""
         self.table.keep(rows)
+        self.class_logits = self.class_logits[rows]
         self.anchor_frame_ids, self.trust = self.anchor_frame_ids[rows], self.trust[rows]
 
     def append(self, seeds: GaussianMap, trust: Tensor) -> None:
         """Add Gaussians with empty moments."""
         self.table.append({k: getattr(seeds, k) for k in KEYS})
+        self.class_logits = torch.cat([self.class_logits, seeds.class_logits])
         self.anchor_frame_ids = torch.cat([self.anchor_frame_ids, seeds.anchor_frame_ids])
         self.trust = torch.cat([self.trust, trust])
 
     def to_tensors(self) -> dict[str, Tensor]:
         """A flat table for a snapshot."""
-        return {**self.table.to_tensors("map"), "anchor_frame_ids": self.anchor_frame_ids, "trust": self.trust}
+        beside = {name: getattr(self, name) for name in _BESIDE}
+        return {**self.table.to_tensors("map"), **beside}
 
     @staticmethod
     def from_tensors(tensors: Mapping[str, Tensor]) -> MapParameters:
         """Restore the parameters from what `to_tensors` returned."""
         table = AdamTable.from_tensors(tensors, "map", KEYS)
-        return MapParameters(table, tensors["anchor_frame_ids"], tensors["trust"])
+        return MapParameters(table, *(tensors[name] for name in _BESIDE))
 
 
 def empty_map(classes: int, device: torch.device | str = "cpu") -> GaussianMap:

@@ -46,7 +46,6 @@ class Seeding(Enum):
 class Step:
     """One visit: view index, loss weight, learning rate factor, and what happens around it."""
 
-    iteration: int
     view: int
     weight: float
     rate: float
@@ -112,7 +111,7 @@ class Schedule:
         """The new keyframe first, then in turn one that sees the same and one of all past ones."""
         per_view = WINDOW_STEPS
         if iteration >= per_view * self.views:
-            return self._filling_step(iteration, iteration - per_view * self.views)
+            return self._filling_step(iteration - per_view * self.views)
         now, nth = divmod(iteration, per_view)
         rng = np.random.default_rng([self.seed, 1, iteration])
         view = now
@@ -120,11 +119,11 @@ class Schedule:
             view = self._covisible(now, rng) if nth % 2 else int(rng.integers(now))
         weights = keyframe_weights(now, self.reliability, TIME_DECAY, RELIABILITY_DECAY)
         seed = Seeding.TRUSTED if nth == 0 else Seeding.NOTHING
-        return Step(iteration, view, float(weights[view]), 1.0, True, seed, False, False, False, False)
+        return Step(view, float(weights[view]), 1.0, True, seed, False, False, False, False)
 
-    def _filling_step(self, iteration: int, view: int) -> Step:
+    def _filling_step(self, view: int) -> Step:
         weights = keyframe_weights(0, self.reliability, 0.0, RELIABILITY_DECAY)
-        return Step(iteration, view, float(weights[view]), 1.0, True, Seeding.REST, False, False, False, False)
+        return Step(view, float(weights[view]), 1.0, True, Seeding.REST, False, False, False, False)
 
     def _covisible(self, now: int, rng: np.random.Generator) -> int:
         row = slice(*self.overlap.indptr[now : now + 2])
@@ -158,7 +157,6 @@ class Schedule:
         coarse, grows = self._kind_of_pass(number)
         weights = keyframe_weights(0, self.reliability, 0.0, RELIABILITY_DECAY)
         return Step(
-            iteration=iteration,
             view=view,
             weight=float(weights[view] / weights.mean()),
             rate=self.first_rate * (RATE_DECAY / self.first_rate) ** share,

@@ -203,7 +203,7 @@ def agree_submap(task: SubmapTask, progress: Progress) -> None:
         mine = np.isin(told.gaussian_map.anchor_frame_ids.cpu().numpy(), task.submap.own)
         rows, weights = (torch.from_numpy(a[mine]).to(total.device) for a in (told.rows, told.weights))
         total[rows] += weights
-        for key in KEYS:
+        for key in (*KEYS, "class_logits"):
             values, said = getattr(agreed, key), getattr(told.gaussian_map, key)[torch.from_numpy(mine)]
             share = (weights / total[rows]).reshape(-1, *[1] * (values.ndim - 1))
             values[rows] += share * (said - values[rows])
@@ -256,7 +256,7 @@ def _optimise(
     return optimise_map(
         given.views, len(task.class_ids), settings, seed, initial, passes,
         progress=progress, snapshot=task.file(f"{kind}_state"), label=_LABELS[kind] + of,
-        exposure=exposure, paper=task.config.paper, first_rate=rate,
+        exposure=exposure, first_rate=rate,
     )  # fmt: skip
 
 

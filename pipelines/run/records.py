@@ -14,7 +14,7 @@ from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.jsonfile import read_json_object, write_json
 from msgs_slam.formats.reading import parsing
-from msgs_slam.pipelines.config import Config, config_to_dict, settings_of_stage
+from msgs_slam.pipelines.config import Config, config_to_dict
 from msgs_slam.pipelines.read_config import merge_known_settings
 from msgs_slam.pipelines.run.layouts import dataclass_from_json
 from msgs_slam.pipelines.run.names import EXTENSION, SOURCE_LIST, STAGES
@@ -145,11 +145,7 @@ def recorded_config(records: Mapping[str, StageRecord], config: Config) -> Confi
 
 def settings_of(config: Config, stage: str) -> dict[str, dict[str, Any]]:
     """Return the settings that a stage's record keeps."""
-    kept: dict[str, dict[str, Any]] = {"run": config_to_dict(config.run)}
-    for key, value in settings_of_stage(config, stage).items():
-        section, _, name = key.rpartition(".")
-        kept.setdefault(section or stage, {})[name] = value
-    return kept
+    return {section: config_to_dict(getattr(config, section)) for section in ("run", stage)}
 
 
 def differing_settings(record: StageRecord, config: Config) -> list[str]:
@@ -157,7 +153,7 @@ def differing_settings(record: StageRecord, config: Config) -> list[str]:
     return [
         f"{section}.{key}={value}"
         for section, values in record.settings.items()
-        if section != "run"
+        if section != "run" and hasattr(config, section)  # a section may be of an earlier version
         for key, value in config_to_dict(getattr(config, section)).items()
         if values.get(key, value) != value
     ]

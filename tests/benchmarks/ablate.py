@@ -40,7 +40,6 @@ COMPLETE = "complete"
 ABLATIONS: dict[str, tuple[str, ...]] = {
     COMPLETE: (),
     "without proxy depth": ("mapping.use_proxy_depth=false",),
-    "with semantic loss": ("paper.label_weight=0.1",),
     "without loops": ("global_ba.use_loops=false",),
     "without depth loss": ("mapping.depth_weight=0.0",),
 }

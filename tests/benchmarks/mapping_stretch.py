@@ -116,7 +116,7 @@ def measure(sequence: Sequence, shots: list[Shot], camera: Intrinsics, config: C
     classes = occurring_classes([s.maps.labels for s in used])
     started = time.process_time()
     views = agreeing([s.view(sequence, camera, classes) for s in used])
-    result = optimise_map(views, len(classes), config.mapping, 0, paper=config.paper)
+    result = optimise_map(views, len(classes), config.mapping, 0)
     row: dict[str, float] = {"cpu seconds": time.process_time() - started, "gaussians": len(result.gaussian_map)}
     label_of = np.array([*classes, *[VOID] * (256 - len(classes))], np.uint8)
     depth, count = DepthErrorSum(), len(sequence.classes)
@@ -169,7 +169,7 @@ def main() -> None:
     indices = range(arguments.first, min(arguments.first + arguments.frames, len(sequence)))
     shots = load_shots(sequence, camera, indices, arguments.depth, arguments.labels)
     rows = []
-    variants = {n: s for n, s in ABLATIONS.items() if all(x.startswith(("mapping.", "paper.")) for x in s)}
+    variants = {n: s for n, s in ABLATIONS.items() if all(x.startswith("mapping.") for x in s)}
     for name, switches in (variants if arguments.ablation else {"complete": ()}).items():
         config = load_config(None, ["mapping.min_iterations=0", *arguments.overrides, *switches])
         row = measure(sequence, shots, camera, config)

@@ -8,9 +8,7 @@ from skimage.metrics import structural_similarity
 from msgs_slam.pipelines.gaussians.ssim import ssim_map
 from msgs_slam.pipelines.mapping import losses
 from msgs_slam.pipelines.mapping.exposure import expose, fit_exposure
-from msgs_slam.pipelines.mapping.paper.label_image import label_image_loss
 from msgs_slam.pipelines.mapping.photo_loss import photo_loss, plain_photo_loss
-from msgs_slam.pipelines.types import VOID
 
 
 def pictures(dtype: torch.dtype = torch.float32, size: tuple[int, int] = (24, 31)) -> tuple[torch.Tensor, torch.Tensor]:
@@ -97,25 +95,6 @@ def test_depth_loss_has_no_unit_and_ignores_unknown_depth() -> None:
     assert torch.isclose(loss, torch.tensor((0.1 + 0.2 * 0.5) / 4 / 2.0))
     assert torch.isclose(losses.depth_loss(100 * rendered, 100 * proxy, weight, 200.0), loss)
     assert torch.allclose(losses.depth_weight(torch.tensor([0.5, 1.0])), torch.tensor([0.5 * losses.NU, 1.0]))
-
-
-def test_the_label_loss_ignores_void_and_falls_with_the_right_logit() -> None:
-    labels = torch.tensor([[0, 1], [2, VOID]], dtype=torch.uint8)
-    weight = torch.ones(2, 2)
-
-    def loss(logits: torch.Tensor) -> torch.Tensor:
-        return label_image_loss(logits, labels, weight)
-
-    good = torch.nn.functional.one_hot(torch.tensor([[0, 1], [2, 0]]), 3) * 9.0
-    other_void = good.clone()
-    other_void[1, 1] = torch.tensor([0.0, 0.0, 9.0])
-    assert torch.isclose(loss(good), loss(other_void))
-    assert 0 <= loss(good) < 0.02 < loss(torch.zeros(2, 2, 3))
-    gradient = torch.zeros(2, 2, 3, requires_grad=True)
-    loss(gradient).backward()
-    assert gradient.grad is not None
-    assert gradient.grad[1, 1].abs().max() == 0
-    assert gradient.grad[0, 1, 1] < 0
 
 
 def test_size_and_silhouette() -> None:

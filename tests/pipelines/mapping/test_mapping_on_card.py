@@ -15,7 +15,7 @@ if not ON_CARD:
     os.environ["TRITON_INTERPRET"] = "1"  # read when triton is imported and again when the kernels are
 pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip install 'msgs-slam[cuda-check]'")
 
-from msgs_slam.pipelines.config import MappingConfig, PaperConfig  # noqa: E402
+from msgs_slam.pipelines.config import MappingConfig  # noqa: E402
 from msgs_slam.pipelines.gaussians.render import Rendering, cards  # noqa: E402
 from msgs_slam.pipelines.mapping import losses  # noqa: E402
 from msgs_slam.pipelines.mapping.card_loss import color_errors_on_card, fit_exposure_on_card  # noqa: E402
@@ -63,23 +63,21 @@ def there(view: View) -> View:
 
 
 @pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize(("size", "classes", "labels"), [((24, 31), 0, False), ((5, 70), 5, True), ((64, 8), 1, False)])
-def test_the_loss_has_the_plain_value_and_gradient(
-    size: tuple[int, int], classes: int, labels: bool, masked: bool
-) -> None:
-    """Also of pictures smaller than the window, with classes that do not count and with none."""
+@pytest.mark.parametrize("size", [(24, 31), (5, 70), (64, 8)])
+def test_the_loss_has_the_plain_value_and_gradient(size: tuple[int, int], masked: bool) -> None:
+    """Also of pictures smaller than the window."""
     generator = torch.Generator().manual_seed(3)
-    view, features = made_view(size, classes, masked, generator)
+    view, features = made_view(size, 0, masked, generator)
     depth, silhouette = (torch.rand(size, generator=generator) * k for k in (3, 1))
     log_radii = torch.randn(700, generator=generator) - 2.0
     in_view = torch.rand(700, generator=generator) > 0.4
-    objective, found = Objective(MappingConfig(), PaperConfig(label_weight=0.1), classes, UNIT), []
+    objective, found = Objective(MappingConfig(), UNIT), []
     for place, device, kind in ((there, DEVICE, torch.float32), (lambda v: v, "cpu", torch.float64)):
         leaves = [x.to(device, kind, copy=True).requires_grad_() for x in (features, depth, silhouette, log_radii)]
         marks = in_view.to(device) if kind == torch.float32 else None
         sizes = leaves[3] if marks is not None else leaves[3][in_view]
         drawn = Rendering(*leaves[:3])
-        value = objective.of(place(view), EXPOSURE.to(device, kind), drawn, sizes, labels, marks)
+        value = objective.of(place(view), EXPOSURE.to(device, kind), drawn, sizes, marks)
         found.append([value.detach(), *torch.autograd.grad(3 * value, leaves)])
     for mine, theirs in zip(*found, strict=True):
         assert theirs.abs().max() > 0
@@ -90,8 +88,8 @@ def test_the_loss_without_depth_has_none(monkeypatch: pytest.MonkeyPatch) -> Non
     generator = torch.Generator().manual_seed(1)
     view, features = made_view((9, 12), 0, False, generator)
     leaves = [x.to(DEVICE).requires_grad_() for x in (features, torch.rand(9, 12), torch.rand(9, 12))]
-    objective = Objective(MappingConfig(use_proxy_depth=False), PaperConfig(), 0, UNIT)
-    rest = (torch.zeros(3, device=DEVICE), False, torch.ones(3, dtype=torch.bool, device=DEVICE))
+    objective = Objective(MappingConfig(use_proxy_depth=False), UNIT)
+    rest = (torch.zeros(3, device=DEVICE), torch.ones(3, dtype=torch.bool, device=DEVICE))
     value = objective.of(there(view), EXPOSURE.to(DEVICE), Rendering(*leaves), *rest)
     assert torch.autograd.grad(value, leaves[1])[0].abs().max() == 0
 
@@ -133,7 +131,7 @@ def started(room: MappingInput) -> Any:
 
 
 def test_visits_are_those_of_the_cpu(started: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Map, poses and exposures after a pass, with labels and without, classes, what the map is pruned and split by."""
+    """Map, poses and exposures after a pass, classes, what the map is pruned and split by."""
     views, first, classes = started
     found = []
     for takes, place in ((True, there), (False, lambda v: v)):
@@ -144,16 +142,16 @@ def test_visits_are_those_of_the_cpu(started: Any, monkeypatch: pytest.MonkeyPat
         )
         state = OptimiserState.fresh(own, classes, gaussians, (first.log_gains, first.offsets))
         before = {k: state.parameters[k].detach().cpu().clone() for k in KEYS}
-        optimiser = MapOptimiser(own, classes, MappingConfig(), PaperConfig(label_weight=0.1), state)
+        optimiser = MapOptimiser(own, classes, MappingConfig(), state)
         for i in (0, 1, 2, 1):
-            optimiser.visit(Step(i, i, 1.3, 0.5, False, Seeding.NOTHING, False, False, False, i > 0))
+            optimiser.visit(Step(i, 1.3, 0.5, False, Seeding.NOTHING, False, False, False, i > 0))
         blame = optimiser._blame()
         result = state.result(own, 4)
         moved = {k: state.parameters[k].detach().cpu() - before[k] for k in KEYS}
         optimiser.count_labels()
         poses = torch.from_numpy(result.cam_from_world - first.cam_from_world)
         exposures = torch.from_numpy(np.stack([result.log_gains, result.offsets]))
-        rest = {"classes": state.parameters["class_logits"].detach(), "weights": optimiser._blending_weights()}
+        rest = {"classes": state.parameters.class_logits, "weights": optimiser._blending_weights()}
         rest |= {"blame": blame.error, "poses": poses, "exposures": exposures}
         found.append({k: x.cpu().double() for k, x in (moved | rest).items()})
     for name, mine in found[0].items():

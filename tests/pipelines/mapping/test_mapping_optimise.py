@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from msgs_slam.pipelines.config import MappingConfig, PaperConfig
+from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.gaussians.seeding import SEED_LOGIT
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project_gaussians
-from msgs_slam.pipelines.mapping import growth, objective, optimise, schedule
+from msgs_slam.pipelines.mapping import growth, optimise, schedule
 from msgs_slam.pipelines.mapping.label_votes import voted_logits
 from msgs_slam.pipelines.mapping.load import MappingInput
 from msgs_slam.pipelines.mapping.measure import ViewFigures, measure_view
@@ -69,7 +69,7 @@ def test_splitting_stops_at_the_largest_map(room: MappingInput) -> None:
     few = optimise_map(room.views, len(room.class_ids), replace(SETTINGS, seed_stride=4, split_error=0.0), seed=0)
     classes, most = len(room.class_ids), len(few.gaussian_map) + 31
     state = OptimiserState.fresh(room.views, classes, few.gaussian_map, None)
-    optimiser = MapOptimiser(room.views, classes, replace(SETTINGS, max_gaussians=most), PaperConfig(), state)
+    optimiser = MapOptimiser(room.views, classes, replace(SETTINGS, max_gaussians=most), state)
     optimiser.growth.split(optimiser._blame())
     assert len(state.parameters) == len(few.gaussian_map) + 30
 
@@ -81,7 +81,7 @@ def test_what_stands_only_where_a_view_shows_no_scene_has_no_weight(room: Mappin
 
     def weights(seen: View) -> torch.Tensor:
         state = OptimiserState.fresh([seen], len(room.class_ids), m, None)
-        return MapOptimiser([seen], len(room.class_ids), SETTINGS, PaperConfig(), state)._blending_weights()
+        return MapOptimiser([seen], len(room.class_ids), SETTINGS, state)._blending_weights()
 
     in_cam = m.means @ view.cam_from_world[:3, :3].float().T + view.cam_from_world[:3, 3].float()
     u, _, sigma, z = project_gaussians(in_cam, m.radii, view.intrinsics, 0.1)
@@ -91,28 +91,6 @@ def test_what_stands_only_where_a_view_shows_no_scene_has_no_weight(room: Mappin
     assert masked[left].max() == 0
     assert all_of_it[right].max() > 0.5
     assert torch.equal(masked[right], all_of_it[right])
-
-
-@pytest.mark.parametrize("iteration", [0, 1])
-def test_labels_count_as_often_while_the_map_grows(room: MappingInput, iteration: int) -> None:
-    """At every second step and at no other, whether it grows or not; never where they are counted in the end."""
-    plan = schedule.Schedule.plan(room.views, SETTINGS, seed=0, seeding=True, passes=None)
-    growing = next(s for i in range(plan.total) if (s := plan.step(i)).grow)
-    for weight in (0.0, 0.1):
-        state = OptimiserState.fresh(room.views, len(room.class_ids), None, None)
-        optimiser = MapOptimiser(room.views, len(room.class_ids), SETTINGS, PaperConfig(label_weight=weight), state)
-        optimiser.visit(replace(plan.step(0), view=growing.view))
-        before = state.parameters["class_logits"].clone()
-        optimiser.visit(replace(growing, iteration=iteration))
-        moved = (state.parameters["class_logits"][: len(before)] - before).abs().max() > 0
-        assert bool(moved) == (weight > 0 and iteration % objective.LABEL_EVERY == 0)
-
-
-def test_counted_classes_are_as_good_as_learnt_ones(room: MappingInput, mapped: OptimisedMap) -> None:
-    paper = PaperConfig(label_weight=0.1)
-    learnt = optimise_map(room.views, len(room.class_ids), SETTINGS, seed=0, paper=paper)
-    for views in (room.views, room.held_out):
-        assert mean(mapped, views, "label_agreement") > mean(learnt, views, "label_agreement")
 
 
 def test_a_gaussian_takes_the_classes_of_the_pixels_it_fills(room: MappingInput, mapped: OptimisedMap) -> None:

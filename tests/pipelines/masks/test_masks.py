@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_grey_png, write_rgb
-from msgs_slam.pipelines.config import MappingConfig, PaperConfig
+from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.correspondence.features import extract_features
 from msgs_slam.pipelines.correspondence.flow import corners
 from msgs_slam.pipelines.frames.keyframes import choose_keyframes
@@ -265,8 +265,8 @@ def a_view() -> tuple[View, Callable]:
     def loss_of(seen: View) -> tuple[float, torch.Tensor]:
         shown = (view.colors * 0.9 + 0.03).requires_grad_()
         rendering = Rendering(shown, torch.ones(60, 80), torch.full((60, 80), 0.9))
-        objective = Objective(MappingConfig(), PaperConfig(), 0, 1.0)
-        loss = objective.of(seen, torch.zeros(2, 3), rendering, torch.zeros(4), False)
+        objective = Objective(MappingConfig(), 1.0)
+        loss = objective.of(seen, torch.zeros(2, 3), rendering, torch.zeros(4))
         loss.backward()
         assert shown.grad is not None
         if seen.scene is not None:
