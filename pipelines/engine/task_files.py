@@ -1,13 +1,15 @@
-"""Tasks, and what they return, as files for any machine: dataclasses of this program, arrays and plain values."""
+"""Values as files for any machine, or for going on after an interruption: dataclasses of this program, arrays and plain
+values. Tasks and what they return are kept so, and the snapshots of the stages."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +31,9 @@ TASK_MODULES = (
 
 def save_value(path: Path, value: Any) -> None:
     """One .npz, whole or not at all. Raises TypeError for what is neither of these."""
-    arrays: dict[str, NDArray] = {}
-    tree = json.dumps(_plain(value, arrays))
+    columns = _Columns()
+    tree = json.dumps(_plain(value, columns))
+    arrays = {name: np.concatenate(parts) for name, parts in columns.parts.items()}
     save_arrays(path, {**arrays, _TREE: np.frombuffer(tree.encode(), np.uint8)}, compress=False)
 
 
@@ -55,14 +58,41 @@ def of_name(name: str) -> Any:
     return found
 
 
-def _plain(value: Any, arrays: dict[str, NDArray]) -> Any:
+@dataclass
+class _Columns:
+    """All arrays of one type after each other: there may be thousands of small ones."""
+
+    parts: dict[str, list[NDArray]] = field(default_factory=dict)
+    length: dict[str, int] = field(default_factory=dict)
+
+    def add(self, array: NDArray) -> list[Any]:
+        """Append the array; returns by what `_array` finds it again."""
+        kind, order = array.dtype.str, _order(array)
+        start = self.length.get(kind, 0)
+        self.parts.setdefault(kind, []).append(array.ravel(order))
+        self.length[kind] = start + array.size
+        return [kind, start, array.shape, order]
+
+
+def _order(array: NDArray) -> Literal["C", "F"]:
+    return "F" if np.isfortran(array) else "C"
+
+
+def _array(
+    columns: Mapping[str, NDArray], kind: str, start: int, shape: list[int], order: Literal["C", "F"]
+) -> NDArray:
+    return columns[kind][start : start + math.prod(shape)].reshape(shape, order=order)
+
+
+def _plain(value: Any, arrays: _Columns) -> Any:
     if value is None or isinstance(value, str | bool | int | float):
         return value
     if isinstance(value, Path):
         return {"path": str(value)}
-    if isinstance(value, np.ndarray | np.generic):
-        arrays[name := f"a{len(arrays)}"] = np.asarray(value)
-        return {"array": name}
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return {"array": arrays.add(value)}
     if isinstance(value, tuple | list):
         return {type(value).__name__: [_plain(v, arrays) for v in value]}
     if isinstance(value, Mapping):
@@ -80,7 +110,7 @@ def _value(tree: Any, arrays: Mapping[str, NDArray]) -> Any:
     if kind == "path":
         return Path(content)
     if kind == "array":
-        return arrays[content]
+        return _array(arrays, *content)
     if kind in ("tuple", "list"):
         items = [_value(v, arrays) for v in content]
         return tuple(items) if kind == "tuple" else items

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.tensors import load_arrays, save_arrays
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.global_ba.verify import ROTATION, TRANSLATION, KeyframeView, Loop, verify_loop
-from msgs_slam.pipelines.tracking.state import Sightings
-from msgs_slam.pipelines.types import Intrinsics, LoopEdge
+from msgs_slam.pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
 
@@ -124,38 +121,3 @@ def _agree(
     return bool(
         se3.rotation_angle(apart) < 3 * np.radians(ROTATION) and np.linalg.norm(apart[:3, 3]) < 3 * TRANSLATION * depth
     )
-
-
-def save_found(path: Path, found: FoundLoops) -> None:
-    """One npz, for going on after an interruption."""
-    loops = found.loops
-    sides = [s for loop in loops for s in (loop.in_second, loop.in_first)]
-    empty = Sightings(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
-    save_arrays(
-        path,
-        {
-            "counts": np.array([found.tried, found.unverified, found.implausible, found.unsupported]),
-            "ids": np.array([(x.edge.frame1_id, x.edge.frame2_id, x.edge.inliers) for x in loops]).reshape(-1, 3),
-            "motion": np.array([x.edge.frame2_from_frame1 for x in loops]).reshape(-1, 4, 4),
-            "scale": np.array([x.edge.scale for x in loops], dtype=np.float64),
-            "lengths": np.array([len(s) for s in sides], np.int64),
-            "point": np.concatenate([s.point for s in [*sides, empty]]),
-            "xy": np.concatenate([s.xy for s in [*sides, empty]]),
-            "sd": np.concatenate([s.sd for s in [*sides, empty]]),
-        },
-    )
-
-
-def load_found(path: Path) -> FoundLoops:
-    """Load what `save_found` wrote."""
-    a = load_arrays(path, own=True)
-    ends = np.cumsum(a["lengths"])
-    sides = [
-        Sightings(a["point"][e - n : e], a["xy"][e - n : e], a["sd"][e - n : e])
-        for e, n in zip(ends, a["lengths"], strict=True)
-    ]
-    loops = [
-        Loop(LoopEdge(int(i[0]), int(i[1]), m, float(s), int(i[2])), sides[2 * k], sides[2 * k + 1])
-        for k, (i, m, s) in enumerate(zip(a["ids"], a["motion"], a["scale"], strict=True))
-    ]
-    return FoundLoops(loops, *(int(c) for c in a["counts"]))

@@ -12,12 +12,13 @@ from msgs_slam.formats.atomic import copy_file
 from msgs_slam.pipelines.correspondence.retrieval import GlobalDescriptors, compute_global_descriptors, unit
 from msgs_slam.pipelines.depth.scales import sample_proxy
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
+from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.candidates import loop_candidates
 from msgs_slam.pipelines.global_ba.close import Closed, close_loops
-from msgs_slam.pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_found
+from msgs_slam.pipelines.global_ba.loops import FoundLoops, find_loops
 from msgs_slam.pipelines.global_ba.semantics import LabelSummary, summarise_labels
 from msgs_slam.pipelines.global_ba.verify import KeyframeView, Loop, make_view
 from msgs_slam.pipelines.mapping.build import Refined, refine_map
@@ -93,7 +94,7 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
     """Candidates by appearance and semantics, verified; kept in a snapshot."""
     snapshot = context.snapshot / "loops.npz"
     if snapshot.exists():
-        return load_found(snapshot)
+        return load_value(snapshot)
     run, settings, seed = context.run, context.config.global_ba, context.config.run.seed
     pictures = Pictures(run, context.config.frames)
     views = keyframe_views(context, model, pictures)
@@ -108,7 +109,7 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
     pairs = loop_candidates(model, GlobalDescriptors(tuple(kinds)), load_summaries(run, model), refused, settings)
     tracked = context.progress.track(pairs, "loops", len(pairs))
     found = find_loops(tracked, views, model.cam_from_world, run.load(CALIBRATION).intrinsics, seed)
-    save_found(snapshot, found)
+    save_value(snapshot, found)
     return found
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.engine.chunks import Chunk, in_chunks
 from msgs_slam.pipelines.engine.stages import StageContext
+from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.masks.moving import SIDE, MovingView, look_once
 from msgs_slam.pipelines.proxy.compact import compact
 from msgs_slam.pipelines.proxy.providers import (
@@ -25,7 +26,6 @@ from msgs_slam.pipelines.proxy.providers import (
 )
 from msgs_slam.pipelines.proxy.reliability import reliability, semantic_agreement, theta, warp_labels
 from msgs_slam.pipelines.proxy.scale import DepthScale
-from msgs_slam.pipelines.proxy.scratch import load_scratch, save_scratch
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth, open_semantics
 from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, LEFT_OUT, PROXY_MAPS
@@ -82,16 +82,13 @@ class ProxyWork:
 
     def computed_depth(self, frame: Frame) -> DepthEstimate:
         """What `make_depths` has left."""
-        stored = load_scratch(self._depth_path(frame))
-        return DepthEstimate(stored["depth"], stored["confidence"], int(stored["invalid"]), stored.get("normals"))
+        found: DepthEstimate = load_value(self._depth_path(frame))
+        return found
 
     def save_depth(self, frame: Frame) -> None:
         """Depth of what the frame shows of the scene, to the snapshot; what is there stays."""
         if not (path := self._depth_path(frame)).exists():
-            estimate = self.depths.estimate(frame).without(self.sequence.left_out(frame))
-            arrays = {"depth": estimate.depth, "confidence": estimate.confidence, "invalid": np.array(estimate.invalid)}
-            normals = {} if estimate.normals is None else {"normals": estimate.normals}
-            save_scratch(path, **arrays, **normals)
+            save_value(path, self.depths.estimate(frame).without(self.sequence.left_out(frame)))
 
     def _depth_path(self, frame: Frame) -> Path:
         return self.context.snapshot / "depth" / f"{frame.id:06d}.npz"

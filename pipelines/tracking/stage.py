@@ -6,6 +6,7 @@ from typing import Any
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
+from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.geometry.rig import Rig, rig_of
 from msgs_slam.pipelines.run.files import (
     BACKBONE,
@@ -84,7 +85,7 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
     snapshot = context.snapshot / "state.npz"
     rig = rig_of(context.run.load(CALIBRATION).directions, len(frames))
     shutter = load_shutter(context.run)
-    state = TrackState.load(snapshot, rig, shutter) if snapshot.exists() else start_state(context, rig, shutter)
+    state: TrackState = load_value(snapshot) if snapshot.exists() else start_state(context, rig, shutter)
     front_end = FrontEnd(state, pictures, context.config.run.seed)
     every = max(SNAPSHOT_EVERY, len(frames) // SNAPSHOTS)
     for frame in context.progress.track(frames[state.done :], "tracking", len(frames) - state.done):
@@ -92,7 +93,7 @@ def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures)
             front_end.track(frame.id)
         state.done += 1
         if state.done % every == 0 or is_asked():
-            state.save(snapshot)
+            save_value(snapshot, state)
     sync_rig_poses(state)
     # Frames before the first keyframe could not be followed from anywhere; now there are neighbours behind them.
     for frame_id in sorted(state.lost, reverse=True):

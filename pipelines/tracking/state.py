@@ -5,12 +5,10 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.tensors import load_arrays, save_arrays
 from msgs_slam.pipelines.geometry.rig import ONE_CAMERA, Rig
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.structure.rolling import Shutter, velocities
@@ -133,50 +131,3 @@ class TrackState:
         place, behind = bisect_left(self.keyframes, frame_id), bisect_right(self.keyframes, frame_id)
         before, after = self.keyframes[max(place - count, 0) : place], self.keyframes[behind : behind + count]
         return sorted(before + after, key=lambda k: (abs(k - frame_id), k))
-
-    def save(self, path: Path) -> None:
-        """One npz, for going on after an interruption."""
-        ids = sorted(self.poses)
-        rows = [self.sightings[i] for i in ids]
-        lost = sorted(self.lost)
-        arrays: dict[str, NDArray] = {
-            "points": self.points,
-            "colors": self.colors,
-            "ids": np.array(ids, np.int64),
-            "poses": np.array([self.poses[i] for i in ids]).reshape(-1, 4, 4),
-            "segment": np.array([self.segment[i] for i in ids], np.int64),
-            "counts": np.array([len(s) for s in rows], np.int64),
-            "point": np.concatenate([s.point for s in rows] or [NO_SIGHTINGS.point]),
-            "xy": np.concatenate([s.xy for s in rows] or [NO_SIGHTINGS.xy]),
-            "sd": np.concatenate([s.sd for s in rows] or [NO_SIGHTINGS.sd]),
-            "keyframes": np.array(self.keyframes, np.int64),
-            "lost": np.array(lost, np.int64),
-            "reasons": np.array([self.lost[i] for i in lost], np.str_),
-            "rendered": np.array(self.rendered, np.int64),
-            "done": np.array(self.done),
-        }
-        save_arrays(path, arrays)
-
-    @staticmethod
-    def load(path: Path, rig: Rig = ONE_CAMERA, shutter: Shutter | None = None) -> TrackState:
-        """Load what `save` wrote."""
-        a = load_arrays(path, own=True)
-        ends = np.cumsum(a["counts"])
-        ids = [int(i) for i in a["ids"]]
-        sightings = {
-            i: Sightings(a["point"][e - c : e], a["xy"][e - c : e], a["sd"][e - c : e])
-            for i, e, c in zip(ids, ends, a["counts"], strict=True)
-        }
-        return TrackState(
-            a["points"],
-            a["colors"],
-            dict(zip(ids, a["poses"], strict=True)),
-            sightings,
-            [int(k) for k in a["keyframes"]],
-            {int(i): str(r) for i, r in zip(a["lost"], a["reasons"], strict=True)},
-            dict(zip(ids, (int(s) for s in a["segment"]), strict=True)),
-            [int(i) for i in a["rendered"]],
-            int(a["done"]),
-            rig,
-            shutter=shutter or Shutter(),
-        )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.atomic import atomic_path
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.tensors import load_arrays
-from msgs_slam.pipelines.proxy.scratch import load_scratch, save_scratch
+from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.system.progress import Progress, log
 from msgs_slam.pipelines.types import Frame
@@ -127,12 +127,13 @@ class NetworkPass:
                 cache.save(key, arrays)
                 if computed == _MEASURED:
                     self._announce(seconds / computed, len(todo) - done - 1)
-            save_scratch(self._path(frame), **arrays)
+            save_value(self._path(frame), arrays)
         cache.trim()
 
     def load(self, frame: Frame) -> Arrays:
         """Load the results of `run` for a frame."""
-        return load_scratch(self._path(frame))
+        arrays: Arrays = load_value(self._path(frame))
+        return arrays
 
     def _is_whole(self, frame: Frame) -> bool:
         """A damaged result is made again like a missing one."""

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.scratch import load_scratch, save_scratch
 from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
 from msgs_slam.pipelines.proxy.stereo.borrow import agreed_depth, borrow_depth, carry_depth
@@ -104,7 +104,7 @@ class MultiviewDepth:
         for frame in self._progress.track([f for f in frames if f.id in self._index], "stereo"):
             path = self._path(frame.id)
             if not path.exists():
-                save_scratch(path, inverse_depth=self._sweep(self._index[frame.id]))
+                save_value(path, self._sweep(self._index[frame.id]))
 
     def _sweep(self, index: int) -> NDArray[np.float32]:
         """(H, W) inverse depth of one keyframe from its neighbours alone; 0 where nothing matches."""
@@ -242,8 +242,7 @@ class MultiviewDepth:
         return resize_area(image, self._camera.width, self._camera.height)
 
     def _load_raw(self, index: int) -> NDArray[np.float32]:
-        inverse = load_scratch(self._path(int(self._model.frame_ids[index])))["inverse_depth"]
-        return invert(inverse)
+        return invert(load_value(self._path(int(self._model.frame_ids[index]))))
 
 
 def _blanked(grey: NDArray[np.float32], left_out: NDArray[np.bool_] | None) -> NDArray[np.float32]:

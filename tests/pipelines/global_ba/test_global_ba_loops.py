@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import GlobalBaConfig, TrackingConfig
 from msgs_slam.pipelines.correspondence.retrieval import GlobalDescriptors, describe, learn_vocabulary
+from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.camera import project
@@ -19,7 +20,7 @@ from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba import loops
 from msgs_slam.pipelines.global_ba.candidates import loop_candidates, shared_points
 from msgs_slam.pipelines.global_ba.close import close_loops, reprojection_error
-from msgs_slam.pipelines.global_ba.loops import FoundLoops, find_loops, load_found, save_found
+from msgs_slam.pipelines.global_ba.loops import FoundLoops, find_loops
 from msgs_slam.pipelines.global_ba.semantics import summarise_labels
 from msgs_slam.pipelines.global_ba.verify import KeyframeView, make_view, verify_loop
 from msgs_slam.pipelines.tracking.state import TrackState
@@ -197,8 +198,8 @@ def test_reprojection_error_is_that_of_the_noise() -> None:
 
 def test_found_loops_come_back_from_disk(tmp_path: Path) -> None:
     found = make_walk().find()
-    save_found(tmp_path / "loops.npz", found)
-    back = load_found(tmp_path / "loops.npz")
+    save_value(tmp_path / "loops.npz", found)
+    back = load_value(tmp_path / "loops.npz")
     assert (back.tried, back.unverified) == (found.tried, found.unverified)
     for a, b in zip(found.loops, back.loops, strict=True):
         assert a.edge.inliers == b.edge.inliers
@@ -206,8 +207,8 @@ def test_found_loops_come_back_from_disk(tmp_path: Path) -> None:
         assert np.array_equal(a.in_first.xy, b.in_first.xy)
         assert np.array_equal(a.in_second.point, b.in_second.point)
     empty = FoundLoops([], 3, 3, 0, 0)
-    save_found(tmp_path / "none.npz", empty)
-    assert load_found(tmp_path / "none.npz") == empty
+    save_value(tmp_path / "none.npz", empty)
+    assert load_value(tmp_path / "none.npz") == empty
 
 
 def test_search_is_repeatable() -> None:

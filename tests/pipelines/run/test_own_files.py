@@ -32,8 +32,8 @@ def test_a_snapshot_of_many_sightings_is_read_again(tmp_path: Path, monkeypatch:
     for k in range(20):
         seen = Sightings(np.arange(10), np.full((10, 2), float(k)), np.ones(10))
         state.add_frame(k, np.eye(4), seen, is_keyframe=k % 2 == 0, segment=0)
-    state.save(tmp_path / "state.npz")
-    back = TrackState.load(tmp_path / "state.npz")
+    save_value(tmp_path / "state.npz", state)
+    back = load_value(tmp_path / "state.npz")
     assert back.keyframes == state.keyframes
     np.testing.assert_array_equal(back.sightings[19].xy, state.sightings[19].xy)
     with pytest.raises(InputError, match="would unpack"):

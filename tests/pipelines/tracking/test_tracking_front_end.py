@@ -9,6 +9,7 @@ import pytest
 from msgs_slam.pipelines.correspondence.features import extract_features
 from msgs_slam.pipelines.correspondence.flow import corners, follow
 from msgs_slam.pipelines.correspondence.matching import match_descriptors
+from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.tracking.extend import triangulate
@@ -129,8 +130,8 @@ def test_state_comes_back_from_disk(tmp_path: Path) -> None:
     state.add_frame(6, 2 * np.eye(4), Sightings(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)), False, 1)
     state.lost[5] = "too dark, ½"
     state.done = 7
-    state.save(tmp_path / "s.npz")
-    back = TrackState.load(tmp_path / "s.npz")
+    save_value(tmp_path / "s.npz", state)
+    back = load_value(tmp_path / "s.npz")
     assert back.sightings[4].point.tolist() == [1, 3]
     for name in ("keyframes", "lost", "segment", "done"):
         assert getattr(back, name) == getattr(state, name)
