@@ -49,44 +49,27 @@ class ColmapModel:
     obs_xy: NDArray[np.float64]
 
 
-def write_colmap_model(
-    folder: Path,
-    width: int,
-    height: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    names: tuple[str, ...] | list[str],
-    cam_from_world: NDArray[np.float64],
-    points: NDArray[np.float64],
-    colors: NDArray[np.uint8],
-    obs_image: NDArray[np.int64],
-    obs_point: NDArray[np.int64],
-    obs_xy: NDArray[np.float64],
-) -> None:
-    """Write cameras, images and points3D, binary and text, for one PINHOLE camera.
+def write_colmap_model(folder: Path, model: ColmapModel) -> None:
+    """Write cameras, images and points3D, binary and text, of images by one PINHOLE camera.
 
-    names: N; cam_from_world (N, 4, 4); points (P, 3); colors (P, 3) uint8; obs_image (O,) in 0..N-1, obs_point (O,)
-    in 0..P-1, obs_xy (O, 2) pixels with the first pixel's centre at (0.5, 0.5). Ids in the files count from 1, in the
-    order given. Each point's error is the mean reprojection error of its observations. COLMAP's text format has no
-    way to write blanks in a name: such names are whole in the binary files only.
+    Ids in the files count from 1, in the order given. Each point's error is the mean reprojection error of its
+    observations. COLMAP's text format has no way to write blanks in a name: such names are whole in the binary files
+    only.
 
     Raises ValueError for shapes or indices that do not fit together, InputError when the disk refuses.
     """
-    _require_consistent(names, cam_from_world, points, colors, obs_image, obs_point, obs_xy)
-    camera = (width, height, fx, fy, cx, cy)
-    errors = _point_errors(camera, cam_from_world, points, obs_image, obs_point, obs_xy)
-    images = _Images.from_arrays(names, cam_from_world, obs_image, obs_point, obs_xy)
-    tracks = _tracks(images, len(points))
+    _require_consistent(model)
+    camera, errors, images = _camera(model), _point_errors(model), _Images.from_model(model)
+    tracks = _tracks(images, len(model.points))
+    points = (model.points, model.colors, errors, tracks)
     folder = Path(folder)
     # Binary last: readers look for it first, and must not find it before the rest is there.
     write_text(folder / "cameras.txt", _cameras_text(camera))
     write_lines(folder / "images.txt", _images_text(images))
-    write_lines(folder / "points3D.txt", _points_text(points, colors, errors, tracks))
+    write_lines(folder / "points3D.txt", _points_text(*points))
     write_bytes(folder / "cameras.bin", _cameras_binary(camera))
     write_bytes(folder / "images.bin", _images_binary(images))
-    write_bytes(folder / "points3D.bin", _points_binary(points, colors, errors, tracks))
+    write_bytes(folder / "points3D.bin", _points_binary(*points))
 
 
 def read_colmap_model(folder: Path) -> ColmapModel:
@@ -191,22 +174,14 @@ class _Images:
     obs_point: NDArray[np.int64]
     obs_xy: NDArray[np.float64]
 
-    @classmethod
-    def from_arrays(
-        cls,
-        names: tuple[str, ...] | list[str],
-        cam_from_world: NDArray[np.float64],
-        obs_image: NDArray[np.int64],
-        obs_point: NDArray[np.int64],
-        obs_xy: NDArray[np.float64],
-    ) -> _Images:
-        order = np.argsort(obs_image, kind="stable")
-        starts = np.searchsorted(obs_image[order], np.arange(len(names) + 1)).astype(np.int64)
-        rotations = nearest_rotation(cam_from_world[:, :3, :3])
-        quat_xyzw = Rotation.from_matrix(rotations).as_quat(canonical=True) if len(names) else np.zeros((0, 4))
-        return cls(
-            tuple(names), quat_xyzw[:, [3, 0, 1, 2]], cam_from_world[:, :3, 3], starts, obs_point[order], obs_xy[order]
-        )
+    @staticmethod
+    def from_model(m: ColmapModel) -> _Images:
+        order = np.argsort(m.obs_image, kind="stable")
+        starts = np.searchsorted(m.obs_image[order], np.arange(len(m.names) + 1)).astype(np.int64)
+        rotations = nearest_rotation(m.cam_from_world[:, :3, :3])
+        quat_xyzw = Rotation.from_matrix(rotations).as_quat(canonical=True) if len(m.names) else np.zeros((0, 4))
+        quat_wxyz, translations = quat_xyzw[:, [3, 0, 1, 2]], m.cam_from_world[:, :3, 3]
+        return _Images(tuple(m.names), quat_wxyz, translations, starts, m.obs_point[order], m.obs_xy[order])
 
 
 @dataclass(frozen=True)
@@ -227,19 +202,22 @@ def _tracks(images: _Images, point_count: int) -> _Tracks:
     return _Tracks(starts, elements[order])
 
 
-def _point_errors(
-    camera: tuple[int, int, float, float, float, float],
-    cam_from_world: NDArray[np.float64],
-    points: NDArray[np.float64],
-    obs_image: NDArray[np.int64],
-    obs_point: NDArray[np.int64],
-    obs_xy: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _camera(model: ColmapModel) -> tuple[int, int, float, float, float, float]:
+    """Width, height, fx, fy, cx, cy of its one camera."""
+    ((kind, width, height, parameters),) = model.cameras
+    fx, fy, cx, cy = parameters
+    if kind != "PINHOLE":
+        raise ValueError(f"write_colmap_model: got a camera of the model {kind}, expected PINHOLE")
+    return width, height, fx, fy, cx, cy
+
+
+def _point_errors(model: ColmapModel) -> NDArray[np.float64]:
     """(P,) mean reprojection error in pixels, 0 for a point without observations."""
-    _, _, fx, fy, cx, cy = camera
+    _, _, fx, fy, cx, cy = _camera(model)
+    points, obs_point, obs_xy = model.points, model.obs_point, model.obs_xy
     distance = np.zeros(len(obs_xy))
     for rows in slices(len(obs_xy)):  # a pose for each observation is the largest thing here
-        transforms = cam_from_world[obs_image[rows]]
+        transforms = model.cam_from_world[model.obs_image[rows]]
         in_cam = np.einsum("oij,oj->oi", transforms[:, :3, :3], points[obs_point[rows]]) + transforms[:, :3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             projected = in_cam[:, :2] / in_cam[:, 2:] * [fx, fy] + [cx, cy]
@@ -309,29 +287,15 @@ def _numbers(values: list[float]) -> str:
     return " ".join(repr(float(v)) for v in values)
 
 
-def _require_consistent(
-    names: tuple[str, ...] | list[str],
-    cam_from_world: NDArray[np.float64],
-    points: NDArray[np.float64],
-    colors: NDArray[np.uint8],
-    obs_image: NDArray[np.int64],
-    obs_point: NDArray[np.int64],
-    obs_xy: NDArray[np.float64],
-) -> None:
-    n, p, o = len(names), len(points), len(obs_image)
-    shapes = {
-        "cam_from_world": (cam_from_world.shape, (n, 4, 4)),
-        "points": (points.shape, (p, 3)),
-        "colors": (colors.shape, (p, 3)),
-        "obs_point": (obs_point.shape, (o,)),
-        "obs_xy": (obs_xy.shape, (o, 2)),
-    }
-    for what, (got, expected) in shapes.items():
-        if got != expected:
+def _require_consistent(m: ColmapModel) -> None:
+    n, p, o = len(m.names), len(m.points), len(m.obs_image)
+    shapes = {"cam_from_world": (n, 4, 4), "points": (p, 3), "colors": (p, 3), "obs_point": (o,), "obs_xy": (o, 2)}
+    for what, expected in shapes.items():
+        if (got := getattr(m, what).shape) != expected:
             raise ValueError(f"write_colmap_model: {what}: got shape {got}, expected {expected}")
-    if o and not (0 <= obs_image.min() <= obs_image.max() < n and 0 <= obs_point.min() <= obs_point.max() < p):
+    if o and not (0 <= m.obs_image.min() <= m.obs_image.max() < n and 0 <= m.obs_point.min() <= m.obs_point.max() < p):
         raise ValueError("write_colmap_model: an observation points outside the images or points")
-    if len(set(names)) != n or any(not name or "\n" in name or "\0" in name for name in names):
+    if len(set(m.names)) != n or any(not name or "\n" in name or "\0" in name for name in m.names):
         raise ValueError("write_colmap_model: image names must be unique, not empty, and without line breaks")
-    if not (np.isfinite(cam_from_world).all() and np.isfinite(points).all() and np.isfinite(obs_xy).all()):
+    if not (np.isfinite(m.cam_from_world).all() and np.isfinite(m.points).all() and np.isfinite(m.obs_xy).all()):
         raise ValueError("write_colmap_model: got a value that is not finite")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from msgs_slam.formats.atomic import copy_file, write_text
-from msgs_slam.formats.colmap import write_colmap_model
+from msgs_slam.formats.colmap import ColmapModel, write_colmap_model
 from msgs_slam.formats.gaussian_glb import write_gaussian_glb
 from msgs_slam.formats.gaussian_ply import write_gaussian_ply
 from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
@@ -51,7 +51,9 @@ def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
         if (left_out := outcome.run.left_out(frame)) is not None:
             LEFT_OUT.save(folder, left_out, frame.name)
     points = seen_points(outcome.load_sparse(), trajectory.frame_ids[posed])
-    write_colmap_model(folder / SPARSE, *camera, names, trajectory.cam_from_world[posed], *points)
+    pinhole, first = ("PINHOLE", k.width, k.height, (k.fx, k.fy, k.cx, k.cy)), np.zeros(len(names), np.int64)
+    model = ColmapModel(names, trajectory.cam_from_world[posed], (pinhole,), first, *points)
+    write_colmap_model(folder / SPARSE, model)
     start = write_start(folder, points[0], points[1])
     paths = [f"{IMAGES}/{name}" for name in names]
     write_transforms(folder / "transforms.json", *camera, paths, trajectory.world_from_cam[posed], start)

@@ -11,7 +11,7 @@ import math
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -72,6 +72,7 @@ from msgs_slam.pipelines.proxy.learned.network_pass import ResultCache
 from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
 from msgs_slam.pipelines.viewer.scene import load_scenes
+from tests.colmap_models import posed_images
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 4
 
@@ -322,7 +323,9 @@ def make_colmap(suffix: str) -> Callable[[Path], None]:
         image, point = np.repeat(np.arange(FRAMES), points), np.tile(np.arange(points), FRAMES)
         xyz, rgb = _rng().normal(size=(points, 3)), _rng().integers(0, 255, (points, 3)).astype(np.uint8)
         xy = _rng().random((FRAMES * points, 2)) * 48
-        write_colmap_model(folder, WIDTH, HEIGHT, 50, 51, 32, 24, names, _poses(), xyz, rgb, image, point, xy)
+        model = posed_images(names, _poses(), WIDTH, HEIGHT, 50.0, 51.0, 32.0, 24.0)
+        seen = {"points": xyz, "colors": rgb, "obs_image": image, "obs_point": point, "obs_xy": xy}
+        write_colmap_model(folder, replace(model, **seen))
         for other in (p for p in folder.iterdir() if p.suffix != suffix):
             other.unlink()
 

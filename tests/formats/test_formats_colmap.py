@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.colmap import ColmapModel, model_suffix, read_colmap_model, write_colmap_model
 from msgs_slam.formats.errors import InputError
+from tests.colmap_models import posed_images
 
 WIDTH, HEIGHT, FX, FY, CX, CY = 640, 480, 525.0, 520.0, 321.0, 238.5
 
@@ -43,18 +44,11 @@ def _scene(noise: float = 0.0) -> ColmapModel:
     )
 
 
-def _write(folder: Path, m: ColmapModel) -> None:
-    write_colmap_model(
-        folder, WIDTH, HEIGHT, FX, FY, CX, CY, m.names, m.cam_from_world, m.points, m.colors, m.obs_image,
-        m.obs_point, m.obs_xy,
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize("kind", ["bin", "txt"])
 @pytest.mark.parametrize("noise", [0.0, 0.5])
 def test_pycolmap_reads_both_kinds(tmp_path: Path, kind: str, noise: float) -> None:
     scene = _scene(noise)
-    _write(tmp_path, scene)
+    write_colmap_model(tmp_path, scene)
     for path in tmp_path.glob("*"):
         if path.suffix != f".{kind}":
             path.unlink()
@@ -79,18 +73,15 @@ def test_pycolmap_reads_both_kinds(tmp_path: Path, kind: str, noise: float) -> N
 
 
 def test_written_files_are_the_same_every_time(tmp_path: Path) -> None:
-    _write(tmp_path / "a", _scene())
-    _write(tmp_path / "b", _scene())
+    write_colmap_model(tmp_path / "a", _scene())
+    write_colmap_model(tmp_path / "b", _scene())
     names = sorted(p.name for p in (tmp_path / "a").iterdir())
     assert names == [f"{n}{s}" for n in ("cameras", "images", "points3D") for s in (".bin", ".txt")]
     assert all((tmp_path / "a" / n).read_bytes() == (tmp_path / "b" / n).read_bytes() for n in names)
 
 
 def test_a_model_without_points(tmp_path: Path) -> None:
-    write_colmap_model(
-        tmp_path, 8, 8, 5, 5, 4, 4, ["a.png"], np.eye(4)[None], np.zeros((0, 3)), np.zeros((0, 3), np.uint8),
-        np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)),
-    )  # fmt: skip
+    write_colmap_model(tmp_path, posed_images(["a.png"], np.eye(4)[None], 8, 8, 5.0, 5.0, 4.0, 4.0))
     back = read_colmap_model(tmp_path)
     assert back.names == ("a.png",)
     assert back.points.shape == (0, 3)
@@ -99,7 +90,9 @@ def test_a_model_without_points(tmp_path: Path) -> None:
 
 def test_names_with_blanks_survive_in_the_binary_files(tmp_path: Path) -> None:
     scene = _scene()
-    _write(tmp_path, ColmapModel(**{**scene.__dict__, "names": tuple(f"my image {i}.jpg" for i in range(6))}))
+    write_colmap_model(
+        tmp_path, ColmapModel(**{**scene.__dict__, "names": tuple(f"my image {i}.jpg" for i in range(6))})
+    )
     assert read_colmap_model(tmp_path).names[2] == "my image 2.jpg"
 
 
@@ -113,7 +106,7 @@ def test_arrays_that_do_not_fit_are_refused(tmp_path: Path, spoil: str) -> None:
         "nan": {"points": scene.points * np.nan},
     }[spoil]
     with pytest.raises(ValueError, match="write_colmap_model"):
-        _write(tmp_path, ColmapModel(**{**scene.__dict__, **changed}))
+        write_colmap_model(tmp_path, ColmapModel(**{**scene.__dict__, **changed}))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -138,7 +131,7 @@ def test_incomplete_models_are_explained(shared_data: Path, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("part", ["cameras", "images", "points3D"])
 def test_truncated_files_are_refused_before_memory_is_spent(tmp_path: Path, part: str) -> None:
-    _write(tmp_path / "whole", _scene())
+    write_colmap_model(tmp_path / "whole", _scene())
     data = (tmp_path / "whole" / f"{part}.bin").read_bytes()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for keep in (0, 4, 9, len(data) // 3, len(data) - 1):

@@ -19,6 +19,7 @@ from msgs_slam.formats.datasets.colmap import camera_from_colmap
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png, write_rgb
 from msgs_slam.formats.trajectory import write_matrices
+from tests.colmap_models import posed_images
 
 WIDTH, HEIGHT, N = 64, 48, 5
 
@@ -277,10 +278,8 @@ def test_a_depth_frame_unpacks_to_no_more_than_its_size(tmp_path: Path, known: K
 def _colmap_folder(path: Path, known: Known, names: list[str]) -> None:
     for name, rgb in zip(names, known.rgb, strict=True):
         write_rgb(path / "images" / name, rgb)
-    write_colmap_model(
-        path / "sparse" / "0", WIDTH, HEIGHT, 50, 51, 32.5, 24, names, np.linalg.inv(known.poses), np.zeros((0, 3)),
-        np.zeros((0, 3), np.uint8), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)),
-    )  # fmt: skip
+    camera = (WIDTH, HEIGHT, 50.0, 51.0, 32.5, 24.0)
+    write_colmap_model(path / "sparse" / "0", posed_images(names, np.linalg.inv(known.poses), *camera))
 
 
 @pytest.mark.parametrize("place", [".", "sparse/0"])

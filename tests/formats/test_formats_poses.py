@@ -15,6 +15,7 @@ from msgs_slam.formats.colmap import write_colmap_model
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.poses import read_poses
 from msgs_slam.formats.trajectory import write_matrices, write_tum
+from tests.colmap_models import posed_images
 
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
 Poses = NDArray[np.float64]
@@ -29,11 +30,9 @@ def made() -> Poses:
 
 
 def colmap(folder: Path, poses: Poses) -> Path:
-    names, nothing = [f"images/frame_{i:03d}.jpg" for i in range(5)], np.zeros((0, 3))
-    write_colmap_model(
-        folder / "sparse" / "0", 640, 480, 500, 500, 320, 240, names, np.linalg.inv(poses), nothing,
-        nothing.astype(np.uint8), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)),
-    )  # fmt: skip
+    names = [f"images/frame_{i:03d}.jpg" for i in range(5)]
+    model = posed_images(names, np.linalg.inv(poses), 640, 480, 500.0, 500.0, 320.0, 240.0)
+    write_colmap_model(folder / "sparse" / "0", model)
     return folder
 
 
