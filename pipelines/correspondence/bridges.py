@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.correspondence.flow import corners, follow
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair
-from msgs_slam.pipelines.correspondence.snapshots import Snapshots
+from msgs_slam.pipelines.correspondence.snapshots import Snapshots, features_name, pairs_name
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.types import Features
 
@@ -60,11 +60,14 @@ def with_bridges(
     """Run `bridged` once and keep its features in the snapshots: those of all keyframes would fill the memory."""
 
     def save(k: int, found: Features) -> None:
-        stored.features(k, lambda: found)
+        stored.value(features_name(k), lambda: found)
 
-    more = {(p.first, p.second): p for p in stored.pairs(0, lambda: bridged(features, pairs, weak, picture, save))}
+    more = {
+        (p.first, p.second): p
+        for p in stored.value(pairs_name(0), lambda: bridged(features, pairs, weak, picture, save))
+    }
     touched = {k for pair in more for k in pair}
-    changed = features.changed(lambda k, f: stored.features(k, lambda: f) if k in touched else f)
+    changed = features.changed(lambda k, f: stored.value(features_name(k), lambda: f) if k in touched else f)
     return changed, [more.get((p.first, p.second), p) for p in pairs]
 
 

@@ -5,25 +5,33 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
-import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from msgs_slam.formats.atomic import free_bytes, write_bytes
 from msgs_slam.formats.errors import DiskFullError
 from msgs_slam.formats.jsonfile import read_json, write_json
-from msgs_slam.formats.tensors import load_arrays, save_arrays
-from msgs_slam.pipelines.correspondence.matching import VerifiedPair
-from msgs_slam.pipelines.types import Features
+from msgs_slam.pipelines.system.values import load_value, save_value
 
+T = TypeVar("T")
 _DATABASE_SHARE = 3
-"""Bytes of the database and the models made from it, over those of the packed features and matches: a guess on the safe
-side, descriptors hardly pack."""
+"""Bytes of the database and the models made from it, over those of the features and matches: a guess on the safe
+side."""
 _LEAST_ROOM = 30_000_000
+
+
+def features_name(frame_id: int) -> str:
+    """Under which a frame's features are stored."""
+    return f"features/{frame_id:06d}"
+
+
+def pairs_name(block: int) -> str:
+    """Under which a block of verified pairs is stored."""
+    return f"pairs/{block:06d}"
 
 
 @dataclass(frozen=True)
@@ -32,23 +40,15 @@ class Snapshots:
 
     folder: Path
 
-    def features(self, frame_id: int, compute: Callable[[], Features]) -> Features:
-        """Features of a frame, computed unless they are stored."""
-        path = self.folder / "features" / f"{frame_id:06d}.npz"
-        if not path.exists():
-            features = compute()
-            save_arrays(path, {"keypoints": features.keypoints, "descriptors": features.descriptors})
-            return features
-        return Features(**load_arrays(path, own=True))
-
-    def pairs(self, block: int, compute: Callable[[], list[VerifiedPair]]) -> list[VerifiedPair]:
-        """One block of verified pairs, computed unless they are stored."""
-        path = self.folder / "pairs" / f"{block:06d}.npz"
-        if not path.exists():
-            pairs = compute()
-            save_arrays(path, _pack(pairs))
-            return pairs
-        return _unpack(load_arrays(path, own=True))
+    def value(self, name: str, compute: Callable[[], T]) -> T:
+        """A value, computed unless it is stored."""
+        path = self.folder / f"{name}.npz"
+        if path.exists():
+            stored: T = load_value(path)
+            return stored
+        value = compute()
+        save_value(path, value)
+        return value
 
     def model(
         self, name: str, compute: Callable[[Path], pycolmap.Reconstruction | None]
@@ -96,24 +96,3 @@ class Snapshots:
             ) from error
         finally:
             place.unlink(missing_ok=True)
-
-
-def _pack(pairs: Sequence[VerifiedPair]) -> dict[str, NDArray]:
-    return {
-        "index": np.array([(p.first, p.second, p.config, p.proposed, len(p.matches)) for p in pairs]).reshape(-1, 5),
-        "matches": _concatenated([p.matches for p in pairs]),
-        "matrices": np.array([p.matrices for p in pairs]).reshape(-1, 3, 3, 3),
-    }
-
-
-def _unpack(arrays: dict[str, NDArray]) -> list[VerifiedPair]:
-    index = arrays["index"].astype(np.int64)
-    ends = np.cumsum(index[:, 4])
-    return [
-        VerifiedPair(int(i), int(j), arrays["matches"][end - count : end], int(config), matrices, int(proposed))
-        for (i, j, config, proposed, count), end, matrices in zip(index, ends, arrays["matrices"], strict=True)
-    ]
-
-
-def _concatenated(parts: Iterable[NDArray[np.uint32]]) -> NDArray[np.uint32]:
-    return np.concatenate([np.zeros((0, 2), np.uint32), *parts])

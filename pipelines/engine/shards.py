@@ -18,12 +18,12 @@ from typing import Any, TypeVar
 
 from msgs_slam.formats.errors import InputError, RecoverableError
 from msgs_slam.formats.jsonfile import read_json, write_json
-from msgs_slam.pipelines.engine.task_files import TASK_MODULES, load_value, name_of, of_name, save_value
 from msgs_slam.pipelines.engine.workers import code_identity, work_here
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import take_lock
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.system.stopping import stop_if_asked
+from msgs_slam.pipelines.system.values import load_value, name_of, of_name, save_value
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -31,6 +31,13 @@ _TASKS = ".tasks"
 _READY = "ready.json"
 BETWEEN_LOOKS = 0.5
 """Seconds."""
+TASK_MODULES = (
+    "msgs_slam.pipelines.frames.tasks",
+    "msgs_slam.pipelines.proxy.tasks",
+    "msgs_slam.pipelines.mapping.submap_tasks",
+    "msgs_slam.pipelines.export.tasks",
+)
+"""Where functions that do tasks are defined: a run from elsewhere could name any function of the program."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from msgs_slam.formats.mesh import MeshBlocks, read_mesh_ply
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.depth.posed import PosedDepth
 from msgs_slam.pipelines.depth.resize import resample_nearest
-from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.export.joined import Region
 from msgs_slam.pipelines.export.paint import paint
 from msgs_slam.pipelines.export.planes import Planes
@@ -27,6 +26,7 @@ from msgs_slam.pipelines.outcome import Outcome, maps_around
 from msgs_slam.pipelines.run.files import MESH
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.progress import Progress
+from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps, SemanticMesh
 from msgs_slam.pipelines.upright.world import WORLD, World
 

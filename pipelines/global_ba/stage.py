@@ -12,7 +12,6 @@ from msgs_slam.formats.atomic import copy_file
 from msgs_slam.pipelines.correspondence.retrieval import GlobalDescriptors, compute_global_descriptors, unit
 from msgs_slam.pipelines.depth.scales import sample_proxy
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
-from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
@@ -41,6 +40,7 @@ from msgs_slam.pipelines.run.files import (
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.structure.bundle import reprojection_errors
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
+from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.tracking.adjust import align_depths, without_dependent_depth
 from msgs_slam.pipelines.tracking.pictures import Pictures, load_shutter
 from msgs_slam.pipelines.tracking.result import to_sparse_model

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.engine.chunks import Chunk, in_chunks
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.masks.moving import SIDE, MovingView, look_once
 from msgs_slam.pipelines.proxy.compact import compact
 from msgs_slam.pipelines.proxy.providers import (
@@ -31,6 +30,7 @@ from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, LEFT_OUT, PROXY_MAPS
 from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.system.progress import Progress
+from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.types import Frame, Intrinsics, ProxyMaps, any_of
 from msgs_slam.pipelines.voxels.voxels import to_lab
 

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -26,7 +27,7 @@ from msgs_slam.pipelines.correspondence.retrieval import (
     loop_pairs,
     sequential_pairs,
 )
-from msgs_slam.pipelines.correspondence.snapshots import Snapshots
+from msgs_slam.pipelines.correspondence.snapshots import Snapshots, features_name, pairs_name
 from msgs_slam.pipelines.structure.adjust import adjust
 from msgs_slam.pipelines.structure.candidates import GIVEN_ALONE, Adjusted, Candidates, Views
 from msgs_slam.pipelines.structure.consistency import ModelReport, judge
@@ -252,7 +253,7 @@ class StructureFromMotion(Candidates):
         """Return the features of all keyframes; those of a `part` of them (all) are extracted at once."""
 
         def stored(frame_id: int) -> Features:
-            return self.snapshots.features(frame_id, lambda: self.extract(frame_id))
+            return self.snapshots.value(features_name(frame_id), lambda: self.extract(frame_id))
 
         numbers = range(len(keyframe_ids)) if part is None else part
         found = parallel_map(stored, [keyframe_ids[k] for k in numbers], self.threads)
@@ -284,7 +285,7 @@ class StructureFromMotion(Candidates):
             return [p for p in parallel_map(match, block, self.threads) if p is not None]
 
         numbered = self.progress.track(wanted, "matches", len(wanted))
-        found = (self.snapshots.pairs(i, lambda b=blocks[i]: match_block(b)) for i in numbered)  # type: ignore[misc]
+        found = (self.snapshots.value(pairs_name(i), partial(match_block, blocks[i])) for i in numbered)
         return list(itertools.chain.from_iterable(found))
 
     def _bridged(

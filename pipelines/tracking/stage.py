@@ -6,7 +6,6 @@ from typing import Any
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
-from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.geometry.rig import Rig, rig_of
 from msgs_slam.pipelines.run.files import (
     BACKBONE,
@@ -21,6 +20,7 @@ from msgs_slam.pipelines.run.files import (
 from msgs_slam.pipelines.structure.rolling import Shutter
 from msgs_slam.pipelines.system.memory import release_free_memory
 from msgs_slam.pipelines.system.stopping import is_asked
+from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.system.wording import stretches
 from msgs_slam.pipelines.tracking.adjust import Report, adjust_state, align_depths, without_dependent_depth
 from msgs_slam.pipelines.tracking.carry import carry_given

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from msgs_slam.pipelines.engine.task_files import load_value, name_of, of_name, save_value
 from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.system.values import load_value, name_of, of_name, save_value
 
 
 @dataclass

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
@@ -32,6 +31,7 @@ from msgs_slam.pipelines.proxy.stereo.neighbours import choose_neighbours, depth
 from msgs_slam.pipelines.proxy.stereo.sweep import warps_to
 from msgs_slam.pipelines.proxy.stereo.upsample import upsample_depth
 from msgs_slam.pipelines.system.progress import Progress
+from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.types import Frame, Intrinsics
 from msgs_slam.pipelines.voxels.voxels import to_lab
 

@@ -14,9 +14,10 @@ import engine_calls
 import pytest
 
 from msgs_slam.formats.errors import InputError, RecoverableError
-from msgs_slam.pipelines.engine import shards, task_files, workers
+from msgs_slam.pipelines.engine import shards, workers
 from msgs_slam.pipelines.engine.shards import Posted, Shard, SharedWorkers, posted_in
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system import values
 
 HOLDS = "import fcntl, sys; f = open(sys.argv[1], 'ab'); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()"
 
@@ -24,7 +25,7 @@ HOLDS = "import fcntl, sys; f = open(sys.argv[1], 'ab'); fcntl.flock(f, fcntl.LO
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Of an unfinished stage; the tasks are those of the tests."""
-    monkeypatch.setattr(task_files, "_OURS", "engine_calls")
+    monkeypatch.setattr(values, "_OURS", "engine_calls")
     monkeypatch.setattr(shards, "TASK_MODULES", ("engine_calls",))
     (tmp_path / "proxy.partial").mkdir()
     return tmp_path / "proxy.partial"
@@ -84,7 +85,7 @@ def test_what_a_killed_process_was_at_is_done_by_another(folder: Path) -> None:
     process.kill()
     process.wait()
     assert posted.do_one(Shard(), engine_calls.silent)
-    assert task_files.load_value(posted.done(0)) == 2
+    assert values.load_value(posted.done(0)) == 2
 
 
 def test_a_new_lead_waits_for_who_is_at_a_task_and_begins_anew(folder: Path) -> None:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.export.mesh import draw, drawn_views, keyframe_rows, planes_in, straighten
 from msgs_slam.pipelines.export.planes import Planes, find_planes
 from msgs_slam.pipelines.export.straighten import planes_of, straightened
@@ -18,6 +17,7 @@ from msgs_slam.pipelines.mapping.depth_views import DrawnView
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.types import Intrinsics
 from msgs_slam.pipelines.voxels.voxels import Voxels
 

@@ -221,8 +221,8 @@ def test_snapshots_come_back_as_they_were_and_are_not_computed_twice(tmp_path: P
     snapshots = Snapshots(tmp_path)
     for compute in (True, False):
         calls: list[str] = []
-        made = snapshots.features(4, lambda calls=calls: calls.append("f") or features)  # type: ignore[misc]
-        found = snapshots.pairs(0, lambda calls=calls: calls.append("p") or pairs)  # type: ignore[misc]
+        made = snapshots.value("features/4", lambda calls=calls: calls.append("f") or features)  # type: ignore[misc]
+        found = snapshots.value("pairs/0", lambda calls=calls: calls.append("p") or pairs)  # type: ignore[misc]
         assert calls == (["f", "p"] if compute else [])
         np.testing.assert_array_equal(made.keypoints, features.keypoints)
         np.testing.assert_array_equal(made.descriptors, features.descriptors)
@@ -230,7 +230,7 @@ def test_snapshots_come_back_as_they_were_and_are_not_computed_twice(tmp_path: P
             assert (a.first, a.second, a.config, a.proposed) == (b.first, b.second, b.config, b.proposed)
             np.testing.assert_array_equal(a.matches, b.matches)
             np.testing.assert_array_equal(a.matrices, b.matrices)
-    assert snapshots.pairs(1, lambda: []) == snapshots.pairs(1, lambda: pairs) == []
+    assert snapshots.value("pairs/1", lambda: []) == snapshots.value("pairs/1", lambda: pairs) == []
 
 
 def _known_model(

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import GlobalBaConfig, TrackingConfig
 from msgs_slam.pipelines.correspondence.retrieval import GlobalDescriptors, describe, learn_vocabulary
-from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.camera import project
@@ -23,6 +22,7 @@ from msgs_slam.pipelines.global_ba.close import close_loops, reprojection_error
 from msgs_slam.pipelines.global_ba.loops import FoundLoops, find_loops
 from msgs_slam.pipelines.global_ba.semantics import summarise_labels
 from msgs_slam.pipelines.global_ba.verify import KeyframeView, make_view, verify_loop
+from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.tracking.state import TrackState
 from msgs_slam.pipelines.types import Features, Intrinsics
 

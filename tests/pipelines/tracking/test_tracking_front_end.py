@@ -9,9 +9,9 @@ import pytest
 from msgs_slam.pipelines.correspondence.features import extract_features
 from msgs_slam.pipelines.correspondence.flow import corners, follow
 from msgs_slam.pipelines.correspondence.matching import match_descriptors
-from msgs_slam.pipelines.engine.task_files import load_value, save_value
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.tracking.extend import triangulate
 from msgs_slam.pipelines.tracking.motion import interpolate_pose, predict_pose
 from msgs_slam.pipelines.tracking.pnp import solve_pose

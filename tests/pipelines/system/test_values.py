@@ -10,9 +10,9 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.tensors import save_arrays
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.depth.fields import DepthFields
-from msgs_slam.pipelines.engine.task_files import load_value, of_name, save_value
 from msgs_slam.pipelines.mapping.measure import ViewFigures
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.values import load_value, of_name, save_value
 from msgs_slam.pipelines.types import Intrinsics
 
 
@@ -52,10 +52,10 @@ def test_what_is_not_of_this_program_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not of this program"):
         of_name("msgs_slam.pipelines.engine.shards:shutil")
     with pytest.raises(InputError, match="not of this program"):
-        of_name("msgs_slam.pipelines.engine.task_files:save_arrays")
+        of_name("msgs_slam.pipelines.system.values:save_arrays")
     with pytest.raises(TypeError, match="does not travel"):
         save_value(tmp_path / "thing.npz", object())
-    tree = np.frombuffer(b'{"msgs_slam.pipelines.engine.task_files:save_value": {"path": "x", "value": 1}}', np.uint8)
+    tree = np.frombuffer(b'{"msgs_slam.pipelines.system.values:save_value": {"path": "x", "value": 1}}', np.uint8)
     save_arrays(tmp_path / "call.npz", {"tree": tree})
     with pytest.raises(
         InputError, match=r"call\.npz is damaged or no value of this program .*no dataclass.*: delete it"

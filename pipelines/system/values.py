@@ -20,13 +20,6 @@ from msgs_slam.formats.tensors import load_arrays, save_arrays
 
 _TREE = "tree"
 _OURS = "msgs_slam.pipelines."
-TASK_MODULES = (
-    "msgs_slam.pipelines.frames.tasks",
-    "msgs_slam.pipelines.proxy.tasks",
-    "msgs_slam.pipelines.mapping.submap_tasks",
-    "msgs_slam.pipelines.export.tasks",
-)
-"""Where functions that do tasks are defined: a run from elsewhere could name any function of the program."""
 
 
 def save_value(path: Path, value: Any) -> None:
