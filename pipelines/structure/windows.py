@@ -19,6 +19,7 @@ from msgs_slam.pipelines.geometry.alignment import Similarity, best_rotation
 from msgs_slam.pipelines.structure.adjust import filter_outliers, median_error
 from msgs_slam.pipelines.structure.backbone import pose_of
 from msgs_slam.pipelines.structure.bundle import adjust_bundle
+from msgs_slam.pipelines.structure.given import bare_model
 from msgs_slam.pipelines.structure.rolling import FEATURE_SD, Readout, RollingModel, rectified_bundle, velocities
 
 Array = NDArray[np.float64]
@@ -71,12 +72,8 @@ class Joined:
 
     def model(self, camera: pycolmap.Camera, xy: Sequence[Array]) -> pycolmap.Reconstruction:
         """Convert to a pycolmap model of all keyframes; image i + 1 has the pixels xy[i]."""
-        model = pycolmap.Reconstruction()
-        model.add_camera_with_trivial_rig(camera)
-        for i, pose in sorted(self.poses.items()):
-            pixels = pycolmap.Point2DList([pycolmap.Point2D(at) for at in xy[i - 1]])
-            image = pycolmap.Image(name=f"{i - 1:06d}", points2D=pixels, camera_id=camera.camera_id, image_id=i)
-            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+        nowhere = np.full((4, 4), np.nan)
+        model = bare_model(camera, xy, np.array([self.poses.get(i + 1, nowhere) for i in range(len(xy))]))
         observations = np.concatenate(self.observations)
         observations = observations[np.argsort(observations[:, 2], kind="stable")]
         starts = np.searchsorted(observations[:, 2], np.arange(len(self.points) + 1))
