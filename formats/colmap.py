@@ -32,8 +32,8 @@ _TRACK_ELEMENT = np.dtype([("image_id", "<u4"), ("point2D_idx", "<u4")])
 class ColmapModel:
     """Images with poses, and points with their observations.
 
-    names: N image names. cam_from_world (N, 4, 4) float64. cameras: COLMAP's own (model name, width, height, params),
-    camera_index (N,) int which of them each image has. points (P, 3) float64, colors (P, 3) uint8. Observations:
+    names: N image names. cam_from_world (N, 4, 4) float64. cameras: COLMAP's own (model name, width, height, params).
+    points (P, 3) float64, colors (P, 3) uint8. Observations:
     obs_image (O,) and obs_point (O,) int indices into images and points, obs_xy (O, 2) float64 pixels, first pixel's
     centre at (0.5, 0.5).
     """
@@ -41,7 +41,6 @@ class ColmapModel:
     names: tuple[str, ...]
     cam_from_world: NDArray[np.float64]
     cameras: tuple[tuple[str, int, int, tuple[float, ...]], ...]
-    camera_index: NDArray[np.int64]
     points: NDArray[np.float64]
     colors: NDArray[np.uint8]
     obs_image: NDArray[np.int64]
@@ -101,7 +100,6 @@ def _plain_model(reconstruction: Any, folder: Path) -> ColmapModel:
             str(folder),
         ),
         cameras=tuple(_plain_camera(reconstruction.cameras[i]) for i in camera_ids),
-        camera_index=np.array([camera_ids.index(image.camera_id) for image in images], dtype=np.int64),
         points=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
         colors=np.array([p.color for p in points], dtype=np.uint8).reshape(-1, 3),
         obs_image=obs_image,

@@ -1,4 +1,4 @@
-"""Named arrays on disk: npz for numpy, safetensors for torch and for arrays with metadata. Never pickle."""
+"""Named arrays on disk: npz for numpy, safetensors for torch. Never pickle."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def load_tensors(path: Path) -> dict[str, torch.Tensor]:
         return safetensors.torch.load_file(path)
 
 
-def save_safetensors(path: Path, arrays: Mapping[str, NDArray], meta: Mapping[str, str] | None = None) -> None:
+def save_safetensors(path: Path, arrays: Mapping[str, NDArray]) -> None:
     """Write named arrays to a .safetensors file, atomically; the same arrays give the same bytes.
 
     Raises InputError when the disk refuses.
@@ -89,7 +89,7 @@ def save_safetensors(path: Path, arrays: Mapping[str, NDArray], meta: Mapping[st
     # The library holds all of it in memory twice before it writes, which were the peak of a mapping.
     contiguous = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     names = sorted(contiguous, key=lambda name: (-contiguous[name].itemsize, name))  # so that each is aligned
-    header: dict[str, Any] = {"__metadata__": dict(sorted(meta.items()))} if meta else {}
+    header: dict[str, Any] = {}
     end = 0
     for name in names:
         array, begin = contiguous[name], end

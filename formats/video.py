@@ -47,15 +47,14 @@ _SHORTEST_STEP = 1e-6
 class VideoInfo:
     """Metadata of a video file; the size is that of the decoded frames, after rotation.
 
-    `frame_count_claimed` (0 = not said) and `duration` in seconds come from the header: a truncated file still says
-    what it once held. `fps` is the mean rate; single frames may be apart by other times.
+    `frame_count_claimed` (0 = not said) comes from the header: a truncated file still says what it once held. `fps` is
+    the mean rate; single frames may be apart by other times.
     """
 
     width: int
     height: int
     frame_count_claimed: int
     fps: float
-    duration: float
 
 
 class VideoFrame(NamedTuple):
@@ -75,11 +74,6 @@ def probe_video(path: Path) -> VideoInfo:
         if next(reader, None) is None:
             raise _undecodable(Path(path))
         return reader.info
-
-
-def iter_video(path: Path, wanted: Callable[[int], bool] | Container[int] | None = None) -> VideoReader:
-    """Decode a video from start to end; see `VideoReader`, which this returns."""
-    return VideoReader(path, wanted)
 
 
 class VideoReader(Iterator[VideoFrame]):
@@ -250,7 +244,7 @@ def _read_info(capture: cv2.VideoCapture | HdrCapture, path: Path) -> VideoInfo:
     fps = capture.get(cv2.CAP_PROP_FPS)
     claimed = int(count) if math.isfinite(count) and count > 0 else 0
     rate = fps if math.isfinite(fps) and fps > 0 else _UNKNOWN_RATE
-    return VideoInfo(width, height, claimed, rate, claimed / rate)
+    return VideoInfo(width, height, claimed, rate)
 
 
 def _as_rgb8(decoded: NDArray) -> NDArray[np.uint8]:

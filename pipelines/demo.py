@@ -12,7 +12,7 @@ from msgs_slam.formats.atomic import write_bytes
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.video import iter_video
+from msgs_slam.formats.video import VideoReader
 from msgs_slam.pipelines.evaluation.table import evaluation_table
 from msgs_slam.pipelines.evaluation.write import write_evaluation
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -44,7 +44,7 @@ def unpack_demo_clip(folder: Path, clip: Path = CLIP) -> tuple[Path, Path]:
         if video.read_bytes() != content:
             raise InputError(f"{video} is there already and is not the demo's. Choose another folder")
         return video, truth
-    for frame in iter_video(clip / VIDEO):
+    for frame in VideoReader(clip / VIDEO):
         write_rgb(truth / "rgb" / f"{frame.source_index:06d}.png", frame.rgb)
     with zipfile.ZipFile(clip / f"{TRUTH}.zip") as archive:
         archive.extractall(truth)

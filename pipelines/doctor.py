@@ -101,13 +101,13 @@ def _libraries() -> Finding:
 
 def _video() -> Finding:
     """A few frames through the encoder and back."""
-    from msgs_slam.formats.video import iter_video
+    from msgs_slam.formats.video import VideoReader
     from msgs_slam.formats.video_writer import write_video
 
     frames = [np.full((48, 64, 3), 40 * i, np.uint8) for i in range(5)]
     with tempfile.TemporaryDirectory() as folder:
         path = write_video(Path(folder) / "check.mp4", frames, 10.0)
-        read = sum(1 for _ in iter_video(path))
+        read = sum(1 for _ in VideoReader(path))
     if read != len(frames):
         fix = "pip install --force-reinstall opencv-python-headless"
         return Finding("video", BAD, f"{read} of {len(frames)} frames came back from an MP4", fix)

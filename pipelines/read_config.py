@@ -107,18 +107,16 @@ def _parse_value(text: str) -> Any:
         return text
 
 
-def config_to_toml(config: Config, comments: bool = True) -> str:
+def config_to_toml(config: Config) -> str:
     """The settings as TOML that `load_config` reads back, each with its help text above it."""
     lines = []
     for section in fields(config):
         values = getattr(config, section.name)
-        if comments:
-            lines.append(f"# {(type(values).__doc__ or '').strip()}")
+        lines.append(f"# {(type(values).__doc__ or '').strip()}")
         lines.append(f"[{section.name}]")
         for f in fields(values):
-            if comments:
-                allowed = allowed_values(f)
-                lines.append(f"# {f.metadata['help']}" + (f" ({allowed})" if allowed else ""))
+            allowed = allowed_values(f)
+            lines.append(f"# {f.metadata['help']}" + (f" ({allowed})" if allowed else ""))
             lines.append(f"{f.name} = {_toml_value(getattr(values, f.name))}")
         lines.append("")
     return "\n".join(lines)

@@ -14,4 +14,4 @@ def posed_images(
     """Images by one camera, without points."""
     none, camera = np.zeros(0, np.int64), ("PINHOLE", width, height, pinhole)
     points = (np.zeros((0, 3)), np.zeros((0, 3), np.uint8), none, none, np.zeros((0, 2)))
-    return ColmapModel(tuple(names), cam_from_world, (camera,), np.zeros(len(names), np.int64), *points)
+    return ColmapModel(tuple(names), cam_from_world, (camera,), *points)

@@ -82,8 +82,8 @@ def nearest_index(sorted_times: NDArray[np.float64], times: NDArray[np.float64])
     return np.where(closer, before, after).astype(np.int64)
 
 
-def times_or_frame_numbers(images: list[Path], rate: float = ASSUMED_RATE) -> tuple[NDArray[np.float64], bool]:
-    """(N,) seconds: the images' own times, else their frame numbers (or else their order) over `rate`; and whether
+def times_or_frame_numbers(images: list[Path]) -> tuple[NDArray[np.float64], bool]:
+    """(N,) seconds: the images' own times, else their frame numbers (else their order) over `ASSUMED_RATE`; and whether
     they are the images' own."""
     times = read_image_times(images)
     if times is not None:
@@ -91,17 +91,17 @@ def times_or_frame_numbers(images: list[Path], rate: float = ASSUMED_RATE) -> tu
     numbers = [frame_number(p) for p in images]
     usable = all(a is not None and b is not None and a < b for a, b in itertools.pairwise(numbers))
     counts = numbers if usable and numbers[0] is not None else list(range(len(images)))
-    return np.array(counts, dtype=np.float64) / rate, False
+    return np.array(counts, dtype=np.float64) / ASSUMED_RATE, False
 
 
-def classes_found(paths: tuple[Path | None, ...], void_ids: tuple[int, ...] = (0,)) -> tuple[LabelClass, ...]:
+def classes_found(paths: tuple[Path | None, ...]) -> tuple[LabelClass, ...]:
     """A class for every id that occurs in the label images, named by its number: for sets that name none.
 
     Of long sequences some `_MOST_IMAGES_SEARCHED` evenly spread images are looked at.
     """
     existing = [p for p in paths if p is not None]
     used = used_label_ids(existing[:: max(1, len(existing) // _MOST_IMAGES_SEARCHED)])
-    return tuple(LabelClass(i, f"class {i}") for i in sorted(used - set(void_ids)))
+    return tuple(LabelClass(i, f"class {i}") for i in sorted(used - {0}))
 
 
 def _by_name(path: Path) -> tuple[tuple[int, int, str], ...]:

@@ -27,8 +27,7 @@ class VerifiedPair:
     """Two keyframes (indices into the keyframes, first < second) whose matches obey one geometry.
 
     matches (M, 2) uint32 feature indices; `config` is pycolmap's TwoViewGeometryConfiguration as a number.
-    matrices (3, 3, 3) float64 are F, E and H, zero where the configuration has none. `proposed` counts the matches
-    before verification.
+    matrices (3, 3, 3) float64 are F, E and H, zero where the configuration has none.
     """
 
     first: int
@@ -36,7 +35,6 @@ class VerifiedPair:
     matches: NDArray[np.uint32]
     config: int
     matrices: NDArray[np.float64]
-    proposed: int
 
 
 def match_descriptors(
@@ -124,7 +122,7 @@ def verify_matches(
     if len(inliers) < _MIN_INLIERS:
         return None
     matrices = np.stack([_matrix(m) for m in (geometry.F, geometry.E, geometry.H)])
-    return VerifiedPair(*pair, inliers, int(geometry.config), matrices, len(matches))
+    return VerifiedPair(*pair, inliers, int(geometry.config), matrices)
 
 
 def _may_agree(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:

@@ -125,7 +125,6 @@ class Stage:
 
     name: str
     run: Callable[[StageContext], dict[str, Any]]
-    summary: str
     inputs: Callable[[Path, Config], Any] | None = None
     check: Callable[[Path, Config], None] | None = None
     auto: Callable[[Config], tuple[str, ...]] = lambda config: ()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.evaluation.class_map import ClassMap, Matching, match_classes
-from msgs_slam.pipelines.evaluation.measure import Measured, measure_views
+from msgs_slam.pipelines.evaluation.measure import measure_views
 from msgs_slam.pipelines.evaluation.mesh_cells import mesh_cells
 from msgs_slam.pipelines.evaluation.trajectory_error import (
     AbsoluteError,
@@ -51,7 +51,7 @@ def evaluate_run(
     At most `max_views` of the keyframes, and as many of the other frames, are rendered. Raises InputError for a run
     without poses and for a truth of which no frame belongs to the run.
     """
-    return evaluate_outcome(load_outcome(run), truth, progress, max_views)[0]
+    return evaluate_outcome(load_outcome(run), truth, progress, max_views)
 
 
 def evaluate_outcome(
@@ -60,8 +60,8 @@ def evaluate_outcome(
     progress: Progress | None = None,
     max_views: int = 100,
     class_map: ClassMap | None = None,
-) -> tuple[dict[str, Any], Measured | None]:
-    """Evaluate like `evaluate_run`; returns the figures and the measured views."""
+) -> dict[str, Any]:
+    """Evaluate like `evaluate_run`."""
     matched = match_truth(outcome.frames, outcome.source_is_folder, truth)
     if not matched.has_pose.any() and not (matched.image >= 0).any():
         raise InputError(
@@ -88,7 +88,7 @@ def evaluate_outcome(
         "cost": cost_cells(outcome),
     }
     # A round trip: what cannot be written as JSON (NaN, arrays) shows here and not at the user's.
-    return json.loads(json.dumps(result, allow_nan=False)), measured
+    return json.loads(json.dumps(result, allow_nan=False))
 
 
 def _matching(outcome: Outcome, truth: Sequence, class_map: ClassMap | None) -> Matching | None:

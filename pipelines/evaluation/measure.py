@@ -176,7 +176,7 @@ def _measure(
         if (depth := matched.sequence.depth(index)) is not None:
             depth_l1 = _add_depth(measured, view, pixels.sample(depth))
         if (labels := matched.sequence.labels(index)) is not None:
-            accuracy = _add_labels(measured, outcome, view, pixels.sample(labels))
+            accuracy = _add_labels(measured, view, pixels.sample(labels))
     perceived = float("nan") if isinstance(measured.lpips, str) else measured.lpips(picture, photo)
     likeness = psnr(picture, photo, None if left_out is None else ~left_out)
     return MeasuredView(frame_id, kind, likeness, ssim(picture, photo), perceived, depth_l1, accuracy)
@@ -188,7 +188,7 @@ def _add_depth(measured: Measured, view: MapView, truth: NDArray[np.float32]) ->
     return float(np.abs(view.depth - truth)[both].mean()) if both.any() else float("nan")
 
 
-def _add_labels(measured: Measured, outcome: Outcome, view: MapView, truth: NDArray[np.uint8]) -> float:
+def _add_labels(measured: Measured, view: MapView, truth: NDArray[np.uint8]) -> float:
     true_classes, classes = len(measured.confusion), measured.confusion.shape[1] - 1
     counts = count_labels(view.labels, truth, classes, true_classes)
     measured.confusion += counts

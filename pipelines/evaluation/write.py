@@ -48,7 +48,7 @@ def write_evaluation(
     Returns the figures (see `evaluate_run`). Raises InputError as that does, before anything is written.
     """
     outcome = load_outcome(run)
-    result, _ = evaluate_outcome(outcome, truth, progress, max_views, class_map)
+    result = evaluate_outcome(outcome, truth, progress, max_views, class_map)
     folder = run.evaluation_file.parent
     write_json(run.evaluation_file, result)
     write_text(folder / "evaluation.md", evaluation_table(result))

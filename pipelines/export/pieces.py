@@ -46,7 +46,7 @@ def make_pieces(context: StageContext) -> list[RunFolder]:
         piece = RunFolder(run.root / name)
         piece.root.mkdir(exist_ok=True)
         origin = sha256(f"{name} {records['frames'].content} {records['tracking'].content}".encode()).hexdigest()
-        stages = [Stage("frames", take_frames, "the frames of the piece"), *context.stages[1:]]
+        stages = [Stage("frames", take_frames), *context.stages[1:]]
         try:
             inside = WithinStage(context.progress, name)
             run_stages(stages, piece, context.source, origin, _settings(context.config), inside)

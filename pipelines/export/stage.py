@@ -290,7 +290,6 @@ def _kept_world(outcome: Outcome, settings: ExportConfig) -> World | None:
 STAGE = Stage(
     "export",
     run,
-    "COLMAP model, Gaussian PLY, labelled mesh, trajectory, metres",
     inputs=export_inputs,
     check=_check,
     auto=lambda config: ("metres",) if config.export.scale == "auto" else (),

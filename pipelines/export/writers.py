@@ -51,8 +51,8 @@ def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
         if (left_out := outcome.run.left_out(frame)) is not None:
             LEFT_OUT.save(folder, left_out, frame.name)
     points = seen_points(outcome.load_sparse(), trajectory.frame_ids[posed])
-    pinhole, first = ("PINHOLE", k.width, k.height, (k.fx, k.fy, k.cx, k.cy)), np.zeros(len(names), np.int64)
-    model = ColmapModel(names, trajectory.cam_from_world[posed], (pinhole,), first, *points)
+    pinhole = ("PINHOLE", k.width, k.height, (k.fx, k.fy, k.cx, k.cy))
+    model = ColmapModel(names, trajectory.cam_from_world[posed], (pinhole,), *points)
     write_colmap_model(folder / SPARSE, model)
     start = write_start(folder, points[0], points[1])
     paths = [f"{IMAGES}/{name}" for name in names]

@@ -315,7 +315,7 @@ def _division(run: RunFolder, config: Config) -> list[range]:
 
 
 STAGE = Stage(
-    "frames", run, "pick frames, calibrate the camera, structure from motion over keyframes",
+    "frames", run,
     inputs=_inputs, check=check, auto=lambda config: ("people",) if config.frames.people == "auto" else (),
     division=_division,
 )  # fmt: skip

@@ -51,7 +51,7 @@ def loop_candidates(
         return apart(part) & (shared[part].toarray() < SHARED_POINTS)
 
     alike = loop_pairs(looks, unrelated, PER_KEYFRAME, LEAST_ALIKE)
-    by_labels = _semantic_candidates(unrelated, looks, summaries, settings) if settings.use_semantics else set()
+    by_labels = _semantic_candidates(unrelated, looks, summaries) if settings.use_semantics else set()
     return sorted(pair for pair in {*alike, *by_labels} if (ids[pair[0]], ids[pair[1]]) not in refused)
 
 
@@ -59,7 +59,6 @@ def _semantic_candidates(
     unrelated: Callable[[slice], NDArray[np.bool_]],
     looks: GlobalDescriptors,
     summaries: Sequence[LabelSummary],
-    settings: GlobalBaConfig,
 ) -> set[tuple[int, int]]:
     out: set[tuple[int, int]] = set()
     for i in np.flatnonzero(richness(summaries) > RICH).tolist():

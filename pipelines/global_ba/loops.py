@@ -26,7 +26,6 @@ class FoundLoops:
 
     loops: list[Loop]
     tried: int
-    unverified: int
     implausible: int
     unsupported: int
 
@@ -48,13 +47,13 @@ def find_loops(
     centres = se3.inverse(cam_from_world)[:, :3, 3]
     path = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
     verified: dict[tuple[int, int], Loop] = {}
-    tried = implausible = unverified = 0
+    tried = implausible = 0
     for first, second in pairs:
         tried += 1
         loop = verify_loop(views[first], views[second], intrinsics, seed)
         if loop is None:
-            unverified += 1
-        elif not is_plausible(loop, views[first], views[second], float(path[second] - path[first])):
+            continue
+        if not is_plausible(loop, views[first], views[second], float(path[second] - path[first])):
             implausible += 1
         else:
             verified[(first, second)] = loop
@@ -63,7 +62,7 @@ def find_loops(
         for pair, loop in verified.items()
         if loop.edge.inliers >= SURE_INLIERS or _has_support(pair, loop, verified, views, intrinsics, seed)
     }
-    return FoundLoops(list(supported.values()), tried, unverified, implausible, len(verified) - len(supported))
+    return FoundLoops(list(supported.values()), tried, implausible, len(verified) - len(supported))
 
 
 def claimed_drift(loop: Loop, first: KeyframeView, second: KeyframeView) -> tuple[float, float]:

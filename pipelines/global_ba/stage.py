@@ -67,7 +67,7 @@ def run(context: StageContext) -> dict[str, Any]:
 
     # Loops of panoramas are those that structure from motion closes: the pose graph knows no places.
     is_rig = context.run.load(CALIBRATION).directions > 1
-    found = search(context, model) if settings.use_loops and not is_rig else FoundLoops([], 0, 0, 0, 0)
+    found = search(context, model) if settings.use_loops and not is_rig else FoundLoops([], 0, 0, 0)
     closed = adjust(context, model, found)
     gaussian_map: GaussianMap | None = None  # as mapping left it
     moved_px = 0.0
@@ -260,4 +260,4 @@ def save(
     return figures
 
 
-STAGE = Stage("global_ba", run, "loops, global adjustment, the map moved and refined with it")
+STAGE = Stage("global_ba", run)

@@ -80,4 +80,4 @@ def _inputs(source: Path, config: Config) -> dict[str, str] | None:
     return before_inputs(source) or None
 
 
-STAGE = Stage("mapping", run, "the semantic Gaussian map from the keyframes", inputs=_inputs, division=_division)
+STAGE = Stage("mapping", run, inputs=_inputs, division=_division)

@@ -162,7 +162,6 @@ def _figures(work: ProxyWork, frames: list[Frame], agreements: list[float]) -> d
 STAGE = Stage(
     "proxy",
     run,
-    "depth, reliability and classes of the keyframes",
     inputs=proxy_inputs,
     check=check_proxy,
     auto=left_to_auto,

@@ -43,7 +43,7 @@ def given_poses(config: FramesConfig, source: AnySource, frames: Sequence[Frame]
     if known.sum() < min(LEAST, len(frames)):
         raise InputError(
             f"--poses {config.poses}: of its {len(file)} poses {known.sum()} belong to frames of {source.path}"
-            f"{_examples(file, source, frames)}. Give the poses of these images"
+            f"{_examples(file, frames)}. Give the poses of these images"
         )
     cam_from_world = np.full_like(found, np.nan)
     cam_from_world[known] = se3.inverse(found[known])
@@ -95,7 +95,7 @@ def _rows(file: PoseFile, rows: Sequence[int | None]) -> NDArray[np.float64]:
     return found
 
 
-def _examples(file: PoseFile, source: AnySource, frames: Sequence[Frame]) -> str:
+def _examples(file: PoseFile, frames: Sequence[Frame]) -> str:
     if file.names:
         return f" (its first is of {file.names[0]!r}, the source's first image is {stem(frames[0].name)!r})"
     if file.times is None:

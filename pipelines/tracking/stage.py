@@ -143,4 +143,4 @@ def describe(state: TrackState, frames: list[Frame], report: Report, metric: boo
     }
 
 
-STAGE = Stage("tracking", run, "a pose for every frame, by correspondences and bundle adjustment")
+STAGE = Stage("tracking", run)

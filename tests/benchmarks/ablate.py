@@ -114,7 +114,7 @@ def _claim(folder: Path, source: Path, truth: Sequence, config: Config) -> None:
     stamp = {
         "source": str(source.resolve()),
         "truth": str(truth.root.resolve()),
-        "settings": config_to_toml(replace(config, run=replace(config.run, seed=0)), comments=False),
+        "settings": config_to_toml(replace(config, run=replace(config.run, seed=0))),
     }
     file = folder / "origin.json"
     if file.exists():

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.video import iter_video
+from msgs_slam.formats.video import VideoReader
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.demo import CLIP, VIDEO
 from msgs_slam.pipelines.evaluation.report import write_report
@@ -60,7 +60,7 @@ def takes(run: RunFolder, target: Path, keep: Path) -> None:
     """A frame of the demo's clip, of a turn on the spot and of a hurried walk in the dark."""
     world = make_world(texel=TEXEL)
     clips = {
-        VIDEO: [frame.rgb for frame in iter_video(CLIP / VIDEO)],
+        VIDEO: [frame.rgb for frame in VideoReader(CLIP / VIDEO)],
         "turned.mp4": list(turned(world)),
         "hurried.mp4": [frame.rgb for frame in iter_clip(world, HURRIED)],
     }

@@ -151,13 +151,13 @@ def replica_fast(folder: Path, data: Path) -> Array:
 
 def whiteroom_fast(folder: Path, data: Path) -> Array:
     """The white room in steps of 10 to 17 degrees; most of it has hardly any texture."""
-    from msgs_slam.formats.video import iter_video
+    from msgs_slam.formats.video import VideoReader
 
     steps = np.cumsum(np.random.default_rng(4).integers(12, 17, 40))
     poses = np.loadtxt(data / "whiteroom/traj.txt").reshape(-1, 4, 4)
     steps = steps[steps < len(poses)]
     wanted = {int(i): row for row, i in enumerate(steps)}
-    for frame in iter_video(data / "whiteroom/video.mp4", wanted):
+    for frame in VideoReader(data / "whiteroom/video.mp4", wanted):
         save(folder, wanted[frame.source_index], frame.rgb[..., ::-1])
     return poses[steps]
 

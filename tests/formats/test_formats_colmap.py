@@ -35,7 +35,6 @@ def _scene(noise: float = 0.0) -> ColmapModel:
         names=tuple(f"img_{i * 7 % 6}.jpg" for i in range(6)),
         cam_from_world=cam_from_world,
         cameras=(("PINHOLE", WIDTH, HEIGHT, (FX, FY, CX, CY)),),
-        camera_index=np.zeros(6, np.int64),
         points=points,
         colors=rng.integers(0, 256, (200, 3)).astype(np.uint8),
         obs_image=image,

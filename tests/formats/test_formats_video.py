@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.video import _Clock, iter_video, probe_video
+from msgs_slam.formats.video import VideoReader, _Clock, probe_video
 from msgs_slam.formats.video_writer import write_video
 
 REPO = Path(__file__).resolve().parents[2]
@@ -37,7 +37,7 @@ def counted_video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_frames_come_as_rgb_in_order_with_times(counted_video: Path) -> None:
-    frames = list(iter_video(counted_video))
+    frames = list(VideoReader(counted_video))
     assert [f.source_index for f in frames] == list(range(40))
     np.testing.assert_allclose([f.timestamp for f in frames], np.arange(40) / 25, atol=1e-6)
     assert frames[0].rgb.shape == (64, 96, 3)
@@ -52,13 +52,12 @@ def test_probe_agrees_with_what_is_decoded(counted_video: Path) -> None:
     info = probe_video(counted_video)
     assert (info.width, info.height, info.frame_count_claimed) == (96, 64, 40)
     assert info.fps == pytest.approx(25)
-    assert info.duration == pytest.approx(1.6)
 
 
 @pytest.mark.parametrize("wanted", [{3, 17, 39}, lambda i: i in (3, 17, 39), range(3, 40, 18)])
 def test_wanted_frames_are_the_same_pictures(counted_video: Path, wanted: object) -> None:
-    every = list(iter_video(counted_video))
-    reader = iter_video(counted_video, wanted)  # type: ignore[arg-type]
+    every = list(VideoReader(counted_video))
+    reader = VideoReader(counted_video, wanted)  # type: ignore[arg-type]
     some = list(reader)
     assert len(some) == len(range(3, 40, 18)) if isinstance(wanted, range) else 3
     assert all(
@@ -83,7 +82,7 @@ def test_frames_not_wanted_are_not_converted(shared_data: Path, monkeypatch: pyt
             return getattr(self._reader, name)
 
     monkeypatch.setattr(cv2, "VideoCapture", Counting)
-    for frame in iter_video(shared_data / "videos" / "bedroom_848x364_58fps.mp4", range(199, 201)):
+    for frame in VideoReader(shared_data / "videos" / "bedroom_848x364_58fps.mp4", range(199, 201)):
         if frame.source_index == 200:
             break
     assert len(converted) == 2
@@ -104,7 +103,7 @@ def test_frames_not_wanted_are_not_converted(shared_data: Path, monkeypatch: pyt
     ],
 )
 def test_odd_videos(shared_data: Path, name: str, size: tuple[int, int], decoded: int, missing: int) -> None:
-    reader = iter_video(shared_data / "odd_videos" / name, lambda i: i % 50 == 0)
+    reader = VideoReader(shared_data / "odd_videos" / name, lambda i: i % 50 == 0)
     for frame in reader:
         assert frame.rgb.shape == (size[1], size[0], 3)
         assert frame.rgb.std() < 125
@@ -115,8 +114,8 @@ def test_odd_videos(shared_data: Path, name: str, size: tuple[int, int], decoded
 
 
 def test_rotation_turns_the_picture(shared_data: Path) -> None:
-    turned = next(iter_video(shared_data / "odd_videos" / "d_rotate90_metadata.mp4")).rgb.astype(float)
-    upright = next(iter_video(shared_data / "videos" / "bedroom_848x364_58fps.mp4")).rgb.astype(float)
+    turned = next(VideoReader(shared_data / "odd_videos" / "d_rotate90_metadata.mp4")).rgb.astype(float)
+    upright = next(VideoReader(shared_data / "videos" / "bedroom_848x364_58fps.mp4")).rgb.astype(float)
     errors = [np.abs(turned - np.rot90(upright, k)).mean() for k in (1, 3)]
     assert min(errors) < 15 < max(errors)
 
@@ -129,7 +128,7 @@ def test_variable_rate_is_kept(shared_data: Path) -> None:
 
 def iter_video_times(path: Path) -> np.ndarray:
     """Decode without converting anything."""
-    reader = iter_video(path, ())
+    reader = VideoReader(path, ())
     assert list(reader) == []
     return reader.timestamps
 
@@ -270,7 +269,7 @@ def test_hdr_has_the_colours_of_the_scene(tmp_path: Path, transfer: str) -> None
     patches = np.random.default_rng(0).uniform(0.05, 0.8, (4, 6, 3))
     picture = np.kron(patches, np.ones((16, 16, 1)))
     write_hdr(tmp_path / "a.mp4", [hdr_signal(picture, transfer)] * 3, transfer)
-    reader = iter_video(tmp_path / "a.mp4")
+    reader = VideoReader(tmp_path / "a.mp4")
     frames = list(reader)
     assert (reader.hdr, reader.tone_mapped, reader.missing_frames) == (transfer, True, 0)
     assert [f.timestamp for f in frames] == pytest.approx([0, 0.1, 0.2])
@@ -281,7 +280,7 @@ def test_hdr_has_the_colours_of_the_scene(tmp_path: Path, transfer: str) -> None
 def test_hdr_has_no_bands_and_no_blown_whites(tmp_path: Path) -> None:
     ramp = np.repeat(np.linspace(0, 65535, 1024)[None, :, None], 32, axis=0).repeat(3, axis=2).astype(np.uint16)
     write_hdr(tmp_path / "a.mp4", [ramp], "HLG")
-    (frame,) = iter_video(tmp_path / "a.mp4")
+    (frame,) = VideoReader(tmp_path / "a.mp4")
     levels = frame.rgb[16, :, 1].astype(int)
     assert len(np.unique(levels)) > 240
     assert np.diff(levels).min() >= -1  # a codec
@@ -301,15 +300,15 @@ def test_hdr_upright(tmp_path: Path) -> None:
     (tmp_path / "b.mp4").write_bytes(data)
     info = probe_video(tmp_path / "b.mp4")
     assert (info.width, info.height) == (64, 96)
-    turned = next(iter_video(tmp_path / "b.mp4")).rgb
-    lying = next(iter_video(tmp_path / "a.mp4")).rgb
+    turned = next(VideoReader(tmp_path / "b.mp4")).rgb
+    lying = next(VideoReader(tmp_path / "a.mp4")).rgb
     assert (turned == np.rot90(lying, -1)).all()  # as OpenCV turns such a file
 
 
 def test_ordinary_videos_are_not_taken_for_hdr(counted_video: Path, tmp_path: Path) -> None:
-    assert not iter_video(counted_video).hdr
+    assert not VideoReader(counted_video).hdr
     write_hdr(tmp_path / "a.mp4", [np.zeros((64, 64, 3), np.uint16)] * 5, "PQ")
     data = (tmp_path / "a.mp4").read_bytes()
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) * 2 // 3])
     with pytest.raises(InputError, match="no image can be decoded"):
-        list(iter_video(tmp_path / "cut.mp4"))
+        list(VideoReader(tmp_path / "cut.mp4"))

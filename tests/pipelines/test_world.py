@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.video import iter_video
+from msgs_slam.formats.video import VideoReader
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.types import Intrinsics
 from tests.world import (
@@ -280,7 +280,7 @@ def test_video_decodes_to_its_frames(world: World, tmp_path: Path, name: str, le
     options = replace(OPTIONS, frames=5, laps=0.05)
     frames = [render_frame(world, options, i).rgb for i in range(5)]
     path = write_video(tmp_path / name, frames, options.fps)
-    decoded = list(iter_video(path))
+    decoded = list(VideoReader(path))
     assert len(decoded) == 5
     for got, frame in zip(decoded, frames, strict=True):
         error = np.mean((got.rgb.astype(float) - frame) ** 2)

@@ -27,7 +27,7 @@ class Recorder:
         self.error: BaseException = KeyboardInterrupt()
 
     def stages(self) -> list[Stage]:
-        return [Stage(name, self.make(name), "") for name in STAGES]
+        return [Stage(name, self.make(name)) for name in STAGES]
 
     def make(self, name: str) -> Any:
         def run(context: StageContext) -> dict[str, Any]:

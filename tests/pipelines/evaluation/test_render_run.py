@@ -11,7 +11,7 @@ from finished import note_finished
 from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import list_images, read_rgb
-from msgs_slam.formats.video import iter_video
+from msgs_slam.formats.video import VideoReader
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.demo import TRUTH, VIDEO, demo_summary, run_demo, unpack_demo_clip
 from msgs_slam.pipelines.evaluation.image_quality import psnr
@@ -35,7 +35,7 @@ def test_own_path_in_colour_shows_the_frames(oracle_run: OracleRun, truth: Seque
 
 def test_side_by_side_video_of_an_orbit(oracle_run: OracleRun, tmp_path: Path) -> None:
     video = render_run(oracle_run(), tmp_path / "orbit.mp4", "side-by-side", "orbit", frames=4)
-    frames = [f.rgb for f in iter_video(video)]
+    frames = [f.rgb for f in VideoReader(video)]
     assert len(frames) == 4
     assert frames[0].shape == (180, 3 * 240, 3)
     for first, second in ((frames[0], frames[1]), (frames[0][:, :240], frames[0][:, 240:480])):
@@ -77,7 +77,7 @@ def test_demo_reconstructs_the_video_alone_and_then_opens_the_truth(
 
     result = run_demo(tmp_path, reconstruct, SilentProgress(), clip)
     assert seen == [tmp_path / VIDEO]
-    assert sum(1 for _ in iter_video(result.video)) == 32
+    assert sum(1 for _ in VideoReader(result.video)) == 32
     assert result.figures["trajectory"]["sim3 all"]["rmse"] < 1e-6
     assert "32 of 32 frames posed" in demo_summary(result)[0]
     assert (result.run.root / "evaluation" / "views.png").exists()

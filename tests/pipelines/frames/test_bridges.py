@@ -21,7 +21,7 @@ SIZE = (160, 120)
 
 def _pair(first: int, second: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> VerifiedPair:
     matches = np.stack([a, b], 1).astype(np.uint32)
-    return VerifiedPair(first, second, matches, 3, np.zeros((3, 3, 3)), len(matches))
+    return VerifiedPair(first, second, matches, 3, np.zeros((3, 3, 3)))
 
 
 def _picture(k: int) -> NDArray[np.uint8]:

@@ -85,7 +85,6 @@ def test_verification_drops_outliers_and_depends_on_the_seed_and_the_pair_alone(
     matches[wrong, 1] = np.roll(matches[wrong, 1], 7)
     found = verify_matches((0, 1), matches, (first, second), CAMERA, 0)
     assert found is not None
-    assert found.proposed == 200
     assert 120 <= len(found.matches) <= 150
     right = found.matches[:, 0] == found.matches[:, 1]
     assert right.mean() > 0.95
@@ -120,7 +119,7 @@ def test_a_turn_is_told_from_a_step_without_the_focal_length() -> None:
     turned_rays = np.column_stack([CAMERA.cam_from_img(first), np.ones(200)]) @ turn(0.15, 0.05)
     turned = CAMERA.img_from_cam(turned_rays) + np.random.default_rng(0).normal(0, 0.3, (200, 2))
     matches = np.stack([np.arange(200)] * 2, axis=1).astype(np.uint32)
-    pair = VerifiedPair(0, 1, matches, 3, np.zeros((3, 3, 3)), 200)
+    pair = VerifiedPair(0, 1, matches, 3, np.zeros((3, 3, 3)))
     size = (WIDTH, HEIGHT)
     step = min(rotation_residual(pair, (first, second), size, f) for f in np.geomspace(100, 1500, 30))
     only_turned = min(rotation_residual(pair, (first, turned), size, f) for f in np.geomspace(100, 1500, 30))
@@ -215,7 +214,7 @@ def test_snapshots_come_back_as_they_were_and_are_not_computed_twice(tmp_path: P
     rng = np.random.default_rng(0)
     features = Features(rng.random((9, 4)).astype(np.float32), _descriptors(rng, 9))
     pairs = [
-        VerifiedPair(i, i + 2, rng.integers(0, 99, (5 + i, 2)).astype(np.uint32), 3, rng.random((3, 3, 3)), 20)
+        VerifiedPair(i, i + 2, rng.integers(0, 99, (5 + i, 2)).astype(np.uint32), 3, rng.random((3, 3, 3)))
         for i in range(3)
     ]
     snapshots = Snapshots(tmp_path)
@@ -227,7 +226,7 @@ def test_snapshots_come_back_as_they_were_and_are_not_computed_twice(tmp_path: P
         np.testing.assert_array_equal(made.keypoints, features.keypoints)
         np.testing.assert_array_equal(made.descriptors, features.descriptors)
         for a, b in zip(found, pairs, strict=True):
-            assert (a.first, a.second, a.config, a.proposed) == (b.first, b.second, b.config, b.proposed)
+            assert (a.first, a.second, a.config) == (b.first, b.second, b.config)
             np.testing.assert_array_equal(a.matches, b.matches)
             np.testing.assert_array_equal(a.matrices, b.matrices)
     assert snapshots.value("pairs/1", lambda: []) == snapshots.value("pairs/1", lambda: pairs) == []
@@ -250,7 +249,7 @@ def _known_model(
         for j in range(i + 1, 10):
             common = sorted(points[i].keys() & points[j].keys())
             matches = np.array([(points[i][p], points[j][p]) for p in common], np.uint32)
-            pairs.append(VerifiedPair(i, j, matches, 2, np.zeros((3, 3, 3)), len(matches)))
+            pairs.append(VerifiedPair(i, j, matches, 2, np.zeros((3, 3, 3))))
     swing = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, np.sin(bend / 2), 0.0, np.cos(bend / 2)])), np.zeros(3))
     for view in turned:
         frame = model.frames[view + 1]
@@ -286,7 +285,7 @@ def test_pycolmap_reads_the_database(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     features = [Features(rng.random((20, 4)).astype(np.float32) * 100, _descriptors(rng, 20)) for _ in range(3)]
     matches = np.stack([np.arange(15), np.arange(15)[::-1]], axis=1).astype(np.uint32)
-    pair = VerifiedPair(0, 2, matches, 3, np.stack([rng.random((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))]), 18)
+    pair = VerifiedPair(0, 2, matches, 3, np.stack([rng.random((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))]))
     for _ in range(2):  # the second replaces the first
         write_database(tmp_path / "a.db", CAMERA, ["x", "y", "z"], features, [pair], ONE_CAMERA.cam_from_rig)
     with pycolmap.Database.open(tmp_path / "a.db") as database:

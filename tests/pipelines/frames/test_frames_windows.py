@@ -134,9 +134,7 @@ def test_a_loop_between_windows_is_closed() -> None:
     """Nothing but the matches holds the two walks together."""
     model, xy = drifted()
     matches = [np.repeat(np.arange(len(xy[k]), dtype=np.uint32)[:, None], 2, 1) for k in range(COUNT)]
-    pairs = [
-        VerifiedPair(k, COUNT + k, matches[k], 2, np.zeros((3, 3, 3)), len(matches[k])) for k in range(0, COUNT, 4)
-    ]
+    pairs = [VerifiedPair(k, COUNT + k, matches[k], 2, np.zeros((3, 3, 3))) for k in range(0, COUNT, 4)]
     apart = lambda: max(  # noqa: E731
         np.linalg.norm(model.images[k].projection_center() - model.images[COUNT + k].projection_center())
         for k in range(1, COUNT + 1)
@@ -165,7 +163,7 @@ def matched(xy: list[Array], numbers: list[NDArray[np.int64]]) -> list[VerifiedP
     for a in range(COUNT):
         for b in range(a + 1, min(a + 4, COUNT)):
             _, i, j = np.intersect1d(numbers[a], numbers[b], return_indices=True)
-            pairs.append(VerifiedPair(a, b, np.stack([i, j], 1).astype(np.uint32), 2, np.zeros((3, 3, 3)), len(i)))
+            pairs.append(VerifiedPair(a, b, np.stack([i, j], 1).astype(np.uint32), 2, np.zeros((3, 3, 3))))
     return pairs
 
 

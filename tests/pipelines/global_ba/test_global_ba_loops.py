@@ -200,13 +200,13 @@ def test_found_loops_come_back_from_disk(tmp_path: Path) -> None:
     found = make_walk().find()
     save_value(tmp_path / "loops.npz", found)
     back = load_value(tmp_path / "loops.npz")
-    assert (back.tried, back.unverified) == (found.tried, found.unverified)
+    assert (back.tried, back.implausible) == (found.tried, found.implausible)
     for a, b in zip(found.loops, back.loops, strict=True):
         assert a.edge.inliers == b.edge.inliers
         assert np.array_equal(a.edge.frame2_from_frame1, b.edge.frame2_from_frame1)
         assert np.array_equal(a.in_first.xy, b.in_first.xy)
         assert np.array_equal(a.in_second.point, b.in_second.point)
-    empty = FoundLoops([], 3, 3, 0, 0)
+    empty = FoundLoops([], 3, 0, 0)
     save_value(tmp_path / "none.npz", empty)
     assert load_value(tmp_path / "none.npz") == empty
 
