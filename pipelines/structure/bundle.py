@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 
 DENSE_CAMERAS = 250
 """Up to so many a dense factorisation of the reduced system is faster than a sparse one."""
+_LEAST_GAIN = 1e-5
+"""An adjustment ends with a step that lowers the cost by less, relatively."""
 
 
 @dataclass(frozen=True)
@@ -90,18 +92,15 @@ def adjust_bundle(
     intrinsics: Intrinsics,
     iterations: int = 20,
     width: float = 2.0,
-    fixed: NDArray[np.bool_] | None = None,
-    tolerance: float = 1e-5,
     ids: NDArray[np.int64] | None = None,
     rig: Rig = ONE_CAMERA,
 ) -> Adjusted:
     """Minimise reprojection and depth errors, each under Cauchy's loss of `width` standard deviations.
 
-    `fixed` (N,) bool: cameras that do not move. The free motion of the whole is left to the damping, so poses stay near
-    where they were. `ids` (N,): the cameras' frames, of which those at one place of the `rig` move together. Stops when
-    a step lowers the cost by less than `tolerance`, relatively.
+    The free motion of the whole is left to the damping, so poses stay near where they were. `ids` (N,): the cameras'
+    frames, of which those at one place of the `rig` move together. Stops when a step hardly lowers the cost.
     """
-    problem = Problem(bundle, intrinsics, width, fixed, ids, rig)
+    problem = Problem(bundle, intrinsics, width, ids, rig)
     motions, points = bundle.cam_from_world.copy(), bundle.points.copy()
     cost = initial = problem.cost(motions, points)
     damping, done = 1e-4, 0
@@ -122,7 +121,7 @@ def adjust_bundle(
             break
         gain, cost, motions, points = (cost - tried) / cost, tried, moved, shifted
         damping = max(damping / 5, 1e-8)
-        if gain < tolerance:
+        if gain < _LEAST_GAIN:
             break
     return Adjusted(replace(bundle, cam_from_world=motions, points=points), initial, cost, done)
 
@@ -131,7 +130,7 @@ class Problem:
     """The arrays of a bundle in the order the kernels want: by point, then by camera."""
 
     def __init__(
-        self, bundle: Bundle, intrinsics: Intrinsics, width: float = 2.0, fixed: NDArray[np.bool_] | None = None,
+        self, bundle: Bundle, intrinsics: Intrinsics, width: float = 2.0,
         ids: NDArray[np.int64] | None = None, rig: Rig = ONE_CAMERA,
     ) -> None:  # fmt: skip
         order = np.lexsort((bundle.obs_cam, bundle.obs_point))
@@ -142,10 +141,8 @@ class Problem:
         self.obs_cam, self.obs_point = b.obs_cam.astype(np.int64), b.obs_point.astype(np.int64)
         self.data = (intrinsics.numbers, self.obs_cam, self.obs_point, b.obs_xy, 1 / b.obs_sd, log_depth, weight, width)
         self.starts = np.searchsorted(self.obs_point, np.arange(len(b.points) + 1))
-        self.free = np.ones(len(b.cam_from_world), bool) if fixed is None else ~fixed
         self.rows, columns = kernels.number_blocks(self.starts, self.obs_cam, len(b.cam_from_world))
         self.pairs = np.column_stack([np.repeat(np.arange(len(b.cam_from_world)), np.diff(self.rows)), columns])
-        self.dense_cameras = DENSE_CAMERAS
         self.ids, self.rig = np.arange(len(b.cam_from_world)) if ids is None else ids, rig
 
     def cost(self, motions: Array, points: Array) -> float:
@@ -170,45 +167,36 @@ class Problem:
         inverse = kernels.invert_points(point_block, damping)
         index = self.rows, np.ascontiguousarray(self.pairs[:, 1])
         kernels.eliminate_points(*at, *self.data, self.starts, inverse, point_right, *index, blocks, right)
-        pairs, moving, turns, place = self.pairs, self.free, None, np.arange(n)
+        pairs, turns, place = self.pairs, None, np.arange(n)
         if len(self.rig) > 1:
             blocks, pairs, right, place, turns = tie_cameras(blocks, pairs, right, self.ids, self.rig)
-            moving = np.bincount(place, ~self.free) == 0
-        step = np.zeros(6 * len(moving))
-        free = np.repeat(moving, 6)
-        if free.any():
-            solved = solve_blocks(blocks, pairs, len(moving), right, free, self.dense_cameras)
-            if solved is None:
-                return None
-            step[free] = solved
-        cam_step = step.reshape(-1, 6)[place]
+        solved = solve_blocks(blocks, pairs, right)
+        if solved is None:
+            return None
+        cam_step = solved.reshape(-1, 6)[place]
         if turns is not None:
             cam_step = np.einsum("nij,nj->ni", turns, cam_step)
         shift = kernels.point_steps(*at, *self.data, inverse, point_right, cam_step)
         return cam_step, shift
 
 
-def solve_blocks(
-    blocks: Array, pairs: NDArray[np.int64], count: int, right: Array, free: NDArray[np.bool_], dense_cameras: int
-) -> Array | None:
-    """Solve the symmetric system of upper blocks (B, 6, 6) at pairs (B, 2) for the free of its 6 * count unknowns.
+def solve_blocks(blocks: Array, pairs: NDArray[np.int64], right: Array) -> Array | None:
+    """Solve the symmetric system of upper blocks (B, 6, 6) at pairs (B, 2) with the right side (6 * count,).
 
-    Dense Cholesky for up to `dense_cameras` cameras, else sparse LU. None where it has no (positive definite) solution.
+    Dense Cholesky for up to DENSE_CAMERAS, else sparse LU. None where it has no (positive definite) solution.
     """
-    if count <= dense_cameras:
+    count = len(right) // 6
+    if count <= DENSE_CAMERAS:
         dense = np.zeros((count, 6, count, 6))
         dense[pairs[:, 0], :, pairs[:, 1], :] = blocks
-        matrix = dense.reshape(6 * count, 6 * count)
         try:
-            factor = cho_factor(matrix if free.all() else matrix[np.ix_(free, free)], lower=False)
+            factor = cho_factor(dense.reshape(6 * count, 6 * count), lower=False)
         except LinAlgError:
             return None
-        return cho_solve(factor, right[free])
+        return cho_solve(factor, right)
     matrix = _symmetric(blocks, pairs, count)
-    if not free.all():
-        matrix = matrix[free][:, free]
     try:
-        return splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(right[free])
+        return splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(right)
     except RuntimeError:  # exactly singular
         return None
 
