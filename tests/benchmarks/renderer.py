@@ -212,7 +212,6 @@ def measure_tracking(repeats: int) -> None:
     seen = render(*gaussians, truth, scene.intrinsics)
     generator = torch.Generator().manual_seed(0)
     image = seen.features + 0.02 * torch.randn(seen.features.shape, generator=generator)
-    depth = seen.depth * (1 + 0.01 * torch.randn(seen.depth.shape, generator=generator))
     rng = np.random.default_rng(0)
     for distance, degrees in ((0.01, 0.3), (0.03, 1.0), (0.1, 3.0)):
         fits, times = [], []
@@ -220,7 +219,7 @@ def measure_tracking(repeats: int) -> None:
             a, b = (x / np.linalg.norm(x) for x in rng.normal(size=(2, 3)))
             start = se3.exp(torch.from_numpy(np.concatenate([distance * a, np.radians(degrees) * b])))
             began = time.perf_counter()
-            fits.append(track_gn(*gaussians, start, scene.intrinsics, image, depth))
+            fits.append(track_gn(*gaussians, start, scene.intrinsics, image))
             times.append(1e3 * (time.perf_counter() - began) / fits[-1].evaluations)
         good = [fit for fit in fits if fit.converged]
         errors = sorted(1e3 * float(se3.inverse(fit.cam_from_world)[:3, 3].norm()) for fit in good)

@@ -1,7 +1,7 @@
 """Normal equations of a camera pose, by carrying six derivatives through the blending next to every value.
 
 A dual number is eight lanes: the derivatives by the six numbers of a left twist (translation first), the value, and one
-lane unused. Two dual numbers share a vector: red and green, blue and depth sum; the light is kept twice.
+lane unused. Two dual numbers share a vector: red and green, blue and light.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ VALUE = 6
 """The lane of a dual number that holds its value."""
 _ALPHA_MAX = F32(rules.ALPHA_MAX)
 _HALF, _ZERO, _ONE = F32(0.5), F32(0), F32(1)
-_DUAL = 48  # floats per pixel: red and green, blue and depth, light and light
-_JACOBIAN = 32  # floats per Gaussian: derivatives of u/s², v/s², of the exponent by distance², and of z
+_DUAL = 32  # floats per pixel: red and green, blue and light
+_JACOBIAN = 24  # floats per Gaussian: derivatives of u/s², v/s², and of the exponent by distance²
 
 
 def normal_equations(
@@ -38,25 +38,22 @@ def normal_equations(
     points_in_cam: NDArray[np.float32],
     colors: NDArray[np.float32],
     image: NDArray[np.float32],
-    depth: NDArray[np.float32],
-    depth_weights: NDArray[np.float32],
     focal: tuple[float, float],
-    color_weight: float,
     floor: float,
     min_silhouette: float,
     near: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, int]:
-    """JᵀWJ (6, 6), JᵀWr (6,), Σ weight |r| and the number of pixels of color_weight |C - I| + depth_weights |D - D̂|.
+    """JᵀWJ (6, 6), JᵀWr (6,), Σ weight |r| and the number of pixels of |C - I|.
 
     W makes the absolute values quadratic about the present residuals, `floor` being the least residual divided by.
-    projected: u, v, sigma_px, z, opacity (M,); D is the normalised depth; depth (H, W) is 0 where unknown; pixels with
-    a silhouette below `min_silhouette` do not count. The same bytes for any number of threads.
+    projected: u, v, sigma_px, z, opacity (M,); pixels with a silhouette below `min_silhouette` do not count. The same
+    bytes for any number of threads.
     """
-    height, width = depth.shape
+    height, width = image.shape[:2]
     bands = split_into_bands(projected, colors, 3, width, height, near)
     sums, costs = np.zeros((len(bands), 6, 8)), np.zeros((len(bands), 2))
-    settings = (F32(focal[0]), F32(focal[1]), F32(color_weight), F32(floor), F32(min_silhouette))
-    job = (points_in_cam, image, depth, depth_weights, *settings, sums, costs)
+    settings = (F32(focal[0]), F32(focal[1]), F32(floor), F32(min_silhouette))
+    job = (points_in_cam, image, *settings, sums, costs)
     for_each(lambda b: normal_equations_of_band(b, bands.own(b), *bands.prepared[b], *job), len(bands))
     total, (cost, pixels) = sums.sum(axis=0), costs.sum(axis=0)
     return total[:, :6], total[:, VALUE], float(cost), int(pixels)
@@ -70,21 +67,20 @@ def fill_jacobian(
     fy: np.float32,
     sigma_px: np.float32,
 ) -> None:
-    """d exponent = dx * jacobian[0:8] + dy * jacobian[8:16] + distance² * jacobian[16:24]; dz = jacobian[24:32].
+    """d exponent = dx * jacobian[0:8] + dy * jacobian[8:16] + distance² * jacobian[16:24].
 
     A left twist (ρ, φ) moves a point P of the camera by ρ + φ x P.
     """
     clear(jacobian)
     x, y, z = point[0], point[1], point[2]
     scale = _ONE / (z * sigma_px * sigma_px)
-    du, dv, ds, dz = jacobian[0:8], jacobian[8:16], jacobian[16:24], jacobian[24:32]
-    dz[2], dz[3], dz[4] = _ONE, y, -x
+    du, dv, ds = jacobian[0:8], jacobian[8:16], jacobian[16:24]
     du[0], du[4], du[5] = fx * scale, fx * scale * z, -fx * scale * y
     dv[1], dv[3], dv[5] = fy * scale, -fy * scale * z, fy * scale * x
-    for p in range(2, 5):
-        du[p] -= fx * scale * x / z * dz[p]
-        dv[p] -= fy * scale * y / z * dz[p]
-        ds[p] = -scale * dz[p]
+    for p, dz in ((2, _ONE), (3, y), (4, -x)):
+        du[p] -= fx * scale * x / z * dz
+        dv[p] -= fy * scale * y / z * dz
+        ds[p] = -scale * dz
 
 
 @inner
@@ -95,7 +91,6 @@ def blend_duals(
     color: NDArray[np.float32],
     u_tile: np.float32,
     v_tile: np.float32,
-    z: np.float32,
     y0: int,
     y1: int,
     x0: int,
@@ -103,8 +98,7 @@ def blend_duals(
 ) -> None:
     """Blends one Gaussian, whose opacities stand in the plane ALPHA, into a box of a tile's dual numbers."""
     du, dv, ds = load_twice(jacobian, 0), load_twice(jacobian, 8), load_twice(jacobian, 16)
-    dz = load_twice(jacobian, 24) * halves(_ZERO, _ONE)
-    red_green, blue_depth = halves(color[0], color[1]), halves(color[2], z)
+    red_green, blue_light = halves(color[0], color[1]), halves(color[2], -_ONE)
     for y in range(y0, y1 + 1):
         dy = F32(y) + _HALF - v_tile
         for x in range(x0, x1 + 1):
@@ -116,40 +110,24 @@ def blend_duals(
             slope = alpha if alpha < _ALPHA_MAX else _ZERO
             d_alpha = (du * dx + dv * dy + ds * (dx * dx + dy * dy)) * slope
             at = _DUAL * pixel
-            lights = load(duals, at + 32)
-            weight = lights * alpha + d_alpha * light
+            weight = load_twice(duals, at + 24) * alpha + d_alpha * light
             store(duals, at, load(duals, at) + weight * red_green)
-            store(duals, at + 16, load(duals, at + 16) + weight * blue_depth + dz * (alpha * light))
-            store(duals, at + 32, lights - weight)
+            store(duals, at + 16, load(duals, at + 16) + weight * blue_light)
             state[LIGHT + pixel] = light - alpha * light
 
 
 @inner
 def add_pixel(
-    normal: NDArray[np.float32],
-    duals: NDArray[np.float32],
-    seen: np.float32,
-    color: NDArray[np.float32],
-    depth: np.float32,
-    depth_weight: np.float32,
-    color_weight: np.float32,
-    floor: np.float32,
+    normal: NDArray[np.float32], duals: NDArray[np.float32], color: NDArray[np.float32], floor: np.float32
 ) -> np.float32:
-    """Turns a pixel's dual numbers into residuals, adds their products, gives back Σ weight |residual|."""
-    rendered = duals[16 + 8 + VALUE] / seen
-    # (D / S)' = (D' - D / S S') / S, and S' is minus the derivative of the light.
-    corrected = load(duals, 16) + load(duals, 32) * halves(_ZERO, rendered)
-    store(duals, 16, corrected * halves(_ONE, _ONE / seen))
+    """Turns a pixel's dual numbers into residuals, adds their products, gives back Σ |residual|."""
     duals[VALUE] -= color[0]
     duals[8 + VALUE] -= color[1]
     duals[16 + VALUE] -= color[2]
-    duals[16 + 8 + VALUE] = rendered - depth
     red, green, blue = abs(duals[VALUE]), abs(duals[8 + VALUE]), abs(duals[16 + VALUE])
-    away = abs(rendered - depth)
-    of_depth = depth_weight if depth > _ZERO else _ZERO
-    add_products(normal, load(duals, 0), halves(color_weight / max(red, floor), color_weight / max(green, floor)))
-    add_products(normal, load(duals, 16), halves(color_weight / max(blue, floor), of_depth / max(away, floor)))
-    return color_weight * (red + green + blue) + of_depth * away
+    add_products(normal, load(duals, 0), halves(_ONE / max(red, floor), _ONE / max(green, floor)))
+    add_products(normal, load(duals, 16), halves(_ONE / max(blue, floor), _ZERO))
+    return red + green + blue
 
 
 @kernel
@@ -162,18 +140,15 @@ def normal_equations_of_band(
     members: NDArray[np.int32],
     points_in_cam: NDArray[np.float32],
     target: NDArray[np.float32],
-    depth: NDArray[np.float32],
-    depth_weights: NDArray[np.float32],
     fx: np.float32,
     fy: np.float32,
-    color_weight: np.float32,
     floor: np.float32,
     min_silhouette: np.float32,
     sums: NDArray[np.float64],
     costs: NDArray[np.float64],
 ) -> None:
     """Adds the pixels of one band to sums[band] (6, 8) and costs[band] (2,)."""
-    height, width = depth.shape
+    height, width = target.shape[:2]
     jacobians = np.empty(len(own) * _JACOBIAN, np.float32)
     for k in range(len(own)):
         jacobian = jacobians[k * _JACOBIAN : (k + 1) * _JACOBIAN]
@@ -200,7 +175,7 @@ def normal_equations_of_band(
             store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
             weigh_rows(state, falloff_y, exp(dx2 * sharpness), dx2, v_tile, r * r, y0, y1)
             jacobian, color = jacobians[i * _JACOBIAN : (i + 1) * _JACOBIAN], colors[3 * i : 3 * i + 3]
-            blend_duals(duals, state, jacobian, color, u_tile, v_tile, records[at + 3], y0, y1, x0, x1)
+            blend_duals(duals, state, jacobian, color, u_tile, v_tile, y0, y1, x0, x1)
             if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, LIGHT):
                 break
         clear(normal)
@@ -210,10 +185,7 @@ def normal_equations_of_band(
                 seen = _ONE - state[LIGHT + pixel]
                 if seen >= min_silhouette and seen > _ZERO:
                     own_duals = duals[pixel * _DUAL : (pixel + 1) * _DUAL]
-                    costs[band, 0] += add_pixel(
-                        normal, own_duals, seen, target[row, column], depth[row, column],
-                        depth_weights[row, column], color_weight, floor,
-                    )  # fmt: skip
+                    costs[band, 0] += add_pixel(normal, own_duals, target[row, column], floor)
                     costs[band, 1] += 1
         for p in range(6):
             for q in range(8):
@@ -229,5 +201,4 @@ def open_tile(state: NDArray[np.float32], duals: NDArray[np.float32], columns: i
         for x in range(columns):
             pixel = TILE * y + x
             state[LIGHT + pixel] = _ONE
-            duals[pixel * _DUAL + 32 + VALUE] = _ONE
-            duals[pixel * _DUAL + 40 + VALUE] = _ONE
+            duals[pixel * _DUAL + 24 + VALUE] = _ONE

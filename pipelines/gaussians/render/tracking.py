@@ -21,14 +21,16 @@ from msgs_slam.pipelines.types import Intrinsics
 
 FIRST_FLOOR, FLOOR_FACTOR, LAST_FLOOR = 0.3, 0.6, 0.02
 """Residuals below the floor count quadratically, above it absolutely; the floor falls with every evaluation."""
+MIN_OVERLAP, MAX_EVALUATIONS, TOLERANCE_PX = 0.2, 10, 0.05
+"""A fit is refused when less of the image shows the map, or after so many evaluations; it ends with a step that moves
+the image by less."""
 
 
 @dataclass(frozen=True)
 class PoseFit:
     """cam_from_world (4, 4) float64: the fitted pose, or the start where `converged` is False and `reason` says why.
 
-    evaluations: how often the map was rendered; cost: mean weighted |residual| per pixel seen, at the last evaluation;
-    information (6, 6) float64: JᵀWJ there, for a left twist (translation first).
+    evaluations: how often the map was rendered; cost: mean |residual| per pixel seen, at the last evaluation.
     """
 
     cam_from_world: Tensor
@@ -36,7 +38,6 @@ class PoseFit:
     reason: str
     evaluations: int
     cost: float
-    information: NDArray[np.float64]
 
 
 def track_gn(
@@ -47,35 +48,24 @@ def track_gn(
     cam_from_world: Tensor,
     intrinsics: Intrinsics,
     image: Tensor,
-    depth: Tensor | None = None,
-    depth_weights: Tensor | None = None,
-    color_weight: float = 1.0,
-    depth_weight: float = 0.8,
     min_silhouette: float = 0.95,
-    min_overlap: float = 0.2,
-    max_evaluations: int = 10,
-    tolerance_px: float = 0.05,
-    near: float = NEAR,
 ) -> PoseFit:
-    """Fit cam_from_world (4, 4) so that the map looks like image (H, W, 3) in 0..1 and depth (H, W), 0 = unknown.
+    """Fit cam_from_world (4, 4) so that the map looks like image (H, W, 3) in 0..1.
 
-    Minimises Σ color_weight |C - I| + depth_weight depth_weights |D - depth| over the pixels with silhouette >=
-    min_silhouette, depth_weights (H, W) being the reliability of the depth (1 where not given). Ends when a step moves
-    the image by less than tolerance_px; refuses, with `converged` False, if less than min_overlap of the image shows
-    the map, if the cost grows or if max_evaluations do not suffice. Computes in float32 on the CPU wherever the tensors
-    are. Raises ValueError for NaN, infinity or wrong shapes.
+    Minimises Σ |C - I| over the pixels with silhouette >= min_silhouette. Ends when a step moves the image by less than
+    TOLERANCE_PX; refuses, with `converged` False, if less than MIN_OVERLAP of the image shows the map, if the cost
+    grows or if MAX_EVALUATIONS do not suffice. Computes in float32 on the CPU wherever the tensors are. Raises
+    ValueError for NaN, infinity or wrong shapes.
     """
-    problem = _Problem(means, radii, opacities, colors, intrinsics, image, depth, depth_weights, near)
-    weights = (color_weight, depth_weight, min_silhouette)
+    problem = _Problem(means, radii, opacities, colors, intrinsics, image)
     start = cam_from_world.detach().cpu().double()
     require_finite("cam_from_world", start)
     pose, floor, first_cost, cost = start, FIRST_FLOOR, np.inf, np.inf
-    information, reason = np.zeros((6, 6)), f"no convergence within {max_evaluations} evaluations"
-    step_px, evaluation = np.inf, 0
-    for evaluation in range(1, max_evaluations + 1):
-        information, gradient, total, pixels, z = problem.normal_equations(pose, floor, *weights)
-        if pixels < min_overlap * intrinsics.width * intrinsics.height:
-            reason = f"only {pixels} pixels show the map, fewer than {min_overlap:.0%} of the image"
+    reason, evaluation = f"no convergence within {MAX_EVALUATIONS} evaluations", 0
+    for evaluation in range(1, MAX_EVALUATIONS + 1):
+        information, gradient, total, pixels, z = problem.normal_equations(pose, floor, min_silhouette)
+        if pixels < MIN_OVERLAP * intrinsics.width * intrinsics.height:
+            reason = f"only {pixels} pixels show the map, fewer than {MIN_OVERLAP:.0%} of the image"
             break
         cost = total / pixels
         first_cost = min(first_cost, cost) if evaluation == 1 else first_cost
@@ -85,11 +75,11 @@ def track_gn(
         step = torch.from_numpy(-np.linalg.solve(information, gradient))
         pose = se3.exp(step) @ pose
         step_px = max(intrinsics.fx, intrinsics.fy) * float(step[:3].norm() / z + step[3:].norm())
-        if step_px < tolerance_px:
+        if step_px < TOLERANCE_PX:
             reason = "" if cost <= first_cost else "the cost grew"
             break
         floor = max(floor * FLOOR_FACTOR, LAST_FLOOR)
-    return PoseFit(start if reason else pose, not reason, reason, evaluation, float(cost), information)
+    return PoseFit(start if reason else pose, not reason, reason, evaluation, float(cost))
 
 
 class _Problem:
@@ -103,50 +93,27 @@ class _Problem:
         colors: Tensor,
         intrinsics: Intrinsics,
         image: Tensor,
-        depth: Tensor | None,
-        depth_weights: Tensor | None,
-        near: float,
     ) -> None:
-        size, count = (intrinsics.height, intrinsics.width), len(means)
-        depth = torch.zeros(size) if depth is None else depth
-        depth_weights = torch.ones(size) if depth_weights is None else depth_weights
-        self.intrinsics, self.near = intrinsics, near
+        self.intrinsics, count = intrinsics, len(means)
         self.means = _checked("means", means, (count, 3))
         self.radii = _checked("radii", radii, (count,))
         self.opacities = _checked("opacities", opacities, (count,)).numpy()
         self.colors = _checked("colors", colors, (count, 3)).numpy()
-        self.image = _checked("image", image, (*size, 3)).numpy()
-        self.depth = _checked("depth", depth, size).numpy()
-        self.depth_weights = _checked("depth_weights", depth_weights, size).numpy()
+        self.image = _checked("image", image, (intrinsics.height, intrinsics.width, 3)).numpy()
 
     def normal_equations(
-        self,
-        pose: Tensor,
-        floor: float,
-        color_weight: float,
-        depth_weight: float,
-        min_silhouette: float,
+        self, pose: Tensor, floor: float, min_silhouette: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, int, float]:
         """JᵀWJ, JᵀWr, cost, pixels, and the median depth of the Gaussians in front of the camera."""
         from msgs_slam.pipelines.gaussians.render.cpu_tracking import normal_equations  # imports numba
 
         points_in_cam = se3.transform(pose.float(), self.means)
-        u, v, sigma_px, z = project_gaussians(points_in_cam, self.radii, self.intrinsics, self.near)
-        front = z[z > self.near]
+        u, v, sigma_px, z = project_gaussians(points_in_cam, self.radii, self.intrinsics, NEAR)
+        front = z[z > NEAR]
         projected = (u.numpy(), v.numpy(), sigma_px.numpy(), z.contiguous().numpy(), self.opacities)
-
+        focal = (self.intrinsics.fx, self.intrinsics.fy)
         result = normal_equations(
-            projected,
-            points_in_cam.numpy(),
-            self.colors,
-            self.image,
-            self.depth,
-            self.depth_weights * np.float32(depth_weight),
-            (self.intrinsics.fx, self.intrinsics.fy),
-            color_weight,
-            floor,
-            min_silhouette,
-            self.near,
+            projected, points_in_cam.numpy(), self.colors, self.image, focal, floor, min_silhouette, NEAR
         )
         return (*result, float(front.median()) if len(front) else 1.0)
 
