@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render.cpu_backward import backward_band, sum_shared
+from msgs_slam.pipelines.gaussians.render.cpu_backward import COLORS, backward_band, sum_shared
 from msgs_slam.pipelines.gaussians.render.cpu_bands import split_into_bands
 from msgs_slam.pipelines.gaussians.render.cpu_forward import draw_bands
 from msgs_slam.pipelines.gaussians.render.cpu_inspect import class_weights, inspect, weighted_errors
@@ -47,28 +47,28 @@ class _Composite(torch.autograd.Function):
         features, planes = draw_bands(bands, vectors, values.shape[1], width, height)
         outputs = (torch.from_numpy(features), *torch.from_numpy(planes).unbind(0))
         ctx.save_for_backward(outputs[0])
-        ctx.state = (bands, vectors, planes)
+        ctx.state = (bands, planes)
         ctx.set_materialize_grads(False)
         return outputs
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        bands, vectors, planes = ctx.state
+        bands, planes = ctx.state
         features = _array(ctx.saved_tensors[0])
+        if features.shape[2] != COLORS:
+            raise ValueError(f"the cpu backend has gradients of {COLORS} features, got {features.shape[2]}")
         images = (features, *planes)
         upstream = [
             np.zeros_like(image) if gradient is None else _array(gradient)
             for image, gradient in zip(images, gradients, strict=True)
         ]
         job = (features, planes, upstream[0], np.stack(upstream[1:]))
-        count, channels = len(bands.first), features.shape[2]
-        d_geometry, d_features = np.zeros((5, count), F32), np.zeros((count, channels), F32)
-        shared = np.empty((int(bands.slots[-1]), 5 + channels), F32)
+        count = len(bands.first)
+        d_geometry, d_features = np.zeros((5, count), F32), np.zeros((count, COLORS), F32)
+        shared = np.empty((int(bands.slots[-1]), 5 + COLORS), F32)
         results = (d_geometry, d_features, shared)
         places = (bands.first, bands.slots)
-        for_each(
-            lambda b: backward_band(vectors, b, bands.own(b), *places, *bands.prepared[b], *job, *results), len(bands)
-        )
+        for_each(lambda b: backward_band(b, bands.own(b), *places, *bands.prepared[b], *job, *results), len(bands))
         for_each(
             lambda n: sum_shared(n * _ROWS, _ROWS, bands.slots, shared, d_geometry, d_features), -(-count // _ROWS)
         )

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import msgs_slam.pipelines.gaussians.render.rules as rules
-from msgs_slam.pipelines.gaussians.render.boxes import gradients_of_box
 from msgs_slam.pipelines.gaussians.render.cpu_bands import (
     BAND_ROWS,
     RECORD,
@@ -22,8 +21,6 @@ from msgs_slam.pipelines.gaussians.render.cpu_bands import (
 from msgs_slam.pipelines.gaussians.render.cpu_forward import (
     CHECK_EVERY,
     PIXELS,
-    Vectors,
-    channels_of,
     clear,
     is_opaque,
 )
@@ -41,10 +38,12 @@ from msgs_slam.pipelines.gaussians.render.lanes import (
 )
 
 F32 = np.float32
-LIGHT, BEHIND, D_DEPTH, D_SEEN, ALPHA, WEIGHT, PRODUCT = (PIXELS * i for i in range(7))
+LIGHT, BEHIND, D_DEPTH, D_SEEN = (PIXELS * i for i in range(4))
 """Planes of a tile's state: light as in the forward pass; what is still behind; the gradients of depth sum and
-silhouette; and three that pass from one step of a Gaussian to the next."""
-PLANES = 7
+silhouette."""
+PLANES = 4
+COLORS = 3
+"""Features that have gradients: nobody asks for those of class logits."""
 
 _ALPHA_MAX, _LIGHT_MIN = F32(rules.ALPHA_MAX), F32(rules.TRANSMITTANCE_MIN)
 _HALF, _ZERO, _ONE = F32(0.5), F32(0), F32(1)
@@ -54,7 +53,6 @@ _HALF, _ZERO, _ONE = F32(0.5), F32(0), F32(1)
 def open_tile(
     state: NDArray[np.float32],
     image: NDArray[np.float32],
-    vectors: Vectors,
     left: int,
     top: int,
     columns: int,
@@ -66,15 +64,14 @@ def open_tile(
 ) -> None:
     """Loads the gradients of the pixels of a tile and everything that will be blended into them."""
     clear(state)
-    used, channels = features.shape[2], channels_of(vectors)
     for y in range(rows):
         for x in range(columns):
             pixel, row, column = TILE * y + x, top + y, left + x
             d_depth, d_depth_seen, d_seen = d_planes[0, row, column], d_planes[1, row, column], d_planes[2, row, column]
             behind = d_seen * planes[2, row, column]
             gradients, values = d_features[row, column], features[row, column]
-            for c in range(used):
-                image[PIXELS * c + pixel if vectors is None else pixel * channels + c] = gradients[c]
+            for c in range(COLORS):
+                image[PIXELS * c + pixel] = gradients[c]
                 behind += gradients[c] * values[c]
             state[LIGHT + pixel] = _ONE
             state[D_DEPTH + pixel] = d_depth
@@ -84,52 +81,7 @@ def open_tile(
 
 
 @inner
-def weigh_rows(
-    state: NDArray[np.float32],
-    falloff_y: NDArray[np.float32],
-    falloff_x: object,
-    dx2: object,
-    y_center: np.float32,
-    reach2: np.float32,
-    first: int,
-    last: int,
-) -> None:
-    """Opacity and weight of one Gaussian in rows first..last of a tile, as the forward pass had them."""
-    for y in range(first, last + 1):
-        row = TILE * y
-        dy = F32(y) + _HALF - y_center
-        alpha = at_most(falloff_x * falloff_y[y], _ALPHA_MAX)
-        inside = (dx2 <= splat(reach2 - dy * dy)) & (load(state, LIGHT + row) >= _LIGHT_MIN)
-        alpha = where(inside, alpha)
-        store(state, ALPHA + row, alpha)
-        store(state, WEIGHT + row, alpha * load(state, LIGHT + row))
-
-
-@inner
 def pull_rows(
-    state: NDArray[np.float32], z: np.float32, y_center: np.float32, first: int, last: int
-) -> tuple[object, object, object, object]:
-    """Sums over rows first..last, column by column, of m, m dy, m dy² and d loss / d z, with
-    m = alpha * d loss / d alpha; light and what is behind go on behind the Gaussian."""
-    pull, pull_y, pull_y2, d_z = splat(_ZERO), splat(_ZERO), splat(_ZERO), splat(_ZERO)
-    for y in range(first, last + 1):
-        row = TILE * y
-        dy = F32(y) + _HALF - y_center
-        alpha, weight, light = load(state, ALPHA + row), load(state, WEIGHT + row), load(state, LIGHT + row)
-        d_depth = load(state, D_DEPTH + row)
-        q = load(state, PRODUCT + row) + d_depth * z + load(state, D_SEEN + row)
-        behind = load(state, BEHIND + row) - weight * q
-        store(state, BEHIND + row, behind)
-        store(state, LIGHT + row, light - weight)
-        d_alpha = light * q - behind * reciprocal(_ONE - alpha)
-        m = where(alpha < splat(_ALPHA_MAX), d_alpha * alpha)
-        pull, pull_y, pull_y2 = pull + m, pull_y + m * dy, pull_y2 + m * (dy * dy)
-        d_z = d_z + weight * d_depth
-    return pull, pull_y, pull_y2, d_z
-
-
-@inner
-def pull_painted_rows(
     state: NDArray[np.float32],
     image: NDArray[np.float32],
     features: NDArray[np.float32],
@@ -143,8 +95,9 @@ def pull_painted_rows(
     first: int,
     last: int,
 ) -> tuple[object, object, object, object, object, object, object]:
-    """`weigh_rows` and `pull_rows` in one, where the gradients of three features lie in the planes of `image`; also the
-    sums, column by column, of the gradients of the Gaussian's features, those from `at` on."""
+    """Sums over rows first..last, column by column, of m, m dy, m dy² and d loss / d z, with m = alpha * d loss /
+    d alpha, and of the gradients of the Gaussian's features, those from `at` on; light and what is behind go on behind
+    the Gaussian. The gradients of the image lie in the planes of `image`."""
     red, green, blue = features[at], features[at + 1], features[at + 2]
     pull, pull_y, pull_y2, d_z = splat(_ZERO), splat(_ZERO), splat(_ZERO), splat(_ZERO)
     d_red, d_green, d_blue = splat(_ZERO), splat(_ZERO), splat(_ZERO)
@@ -171,7 +124,6 @@ def pull_painted_rows(
 
 @kernel
 def backward_band(
-    vectors: Vectors,
     band: int,
     own: NDArray[np.int32],
     first: NDArray[np.int32],
@@ -189,26 +141,21 @@ def backward_band(
     shared: NDArray[np.float32],
 ) -> None:
     """Gradients of the Gaussians seen in a band: of u, v, sigma_px, z, opacity to d_geometry (5, M) and of the features
-    to d_features (M, C), or, where other bands add to them too, to their row of `shared` (S, 5 + C).
+    to d_features (M, 3), or, where other bands add to them too, to their row of `shared` (S, 8).
 
     features and planes are the images of the forward pass, d_image and d_planes their gradients.
     """
-    height, width, used = features.shape
-    channels = channels_of(vectors)
-    d_padded = np.zeros(len(padded), np.float32)
+    height, width = features.shape[:2]
     d_records = np.zeros(8 * len(own), np.float32)
     band_top = band * BAND_ROWS
     across = (width + TILE - 1) // TILE
-    image = np.zeros(PIXELS * channels, np.float32)
+    image = np.zeros(PIXELS * COLORS, np.float32)
     state = np.empty(PIXELS * PLANES, np.float32)
     falloff_y = np.empty(TILE, np.float32)
     for tile in range(len(tile_starts) - 1):
         left, top = TILE * (tile % across), band_top + TILE * (tile // across)
         columns, rows = min(TILE, width - left), min(TILE, height - top)
-        open_tile(
-            state, image, vectors, left, top, columns, rows,
-            features, planes, d_image, d_planes,
-        )  # fmt: skip
+        open_tile(state, image, left, top, columns, rows, features, planes, d_image, d_planes)
         for k in range(tile_starts[tile], tile_starts[tile + 1]):
             i = members[k]
             at = RECORD * i
@@ -223,22 +170,10 @@ def backward_band(
             dx2 = dx * dx
             falloff_x = exp(dx2 * sharpness)
             store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
-            depth, unused = records[at + 3], splat(_ZERO)
-            if vectors is None:
-                pull, pull_y, pull_y2, d_z, d_red, d_green, d_blue = pull_painted_rows(
-                    state, image, padded, i * channels, falloff_y, falloff_x, dx2, depth, v_tile, r * r, y0, y1
-                )
-                add_totals(d_records, 8 * i + 4, pull, d_red, d_green, d_blue)
-            else:
-                weigh_rows(state, falloff_y, falloff_x, dx2, v_tile, r * r, y0, y1)
-                quads = (x1 - x0 + 4) // 4
-                corner = TILE * y0 + min(x0, TILE - 4 * quads)  # four at a time, without leaving the tile
-                gradients_of_box(
-                    image, corner * channels, padded, i * channels, d_padded, i * channels,
-                    state, WEIGHT + corner, state, PRODUCT + corner, y1 - y0 + 1, quads, vectors,
-                )  # fmt: skip
-                pull, pull_y, pull_y2, d_z = pull_rows(state, depth, v_tile, y0, y1)
-                add_totals(d_records, 8 * i + 4, pull, unused, unused, unused)
+            pull, pull_y, pull_y2, d_z, d_red, d_green, d_blue = pull_rows(
+                state, image, padded, i * COLORS, falloff_y, falloff_x, dx2, records[at + 3], v_tile, r * r, y0, y1
+            )
+            add_totals(d_records, 8 * i + 4, pull, d_red, d_green, d_blue)
             add_totals(d_records, 8 * i, pull * dx, pull_y, pull * dx2 + pull_y2, d_z)
             if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, LIGHT):
                 break
@@ -250,21 +185,15 @@ def backward_band(
         d_records[at + 1] *= precision
         d_records[at + 2] *= precision / sigma_px
         d_records[at + 4] /= opacity
-        if vectors is None:
-            values, value_at = d_records, at + 5
-        else:
-            values, value_at = d_padded, k * channels
         if slots[i + 1] > slots[i]:
             row = shared[slots[i] + band - first[i]]
-            for j in range(5):
+            for j in range(5 + COLORS):
                 row[j] = d_records[at + j]
-            for c in range(used):
-                row[5 + c] = values[value_at + c]
         else:
             for j in range(5):
                 d_geometry[j, i] = d_records[at + j]
-            for c in range(used):
-                d_features[i, c] = values[value_at + c]
+            for c in range(COLORS):
+                d_features[i, c] = d_records[at + 5 + c]
 
 
 @kernel
@@ -287,5 +216,5 @@ def sum_shared(
                 first[c] += shared[k, c]
         for j in range(5):
             d_geometry[j, i] = first[j]
-        for c in range(d_features.shape[1]):
+        for c in range(COLORS):
             d_features[i, c] = first[5 + c]

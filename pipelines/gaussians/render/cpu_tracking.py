@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import msgs_slam.pipelines.gaussians.render.rules as rules
-from msgs_slam.pipelines.gaussians.render.cpu_backward import ALPHA, PLANES, weigh_rows
 from msgs_slam.pipelines.gaussians.render.cpu_bands import (
     BAND_ROWS,
     RECORD,
@@ -21,13 +20,26 @@ from msgs_slam.pipelines.gaussians.render.cpu_bands import (
 )
 from msgs_slam.pipelines.gaussians.render.cpu_forward import CHECK_EVERY, LIGHT, PIXELS, clear, is_opaque
 from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
-from msgs_slam.pipelines.gaussians.render.lanes import add_products, counting, exp, halves, load, load_twice, store
+from msgs_slam.pipelines.gaussians.render.lanes import (
+    add_products,
+    at_most,
+    counting,
+    exp,
+    halves,
+    load,
+    load_twice,
+    splat,
+    store,
+    where,
+)
 from msgs_slam.pipelines.gaussians.render.threads import for_each
 
 F32 = np.float32
+ALPHA, PLANES = PIXELS, 2
+"""Where the plane of a Gaussian's opacities starts in a tile's state, behind that of light, and how many there are."""
 VALUE = 6
 """The lane of a dual number that holds its value."""
-_ALPHA_MAX = F32(rules.ALPHA_MAX)
+_ALPHA_MAX, _LIGHT_MIN = F32(rules.ALPHA_MAX), F32(rules.TRANSMITTANCE_MIN)
 _HALF, _ZERO, _ONE = F32(0.5), F32(0), F32(1)
 _DUAL = 32  # floats per pixel: red and green, blue and light
 _JACOBIAN = 24  # floats per Gaussian: derivatives of u/s², v/s², and of the exponent by distance²
@@ -81,6 +93,26 @@ def fill_jacobian(
         du[p] -= fx * scale * x / z * dz
         dv[p] -= fy * scale * y / z * dz
         ds[p] = -scale * dz
+
+
+@inner
+def shade_rows(
+    state: NDArray[np.float32],
+    falloff_y: NDArray[np.float32],
+    falloff_x: object,
+    dx2: object,
+    y_center: np.float32,
+    reach2: np.float32,
+    first: int,
+    last: int,
+) -> None:
+    """Opacity of one Gaussian in rows first..last of a tile, as in the forward pass."""
+    for y in range(first, last + 1):
+        row = TILE * y
+        dy = F32(y) + _HALF - y_center
+        alpha = at_most(falloff_x * falloff_y[y], _ALPHA_MAX)
+        inside = (dx2 <= splat(reach2 - dy * dy)) & (load(state, LIGHT + row) >= _LIGHT_MIN)
+        store(state, ALPHA + row, where(inside, alpha))
 
 
 @inner
@@ -173,7 +205,7 @@ def normal_equations_of_band(
             dx, dy = counting(_HALF - u_tile), counting(_HALF - v_tile)
             dx2 = dx * dx
             store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
-            weigh_rows(state, falloff_y, exp(dx2 * sharpness), dx2, v_tile, r * r, y0, y1)
+            shade_rows(state, falloff_y, exp(dx2 * sharpness), dx2, v_tile, r * r, y0, y1)
             jacobian, color = jacobians[i * _JACOBIAN : (i + 1) * _JACOBIAN], colors[3 * i : 3 * i + 3]
             blend_duals(duals, state, jacobian, color, u_tile, v_tile, y0, y1, x0, x1)
             if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, LIGHT):

@@ -53,7 +53,7 @@ def test_median_depth_is_a_surface_and_not_a_mean():
 
 def test_summed_weights_are_the_gradient_of_a_feature_of_ones():
     scene = room(64, 48, 2000, 1)
-    ones = torch.ones(2000, 1, requires_grad=True)
+    ones = torch.ones(2000, 3, requires_grad=True)
     render(scene.means, scene.radii, scene.opacities, ones, POSE, scene.intrinsics).features.sum().backward()
     weights = blending_weights(scene.means, scene.radii, scene.opacities, POSE, scene.intrinsics)
     torch.testing.assert_close(weights.total, ones.grad[:, 0], rtol=1e-4, atol=1e-5)
