@@ -103,7 +103,7 @@ def read_gaussian_glb(path: Path) -> GaussianCloud:
         primitives = [p for m in document.get("meshes", []) for p in m["primitives"]]
         found = next((p for p in primitives if EXTENSION in p.get("extensions", {})), None)
         if found is None:
-            raise InputError(f"{path} holds no Gaussians ({EXTENSION}): it is a GLB of something else")
+            raise InputError(f"{path} holds no Gaussians ({EXTENSION}), but perhaps a mesh: give a splat file")
         splats = found["extensions"][EXTENSION]
         if COMPRESSION in splats.get("extensions", {}):
             view = document["bufferViews"][splats["extensions"][COMPRESSION]["bufferView"]]

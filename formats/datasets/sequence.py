@@ -84,7 +84,9 @@ class Sequence:
         if not increasing or not np.isfinite(self.timestamps).all():
             raise InputError(f"{self.root}: the frames' timestamps do not increase: sort the image list by time")
         if not _UNITS_PER_METRE[0] <= self.depth_per_metre <= _UNITS_PER_METRE[1]:
-            raise InputError(f"{self.root}: {self.depth_per_metre:g} depth units a metre: correct the depth scale")
+            raise InputError(
+                f"{self.root}: a depth scale of {self.depth_per_metre:g} units a metre cannot be: correct it"
+            )
         for what in ("image_paths", "depth_paths", "label_paths"):
             if len(getattr(self, what)) not in (0, n):
                 raise ValueError(f"Sequence: {len(getattr(self, what))} {what} for {n} frames")

@@ -103,7 +103,7 @@ def read_class_map(path: Path) -> ClassMap:
     values = read_toml(path)
     classes, truth = values.get("classes"), values.get("truth", [])
     if not isinstance(classes, dict) or not classes or set(values) - {"classes", "truth"}:
-        raise InputError(f'{path}: is not a class map. Write [classes] and under it lines like: sofa = "couch"')
+        raise InputError(f'{path} is not a class map. Write [classes] and under it lines like: sofa = "couch"')
     pairs = []
     for ours, theirs in classes.items():
         listed = [theirs] if isinstance(theirs, str) else theirs

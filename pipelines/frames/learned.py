@@ -111,9 +111,9 @@ def _required(store: ModelStore) -> Model:
 def _opened(store: ModelStore, model: Model) -> Runtime:
     path: Path = store.path(model)
     if file_sha256(path) != model.sha256:
-        raise InputError(f"{path}: is damaged; run: msgs-slam models pull {model.name}")
+        raise InputError(f"{path} is damaged; run: msgs-slam models pull {model.name}")
     # One thread each: pairs and images already go side by side, and results must not depend on how many there are.
     runtime = open_runtime(path, [], 1, "cpu")
     if set(runtime.inputs) != _INPUTS[model.family]:
-        raise InputError(f"{path}: its inputs are {', '.join(runtime.inputs)}; another kind of file is needed")
+        raise InputError(f"{path}: a network with other inputs is needed: msgs-slam models pull {model.name}")
     return runtime

@@ -220,7 +220,7 @@ class ModelStore:
         if not isinstance(pinned, dict) or not all(isinstance(v, str) for v in pinned.values()):
             pinned = None
         if pinned is None or not isinstance(added, list):
-            raise InputError(f"{path}: is damaged. Delete it and add your models again")
+            raise InputError(f"{path} is damaged: delete it and add your models again (msgs-slam models add)")
         return {"pinned": pinned, "added": added}
 
     def _own_model(self, row: Any) -> Model:

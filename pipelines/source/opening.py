@@ -130,7 +130,8 @@ class FolderSource:
         sizes = self._sizes()
         if not sizes:
             raise InputError(
-                f"none of the {len(self._images)} images in {self.path} can be read: they are damaged, copy them again"
+                f"none of the {len(self._images)} images in {self.path} can be read: copy them again, or convert them "
+                "to JPEG or PNG"
             )
         _require_one_size(self.path, sizes, "images")
         self.width, self.height = next(iter(sizes.values()))

@@ -47,7 +47,7 @@ def of_name(name: str) -> Any:
     module, _, attribute = name.partition(":")
     found = getattr(import_module(module), attribute, None) if module.startswith(_OURS) else None
     if getattr(found, "__module__", None) != module:  # what a module only imports, deleting folders for one
-        raise InputError(f"{name} is not of this program")
+        raise InputError(f"a task asks for {name}, which this version does not have: install the same one everywhere")
     return found
 
 

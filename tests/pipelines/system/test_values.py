@@ -45,13 +45,13 @@ class Foreign:
 
 def test_what_is_not_of_this_program_is_refused(tmp_path: Path) -> None:
     save_value(tmp_path / "foreign.npz", Foreign("x"))
-    with pytest.raises(InputError, match="not of this program"):
+    with pytest.raises(InputError, match="install the same one everywhere"):
         load_value(tmp_path / "foreign.npz")
-    with pytest.raises(InputError, match="not of this program"):
+    with pytest.raises(InputError, match="install the same one everywhere"):
         of_name("os:system")
-    with pytest.raises(InputError, match="not of this program"):
+    with pytest.raises(InputError, match="install the same one everywhere"):
         of_name("msgs_slam.pipelines.engine.shards:shutil")
-    with pytest.raises(InputError, match="not of this program"):
+    with pytest.raises(InputError, match="install the same one everywhere"):
         of_name("msgs_slam.pipelines.system.values:save_arrays")
     with pytest.raises(TypeError, match="does not travel"):
         save_value(tmp_path / "thing.npz", object())
