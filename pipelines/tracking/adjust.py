@@ -128,21 +128,9 @@ def align_depths(model: SparseModel, report: Report, intrinsics: Intrinsics, loa
 
 def make_bundle(state: TrackState, frame_ids: list[int]) -> Bundle:
     """All sightings of the given frames, in their order; points seen only once are left out."""
-    rows = [state.sightings[i] for i in frame_ids]
-    cam = np.repeat(np.arange(len(rows)), [len(r) for r in rows])
-    point = np.concatenate([r.point for r in rows])
-    keep = np.bincount(point, minlength=len(state.points))[point] >= 2
-    zeros = np.zeros(int(keep.sum()))
-    return Bundle(
-        np.array([state.poses[i] for i in frame_ids]),
-        state.points.copy(),
-        cam[keep],
-        point[keep],
-        np.concatenate([r.xy for r in rows])[keep],
-        np.concatenate([r.sd for r in rows])[keep],
-        zeros,
-        zeros + 1,
-    )
+    cam, seen = state.shared_sightings(frame_ids)
+    poses, zeros = np.array([state.poses[i] for i in frame_ids]), np.zeros(len(seen))
+    return Bundle(poses, state.points.copy(), cam, seen.point, seen.xy, seen.sd, zeros, zeros + 1)
 
 
 def sample_depths(

@@ -60,17 +60,14 @@ def to_trajectory(state: TrackState, frames: list[Frame]) -> Trajectory:
 
 def to_sparse_model(state: TrackState) -> SparseModel:
     """Keyframes and the points that at least two of them see."""
-    rows = [state.sightings[k] for k in state.keyframes]
-    point = np.concatenate([r.point for r in rows])
-    cam = np.repeat(np.arange(len(rows)), [len(r) for r in rows])
-    keep = np.bincount(point, minlength=len(state.points))[point] >= 2
-    used, renumbered = np.unique(point[keep], return_inverse=True)
+    cam, seen = state.shared_sightings(state.keyframes)
+    used, renumbered = np.unique(seen.point, return_inverse=True)
     return SparseModel(
         np.array(state.keyframes, np.int64),
         np.array([state.poses[k] for k in state.keyframes]),
         state.points[used],
         state.colors[used],
-        cam[keep].astype(np.int64),
+        cam.astype(np.int64),
         renumbered.astype(np.int64),
-        np.concatenate([r.xy for r in rows])[keep],
+        seen.xy,
     )

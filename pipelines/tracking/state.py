@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 
@@ -113,6 +114,15 @@ class TrackState:
         """The segment of the keyframes that see a point; `frame_id` is near them, as a rule."""
         nearest = self.nearest_keyframes(frame_id, _NEAR_KEYFRAMES)
         return next(self.segment[k] for k in chain(nearest, self.keyframes) if point in self.sightings[k].point)
+
+    def shared_sightings(self, frame_ids: Sequence[int]) -> tuple[NDArray[np.int64], Sightings]:
+        """The sightings of these frames, one frame's after the other's, of points that at least two of them see; and
+        (O,) which of the frames each is of."""
+        rows = [self.sightings[i] for i in frame_ids]
+        row = np.repeat(np.arange(len(rows)), [len(r) for r in rows])
+        seen = Sightings(*(np.concatenate([getattr(r, name) for r in rows]) for name in ("point", "xy", "sd")))
+        keep = np.bincount(seen.point, minlength=len(self.points))[seen.point] >= 2
+        return row[keep], seen.select(keep)
 
     def velocities(self) -> dict[int, Array]:
         """(6,) twists a second of all posed frames."""
