@@ -18,7 +18,7 @@ from torch.utils._pytree import tree_flatten, tree_map
 
 from msgs_slam.pipelines import outcome
 from msgs_slam.pipelines.engine import stages
-from msgs_slam.pipelines.gaussians.render import compositing, cpu, inspection
+from msgs_slam.pipelines.gaussians.render import compositing, cpu, inspection, reference
 from msgs_slam.pipelines.mapping import submap_tasks
 
 DEVICE = "meta"
@@ -155,7 +155,9 @@ class _Composite(torch.autograd.Function):
     def forward(ctx: Any, rest: tuple[Any, ...], *values: PretendTensor) -> tuple[torch.Tensor, ...]:
         ctx.inputs = [v.inner.detach().contiguous().requires_grad_() for v in values]
         with torch.enable_grad():
-            ctx.outputs = cpu.composite(*ctx.inputs, *rest)
+            # The card's kernels have gradients of any number of features, the CPU's of colours alone.
+            kernels = cpu if ctx.inputs[5].shape[1] == cpu.COLORS else reference
+            ctx.outputs = kernels.composite(*ctx.inputs, *rest)
         return tuple(PretendTensor(x.detach()) for x in ctx.outputs)
 
     @staticmethod
