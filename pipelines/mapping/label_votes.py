@@ -33,7 +33,7 @@ def voted_logits(gaussian_map: GaussianMap, posed: Iterable[tuple[View, Tensor]]
         seen = (m.means, m.radii, m.opacities, pose, view.intrinsics)
         votes.index_add_(0, *class_weights(*seen, view.channels, view.label_weight, classes))
     total = votes.sum(1, keepdim=True)
-    # In place: a table of all classes is the largest that mapping holds.
+    # In place: a number for each class and Gaussian is a large table.
     votes.div_(total.clamp(min=_LEAST)).div_(_FLOOR).log1p_()
     unseen = total[:, 0] <= _LEAST
     votes[unseen] = gaussian_map.class_logits[unseen]

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -28,8 +29,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.pipelines.evaluation.evaluate import trajectory_cells
-from msgs_slam.pipelines.evaluation.mesh_cells import CELL, VIEWS, true_surface
-from msgs_slam.pipelines.evaluation.surface_error import SurfaceError, depth_points, surface_error, thinned
+from msgs_slam.pipelines.evaluation.mesh_cells import true_surface
+from msgs_slam.pipelines.evaluation.surface_error import SurfaceError, surface_error
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.outcome import load_outcome
@@ -103,16 +104,9 @@ def surface_limit(run: RunFolder, truth: Path) -> SurfaceError | None:
     surface, aligned = true_surface(matched)[0], trajectory_cells(outcome, matched)[1]
     if len(surface) == 0 or aligned is None:
         return None
-    rows = np.flatnonzero(matched.has_pose & (matched.image >= 0))
-    placed, points = np.linalg.inv(aligned.alignment.apply_to_poses(outcome.trajectory.cam_from_world)), []
-    for row in rows[np.unique(np.linspace(0, len(rows) - 1, VIEWS).astype(int))]:
-        depth = matched.sequence.depth(int(matched.image[row]))
-        if depth is None or not np.isfinite(placed[row]).all():
-            continue
-        k = matched.sequence.camera.resized(depth.shape[1], depth.shape[0])
-        camera = Intrinsics(k.width, k.height, k.fx, k.fy, k.cx, k.cy)
-        points.append(depth_points(depth, camera, placed[row], stride=max(1, depth.shape[1] // 320)))
-    return surface_error(thinned(np.concatenate(points), CELL), surface)
+    ours = np.linalg.inv(aligned.alignment.apply_to_poses(outcome.trajectory.cam_from_world))
+    known = matched.has_pose[:, None, None]
+    return surface_error(true_surface(replace(matched, world_from_cam=np.where(known, ours, np.nan)))[0], surface)
 
 
 def main() -> None:
