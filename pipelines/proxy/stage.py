@@ -39,8 +39,8 @@ def run(context: StageContext) -> dict[str, Any]:
     scale = measure_scale(work.sequence, frames, work.depth)
     moving = _leave_out_moving(work, frames, scale)
     reference = reference_scale(context, work.sequence, frames, work.depths, scale, work.depth)
-    agreements = _compute_maps(work, frames, scale, reference)
-    figures = _figures(work, frames, agreements) | scale_figures(work.depths, scale, reference) | moving
+    _compute_maps(work, frames, scale, reference)
+    figures = _figures(work, frames) | scale_figures(work.depths, scale, reference) | moving
     _warn_of_focal(work, figures.get("network_focal_px"))
     FIGURES["proxy"].save(context.folder, figures)
     return figures
@@ -81,10 +81,8 @@ def _compute_depths(work: ProxyWork, frames: list[Frame]) -> None:
     in_frames(work, make_depths, frames, depths=prepared(work.depths))
 
 
-def _compute_maps(
-    work: ProxyWork, frames: list[Frame], scale: DepthScale, reference: ReferenceScale | None
-) -> list[float]:
-    """The result, in metres where there is a `reference`; how well each frame's labels agree with those before."""
+def _compute_maps(work: ProxyWork, frames: list[Frame], scale: DepthScale, reference: ReferenceScale | None) -> None:
+    """The result, in metres where there is a `reference`."""
     folder, semantics = work.context.folder, work.semantics
     in_frames(work, look_for_labels, frames)
     semantics.prepare(frames, lambda frame: scale.in_backbone_unit(work.depth(frame)))
@@ -93,13 +91,12 @@ def _compute_maps(
     CLASSES.save(folder, semantics.classes())
     metres = reference.factor if reference else 1.0
     made = in_frames(work, make_maps, frames, scale=scale, metres=metres, semantics=prepared(semantics))
-    if descriptors := {i: looks for _, part in made for i, looks in part.items()}:
+    if descriptors := {i: looks for part in made for i, looks in part.items()}:
         DESCRIPTORS.save(folder, descriptors)
     scales = scale.of_frame.items()
     FRAME_SCALES.save(
         folder, [{"frame_id": i, "scale": round(s, 6), "spread": round(scale.spread_in[i], 6)} for i, s in scales]
     )
-    return [m for part, _ in made for m in part]
 
 
 def _warn_of_focal(work: ProxyWork, network_focal: float | None) -> None:
@@ -129,7 +126,7 @@ def _leave_out_moving(work: ProxyWork, frames: list[Frame], scale: DepthScale) -
     return {"moving_frames": len(found), "moving_share": share} if found else {}
 
 
-def _figures(work: ProxyWork, frames: list[Frame], agreements: list[float]) -> dict[str, Any]:
+def _figures(work: ProxyWork, frames: list[Frame]) -> dict[str, Any]:
     """For the report."""
     sizes, reliable, void = [], [], []
     invalid = 0
@@ -151,7 +148,6 @@ def _figures(work: ProxyWork, frames: list[Frame], agreements: list[float]) -> d
         "classes": len(semantics.classes()),
         "reliable_pixels": round(float(np.mean(reliable)), 4),
         "void_pixels": round(float(np.mean(void)), 4),
-        "label_agreement": round(float(np.mean(agreements)), 4),
         "kilobytes_a_frame": round(float(np.mean(sizes)) / 1000, 1),
         "invalid_depth_values": invalid,
         **depths.figures(),

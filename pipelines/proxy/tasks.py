@@ -23,7 +23,7 @@ from msgs_slam.pipelines.proxy.providers import (
     SemanticsProvider,
     take_prepared,
 )
-from msgs_slam.pipelines.proxy.reliability import reliability, semantic_agreement, theta, warp_labels
+from msgs_slam.pipelines.proxy.reliability import reliability
 from msgs_slam.pipelines.proxy.scale import DepthScale
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth, open_semantics
 from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
@@ -35,9 +35,6 @@ from msgs_slam.pipelines.types import Frame, Intrinsics, ProxyMaps, any_of
 from msgs_slam.pipelines.voxels.voxels import to_lab
 
 R = TypeVar("R")
-
-MadeMaps = tuple[list[float], dict[int, NDArray[np.float32]]]
-"""Semantic agreement m_t of each frame with the one before it, and what a network says of how frames look, by id."""
 
 
 class ProxyWork:
@@ -105,7 +102,7 @@ class ProxyWork:
 
         def view(k: int) -> MovingView:
             seen = scale.in_backbone_unit(self.computed_depth(posed[k]))
-            sure = reliability(seen.depth, seen.confidence, 1.0)
+            sure = reliability(seen.depth, seen.confidence)
             depth, trust = (resample_nearest(a, camera.height, camera.width) for a in (seen.depth, sure))
             lab = to_lab(resize_area(sequence.image(posed[k]), camera.width, camera.height))
             return MovingView(depth, trust, lab, sequence.cam_from_world[posed[k].id])
@@ -165,47 +162,21 @@ def look_for_labels(task: Chunk, progress: Progress) -> None:
     work.semantics.look(frames[task.first : task.last])
 
 
-def make_maps(task: Chunk, progress: Progress) -> MadeMaps:
-    """Labels and reliability of the frames; known["metres"] turns the provider's depth into that of the maps."""
+def make_maps(task: Chunk, progress: Progress) -> dict[int, NDArray[np.float32]]:
+    """Labels and reliability of the frames; known["metres"] turns the provider's depth into that of the maps. Returns
+    what a network says of how frames look, by id."""
     work, frames = _opened(task, progress)
     take_prepared(work.semantics, task.known["semantics"])
     scale, metres = task.known["scale"], np.float32(task.known["metres"])
-    agreements: list[float] = []
     descriptors = {}
-    previous = before = None
-    if task.first:
-        previous = frames[task.first - 1]
-        before = work.labels(previous, scale.in_backbone_unit(work.depth(previous))).labels
     for frame in progress.track(frames[task.first : task.last], "classes", len(task.numbers)):
         depth = work.depth(frame)
-        seen = scale.in_backbone_unit(depth)
-        labels = work.labels(frame, seen)
-        m = _agreement(work.sequence, frame, previous, seen, labels.labels, before)
-        agreements.append(m)
+        labels = work.labels(frame, scale.in_backbone_unit(depth))
         if labels.descriptor is not None:
             descriptors[frame.id] = labels.descriptor
         if not PROXY_MAPS.path(work.context.folder, frame.id).exists():
-            u = reliability(depth.depth, depth.confidence, theta(m))
+            u = reliability(depth.depth, depth.confidence)
             scaled = (depth.depth * metres).astype(np.float32)
             maps = compact(ProxyMaps(scaled, u, labels.labels, labels.confidence))
             PROXY_MAPS.save(work.context.folder, maps, frame.id)
-        previous, before = frame, labels.labels
-    return agreements, descriptors
-
-
-def _agreement(
-    sequence: Sequence,
-    frame: Frame,
-    previous: Frame | None,
-    depth: DepthEstimate,
-    labels: NDArray[np.uint8],
-    before: NDArray[np.uint8] | None,
-) -> float:
-    """m_t of eq. (3): against the labels of the frame before, warped through depth and poses; 1 where unknown."""
-    poses = sequence.cam_from_world
-    if previous is None or before is None or frame.id not in poses or previous.id not in poses:
-        return 1.0
-    previous_from_cam = poses[previous.id] @ np.linalg.inv(poses[frame.id])
-    sure = np.where(depth.confidence > 0.3, depth.depth, 0).astype(np.float32)
-    m = semantic_agreement(labels, warp_labels(before, previous_from_cam, sure, sequence.intrinsics))
-    return 1.0 if m is None else m
+    return descriptors

@@ -3,8 +3,7 @@
     python tests/benchmarks/terms.py RUN.msgs RUN.msgs ... [--keyframes 14] [--json FILE]
 
 Each finished run's first keyframes are mapped again at 320 pixels, four passes, every eighth frame held out, with one
-term off or on at a time. Labels: share of the pixels that the map labels as its input. θ^γ of eq. (3) is told from the
-run's own labels.
+term off or on at a time. Labels: share of the pixels that the map labels as its input.
 """
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
@@ -27,8 +26,7 @@ from msgs_slam.pipelines.mapping import schedule
 from msgs_slam.pipelines.mapping.load import MappingInput, load_views
 from msgs_slam.pipelines.mapping.measure import mean_figures, measure_view
 from msgs_slam.pipelines.mapping.optimise import optimise_map
-from msgs_slam.pipelines.proxy.reliability import GAMMA, theta
-from msgs_slam.pipelines.run.files import FIGURES, TRAJECTORY
+from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -81,12 +79,8 @@ def main() -> None:
     found: dict[str, Any] = {}
     for path in given.runs:
         run = RunFolder(path)
-        agreement = run.load(FIGURES["proxy"]).get("label_agreement", 0.0)
-        found[path.stem] = {"theta^gamma at the mean agreement": round(theta(agreement) ** GAMMA, 4)}
-        print(path.stem, json.dumps(found[path.stem]), flush=True)
-        views = stretch(run, given.keyframes) if given.keyframes else None
-        if views is None:
-            continue
+        found[path.stem] = {}
+        views = stretch(run, given.keyframes)
         for name, change in VARIANTS.items():
             found[path.stem][name] = trial(views, change)
             print(path.stem, name, json.dumps(found[path.stem][name]), flush=True)

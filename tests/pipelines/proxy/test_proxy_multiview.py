@@ -13,7 +13,7 @@ from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.proxy.fused import FusedDepth, fuse
 from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
-from msgs_slam.pipelines.proxy.reliability import semantic_agreement, warp_labels
+from msgs_slam.pipelines.proxy.reliability import mean_iou
 from msgs_slam.pipelines.proxy.scale import measure_scale
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth
 from msgs_slam.pipelines.proxy.sequence import Sequence
@@ -184,7 +184,20 @@ def test_regions_mean_the_same_in_all_frames_and_know_the_floor(room: Room) -> N
 def flicker_free(labels: dict, truth: dict, sequence: Sequence, a: Frame, b: Frame) -> float:
     b_from_a = sequence.cam_from_world[b.id] @ np.linalg.inv(sequence.cam_from_world[a.id])
     warped = warp_labels(labels[b.id], b_from_a, truth[a.id].depth, sequence.intrinsics)
-    return semantic_agreement(labels[a.id], warped) or 0.0
+    return float(mean_iou(labels[a.id], warped[None])[0])
+
+
+def warp_labels(labels: np.ndarray, other_from_cam: np.ndarray, depth: np.ndarray, camera: Intrinsics) -> np.ndarray:
+    """The other frame's labels as this frame sees them through its own depth; VOID where that leaves the image."""
+    v, u = np.indices(depth.shape) + 0.5
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1)
+    points = (rays * depth[..., None]) @ other_from_cam[:3, :3].T + other_from_cam[:3, 3]
+    z = np.where((depth > 0) & (points[..., 2] > 0), points[..., 2], np.inf)
+    column = np.floor(camera.fx * points[..., 0] / z + camera.cx).astype(int)
+    row = np.floor(camera.fy * points[..., 1] / z + camera.cy).astype(int)
+    height, width = depth.shape
+    inside = np.isfinite(z) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return np.where(inside, labels[np.where(inside, row, 0), np.where(inside, column, 0)], VOID).astype(np.uint8)
 
 
 def world_height(room: Room, frame: Frame, camera: Intrinsics) -> np.ndarray:

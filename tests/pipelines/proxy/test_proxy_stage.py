@@ -47,8 +47,6 @@ def test_files_become_maps_with_reliability(room: Room, make_context: Make) -> N
         assert classes.names[maps.labels[96, 128]] == f"kind {view.labels[96, 128]}"
     assert report["reliable_pixels"] > 0.9
     assert report["metres_per_unit"] == pytest.approx(1 / UNIT, rel=2e-3)
-    # Labels are the truth: what they disagree with the frame before is occlusion.
-    assert report["label_agreement"] > 0.7
 
 
 def test_embedded_providers_go_end_to_end(room: Room, make_context: Make) -> None:
@@ -56,7 +54,6 @@ def test_embedded_providers_go_end_to_end(room: Room, make_context: Make) -> Non
     report = run(context)
     assert (report["depth"], report["semantics"], report["metric"]) == ("multiview", "segments", False)
     assert report["reliable_pixels"] > 0.5
-    assert report["label_agreement"] > 0.6
     errors = []
     for frame in room.frames[2:9]:
         maps = context.run.load(PROXY_MAPS, of=frame.id)
