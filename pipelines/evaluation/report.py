@@ -204,17 +204,18 @@ def _time_section(outcome: Outcome) -> str:
 def _export_section(outcome: Outcome) -> str:
     if "export" not in outcome.records:
         return section("Files for other programs", "<p>Not exported yet.</p>")
-    sizes = [
-        (name, f"{size / 1e6:.2f} MB") for name, size in files_of_export(outcome.run) if Path(name).parts[0] != IMAGES
-    ]
+    files = [row for row in files_of_export(outcome.run) if Path(row[0]).parts[0] != IMAGES]
     notes = readme(outcome.run.find(WORLD) or FIRST, outcome.metres, outcome.metric)
-    return section("Files for other programs", f"<pre>{escape(notes)}</pre>", table(("in export/", "size"), sizes))
+    return section("Files for other programs", f"<pre>{escape(notes)}</pre>", table(("in export/", "size"), files))
 
 
-def files_of_export(run: RunFolder) -> list[tuple[str, int]]:
-    """Name and bytes of the files there: of the stage, and what `msgs-slam export --only` has added since."""
+def files_of_export(run: RunFolder) -> list[tuple[str, str]]:
+    """Name and size of the files of the stage, or that one is not as the stage left it, and of those that
+    `msgs-slam export --only` has added since. Reads all of them."""
     root = run.stage("export")
-    return [(p.relative_to(root).as_posix(), p.stat().st_size) for p in sorted(root.rglob("*")) if p.is_file()]
+    wrong = {name: f"damaged or gone: msgs-slam resume {run.root}" for name in run.damaged("export")}
+    sizes = {p.relative_to(root).as_posix(): f"{p.stat().st_size / 1e6:.2f} MB" for p in root.rglob("*") if p.is_file()}
+    return sorted((sizes | wrong).items())
 
 
 def _settings_section(outcome: Outcome) -> str:

@@ -2,11 +2,12 @@
 
     python tests/benchmarks/damage.py RUN OTHER_RUN --truth DATASET --work DIR [--series 2]
 
-RUN and OTHER_RUN are finished runs of small clips; of files that come in series (frames, proxy maps) `--series` of
-each are taken. A command passes when it ends with code 1, names the file and says what to type, or when it does not
-use the file: then what it writes, or `view` shows, must be the same bytes as for the whole run. `status` must name
-the file, and `view` may, beside a frame that is damaged. At the end one file of each stage is damaged and `resume`
-must bring back the same bytes. Prints the counts; exit code 1 if any is wrong.
+RUN and OTHER_RUN are finished runs of small clips, of different sources; of files that come in series (frames, proxy
+maps) `--series` of each are taken. A command passes when it ends with code 1, names the file and says what to type, or
+when it does not use the file: then what it writes, or `view` shows, must be the same bytes as for the whole run.
+`status` must name the file, `view` may, beside a frame that is damaged, and the report where it lists the exported
+files. At the end one file of each stage is damaged and `resume` must bring back the same bytes. Prints the counts; exit
+code 1 if any is wrong.
 """
 
 from __future__ import annotations
@@ -104,9 +105,12 @@ def written(out: Path, run: Path) -> dict[str, str]:
     return {p.name: file_sha256(p) for p in files}
 
 
-def verdict(name: str, result: Result, file: str, same: bool) -> str:
+def verdict(name: str, result: Result, file: str, same: bool, out: Path) -> str:
     """refused, named, unused, or what is wrong."""
     said = result.stderr + result.stdout
+    if name == "report" and result.exit_code == 0 and not same:
+        listed = f"<td>{file.removeprefix('export/')}</td><td>damaged or gone"
+        return "named" if listed in (out / "report.html").read_text() else "WRONG: used, and nothing said"
     if result.exit_code == 0 and name in ("status", "view") and Path(file).name in said:
         return "named"
     if result.exit_code == 0 and name == "status":
@@ -176,7 +180,7 @@ def main() -> None:
                 assert result.exit_code == 0, result.output
                 whole[name] = written(out, damaged)
                 continue
-            found = verdict(name, result, file, written(out, damaged) == whole[name])
+            found = verdict(name, result, file, written(out, damaged) == whole[name], out)
             counts[f"{name}: {found.split(':')[0]}"] += 1
             if found.startswith("WRONG"):
                 print(f"{damage.__name__} {file}, {name}: {found}", flush=True)

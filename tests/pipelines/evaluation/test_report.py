@@ -62,7 +62,9 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
     (run.stage("proxy") / "classes.json").write_text(json.dumps(classes))
     run.stage("export").mkdir(exist_ok=True)
     WORLD.save(run.stage("export"), World("up", "floor", True, SAME))
+    (run.stage("export") / "mesh.glb").write_bytes(b"mesh")
     note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
+    (run.stage("export") / "mesh.glb").unlink()
     (run.stage("export") / "point_cloud.spz").write_bytes(bytes(30_000))  # by `export --only`, later than the stage
     html = write_report(run).read_text()
     parsed = Balanced()
@@ -88,6 +90,7 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
     assert sum(float(share) for *_, share in swatches) == pytest.approx(100, abs=0.5)
     assert len(swatches) > 3
     assert "point_cloud.spz0.03 MB" in parsed.text
+    assert f"mesh.glbdamaged or gone: msgs-slam resume {run.root}" in parsed.text
     lengths = found_lengths(load_outcome(run))
     assert len(lengths) == 5
     assert all(what in parsed.text and text in parsed.text for what, text in lengths)
