@@ -14,6 +14,7 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import Similarity, best_rotation
 from msgs_slam.pipelines.structure.adjust import filter_outliers, solve
 from msgs_slam.pipelines.structure.freeing import unexplained
+from msgs_slam.pipelines.structure.seams import LEAST_POINTS, remove_keyframes
 from msgs_slam.pipelines.structure.tracks import complete_tracks
 
 Array = NDArray[np.float64]
@@ -84,7 +85,8 @@ def posed_model(
     seed: int,
 ) -> pycolmap.Reconstruction | None:
     """Points of the verified matches (of images with pixels xy), triangulated with given poses (K, 4, 4) and adjusted
-    together with them, in rounds that ask for more and more; None where the poses make none."""
+    together with them, in rounds that ask for more and more; without the images that hardly any point holds. None where
+    the poses make no point."""
     model = bare_model(camera, xy, cam_from_world)
     images = sorted(model.reg_image_ids())
     if len(images) < 2:
@@ -99,7 +101,15 @@ def posed_model(
         solve(model, images, refine_camera and degrees == _TURNS[-1], width=max(1.0, limit / 8))
         pycolmap.ObservationManager(model).filter_all_points3D(max(4.0, limit / 2), 1.0)
     filter_outliers(model)
+    _remove_unheld(model)
     return model if model.num_points3D() else None
+
+
+def _remove_unheld(model: pycolmap.Reconstruction) -> None:
+    """Remove images that see hardly any point, in place: their poses are still the given ones, and COLMAP's mappers
+    cannot add to a model with an image that no match ties to another."""
+    while unheld := [i - 1 for i in sorted(model.reg_image_ids()) if model.images[i].num_points3D < LEAST_POINTS]:
+        remove_keyframes(model, unheld)
 
 
 def bare_model(camera: pycolmap.Camera, xy: Sequence[Array], cam_from_world: Array) -> pycolmap.Reconstruction:

@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 
 _MOST_SCALE_SD = 0.1
 """Relative: over a stretch about as short as their own errors, given poses do not determine the scale."""
+_LEAST_PATH, _JUMP = 5, 5.0
+"""Poses that make a path, and how many times as far as is usual a wrong one lies aside of it."""
 
 
 def carry_given(context: StageContext, state: TrackState) -> dict[str, Any]:
@@ -29,6 +31,7 @@ def carry_given(context: StageContext, state: TrackState) -> dict[str, Any]:
     given = context.run.find(GIVEN_POSES)
     if given is None:
         return {}
+    lose_unfit(state, given)
     joined = join_by_given(state, given)
     carried = pose_lost(state, given)
     if joined:
@@ -41,6 +44,18 @@ def carry_given(context: StageContext, state: TrackState) -> dict[str, Any]:
             f"{len(carried)} frames ({stretches(carried)}) are posed by --poses alone: the images say nothing of them"
         )
     return {"given_joined": joined, "given_carried": len(carried)}
+
+
+def lose_unfit(state: TrackState, given: GivenPoses) -> None:
+    """Lose, in place, every segment that the given poses cannot place (too short for its scale, or contradicted by
+    them) but could replace: where most of its frames have one, and more frames outside than are in it."""
+    known = set(np.flatnonzero(given.known).tolist())
+    for segment in sorted(set(state.segment.values())):
+        inside = {i for i, s in state.segment.items() if s == segment}
+        is_replaced = 2 * len(inside & known) > len(inside) and len(known - inside) > len(inside)
+        if is_replaced and _to_given(state, given, segment) is None:
+            for i in sorted(inside):
+                state.lose_frame(i, "its surroundings do not agree with the given poses")
 
 
 def join_by_given(state: TrackState, given: GivenPoses) -> int:
@@ -67,7 +82,8 @@ def _to_given(state: TrackState, given: GivenPoses, segment: int) -> Similarity 
 def pose_lost(state: TrackState, given: GivenPoses) -> list[int]:
     """Pose every lost frame that has a given pose, in place: the given path is bent so that it runs through the posed
     frames on both sides. The frames that were. Where nothing is posed the world is the given one."""
-    lost = [i for i in sorted(state.lost) if given.known[i]]
+    astray = stray(given)
+    lost = [i for i in sorted(state.lost) if given.known[i] and i not in astray]
     if not lost:
         return []
     counts = Counter(state.segment.values())
@@ -82,6 +98,19 @@ def pose_lost(state: TrackState, given: GivenPoses) -> list[int]:
     for i in lost:
         state.add_frame(i, _bend(i, off) @ here[i], NO_SIGHTINGS, not counts, segment)
     return lost
+
+
+def stray(given: GivenPoses) -> set[int]:
+    """Frames whose given pose is far from the way between those before and behind: no camera jumps there and back."""
+    known = np.flatnonzero(given.known)
+    if len(known) < _LEAST_PATH:
+        return set()
+    centre = se3.inverse(given.cam_from_world[known])[:, :3, 3]
+    share = ((known[1:-1] - known[:-2]) / (known[2:] - known[:-2]))[:, None]
+    aside = np.linalg.norm(centre[1:-1] - (1 - share) * centre[:-2] - share * centre[2:], axis=1)
+    apart = np.linalg.norm(centre[2:] - centre[:-2], axis=1)
+    is_far = (aside > _JUMP * np.median(aside)) & (aside > _JUMP * np.median(apart)) & (aside > apart)
+    return set(known[1:-1][is_far].tolist())
 
 
 def _offs(state: TrackState, here: dict[int, Array], posed: list[int]) -> dict[int, Array]:

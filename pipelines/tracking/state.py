@@ -95,6 +95,15 @@ class TrackState:
             if self.keyframes[place : place + 1] != [frame_id]:
                 self.keyframes.insert(place, frame_id)
 
+    def lose_frame(self, frame_id: int, why: str) -> None:
+        """A frame that was posed, and is not."""
+        for table in (self.poses, self.sightings, self.segment):
+            del table[frame_id]
+        for listed in (self.keyframes, self.rendered, self.turned):
+            if frame_id in listed:
+                listed.remove(frame_id)
+        self.lost[frame_id] = why
+
     def add_segment(self, other: TrackState) -> None:
         """The keyframes of another world that are not posed yet, with their points, as a segment of their own."""
         first = self.add_points(other.points, other.colors)[:1]

@@ -8,10 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from tests.world.build import World
 
 Array = NDArray[np.float64]
 SIZE = (480, 360)
@@ -80,6 +84,26 @@ def fast_walk(folder: Path, count: int, seed: int, blank_walls: bool = False) ->
 
     steps = np.cumsum(np.random.default_rng(seed).uniform(10, 17, count)) / 360
     return draw(folder, room_walk(steps), blurred=room_walk, steps=steps, noise=3.0, blank_walls=blank_walls)
+
+
+def corridor_half_blank(folder: Path, data: Path) -> Array:
+    """Once round the corridor, of which two sides show nothing but lamps on plain walls."""
+    return blank_ring(folder, blank_sides=(1, 2))
+
+
+def corridor_blank(folder: Path, data: Path) -> Array:
+    """The same with no side that shows more."""
+    return blank_ring(folder, blank_sides=(0, 1, 2, 3))
+
+
+def blank_ring(folder: Path, blank_sides: tuple[int, ...]) -> Array:
+    from tests.world.build import build_world
+    from tests.world.corridor import ring_corridor
+    from tests.world.paths import corridor_walk
+
+    poses = corridor_walk(np.linspace(0, 1.08, 150))
+    world = build_world("corridor", ring_corridor(True, blank_sides), 0, 0.006)
+    return draw(folder, poses, world=world)
 
 
 def exposure(folder: Path, data: Path) -> Array:
@@ -165,8 +189,8 @@ def whiteroom_fast(folder: Path, data: Path) -> Array:
 HARD: dict[str, Callable[[Path, Path], Array]] = {
     f.__name__: f
     for f in (
-        turn, turn_within, fast, fast_blank, blackout, exposure, kitchen_twice, replica_fast, whiteroom_fast, rolling,
-        rolling_not,
+        turn, turn_within, fast, fast_blank, blackout, corridor_half_blank, corridor_blank, exposure,
+        kitchen_twice, replica_fast, whiteroom_fast, rolling, rolling_not,
     )
 }  # fmt: skip
 
@@ -193,12 +217,13 @@ def draw(
     steps: Array | None = None,
     noise: float = 1.0,
     blank_walls: bool = False,
+    world: World | None = None,
 ) -> Array:
-    """Pictures of the room from world_from_cam (N, 4, 4), which are returned; with motion blur over a tenth of a step
-    where the walk and its steps are given."""
+    """Pictures of a world, or else the room, from world_from_cam (N, 4, 4), which are returned; with motion blur over
+    a tenth of a step where the walk and its steps are given."""
     from tests.world.clip import ClipOptions, make_world, render_view
 
-    world = make_world("room", texel=0.006, blank_walls=blank_walls)
+    world = make_world("room", texel=0.006, blank_walls=blank_walls) if world is None else world
     options = ClipOptions(width=SIZE[0], height=SIZE[1])
     rng = np.random.default_rng(0)
     for i, pose in enumerate(poses):

@@ -48,6 +48,7 @@ Array = NDArray[np.float64]
 LAST = Path(__file__).with_suffix(".json")
 FORMS = ("video", "plain", "set", "given")
 METRES, DEGREES = 0.05, 3.0
+MADE = ("corridor", "turn", "fast", "kitchen_twice", "two_rooms", "corridor_half_blank", "corridor_blank")
 
 
 def of_set(folder: Path) -> Truth:
@@ -94,14 +95,14 @@ def recordings(work: Path) -> dict[str, dict[str, Case]]:
         "bedroom": {"video": known["bedroom"]},
         "kitchen_long": {"video": known["kitchen_long"]},
         "people": {"plain": Case(DATA / "people", PLAIN, lambda *_: None)},
-        **{name: {"plain": known[name]} for name in ("corridor", "turn", "fast", "kitchen_twice", "two_rooms")},
+        **{name: {"plain": known[name]} for name in MADE},
     }  # fmt: skip
     for name in ("whiteroom_2", "staircase"):
         truth = rows_of(DATA / name / "traj.txt")
         step = lambda _, index, poses=truth: poses[index] if index < len(poses) else None  # noqa: E731
         found[name] = {"video": Case(DATA / name / "video.mp4", (), step)}
         found[name]["set"] = Case(DATA / name, (), of_set(DATA / name))
-    for name in ("replica", "fr1_rpy"):
+    for name in ("replica", "fr1_rpy", "corridor_half_blank", "corridor_blank"):
         found[name]["given"] = found[name]["plain"]
     return found
 

@@ -29,19 +29,22 @@ CLASSES: tuple[tuple[str, tuple[int, int, int]], ...] = (
 )
 
 
-def ring_corridor(blank_walls: bool) -> Scene:
-    """The ring; `blank_walls` leaves the plaster off and the repeated doors and posters on."""
+def ring_corridor(blank_walls: bool, blank_sides: tuple[int, ...] = ()) -> Scene:
+    """The ring; `blank_walls` leaves the plaster off and the repeated doors and posters on, which `blank_sides` (of 0
+    to 3) do without; where there are any the floor is plain as well."""
     kind = "plain" if blank_walls else "plaster"
+    floor = "plain" if blank_sides else "tiles"
     paint = Material(kind, (0.66, 0.64, 0.56))
     solids = [
         Solid(ROOM, "wall", (0, 0, HEIGHT / 2), (OUTER, OUTER, HEIGHT), paint),
         box("wall", (0, 0, HEIGHT / 2), (INNER, INNER, HEIGHT), paint),
-        box("floor", (0, 0, -0.04), (OUTER, OUTER, 0.1), Material("tiles", (0.42, 0.36, 0.3))),
+        box("floor", (0, 0, -0.04), (OUTER, OUTER, 0.1), Material(floor, (0.42, 0.36, 0.3))),
         box("ceiling", (0, 0, HEIGHT + 0.04), (OUTER, OUTER, 0.1), Material(kind, (0.72, 0.72, 0.7))),
     ]
     lights: list[Light] = []
     for side in range(4):
-        solids += _outer_side(side) + _inner_side(side)
+        if side not in blank_sides:
+            solids += _outer_side(side) + _inner_side(side)
         for along in (-2.6, 0.0, 2.6):
             lamp, light = _ceiling_lamp(side, along)
             solids.append(lamp)

@@ -64,6 +64,17 @@ def test_poses_that_are_far_off_make_a_model_as_good_as_none(is_known: bool, tmp
     assert made.off(grown[0]) < (0.02 if is_known else 0.03)
 
 
+def test_images_that_match_nothing_do_not_stop_the_model_from_growing(tmp_path: Path) -> None:
+    made, blank = walk_round(CAMERA), {3, 12}
+    given = disturbed(made.cam_from_world)
+    pairs = [p for p in made.pairs(CAMERA) if not {p.first, p.second} & blank]
+    structure, views = structure_of(made, CAMERA, tmp_path, given=given), made.views(given)
+    found = structure._tried(GIVEN, views, pairs, pairs)
+    assert found is not None
+    grown = structure._grown(found, views, pairs, pairs)[0]
+    assert {i - 1 for i in grown.reg_image_ids()} == set(range(20)) - blank
+
+
 def test_given_poses_cost_nothing_where_the_pictures_are_enough(tmp_path: Path) -> None:
     made = walk_round(CAMERA)
     pairs = made.pairs(CAMERA)

@@ -11,12 +11,16 @@ from numpy.typing import NDArray
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.formats.trajectory import write_matrices
+from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import BACKBONE, FIGURES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.tracking.carry import lose_unfit, pose_lost
+from msgs_slam.pipelines.tracking.state import Sightings, TrackState
+from msgs_slam.pipelines.types import GivenPoses
 from tests.pipelines.frames.conftest import FOCAL, HEIGHT, QUICK, WIDTH, render, sideways
 
 FRAMES, BLANK = 18, range(7, 11)
@@ -81,6 +85,55 @@ def test_pictures_that_show_nothing_stand_where_the_poses_say(tmp_path: Path) ->
     with pytest.raises(InputError, match="no parallax"):
         reconstruct(tmp_path / "pictures", RunFolder(tmp_path / "alone"), load_config(overrides=[*SETTINGS]),
                     SilentProgress(), "frames")  # fmt: skip
+
+
+def walked(count: int) -> NDArray[np.float64]:
+    """(N, 4, 4) cam_from_world of someone who walks round in a circle."""
+    turns = np.linspace(0, 6, count)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, 3] = np.column_stack([3 * np.cos(turns), 3 * np.sin(turns), np.zeros(count)])
+    return se3.inverse(poses)
+
+
+def stretch_at(frames: range, poses: NDArray[np.float64]) -> TrackState:
+    """A state of these frames alone, each seeing one point; the others are lost."""
+    state = TrackState(np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
+    seen = Sightings(np.zeros(1, np.int64), np.zeros((1, 2)), np.ones(1))
+    for i in frames:
+        state.add_frame(i, poses[i], seen, True, 0)
+    state.lost = {i: "blank" for i in range(len(poses)) if i not in frames}
+    return state
+
+
+def test_a_short_stretch_that_does_not_fit_leaves_the_path_to_the_given_poses() -> None:
+    true = walked(40)
+    given = true.copy()
+    given[5::10] = np.nan
+    given[20, :3, 3] += 30.0
+    state = stretch_at(range(8, 13), se3.exp(np.random.default_rng(0).normal(size=(40, 6))))
+    lose_unfit(state, GivenPoses(given, True, "made up"))
+    carried = pose_lost(state, GivenPoses(given, True, "made up"))
+    assert sorted(state.lost) == [5, 15, 20, 25, 35]
+    np.testing.assert_allclose([state.poses[i] for i in carried], true[carried], atol=1e-9)
+
+
+@pytest.mark.parametrize(("frames", "known"), [(range(8, 13), range(4)), (range(25), range(20, 40))])
+def test_a_stretch_that_the_given_poses_could_not_replace_stays(frames: range, known: range) -> None:
+    true = walked(40)
+    given = np.full_like(true, np.nan)
+    given[known] = true[known]
+    found = se3.exp(np.random.default_rng(0).normal(size=(40, 6)))
+    state = stretch_at(frames, found)
+    lose_unfit(state, GivenPoses(given, True, "made up"))
+    assert sorted(state.poses) == list(frames)
+
+
+def test_a_stretch_that_fits_is_never_left() -> None:
+    true = walked(40)
+    state = stretch_at(range(5, 15), true)
+    lose_unfit(state, GivenPoses(true, True, "made up"))
+    assert pose_lost(state, GivenPoses(true, True, "made up")) == [*range(5), *range(15, 40)]
+    np.testing.assert_allclose([state.poses[i] for i in range(40)], true, atol=1e-9)
 
 
 def test_poses_of_another_recording_are_refused_before_anything(tmp_path: Path) -> None:
