@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import sys
@@ -262,6 +263,9 @@ def _run_one(stage: Stage, context: StageContext, fingerprint: str, inputs: Any)
     run, folder = context.run, context.folder
     journal = _open_partial(folder, fingerprint)
     started = time.monotonic()
+    # What caches of methods keep is a cycle: the stage before would hold its pictures and depths through this one.
+    gc.collect()
+    release_free_memory()
     forget_peak()
     try:
         with watched_by(journal):

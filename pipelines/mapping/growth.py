@@ -109,13 +109,9 @@ class Growth:
     def _spacings(self) -> LruSequence[Tensor]:
         """Of each view (H, W) uint8 distances in pixels to the next seed, 0 = no seed here; none in what is no part of
         the scene. Each is asked for twice as the map is seeded, and in every round of growth."""
-        return LruSequence(len(self.views), self._spacing, lambda t: t.nbytes, SPACINGS_ROOM)
-
-    def _spacing(self, index: int) -> Tensor:
-        view, s = self.views[index], self.settings
-        image, depth = view.image.cpu().numpy(), view.depth.cpu().numpy()
-        spacing = seed_spacing(image, depth, s.seed_stride, FINE_SHARE, FLAT_SHARE).astype(np.uint8)
-        return view.of_scene(torch.from_numpy(spacing).to(view.image.device), 0)
+        # Not a method: what is kept here would keep this, the views and the whole optimiser until garbage is collected.
+        views, stride = self.views, self.settings.seed_stride
+        return LruSequence(len(views), lambda i: _spacing(views[i], stride), lambda t: t.nbytes, SPACINGS_ROOM)
 
     def _holes(self, rendering: Rendering) -> Tensor:
         """Condition (a)."""
@@ -163,3 +159,9 @@ class Growth:
         )
         seeds.opacity_logits.fill_(math.log(opacity / (1 - opacity)))
         parameters.append(seeds, trust[pixels])
+
+
+def _spacing(view: View, stride: int) -> Tensor:
+    image, depth = view.image.cpu().numpy(), view.depth.cpu().numpy()
+    spacing = seed_spacing(image, depth, stride, FINE_SHARE, FLAT_SHARE).astype(np.uint8)
+    return view.of_scene(torch.from_numpy(spacing).to(view.image.device), 0)

@@ -1,5 +1,7 @@
 """The map of the synthetic room: as good as it must be, the same bytes after an interruption, poses put right."""
 
+import gc
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -184,3 +186,17 @@ def test_views_without_classes_can_be_mapped(room: MappingInput) -> None:
     result = optimise_map(room.views[:4], 0, settings, seed=0)
     assert result.gaussian_map.class_logits.shape == (len(result.gaussian_map), 0)
     assert mean(result, room.views[:4], "psnr") > 15
+
+
+def test_nothing_keeps_the_views_of_a_finished_map(room: MappingInput) -> None:
+    views = [replace(view) for view in room.views]  # others hold the room's own
+    kept = weakref.ref(views[0])
+    gc.collect()
+    gc.disable()  # what only it would free stays for as long as the next stage needs memory
+    try:
+        optimise_map(views, len(room.class_ids), replace(SETTINGS, passes=1.0), seed=0)
+        assert kept() is not None
+        del views
+        assert kept() is None
+    finally:
+        gc.enable()
