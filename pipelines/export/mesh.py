@@ -30,9 +30,9 @@ from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps, SemanticMesh
 from msgs_slam.pipelines.upright.world import WORLD, World
 
-TRUNCATION = 4.0
+TRUNCATION = 3.0
 """Voxels on either side of a surface that a depth speaks for."""
-LEAST_WEIGHT = 1.5
+LEAST_WEIGHT = 0.5
 """A voxel seen with less weight, in views at the median depth, has no surface."""
 LONG = 200
 """Keyframes of a recording for which `export.max_blocks` is meant; a longer one may have more by its length."""
@@ -149,9 +149,9 @@ def make_region(
     of: str = "",
 ) -> Region:
     """One of the regions of the grid, from the views that see it; `of` names it for the progress."""
-    near, least = grid.views_of(chunks), LEAST_WEIGHT if len(views) >= 4 else 0.5
+    near = grid.views_of(chunks)
     fusing = (views[n].shown for n in progress.track(near, "fusing" + of, len(near)))
-    triangles = chunk_surfaces(fuse(grid, chunks, fusing, get_threads()), chunks, least)
+    triangles = chunk_surfaces(fuse(grid, chunks, fusing, get_threads()), chunks, LEAST_WEIGHT)
     surface = weld(triangles, chunks, grid.voxel)
     painting = (views[n] for n in progress.track(near, "painting" + of, len(near)))
     return Region(surface, *paint(surface.vertices, painting, class_ids, 2 * grid.truncation))
