@@ -43,9 +43,14 @@ _MIN_KEYFRAMES = 3
 _MIN_POINTS = 30
 NEIGHBOURS, GIVEN, GIVEN_ALONE = "neighbours", "given", "given-alone"
 _AS_GOOD = 0.98
-"""Share of the score of a stated camera's model, from which that of a camera found anew is as good."""
+"""Share of a model's score from which another is as good: one of a camera found anew, one of given poses."""
 _Tried = tuple[pycolmap.Reconstruction, str, ModelReport]
 """A model, the mapper that made it, and how good it is."""
+
+
+def _worth(tried: _Tried) -> float:
+    """To choose by: the score, of a model that starts from given poses so much more that it need only be as good."""
+    return tried[2].score / (_AS_GOOD if tried[1].startswith(GIVEN) else 1.0)
 
 
 @dataclass(frozen=True)
@@ -152,8 +157,8 @@ class Candidates:
             if name == GIVEN:
                 found = found and self._grown(found, views, pairs, pairs)
             unfolded = None if found is None or not found[2].contradicted else self._unfolded(views, pairs)
-            # Of two alike the one before.
-            best = max(filter(None, (best, found, unfolded)), key=lambda f: f[2].score, default=None)
+            # Of two alike the one before, but the given poses are evidence that no match is.
+            best = max(filter(None, (best, found, unfolded)), key=_worth, default=None)
         if best is None or best[2].registered < min(_MIN_KEYFRAMES, best[2].total) or best[2].points < _MIN_POINTS:
             return None
         return best

@@ -35,9 +35,9 @@ from tracking import (
     DATA,
     PLAIN,
     Case,
-    Truth,
     cases,
     in_process,
+    of_set,
     original_names,
     prepare,
     rows_of,
@@ -51,32 +51,12 @@ METRES, DEGREES = 0.05, 3.0
 MADE = ("corridor", "turn", "fast", "kitchen_twice", "two_rooms", "corridor_half_blank", "corridor_blank")
 
 
-def of_set(folder: Path) -> Truth:
-    """The truth that a data set brings along, by the picture's name, or by its number where that is not given."""
-
-    def look_up(name: str, index: int) -> Array | None:
-        from msgs_slam.formats.datasets import open_sequence, recognise_source
-
-        if folder not in _OPENED:
-            sequence = open_sequence(folder, recognise_source(folder) or "folder")
-            poses = sequence.world_from_cam
-            assert poses is not None
-            _OPENED[folder] = dict(zip(sequence.names, poses, strict=True))
-        pose = _OPENED[folder][name] if name else list(_OPENED[folder].values())[index]
-        return pose if np.isfinite(pose).all() else None
-
-    return look_up
-
-
-_OPENED: dict[Path, dict[str, Array]] = {}
-
-
 def recordings(work: Path) -> dict[str, dict[str, Case]]:
     """All of them by name, and each one's cases by form."""
     known = cases(work)
     rpy, office = DATA / "tum_fr1_rpy", DATA / "office_loop" / "rgb"
     found = {
-        "fr1_rpy": {"plain": Case(rpy / "rgb", PLAIN, of_set(rpy)), "set": Case(rpy, (), of_set(rpy))},
+        "fr1_rpy": {"plain": known["fr1_rpy"], "set": Case(rpy, (), of_set(rpy))},
         "kitchen": {
             "video": known["kitchen_video"], "plain": known["kitchen"],
             "set": Case(DATA / "kitchen", (), of_set(DATA / "kitchen")),

@@ -93,6 +93,26 @@ def phone_truth(name: str, index: int) -> NDArray[np.float64]:
     return rows_of(DATA / "phone_desk/poses_c2w.txt")[int(Path(name).stem[-4:]) - 1]
 
 
+def of_set(folder: Path) -> Truth:
+    """The truth that a data set brings along, by the picture's name, or by its number where that is not given."""
+
+    def look_up(name: str, index: int) -> NDArray[np.float64] | None:
+        from msgs_slam.formats.datasets import open_sequence, recognise_source
+
+        if folder not in _OPENED:
+            sequence = open_sequence(folder, recognise_source(folder) or "folder")
+            poses = sequence.world_from_cam
+            assert poses is not None
+            _OPENED[folder] = dict(zip(sequence.names, poses, strict=True))
+        pose = _OPENED[folder][name] if name else list(_OPENED[folder].values())[index]
+        return pose if np.isfinite(pose).all() else None
+
+    return look_up
+
+
+_OPENED: dict[Path, dict[str, NDArray[np.float64]]] = {}
+
+
 def cases(work: Path) -> dict[str, Case]:
     """All sequences by name. `work` takes what has to be written for them."""
     replica, white, phone = DATA / "replica_office0", DATA / "whiteroom", DATA / "phone_desk"
@@ -109,6 +129,7 @@ def cases(work: Path) -> dict[str, Case]:
         "phone_desk_jump": Case(phone / "images", PLAIN, phone_truth),
         "whiteroom_video": Case(white / "video.mp4", (), room),
         "whiteroom_files": Case(white / "rgb", (*PLAIN, files), room),
+        "fr1_rpy": Case(DATA / "tum_fr1_rpy" / "rgb", (*PLAIN, *COARSE), of_set(DATA / "tum_fr1_rpy")),
         "corridor": Case(work / "corridor" / "rgb", (*PLAIN, *COARSE), written_truth(work / "corridor" / "traj.txt")),
         "bedroom": Case(DATA / "videos/bedroom_848x364_58fps.mp4", (), lambda *_: None),
         "house_portrait": Case(DATA / "videos/house_portrait_540x960_30fps.mp4", (), lambda *_: None),

@@ -5,13 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets.camera import Camera
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.run.files import GIVEN_POSES
-from msgs_slam.pipelines.structure.candidates import GIVEN
+from msgs_slam.pipelines.structure.candidates import GIVEN, _worth
+from msgs_slam.pipelines.structure.consistency import ModelReport
 from msgs_slam.pipelines.structure.given import agreement, posed_model
 from msgs_slam.pipelines.structure.lens import to_pycolmap, unknown_camera
 from msgs_slam.pipelines.types import GivenPoses
@@ -73,6 +75,16 @@ def test_images_that_match_nothing_do_not_stop_the_model_from_growing(tmp_path: 
     assert found is not None
     grown = structure._grown(found, views, pairs, pairs)[0]
     assert {i - 1 for i in grown.reg_image_ids()} == set(range(20)) - blank
+
+
+@pytest.mark.parametrize(("agreement", "wanted"), [(0.695, GIVEN), (0.65, "neighbours")])
+def test_given_poses_decide_between_models_that_the_matches_do_not(agreement: float, wanted: str) -> None:
+    model, both = pycolmap.Reconstruction(), (tuple(range(9)),)
+    tried = [
+        (model, "neighbours", ModelReport(9, 9, 500, 0.3, 0.7, 0.7, (), both)),
+        (model, GIVEN, ModelReport(9, 9, 500, 0.3, agreement, 0.7, (), both)),
+    ]
+    assert max(tried, key=_worth)[1] == wanted
 
 
 def test_given_poses_cost_nothing_where_the_pictures_are_enough(tmp_path: Path) -> None:
