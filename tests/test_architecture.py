@@ -103,6 +103,14 @@ def test_no_room_imports_one_beside_or_above_it(height: int) -> None:
     assert not {name: bad for name, bad in wrong.items() if bad}
 
 
+def test_no_two_folders_import_each_other() -> None:
+    """A folder inside another one counts as a folder of its own; the flat files stand on floors."""
+    known = {module: path for module, path in modules().items() if path.parent != ROOT / "pipelines"}
+    folders = {module: path.parent.relative_to(ROOT).as_posix() for module, path in known.items()}
+    pairs = {(folders[m], folders[other]) for m, path in known.items() for other in imported_modules(path, known)}
+    assert not sorted((a, b) for a, b in pairs if a < b and (b, a) in pairs)
+
+
 def test_no_file_imports_itself_by_a_detour() -> None:
     known = modules()
     waiting = {m: imported_modules(path, known) - {m} for m, path in known.items()}

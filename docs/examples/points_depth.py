@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
-from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.proxy.selection import ProviderContext
-from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.types import Frame
 
 

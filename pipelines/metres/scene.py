@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.depth.resize import resize_maps
 from msgs_slam.pipelines.geometry.camera import unproject_depth
-from msgs_slam.pipelines.proxy.sequence import resize_area
+from msgs_slam.pipelines.proxy.interface.sequence import resize_area
 from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 from msgs_slam.pipelines.voxels.layout import (
     CEILING,

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.proxy.learned.depth import OnnxDepth
-from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.scale import depth_at_points
-from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.types import Frame
 
 Array = NDArray[np.float64]

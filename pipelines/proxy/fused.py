@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.proxy.providers import DepthEstimate, DepthProvider
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, DepthProvider
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.proxy.scale import DepthScale, measure_scale
-from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.proxy.stereo.fill import SURE
 from msgs_slam.pipelines.proxy.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.types import Frame

@@ -11,6 +11,7 @@ from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.networks.identity import card_identity
 from msgs_slam.pipelines.proxy.files.depth import FilesDepth, require_sizes
 from msgs_slam.pipelines.proxy.files.labels import FilesLabels
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.proxy.scale_reference import POSES, require_reference_in
 from msgs_slam.pipelines.proxy.selection import (
     ProviderContext,
@@ -22,7 +23,6 @@ from msgs_slam.pipelines.proxy.selection import (
     open_learned_depth,
     open_learned_semantics,
 )
-from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.source.recording import RecordingSource
 from msgs_slam.pipelines.system.progress import SilentProgress, log

@@ -9,7 +9,8 @@ import numpy as np
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.proxy.providers import DepthEstimate, DepthProvider
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, DepthProvider
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
 from msgs_slam.pipelines.proxy.scale import DepthScale
 from msgs_slam.pipelines.proxy.scale_reference import (
@@ -19,7 +20,6 @@ from msgs_slam.pipelines.proxy.scale_reference import (
     height_scale,
     parse_reference,
 )
-from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.run.files import BACKBONE, GIVEN_POSES
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.source.opening import open_source

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.geometry.camera import project
-from msgs_slam.pipelines.proxy.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.types import Frame
 
 _LEAST_POINTS = 20

@@ -14,8 +14,8 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.correspondence.features import to_grey
 from msgs_slam.pipelines.correspondence.flow import follow
 from msgs_slam.pipelines.geometry.camera import unproject
-from msgs_slam.pipelines.proxy.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence, resize_area
 from msgs_slam.pipelines.source.opening import Source, VideoSource
 from msgs_slam.pipelines.types import Frame, Intrinsics
 

@@ -19,14 +19,14 @@ from msgs_slam.pipelines.proxy.files.depth import FilesDepth
 from msgs_slam.pipelines.proxy.files.labels import FilesLabels
 from msgs_slam.pipelines.proxy.files.recording import RecordingDepth, RecordingLabels
 from msgs_slam.pipelines.proxy.fused import FusedDepth
+from msgs_slam.pipelines.proxy.interface.providers import DepthProvider, SemanticsProvider
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.proxy.learned.clusters import OnnxClusters
 from msgs_slam.pipelines.proxy.learned.depth import OnnxDepth
 from msgs_slam.pipelines.proxy.learned.labels import OnnxLabels
 from msgs_slam.pipelines.proxy.learned.network_pass import ResultCache, Workplace
-from msgs_slam.pipelines.proxy.providers import DepthProvider, SemanticsProvider
 from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
 from msgs_slam.pipelines.proxy.scale import measure_scale
-from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.proxy.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.system.progress import Progress
 

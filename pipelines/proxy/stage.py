@@ -11,8 +11,8 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.masks.moving import find_moving
 from msgs_slam.pipelines.proxy.inputs import check_proxy, left_to_auto, proxy_inputs
+from msgs_slam.pipelines.proxy.interface.providers import prepared
 from msgs_slam.pipelines.proxy.metres import reference_scale, scale_figures
-from msgs_slam.pipelines.proxy.providers import prepared
 from msgs_slam.pipelines.proxy.scale import DepthScale, measure_scale
 from msgs_slam.pipelines.proxy.scale_reference import ReferenceScale
 from msgs_slam.pipelines.proxy.tasks import (

@@ -16,17 +16,17 @@ from msgs_slam.pipelines.engine.chunks import Chunk, in_chunks
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.masks.moving import SIDE, MovingView, look_once
 from msgs_slam.pipelines.proxy.compact import compact
-from msgs_slam.pipelines.proxy.providers import (
+from msgs_slam.pipelines.proxy.interface.providers import (
     DepthEstimate,
     DepthProvider,
     LabelEstimate,
     SemanticsProvider,
     take_prepared,
 )
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence, resize_area
 from msgs_slam.pipelines.proxy.reliability import reliability
 from msgs_slam.pipelines.proxy.scale import DepthScale
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth, open_semantics
-from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, LEFT_OUT, PROXY_MAPS
 from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.system.progress import Progress

@@ -20,7 +20,7 @@ from msgs_slam.pipelines.export.writers import map_cloud
 from msgs_slam.pipelines.gaussian_map import decided_channels
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.outcome import Outcome, evenly, labels_of_channels, load_outcome
-from msgs_slam.pipelines.proxy.palette import class_colors
+from msgs_slam.pipelines.proxy.interface.palette import class_colors
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, MESH
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_records

@@ -48,7 +48,7 @@ from msgs_slam.pipelines.geometry.camera import unproject_depth
 from msgs_slam.pipelines.networks.labels import network_labels
 from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.proxy.palette import class_colors
+from msgs_slam.pipelines.proxy.interface.palette import class_colors
 from msgs_slam.pipelines.proxy.selection import choose_semantics
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct

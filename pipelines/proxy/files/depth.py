@@ -13,8 +13,8 @@ from msgs_slam.formats.images import MAX_IMAGE_PIXELS, image_size, read_depth_pn
 from msgs_slam.formats.reading import parsing, reaching, require_file
 from msgs_slam.pipelines.depth.resize import resample_nearest, resize_depth
 from msgs_slam.pipelines.proxy.files.matching import find_folder, match_files
-from msgs_slam.pipelines.proxy.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.types import Frame
 
 _SUFFIXES = (".png", ".npy", ".tif", ".tiff")

@@ -15,9 +15,9 @@ from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.networks.classes import MAX_ID, NamedClass, find_class_table, read_class_table
 from msgs_slam.pipelines.proxy.files.depth import require_aspect
 from msgs_slam.pipelines.proxy.files.matching import find_folder, match_files
-from msgs_slam.pipelines.proxy.palette import class_colors
-from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
-from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.proxy.interface.palette import class_colors
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import VOID, ClassTable, Frame
 

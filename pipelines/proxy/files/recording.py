@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import Sequence as Recording
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.proxy.palette import class_colors
-from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
-from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.proxy.interface.palette import class_colors
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.source.source_pixels import FramePixels
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import VOID, ClassTable, Frame

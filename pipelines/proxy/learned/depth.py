@@ -12,8 +12,8 @@ from msgs_slam.pipelines.networks.card import Card
 from msgs_slam.pipelines.networks.depth import network_depth
 from msgs_slam.pipelines.networks.identity import card_identity
 from msgs_slam.pipelines.networks.session import Network
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.learned.network_pass import Arrays, NetworkPass, Workplace
-from msgs_slam.pipelines.proxy.providers import DepthEstimate
 from msgs_slam.pipelines.types import Frame
 
 

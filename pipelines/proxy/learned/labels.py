@@ -14,12 +14,12 @@ from msgs_slam.pipelines.networks.card import Card
 from msgs_slam.pipelines.networks.identity import card_identity
 from msgs_slam.pipelines.networks.labels import best_classes, class_token, network_probabilities
 from msgs_slam.pipelines.networks.session import Network
+from msgs_slam.pipelines.proxy.interface.palette import class_colors
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.interface.sequence import resample_linear
 from msgs_slam.pipelines.proxy.learned.network_pass import Arrays, NetworkPass, Workplace
-from msgs_slam.pipelines.proxy.palette import class_colors
-from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
 from msgs_slam.pipelines.proxy.regions.named import NamedScene, Vocabulary
 from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
-from msgs_slam.pipelines.proxy.sequence import resample_linear
 from msgs_slam.pipelines.types import VOID, ClassTable, Frame
 
 _LEAST_SHARE = 0.001

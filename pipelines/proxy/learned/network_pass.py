@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.atomic import atomic_path
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.tensors import load_arrays
-from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.system.progress import Progress, log
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.types import Frame

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.proxy.graph_cut import cut_graph
+from msgs_slam.pipelines.proxy.regions.graph_cut import cut_graph
 from msgs_slam.pipelines.voxels.voxels import Voxels, touching
 
 _COLOR_UNIT = 12.0

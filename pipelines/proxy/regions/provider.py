@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.geometry.camera import unproject_depth
-from msgs_slam.pipelines.proxy.palette import class_colors
-from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.interface.palette import class_colors
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.proxy.regions.parts import cut_parts
 from msgs_slam.pipelines.proxy.regions.spread import spread_votes
-from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.system.jit import kernel
 from msgs_slam.pipelines.system.memory import release_free_memory
 from msgs_slam.pipelines.system.progress import Progress

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.proxy.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.sequence import Sequence, resize_area
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence, resize_area
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
 from msgs_slam.pipelines.proxy.stereo.borrow import agreed_depth, borrow_depth, carry_depth
 from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
 from msgs_slam.pipelines.system.jit import kernel
 
 _COLOR_SD = 10.0

@@ -23,7 +23,7 @@ from msgs_slam.pipelines.mapping.views import View, make_view
 from msgs_slam.pipelines.masks.files import open_masks
 from msgs_slam.pipelines.masks.people import PeopleFinder, join_people, people_cards
 from msgs_slam.pipelines.networks.registry import ModelStore
-from msgs_slam.pipelines.proxy.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
 from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost
 from msgs_slam.pipelines.read_config import load_config

@@ -14,8 +14,8 @@ from msgs_slam.pipelines.networks.classes import find_class_table, read_class_ta
 from msgs_slam.pipelines.proxy.files.depth import FilesDepth
 from msgs_slam.pipelines.proxy.files.labels import FilesLabels
 from msgs_slam.pipelines.proxy.files.matching import frame_key
-from msgs_slam.pipelines.proxy.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.sequence import Sequence
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics
 

@@ -11,12 +11,12 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
 from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.proxy.fused import FusedDepth, fuse
-from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
 from msgs_slam.pipelines.proxy.reliability import mean_iou
 from msgs_slam.pipelines.proxy.scale import measure_scale
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth
-from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.proxy.stereo.neighbours import depth_range
 from msgs_slam.pipelines.proxy.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.system.progress import SilentProgress

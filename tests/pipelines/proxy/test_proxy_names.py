@@ -10,12 +10,12 @@ from proxy_room import UNIT, Room
 
 from msgs_slam.pipelines.evaluation.label_score import count_labels, score
 from msgs_slam.pipelines.networks.labels import best_classes
-from msgs_slam.pipelines.proxy.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.sequence import resample_linear
 from msgs_slam.pipelines.proxy.regions.belonging import disputed, one_name_each
 from msgs_slam.pipelines.proxy.regions.named import NamedScene, Vocabulary
 from msgs_slam.pipelines.proxy.regions.orientation import name_likelihood
 from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
-from msgs_slam.pipelines.proxy.sequence import resample_linear
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame
 from msgs_slam.pipelines.voxels import voxels

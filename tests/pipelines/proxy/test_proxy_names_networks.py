@@ -19,10 +19,10 @@ from msgs_slam.pipelines.networks.card import Card
 from msgs_slam.pipelines.networks.labels import network_labels
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.networks.session import Network
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.proxy.learned.labels import OnnxLabels
 from msgs_slam.pipelines.proxy.learned.network_pass import ResultCache, Workplace
-from msgs_slam.pipelines.proxy.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics
 from tests.world.room import CLASSES

@@ -21,9 +21,9 @@ from msgs_slam.pipelines.networks.labels import class_token, network_labels
 from msgs_slam.pipelines.networks.letterbox import choose_box
 from msgs_slam.pipelines.networks.onnx_file import external_locations, require_own_weights
 from msgs_slam.pipelines.networks.session import Network
+from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.proxy.learned.depth import OnnxDepth
 from msgs_slam.pipelines.proxy.learned.network_pass import ResultCache, Workplace
-from msgs_slam.pipelines.proxy.sequence import Sequence
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics
 
