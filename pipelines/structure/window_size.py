@@ -24,7 +24,8 @@ def window_size(memory_mb: int, pixels: int) -> int:
 
 
 def windows_of(count: int, size: int = SIZE, shared: int = SHARED) -> list[range]:
-    """All keyframes in windows of about that size; one window for less than half as much again."""
+    """All keyframes in windows of about that size; one window for less than half as much again. For a size of more than
+    twice what is shared none is in three windows."""
     parts = max(1, round((count - shared) / (size - shared))) if count > 1.5 * size else 1
     shared *= parts > 1
     edges = np.linspace(0, count - shared, parts + 1).round().astype(int).tolist()

@@ -35,7 +35,7 @@ WIDE = 40.0
 @dataclass
 class Joined:
     """Poses by image, points, observations (O, 3) of window after window: image, feature, point; and which point an
-    observation (image, feature) of the last window sees."""
+    observation (image, feature) of the last window sees: no image is in three windows, see `windows_of`."""
 
     poses: dict[int, Array] = field(default_factory=dict)
     points: list[Array] = field(default_factory=list)

@@ -94,6 +94,10 @@ def test_the_memory_that_is_given_decides_how_large_windows_are() -> None:
     assert [window_size(m, 27648) for m in (100, 700, 1000)] == [100, 177, 354]
     assert window_size(1000, 307200) < 354  # of larger pictures
     assert all(len(w) <= 1.5 * 177 for w in windows_of(2272, window_size(700, 27648)))
+    least = window_size(100, 27648)
+    for count in range(2 * least, 20 * least):  # what joins them remembers the window before only
+        windows = windows_of(count, least)
+        assert all(after.start >= w.stop for w, after in zip(windows, windows[2:], strict=False))
 
 
 def test_windows_of_three_worlds_become_one_model() -> None:
