@@ -68,9 +68,10 @@ def solve(
     refine_camera: bool,
     width: float = CAUCHY_PX,
     bend_lens: bool = True,
+    iterations: int = 50,
 ) -> pycolmap.CeresBundleAdjuster:
     """Robust adjustment of these images, in place, under Cauchy's loss of so many pixels; deterministic. A camera that
-    is refined keeps its distortion unless `bend_lens`."""
+    is refined keeps its distortion unless `bend_lens`; `iterations` at most."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = refine_camera
     options.refine_extra_params = refine_camera and bend_lens
@@ -82,7 +83,7 @@ def solve(
     solver = options.ceres.solver_options
     # Ceres adds up in the order its threads finish; one thread gives the same bytes every time.
     solver.num_threads = 1
-    solver.max_num_iterations = 50
+    solver.max_num_iterations = iterations
     solver.function_tolerance = 1e-6
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in images:

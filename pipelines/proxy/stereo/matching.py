@@ -24,7 +24,7 @@ SMALL_STEP, JUMP, EDGE = 0.1, 1.2, 0.05
 STIFFNESS = 0.01
 REACH, MOVE = 2, 1 / 3
 """Of the refinement: so many moves either way, of so much of the distance between planes."""
-MARGIN, AROUND, CLEAR = 2, 1, 0.3
+MARGIN, AROUND, CLEAR = 2, 1, 0.2
 """Of the whole size: planes on either side of a coarse one that are tried, coarse pixels around it that try it, and the
 cost below which a match is clear by itself."""
 COARSE = 2
