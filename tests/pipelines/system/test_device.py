@@ -129,8 +129,8 @@ def test_a_misplaced_copy_to_the_cpu_is_found(
     world_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The test of these tests."""
-    right = growth.Growth._spacing
-    monkeypatch.setattr(growth.Growth, "_spacing", lambda self, view: right(self, view).cpu())
+    right = growth._spacing
+    monkeypatch.setattr(growth, "_spacing", lambda view, stride: right(view, stride).cpu())
     made = make_run(tmp_path / "run", world_sequence, every=8)
     made.partial("mapping").mkdir()
     with pytest.raises(WrongDeviceError, match="of the CPU meets"):
