@@ -88,9 +88,9 @@ def read_colmap_model(folder: Path) -> ColmapModel:
 def _plain_model(reconstruction: Any, folder: Path) -> ColmapModel:
     images = sorted((reconstruction.images[i] for i in reconstruction.reg_image_ids()), key=lambda image: image.name)
     camera_ids = sorted({image.camera_id for image in images})
-    point_ids = np.array(sorted(reconstruction.points3D), dtype=np.uint64)
-    points = [reconstruction.points3D[int(i)] for i in point_ids]
-    obs_image, obs_id, obs_xy = _observations(images)
+    from msgs_slam.formats.reconstruction import ModelArrays  # pycolmap takes long to import
+
+    found = ModelArrays.of(reconstruction, [image.image_id for image in images])
     poses = [image.cam_from_world() for image in images]
     return ColmapModel(
         names=tuple(image.name for image in images),
@@ -100,11 +100,11 @@ def _plain_model(reconstruction: Any, folder: Path) -> ColmapModel:
             str(folder),
         ),
         cameras=tuple(_plain_camera(reconstruction.cameras[i]) for i in camera_ids),
-        points=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
-        colors=np.array([p.color for p in points], dtype=np.uint8).reshape(-1, 3),
-        obs_image=obs_image,
-        obs_point=np.searchsorted(point_ids, obs_id).astype(np.int64),
-        obs_xy=obs_xy,
+        points=found.points,
+        colors=np.array([reconstruction.points3D[i].color for i in found.point_ids.tolist()], np.uint8).reshape(-1, 3),
+        obs_image=found.obs_cam,
+        obs_point=found.obs_point,
+        obs_xy=found.obs_xy,
     )
 
 
@@ -146,15 +146,6 @@ def _load(folder: Path) -> Any:
     with parsing(f"the COLMAP model in {folder}", "such model"):
         (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(str(folder))
     return reconstruction
-
-
-def _observations(images: list[Any]) -> tuple[NDArray[np.int64], NDArray[np.uint64], NDArray[np.float64]]:
-    seen = [[(p.point3D_id, *p.xy) for p in image.points2D if p.has_point3D()] for image in images]
-    counts = [len(points) for points in seen]
-    flat = [p for points in seen for p in points]
-    ids = np.array([p[0] for p in flat], dtype=np.uint64)
-    xy = np.array([p[1:] for p in flat], dtype=np.float64).reshape(-1, 2)
-    return np.repeat(np.arange(len(images)), counts).astype(np.int64), ids, xy
 
 
 def _plain_camera(camera: Any) -> tuple[str, int, int, tuple[float, ...]]:

@@ -67,8 +67,8 @@ class RunStatus:
         """Memory that stages plan with here, and the highest peak of the finished ones, in words."""
         peaks = {s.name: s.record.peak_memory_mb for s in self.stages if s.record}
         most = max(peaks, key=lambda name: peaks[name], default="")
-        needed = f"peak {peaks[most] / 1000:.1f} GB in {most} " if most else ""
-        return f"memory: {needed}(budget {self.planned_mb / 1000:.1f} GB)"
+        budget = f"budget {self.planned_mb / 1000:.1f} GB"
+        return f"memory: peak {peaks[most] / 1000:.1f} GB in {most} ({budget})" if most else f"memory: {budget}"
 
     @property
     def warnings(self) -> list[str]:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from msgs_slam.formats.reconstruction import pose_of
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.structure.backbone import pose_of
 from msgs_slam.pipelines.structure.candidates import GIVEN, GIVEN_ALONE
 from msgs_slam.pipelines.structure.given import agreement
 from msgs_slam.pipelines.structure.sfm import Structure

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from msgs_slam.pipelines.correspondence.matching import match_descriptors
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import unproject
 from msgs_slam.pipelines.tracking.pnp import FramePose, solve_pose
-from msgs_slam.pipelines.tracking.relocalise import SNAP
 from msgs_slam.pipelines.tracking.state import Sightings
 from msgs_slam.pipelines.types import Features, Intrinsics, LoopEdge
 
@@ -57,13 +55,10 @@ def make_view(
     intrinsics: Intrinsics,
 ) -> KeyframeView:
     """A keyframe with its points (P, 3), and depth (Q,) at its features, 0 where unknown."""
-    point = np.full(len(features.xy), -1, np.int64)
+    point = sightings.points_at(features.xy)
+    near = point >= 0
     in_cam = np.where(depth[:, None] > 0, unproject(features.xy, depth, intrinsics), np.nan)
-    if len(sightings) and len(features.xy):
-        distance, nearest = cKDTree(sightings.xy).query(features.xy, distance_upper_bound=SNAP)
-        near = np.isfinite(distance)
-        point[near] = sightings.point[nearest[near]]
-        in_cam[near] = points[point[near]] @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
+    in_cam[near] = points[point[near]] @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
     return KeyframeView(frame_id, cam_from_world, features, point, in_cam)
 
 

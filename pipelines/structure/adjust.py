@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from msgs_slam.formats.reconstruction import ModelArrays
 from msgs_slam.pipelines.structure.lens import set_lens
 
 CAUCHY_PX = 1.0
@@ -95,19 +96,16 @@ def solve(
 
 
 def reprojection_errors(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
-    """(O,) pixels, of every observation; infinite behind the camera."""
-    errors = []
-    for image_id in sorted(model.reg_image_ids()):
-        image = model.images[image_id]
-        seen = [p for p in image.points2D if p.has_point3D()]
-        if not seen:
+    """(O,) pixels, of every observation, image after image; infinite behind the camera."""
+    found, errors = ModelArrays.of(model), [np.zeros(0)]
+    for image_id, pose, own in zip(found.image_ids.tolist(), found.cam_from_world, found.rows(), strict=True):
+        if own.start == own.stop:
             continue
-        pose = image.cam_from_world().matrix()
-        points = np.array([model.points3D[p.point3D_id].xyz for p in seen]) @ pose[:, :3].T + pose[:, 3]
-        projected = np.asarray(model.cameras[image.camera_id].img_from_cam(points))
-        error = np.linalg.norm(projected - np.array([p.xy for p in seen]), axis=1)
+        points = found.points[found.obs_point[own]] @ pose[:3, :3].T + pose[:3, 3]
+        projected = np.asarray(model.cameras[model.images[image_id].camera_id].img_from_cam(points))
+        error = np.linalg.norm(projected - found.obs_xy[own], axis=1)
         errors.append(np.where((points[:, 2] > 0) & np.isfinite(error), error, np.inf))
-    return np.concatenate(errors) if errors else np.zeros(0)
+    return np.concatenate(errors)
 
 
 def median_error(model: pycolmap.Reconstruction) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from msgs_slam.formats.reconstruction import ModelArrays
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.structure.lens import Lens
 
@@ -25,31 +26,13 @@ def to_sparse_model(
     keyframe_ids[i] is the frame id of the image with id i + 1; load_rgb(frame_id) gives (H, W, 3) of the frame before
     undistortion, one at a time.
     """
-    image_ids = sorted(model.reg_image_ids())
-    poses = np.stack([pose_of(model.images[i]) for i in image_ids])
-    point_ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
-    points = np.array([model.points3D[int(p)].xyz for p in point_ids], np.float64).reshape(-1, 3)
-    row = {int(p): k for k, p in enumerate(point_ids)}
-    observed = [_observations(model.images[i], row) for i in image_ids]
-    frame_ids = np.array([keyframe_ids[i - 1] for i in image_ids], dtype=np.int64)
-    colors = _mean_colors(observed, len(points), (load_rgb(int(i)) for i in frame_ids))
-    obs_frame = np.concatenate([np.full(len(at), k, np.int64) for k, (at, _) in enumerate(observed)])
-    obs_point = np.concatenate([at for at, _ in observed])
+    found = ModelArrays.of(model)
+    observed = [(found.obs_point[r], found.obs_xy[r]) for r in found.rows()]
+    frame_ids = np.array([keyframe_ids[i - 1] for i in found.image_ids], dtype=np.int64)
+    colors = _mean_colors(observed, len(found.points), (load_rgb(int(i)) for i in frame_ids))
     obs_xy = np.concatenate([lens.undistort_points(xy) for _, xy in observed])
-    poses, points = _rebased(poses, points, obs_frame, obs_point)
-    return SparseModel(frame_ids, poses, points, colors, obs_frame, obs_point, obs_xy)
-
-
-def pose_of(image: pycolmap.Image) -> NDArray[np.float64]:
-    """(4, 4) camera from world."""
-    return np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
-
-
-def _observations(image: pycolmap.Image, row: dict[int, int]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Rows (O,) of the points that an image sees, and where (O, 2)."""
-    seen = [p for p in image.points2D if p.has_point3D()]
-    xy = np.array([p.xy for p in seen], dtype=np.float64).reshape(-1, 2)
-    return np.array([row[p.point3D_id] for p in seen], dtype=np.int64), xy
+    poses, points = _rebased(found.cam_from_world, found.points, found.obs_cam, found.obs_point)
+    return SparseModel(frame_ids, poses, points, colors, found.obs_cam, found.obs_point, obs_xy)
 
 
 def _mean_colors(

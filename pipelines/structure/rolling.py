@@ -18,10 +18,10 @@ import pycolmap
 from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.reconstruction import ModelArrays
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.structure import bundle_kernels as kernels
 from msgs_slam.pipelines.structure.adjust import adjust, solve
-from msgs_slam.pipelines.structure.backbone import pose_of
 from msgs_slam.pipelines.structure.bundle import Bundle, Problem
 from msgs_slam.pipelines.types import Intrinsics
 
@@ -151,29 +151,23 @@ class RollingModel:
     """
 
     def __init__(self, model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array) -> None:
-        self.model = model
-        self.images = sorted(model.reg_image_ids())
-        self.times = times[[i - 1 for i in self.images]]
-        self.point_ids = sorted(model.point3D_ids())
-        seen = [np.array([p.point3D_id for p in model.images[i].points2D], np.uint64) for i in self.images]
-        known = np.array(self.point_ids, np.uint64)
-        self.features = [np.isin(points, known).nonzero()[0] for points in seen]
-        self.obs_cam = np.repeat(np.arange(len(seen)), [len(f) for f in self.features])
-        observed = [points[f] for points, f in zip(seen, self.features, strict=True)]
-        self.obs_point = np.searchsorted(known, np.concatenate([known[:0], *observed]))
+        self.model, self.arrays = model, ModelArrays.of(model)
+        self.images = self.arrays.image_ids.tolist()
+        self.times = times[self.arrays.image_ids - 1]
+        self.features = [self.arrays.obs_feature[own] for own in self.arrays.rows()]
         plain = [xy[i - 1][f] for i, f in zip(self.images, self.features, strict=True)]
         self.plain: Array = np.concatenate([np.zeros((0, 2)), *plain])
         self.now = self.plain
 
     def bundle(self) -> tuple[Bundle, Array, Intrinsics]:
         """Return the bundle in a pinhole's pixels, as the model has them; (O, 2) as the frames do; and the pinhole."""
-        model, camera, count = self.model, self.model.cameras[1], len(self.now)
+        camera, count = self.model.cameras[1], len(self.now)
         focal, half = camera.mean_focal_length(), np.array([camera.width, camera.height]) / 2
         pinhole = Intrinsics(camera.width, camera.height, focal, focal, *half)
+        at = self.arrays.reread(self.model)
         bundle = Bundle(
-            np.array([pose_of(model.images[i]) for i in self.images]),
-            np.array([model.points3D[p].xyz for p in self.point_ids]),
-            self.obs_cam, self.obs_point, np.asarray(camera.cam_from_img(self.now)) * focal + half,
+            np.ascontiguousarray(at.cam_from_world), at.points, at.obs_cam, at.obs_point,
+            np.asarray(camera.cam_from_img(self.now)) * focal + half,
             *(np.broadcast_to(value, count) for value in (FEATURE_SD, 0.0, 1.0)),
         )  # fmt: skip
         return bundle, np.asarray(camera.cam_from_img(self.plain)) * focal + half, pinhole

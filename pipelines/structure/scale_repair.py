@@ -13,9 +13,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from msgs_slam.formats.reconstruction import pose_of, set_pose
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair
 from msgs_slam.pipelines.structure.adjust import filter_outliers, solve
-from msgs_slam.pipelines.structure.backbone import pose_of
 from msgs_slam.pipelines.structure.consistency import ModelReport, judge
 from msgs_slam.pipelines.structure.seams import LEAST_POINTS, tracks_of
 from msgs_slam.pipelines.structure.tracks import complete_tracks
@@ -113,7 +113,7 @@ def resize_behind(model: pycolmap.Reconstruction, keyframe: int, ratio: float) -
         if i > image:
             pose = model.images[i].cam_from_world().matrix()
             pose[:, 3] = ratio * pose[:, 3] + (ratio - 1) * pose[:, :3] @ centre
-            model.frames[model.images[i].frame_id].rig_from_world = pycolmap.Rigid3d(pose)
+            set_pose(model, i, pose)
     for point in model.points3D.values():
         if np.mean([np.sign(e.image_id - image) for e in point.track.elements]) > 0:
             point.xyz = centre + ratio * (point.xyz - centre)

@@ -13,11 +13,11 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from msgs_slam.formats.reconstruction import pose_of, set_pose
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import Similarity, best_rotation
 from msgs_slam.pipelines.structure.adjust import filter_outliers, median_error
-from msgs_slam.pipelines.structure.backbone import pose_of
 from msgs_slam.pipelines.structure.bundle import adjust_bundle
 from msgs_slam.pipelines.structure.given import bare_model
 from msgs_slam.pipelines.structure.rolling import FEATURE_SD, Readout, RollingModel, rectified_bundle, velocities
@@ -145,7 +145,7 @@ def adjust_together(
 ) -> None:  # fmt: skip
     """Poses and points adjusted in place, with the camera as it is; see `adjust_bundle` for the width of the loss."""
     rolling = RollingModel(model, xy, times)
-    images, point_ids = rolling.images, rolling.point_ids
+    images, point_ids = rolling.arrays.image_ids.tolist(), rolling.arrays.point_ids.tolist()
     bundle, plain, pinhole = rolling.bundle()
     if any(readout):
         velocity = velocities(bundle.cam_from_world, rolling.times)
@@ -153,6 +153,6 @@ def adjust_together(
     del rolling, plain  # pixels of all observations once more
     adjusted = adjust_bundle(bundle, pinhole, width=width).bundle
     for i, pose in zip(images, adjusted.cam_from_world, strict=True):
-        model.frames[model.images[i].frame_id].rig_from_world = pycolmap.Rigid3d(pose[:3])
+        set_pose(model, i, pose)
     for p, xyz in zip(point_ids, adjusted.points, strict=True):
         model.points3D[p].xyz = xyz

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from msgs_slam.pipelines.correspondence.matching import match_descriptors
 from msgs_slam.pipelines.geometry import se3
@@ -22,8 +21,6 @@ RIVAL_SHARE = 0.5
 """Another place with this share of the best one's agreeing points is as good an answer."""
 COMMON_POINTS = 8
 """Keyframes with so many points in common show one place."""
-SNAP = 2.0
-"""A SIFT feature within so many pixels of a keyframe's sighting is the same point."""
 
 
 def relocalise(frame_id: int, state: TrackState, pictures: Pictures, seed: int) -> tuple[Sightings, FramePose | None]:
@@ -77,9 +74,8 @@ def match_keyframe(frame_id: int, keyframe: int, state: TrackState, pictures: Pi
         return NO_SIGHTINGS
     theirs, ours = pictures.features(keyframe), pictures.features(frame_id)
     pairs = match_descriptors(theirs.descriptors, ours.descriptors)
-    distance, nearest = cKDTree(known.xy).query(theirs.xy[pairs[:, 0]], distance_upper_bound=SNAP)
-    keep = np.isfinite(distance)
-    points, pairs = known.point[nearest[keep]], pairs[keep]
+    points = known.points_at(theirs.xy[pairs[:, 0]])
+    points, pairs = points[points >= 0], pairs[points >= 0]
     _, first = np.unique(points, return_index=True)
     first = np.sort(first)
     return Sightings(points[first], ours.xy[pairs[first, 1]], np.full(len(first), 1.0))

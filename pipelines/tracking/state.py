@@ -9,6 +9,7 @@ from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from msgs_slam.pipelines.geometry.rig import ONE_CAMERA, Rig
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
@@ -32,6 +33,13 @@ class Sightings:
         """Select sightings by a mask or by indices."""
         return Sightings(self.point[keep], self.xy[keep], self.sd[keep])
 
+    def points_at(self, xy: Array) -> NDArray[np.int64]:
+        """(F,) the point that is seen within 2 px of each of the pixels (F, 2), -1 for none."""
+        if not len(self):
+            return np.full(len(xy), -1, np.int64)
+        distance, nearest = cKDTree(self.xy).query(xy, distance_upper_bound=_SNAP_PX)
+        return np.where(np.isfinite(distance), self.point[np.minimum(nearest, len(self) - 1)], -1)
+
     def joined(self, other: Sightings) -> Sightings:
         """Both, this one's first."""
         return Sightings(
@@ -44,6 +52,8 @@ class Sightings:
 FEATURE_SD = 0.5
 """Pixels: how exactly a feature of structure from motion is known."""
 _NEAR_KEYFRAMES = 8
+_SNAP_PX = 2.0
+"""A feature within so many pixels of a frame's sighting is the same point."""
 NO_SIGHTINGS = Sightings(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
 
 

@@ -11,6 +11,8 @@ and it goes on. Says how many kills there were, in which stages, at which calls 
 a resume that was killed too, and what differed. Figures of several seeds add up; each takes one core.
 """
 
+# ruff: noqa: E402 (the tests' world is found only once the path is set)
+
 from __future__ import annotations
 
 import argparse
@@ -28,6 +30,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
 
 from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.jsonfile import read_json_object, write_json

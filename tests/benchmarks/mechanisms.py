@@ -28,6 +28,7 @@ import numpy as np
 from poses import compare, recordings
 from tracking import Case, in_process, original_names, prepare
 
+from msgs_slam.formats.reconstruction import pose_of
 from msgs_slam.pipelines.correspondence.snapshots import Snapshots
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames import stage as frames_stage
@@ -38,7 +39,6 @@ from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.structure import candidates, sfm
-from msgs_slam.pipelines.structure.backbone import pose_of
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 SMALL = ("replica", "kitchen", "whiteroom", "fr1_rpy", "house_portrait", "corridor", "office_loop", "bedroom")

@@ -12,7 +12,7 @@ from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.geometry.camera import unproject
 from msgs_slam.pipelines.tracking.relocalise import relocalise
 from msgs_slam.pipelines.tracking.segments import agree
-from msgs_slam.pipelines.tracking.state import Sightings, TrackState
+from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics
 
 CAMERA = Intrinsics(320, 240, 280, 280, 160, 120)
@@ -73,3 +73,10 @@ def test_two_ways_to_join_are_as_near_or_far_wherever_the_origin_is(away: float,
     shift = np.array([away, 0, 0])
     first, second = Similarity(1.0, np.eye(3), shift), Similarity(1.02, np.eye(3), shift + np.array([0, apart, 0]))
     assert agree(first, second, np.eye(4), depth=3.0) == joined
+
+
+def test_a_feature_is_the_point_whose_sighting_is_within_two_pixels() -> None:
+    seen = Sightings(np.array([7, 3]), np.array([[10.0, 10.0], [50.0, 20.0]]), np.ones(2))
+    assert seen.points_at(np.array([[11.0, 11.0], [50.0, 22.5], [49.0, 20.0]])).tolist() == [7, -1, 3]
+    assert seen.points_at(np.zeros((0, 2))).tolist() == []
+    assert NO_SIGHTINGS.points_at(np.array([[1.0, 1.0]])).tolist() == [-1]
