@@ -2,8 +2,9 @@
 
 Depth and poses carry the surfaces of other keyframes into each one. Where several of them say what should be seen and
 the image shows another colour, something was there that was gone for them. A thing of the scene is there for the
-others too and explains itself, and over a surface of one colour nobody accuses anybody. RobustNeRF (Sabour et al., CVPR
-2023) too leaves out what the rest of the views does not agree on, there while a map is fitted.
+others too and explains itself, and over a surface of one colour nobody accuses anybody. A thing close to the camera may
+lie outside what the others see: at first only those accuse that have its place in sight. RobustNeRF (Sabour et al.,
+CVPR 2023) too leaves out what the rest of the views does not agree on, there while a map is fitted.
 """
 
 from __future__ import annotations
@@ -17,13 +18,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs_slam.pipelines.geometry.camera import project, unproject_depth
 from msgs_slam.pipelines.system.jit import kernel
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import Intrinsics
 
 SIDE = 160
-"""Pixels along the long side; all numbers below were chosen with it, on a woman pasted into 37 keyframes of one room,
-and on three recordings (204 keyframes) of rooms where nothing moves, in which nothing is found."""
+"""Pixels along the long side; all numbers below were chosen with it, on a woman pasted into the keyframes of one room
+(36 and 37), and on five recordings of rooms where nothing moves, in which nothing is found."""
 _WITNESSES = 12
 _FAR = 1.3
 """Keyframes farther apart (distance over median depth, plus two for a radian) see little of each other."""
@@ -39,14 +41,17 @@ _KEPT = 128
 
 @dataclass(frozen=True)
 class Rules:
-    """Depth of what confidence may accuse; over what gap (share of the width) pieces are one thing."""
+    """Depth of what confidence may accuse; over what gap (share of the width) pieces are one thing; whether a witness
+    must have the place in sight at which the accused pixel's own depth puts it."""
 
     confidence: float
     gap: float
+    in_sight: bool
 
 
-_FIRST, _AGAIN = Rules(0.2, 0.03), Rules(0.1, 0.04)
-"""Once something is found in an image, less will do for the rest of it."""
+_FIRST, _AGAIN = Rules(0.28, 0.03, True), Rules(0.1, 0.04, False)
+"""Depth that was filled in over a plain surface has at most 0.276: a guess that is wrong in most views accuses a whole
+cupboard. Once something is found in an image, less will do for the rest of it."""
 _ROUNDS = 3
 _LEAST_SHARE = 0.006
 """Of the image: the evidence in a thing; and of the thing itself:"""
@@ -97,7 +102,7 @@ def look_once(
             continue
         others = _witnesses(poses, k, float(np.median(depth[depth > 0])))
         witnesses = ((view(o), before.get(o)) for o in others)
-        new = _things(_evidence(view(k), witnesses, camera, rules.confidence), rules.gap, before.get(k))
+        new = _things(_evidence(view(k), witnesses, camera, rules), rules.gap, before.get(k))
         if new.any():
             found[k] = new
     return found
@@ -119,10 +124,10 @@ def _evidence(
     view: MovingView,
     witnesses: Iterator[tuple[MovingView, NDArray[np.bool_] | None]],
     camera: Intrinsics,
-    least: float,
+    rules: Rules,
 ) -> NDArray[np.bool_]:
     """(h, w) where more witnesses, each with what of it moved (h, w), say that another colour belongs there than this
-    one. Only depth of more than the confidence `least` accuses."""
+    one."""
     weight = np.array([0.6, 1, 1], np.float32)
     own, votes = np.ascontiguousarray(view.lab * weight), np.zeros((2, *view.depth.shape), np.int64)
     lens = camera.numbers
@@ -135,7 +140,10 @@ def _evidence(
         sure = confidence > 0.5
         if sure.sum() > _SURE_COUNT:
             expected = expected + np.median((own - expected)[sure], 0)
-        _judge(own, expected, source >= 0, confidence > least, votes)
+        may_accuse = confidence > rules.confidence
+        if rules.in_sight:
+            may_accuse &= _in_sight(view.depth, np.linalg.inv(view_from_other), camera)
+        _judge(own, expected, source >= 0, may_accuse, votes)
     against, for_it = votes
     return cv2.medianBlur(((against >= _LEAST) & (against > for_it)).astype(np.uint8), 3) > 0
 
@@ -159,6 +167,17 @@ def _nearest(depth: NDArray, view_from_other: NDArray[np.float64], lens: NDArray
                 front[int(row), int(column)] = pz
                 source[int(row), int(column)] = y * width + x
     return source
+
+
+def _in_sight(
+    depth: NDArray[np.float32], other_from_view: NDArray[np.float64], camera: Intrinsics
+) -> NDArray[np.bool_]:
+    """(h, w) whether the surface that a depth map shows projects into another view of the same camera; unknown depth
+    may be anywhere."""
+    points = unproject_depth(depth, camera) @ other_from_view[:3, :3].T + other_from_view[:3, 3]
+    xy, z = project(points.reshape(-1, 3), camera)
+    inside = (z > 0) & (xy >= 0).all(1) & (xy < [camera.width, camera.height]).all(1)
+    return np.asarray(inside.reshape(depth.shape) | (depth <= 0))
 
 
 @kernel

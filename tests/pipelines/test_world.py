@@ -116,6 +116,20 @@ def test_the_stairwell_has_bars_of_few_pixels_before_other_things_and_its_floor_
     assert np.abs(color - dull)[names == "floor"].mean() > 0.01
 
 
+def test_the_classroom_has_thirty_desks_on_thin_legs_over_a_floor_without_texture() -> None:
+    room = make_world("classroom", texel=0.03)
+    pose = walk(room, np.array([0.1]))[0]
+    color, depth, solid = render_view(room, OPTIONS, pose)
+    names = np.array(room.class_names)[room.labels[solid]]
+    seen = {name: (names == name).mean() for name in room.class_names}
+    assert min(seen["desk"], seen["wall"], seen["floor"]) > 0.04
+    assert len(np.unique(solid[names == "desk"])) > 30  # tops and legs
+    floor = cv2.erode((names == "floor").astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    steps = np.abs(np.diff(color.astype(np.float32), axis=1))[:, :, 0]
+    assert np.median(steps[floor[:, 1:]]) < 0.2 * np.median(steps[names[:, 1:] == "desk"])
+    assert (depth > 0).all()
+
+
 def test_the_building_goes_on_without_a_hole_and_without_the_whole_of_it() -> None:
     """Every ray ends at a surface, and a place looks the same from whatever module it is built."""
     path = building.Walk(400).poses(np.arange(0, 400, 0.2))

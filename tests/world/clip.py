@@ -12,18 +12,20 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.types import Intrinsics
 from tests.world.build import World, build_world
 from tests.world.cast import render_rays
+from tests.world.classroom import classroom, classroom_walk
 from tests.world.corridor import ring_corridor
 from tests.world.paths import corridor_walk, room_walk
 from tests.world.room import furnished_room
 from tests.world.stairwell import GLOSS, stairwell, stairwell_walk
 
-LAYOUTS = {"room": furnished_room, "corridor": ring_corridor, "stairwell": stairwell}
+LAYOUTS = {"room": furnished_room, "corridor": ring_corridor, "stairwell": stairwell, "classroom": classroom}
 Path = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Laps (N,) -> world_from_cam (N, 4, 4)."""
 _WALKS: dict[str, Path] = {
     "room": room_walk,
     "corridor": corridor_walk,
     "stairwell": stairwell_walk,
+    "classroom": classroom_walk,
 }
 
 ROWS = 4
@@ -75,8 +77,8 @@ class WorldFrame:
 
 
 def make_world(layout: str = "room", seed: int = 0, texel: float = 0.005, blank_walls: bool = False) -> World:
-    """A synthetic world with exact truth: "room" (furnished, one table to walk round), "corridor" (repeats itself) or
-    "stairwell" (thin bars before other things, over a polished floor).
+    """A synthetic world with exact truth: "room" (furnished, one table to walk round), "corridor" (repeats itself),
+    "stairwell" (thin bars before other things, over a polished floor) or "classroom" (thirty desks on a plain floor).
 
     texel: metres per texture pixel on walls. The same arguments give the same bytes.
     """

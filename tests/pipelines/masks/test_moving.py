@@ -1,5 +1,7 @@
 """What moved is found by what the other keyframes see behind it; where nothing moves, nothing is found."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -57,9 +59,19 @@ def test_a_thing_that_walks_along_a_wall_is_found() -> None:
     assert 0 < np.mean(beside) < 0.04  # the rim
 
 
-@pytest.mark.parametrize("stands_at", [2.0, 3.5])
+@pytest.mark.parametrize("stands_at", [0.5, 2.0, 3.5])
 def test_a_thing_that_stands_is_part_of_the_scene(stands_at: float) -> None:
+    """Also one that is so close that most of the others look past it, at the wall behind."""
     assert find(clip(stands_at)[0]) == {}
+
+
+def test_wrong_guesses_over_a_plain_surface_accuse_nobody() -> None:
+    views, things = clip(WALL)
+    guessed = [
+        replace(v, depth=np.where(t, v.depth * 0.7, v.depth), confidence=np.where(t, np.float32(0.276), v.confidence))
+        for v, t in zip(views, things, strict=True)
+    ]
+    assert find(guessed) == {}
 
 
 def test_nothing_is_said_of_one_view_or_of_views_without_depth() -> None:
