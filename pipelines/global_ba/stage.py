@@ -53,6 +53,8 @@ DRIFT_PX = 6.0
 """A loop that is off by more pixels starts a pose graph."""
 JOINT_PX = 0.5
 """What counts as moved."""
+JOINT_PASSES = 4.0
+"""Visits of each keyframe as map and poses are refined together."""
 _VIEWS_ROOM = 100e6
 """Bytes of features of keyframes that are kept for the next pair."""
 
@@ -86,7 +88,7 @@ def run(context: StageContext) -> dict[str, Any]:
     if settings.joint == "always" or (settings.joint == "moved" and moved_px >= JOINT_PX):
         if gaussian_map is None:
             gaussian_map = context.run.load(MAP, "mapping").to(context.device)
-        refined = refine_map(context, gaussian_map, trajectory, fields, settings.joint_passes)
+        refined = refine_map(context, gaussian_map, trajectory, fields, JOINT_PASSES)
     return save(context, model, trajectory, gaussian_map, found, closed, refined, moved_px)
 
 

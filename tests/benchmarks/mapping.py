@@ -65,7 +65,6 @@ CASES = {
 
 ABLATIONS = {
     **ARTICLE_ABLATIONS,
-    "without splitting": ("mapping.split_error=0.0",),
     "without exposure": ("mapping.exposure=false",),
     "without pose refinement": ("mapping.refine_poses=false",),
 }

@@ -36,7 +36,7 @@ from tests.pretend_device import DEVICE, PretendTensor, WrongDeviceError, preten
 CONFIG = Config(
     proxy=ProxyConfig(max_side=96, stereo_side=80, stereo_planes=24),
     mapping=MappingConfig(passes=2.0, min_iterations=0, max_side=40, hold_out=4),
-    global_ba=GlobalBaConfig(use_loops=False, joint="always", joint_passes=1.0),
+    global_ba=GlobalBaConfig(use_loops=False, joint="always"),
     export=ExportConfig(voxel=0.05, mesh_side=40),
 )
 
