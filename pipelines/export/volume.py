@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs_slam.formats.sog import morton_codes
 from msgs_slam.pipelines.depth.posed import PosedDepth
 from msgs_slam.pipelines.gaussians.render.jit import kernel
 from msgs_slam.pipelines.geometry.camera import unproject_depth
@@ -78,7 +79,7 @@ class Grid:
     def regions(self, at_once: int = _AT_ONCE) -> Iterator[NDArray[np.int32]]:
         """(R, 3) chunks that lie together and have about so many blocks."""
         chunks, counts = np.unique(self.blocks // CHUNK, axis=0, return_counts=True)
-        order = np.argsort(_along_curve(chunks), kind="stable")
+        order = np.argsort(morton_codes(chunks - chunks.min(axis=0, initial=0)), kind="stable")
         number = (np.cumsum(counts[order]) - 1) // at_once
         for n in np.unique(number):
             yield chunks[order[number == n]]
@@ -133,16 +134,6 @@ def touched_blocks(views: Iterable[PosedDepth], voxel: float, truncation: float)
 def chunk_keys(cells: NDArray[np.integer]) -> NDArray[np.int64]:
     """(N, 3) coordinates of chunks → (N,) a number for each."""
     return voxel_keys(cells.astype(np.float64), 1.0)
-
-
-def _along_curve(cells: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Numbers in whose order neighbours follow each other: the bits of the coordinates in turn (Morton 1966)."""
-    cells = cells.astype(np.int64) - cells.min(axis=0, initial=0)
-    number = np.zeros(len(cells), np.int64)
-    for bit in range(21):
-        for axis in range(3):
-            number |= (cells[:, axis] >> bit & 1) << 3 * bit + axis
-    return number
 
 
 def fuse(grid: Grid, chunks: NDArray[np.int32], views: Iterable[PosedDepth], threads: int) -> Volume:
