@@ -200,8 +200,7 @@ def correct_trajectory(trajectory: Trajectory, state: TrackState, model: SparseM
     new = np.array([state.poses[i] for i in model.frame_ids.tolist()])
     old, refined = model.cam_from_world, poses_of(trajectory, model.frame_ids)
     # new_from_refined = (new_from_old in the camera), with distances stretched by the keyframe's ratio.
-    small = refined @ se3.inverse(old)
-    small[:, :3, 3] *= ratio[:, None]
+    small = se3.scaled(refined @ se3.inverse(old), ratio)
     poses = follow_keyframes(
         trajectory.frame_ids, trajectory.cam_from_world, model.frame_ids, refined, small @ new, ratio
     )
