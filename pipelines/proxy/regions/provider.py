@@ -26,6 +26,7 @@ from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import VOID, ClassTable, Frame
 from msgs_slam.pipelines.voxels.layout import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
 from msgs_slam.pipelines.voxels.voxels import (
+    LEAST_WEIGHT,
     VOXELS_PER_DEPTH,
     Voxels,
     find_near,
@@ -40,7 +41,6 @@ _LEAST_CONFIDENCE = 0.3
 _REACH = 40.0
 _COLOR_SD = 40.0
 _LEAST_VOTE = 1e-3
-_LEAST_WEIGHT = 1.5
 
 
 class SegmentLabels:
@@ -90,8 +90,8 @@ class SegmentLabels:
         self._size = _scene_depth([depth_of(f) for f in posed[:: max(1, len(posed) // 12)]]) / VOXELS_PER_DEPTH
         release_free_memory()  # what depths and moving things have needed
         tracked = self._progress.track(posed, "regions", len(posed))
-        voxels = merge(self._size, (self._gather(f, depth_of(f)) for f in tracked))
-        voxels, self._size = select(voxels, voxels.weight > _LEAST_WEIGHT), voxels.size
+        voxels = merge(self._size, (self._gather(f, depth_of(f)) for f in tracked), least=LEAST_WEIGHT)
+        self._size = voxels.size
         cameras = np.array([self._world_from_cam[f.id] for f in posed])
         gravity = find_gravity(voxels, -cameras[:, :3, 1].mean(0))
         return voxels, gravity, name_structure(voxels, gravity, cameras[:, :3, 3])
