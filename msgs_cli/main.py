@@ -46,7 +46,7 @@ class FriendlyGroup(click.Group):
     traceback. Where `--log-format json` is asked for, all that is JSON lines."""
 
     def main(self, args: Sequence[str] | None = None, *rest: Any, **more: Any) -> Any:
-        """As click's."""
+        """Run the command line, as click does."""
         words = sys.argv[1:] if args is None else list(args)
         if not is_asked_for(words):
             return super().main(args, *rest, **more)

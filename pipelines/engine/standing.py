@@ -27,7 +27,7 @@ def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) 
 
 
 def next_upstream(upstream: str, record: StageRecord) -> str:
-    """What the stages after `record` are made from, as one digest."""
+    """Digest of everything that the stages after `record` are made from."""
     return hashlib.sha256((upstream + record.content).encode()).hexdigest()
 
 

@@ -103,12 +103,12 @@ class MeshJob:
 
     @property
     def scratch(self) -> Path:
-        """Where views and regions lie."""
+        """Folder of the snapshots of views and regions."""
         return scratch_of(self.context)
 
     @property
     def ply(self) -> Path:
-        """Of the mesh, which a texture needs too."""
+        """Path of the mesh, which a texture needs too."""
         return (self.folder if "mesh" in self.kinds else self.scratch) / "mesh.ply"
 
     @property
@@ -118,7 +118,7 @@ class MeshJob:
 
 
 def write_meshes(job: MeshJob, outcome: Outcome, world: World) -> list[Path]:
-    """What the job asks for; `outcome` has been moved, and may be without its map."""
+    """Write what the job asks for; `outcome` has been moved, and may be without its map."""
     names, axes = outcome.classes.names, world.gltf_from_exported
     glb, count = job.folder / "mesh.glb", len(keyframe_rows(outcome))
     views = drawn_views(job.scratch, count)
@@ -143,12 +143,12 @@ def write_meshes(job: MeshJob, outcome: Outcome, world: World) -> list[Path]:
 
 
 def mesh_kinds(settings: ExportConfig) -> tuple[str, ...]:
-    """What `write_meshes` is to write when nothing in particular is asked for."""
+    """List what `write_meshes` is to write when nothing in particular is asked for."""
     return ("mesh", "texture") if settings.texture else ("mesh",)
 
 
 def guess_metres(context: StageContext, outcome: Outcome, settings: ExportConfig) -> Metres | None:
-    """How long the unit of the run's world is; what speaks against it is warned of."""
+    """Estimate how long the unit of the run's world is, and warn of what speaks against it."""
     machine, guess = Machine(context.threads, context.device), settings.scale == "auto"
     found = find_metres(context.run, outcome.trajectory, metric_card() if guess else None, machine, guess)
     if found.warning:
@@ -157,7 +157,7 @@ def guess_metres(context: StageContext, outcome: Outcome, settings: ExportConfig
 
 
 def metres_figures(metres: Metres | None) -> dict[str, Any]:
-    """How long the unit is, and where that comes from."""
+    """Report how long the unit is, and where that comes from."""
     if metres is None:
         return {"metres_per_unit": None}
     return {
@@ -170,7 +170,7 @@ def metres_figures(metres: Metres | None) -> dict[str, Any]:
 
 
 def gps_metres(world: World) -> Metres | None:
-    """How long the unit of the run's own world is, by GPS."""
+    """Derive from GPS how long the unit of the run's own world is."""
     if world.earth is None:
         return None
     return Metres(world.exported_from_run.scale, max(world.earth.scale_sd, 1e-3), False, ("GPS",))

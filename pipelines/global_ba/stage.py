@@ -135,7 +135,7 @@ def keyframe_views(context: StageContext, model: SparseModel, pictures: Pictures
 
 
 def load_summaries(run: RunFolder, model: SparseModel) -> list[LabelSummary]:
-    """What the labels say of every keyframe; nothing where it has none."""
+    """Summarise the labels of every keyframe; those of one without labels say nothing."""
     classes = len(run.load(CLASSES))
     unknown = np.full((2, 2), VOID, np.uint8)
     ids = model.frame_ids.tolist()
@@ -209,7 +209,7 @@ def correct_trajectory(trajectory: Trajectory, state: TrackState, model: SparseM
 
 
 def largest_motion(context: StageContext, state: TrackState, model: SparseModel) -> float:
-    """How far, in pixels, the keyframes have moved against each other: the largest over keyframes."""
+    """Measure how far, in pixels, the keyframes have moved against each other: the largest over keyframes."""
     new = np.array([state.poses[i] for i in model.frame_ids.tolist()])
     moved = se3.inverse(new) @ model.cam_from_world
     apart = se3.inverse(moved[:1]) @ moved

@@ -88,7 +88,7 @@ class ViewerScene:
 
     @cached_property
     def opacities(self) -> NDArray[np.float32]:
-        """(M, 1)."""
+        """Opacities (M, 1) in 0..1, as the page wants them."""
         return (1 / (1 + np.exp(-self.cloud.opacity_logits)))[:, None].astype(np.float32)
 
     @cached_property

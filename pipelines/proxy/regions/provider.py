@@ -16,7 +16,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.geometry.camera import unproject_depth
 from msgs_slam.pipelines.proxy.interface.palette import class_colors
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate, SemanticsProvider
 from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.proxy.regions.parts import cut_parts
 from msgs_slam.pipelines.proxy.regions.spread import spread_votes
@@ -43,7 +43,7 @@ _COLOR_SD = 40.0
 _LEAST_VOTE = 1e-3
 
 
-class SegmentLabels:
+class SegmentLabels(SemanticsProvider):
     """Unsupervised regions; needs poses (a backbone), because they make the regions consistent over the video."""
 
     name = "segments"
@@ -64,16 +64,9 @@ class SegmentLabels:
         self._gravity: list[float] = []
         self._world_from_cam = {k: np.linalg.inv(v).astype(np.float64) for k, v in sequence.cam_from_world.items()}
 
-    def warnings(self) -> list[str]:
-        """Nothing is ever amiss."""
-        return []
-
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames without a pose."""
         return [f for f in frames if f.id not in self._world_from_cam]
-
-    def look(self, frames: list[Frame]) -> None:
-        """Do nothing: segments need all frames together."""
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Gather all frames and cut the scene."""
