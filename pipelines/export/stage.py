@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,12 +35,10 @@ from msgs_slam.pipelines.export.usd import write_usd
 from msgs_slam.pipelines.export.web_page import write_web_page
 from msgs_slam.pipelines.export.writers import (
     write_colmap,
-    write_glb_file,
     write_notes,
     write_ply,
     write_readme,
-    write_sog_file,
-    write_spz_file,
+    write_splats,
     write_trajectory,
     write_world,
 )
@@ -224,8 +223,8 @@ def write_all_but_mesh(outcome: Outcome, world: World, settings: ExportConfig, f
     """COLMAP model, PLYs, trajectory, notes; SPZ and GLB where the settings want them, tiles of a map that was made in
     parts. `outcome` stands in `world`."""
     paths = write_colmap(outcome, folder) + write_ply(outcome, settings.sh_rest, folder)
-    paths += write_spz_file(outcome, world, settings.spz_version, folder) if settings.spz else []
-    paths += write_glb_file(outcome, world, folder) if settings.splat_glb else []
+    paths += write_splats("spz", outcome, world, settings, folder) if settings.spz else []
+    paths += write_splats("glb", outcome, world, settings, folder) if settings.splat_glb else []
     paths += write_tiles(outcome, world, folder) if outcome.run.load(SUBMAPS) else []
     return paths + write_trajectory(outcome, folder) + write_notes(outcome, world, folder)
 
@@ -261,9 +260,7 @@ def export_run(
     writers: dict[str, Callable[[], list[Path]]] = {
         "colmap": lambda: write_colmap(outcome, folder),
         "ply": lambda: write_ply(outcome, settings.sh_rest, folder),
-        "spz": lambda: write_spz_file(outcome, world, settings.spz_version, folder),
-        "sog": lambda: write_sog_file(outcome, world, folder),
-        "glb": lambda: write_glb_file(outcome, world, folder),
+        **{k: partial(write_splats, k, outcome, world, settings, folder) for k in ("spz", "sog", "glb")},
         "tiles": lambda: write_tiles(outcome, world, folder),
         "html": lambda: write_web_page(outcome, world, folder),
         "mesh": lambda: mesh("mesh"),

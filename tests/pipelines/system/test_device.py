@@ -94,7 +94,7 @@ def test_it_is_measured_there(run: RunFolder, world_sequence: Path) -> None:
 
 
 def test_it_is_drawn_there(run: RunFolder, tmp_path: Path) -> None:
-    render_run(run, tmp_path / "pictures", path="own", frames=2)
+    render_run(run, tmp_path / "pictures", path="own", fps=0.1)
     assert len(list((tmp_path / "pictures").iterdir())) == 2
 
 
