@@ -43,7 +43,7 @@ from msgs_slam.pipelines.export.writers import (
     write_world,
 )
 from msgs_slam.pipelines.mapping.depth_views import Shown
-from msgs_slam.pipelines.metres.find import Machine, find_metres
+from msgs_slam.pipelines.metres.find import find_metres
 from msgs_slam.pipelines.networks.identity import card_identity
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.proxy.selection import metric_card
@@ -148,11 +148,12 @@ def mesh_kinds(settings: ExportConfig) -> tuple[str, ...]:
 
 def guess_metres(context: StageContext, outcome: Outcome, settings: ExportConfig) -> Metres | None:
     """Estimate how long the unit of the run's world is, and warn of what speaks against it."""
-    machine, guess = Machine(context.threads, context.device), settings.scale == "auto"
-    found = find_metres(context.run, outcome.trajectory, metric_card() if guess else None, machine, guess)
-    if found.warning:
-        context.warn(found.warning)
-    return found.metres
+    guess = settings.scale == "auto"
+    card = metric_card() if guess else None
+    metres, warning = find_metres(context.run, outcome.trajectory, guess, card, context.threads, context.device)
+    if warning:
+        context.warn(warning)
+    return metres
 
 
 def metres_figures(metres: Metres | None) -> dict[str, Any]:
