@@ -42,7 +42,7 @@ def close_loops(
 ) -> Closed:
     """Adjust `state` (changed in place) with the loops."""
     before = reprojection_error(state, intrinsics)
-    original = {i: s for i, s in state.sightings.items()}
+    original = dict(state.sightings)
     if drifted:
         straighten(state, loops)
     add_sightings(state, loops)
