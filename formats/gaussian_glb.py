@@ -129,7 +129,6 @@ def _cloud(arrays: dict[str, NDArray[np.float32]]) -> GaussianCloud:
     opacity = arrays[f"{EXTENSION}:OPACITY"][:, 0].astype(np.float64).clip(_LEAST_OPACITY, 1 - _LEAST_OPACITY)
     quat_xyzw = arrays[f"{EXTENSION}:ROTATION"] * np.append(_FLIP, np.float32(1))
     smallest = np.finfo(np.float32).tiny
-    degrees = [int(n.split("_DEGREE_")[1].split("_")[0]) for n in arrays if "SH_DEGREE_" in n]
     return GaussianCloud(
         means=arrays["POSITION"] * _FLIP,
         log_scales=np.log(np.maximum(arrays[f"{EXTENSION}:SCALE"], smallest)),
@@ -137,5 +136,4 @@ def _cloud(arrays: dict[str, NDArray[np.float32]]) -> GaussianCloud:
         opacity_logits=np.log(opacity / (1 - opacity)).astype(np.float32),
         colors=arrays[f"{EXTENSION}:SH_DEGREE_0_COEF_0"] * np.float32(SH_C0) + np.float32(0.5),
         class_ids=arrays[_LABEL][:, 0].astype(np.uint8) if _LABEL in arrays else None,
-        dropped_sh_degree=max(degrees, default=0),
     )

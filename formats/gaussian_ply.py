@@ -101,7 +101,6 @@ def _cloud(ply: PlyData, path: Path) -> GaussianCloud:
         colors=columns(vertex, _DC, path) * np.float32(SH_C0) + np.float32(0.5),
         class_ids=vertex["class_id"].astype(np.uint8) if "class_id" in names else None,
         class_probs=_class_probs(vertex, ply.comments, path),
-        dropped_sh_degree=_rest_degree(names),
     )
 
 
@@ -135,8 +134,3 @@ def _class_probs(vertex: NDArray[Any], comments: list[str], path: Path) -> NDArr
     out = np.zeros((len(vertex), count), np.float32)
     out[:, classes] = columns(vertex, names, path)
     return out
-
-
-def _rest_degree(names: tuple[str, ...]) -> int:
-    count = sum(name.startswith("f_rest_") for name in names)
-    return max(degree for degree, needed in _REST_COUNTS.items() if needed <= count)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,8 @@ class GaussianCloud:
 
     means (M, 3); log_scales (M, 3) logarithms of the standard deviations along the own axes; quat_wxyz (M, 4) turning
     own axes into the world; opacity_logits (M,); colors (M, 3) RGB seen from everywhere, 0..1 for what a screen can
-    show; all float32. class_ids (M,) uint8 and class_probs (M, C) float32, None where the file has none.
-    `dropped_sh_degree` says up to which degree the file held view-dependent colour, which is not kept.
+    show; all float32. class_ids (M,) uint8 and class_probs (M, C) float32, None where the file has none. View-dependent
+    colour is not kept.
     """
 
     means: NDArray[np.float32]
@@ -32,7 +32,6 @@ class GaussianCloud:
     colors: NDArray[np.float32]
     class_ids: NDArray[np.uint8] | None = None
     class_probs: NDArray[np.float32] | None = None
-    dropped_sh_degree: int = 0
 
     def __post_init__(self) -> None:
         m = len(self.means)
@@ -60,9 +59,8 @@ class GaussianCloud:
 
     def only(self, rows: NDArray) -> GaussianCloud:
         """Select Gaussians by a mask (M,) or by indices."""
-        arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "dropped_sh_degree"}
-        chosen: dict[str, Any] = {name: None if a is None else a[rows] for name, a in arrays.items()}
-        return replace(self, **chosen)
+        chosen: dict[str, Any] = {name: None if a is None else a[rows] for name, a in vars(self).items()}
+        return GaussianCloud(**chosen)
 
 
 def unit_quaternions(quat: NDArray) -> NDArray[np.float32]:

@@ -54,7 +54,7 @@ class ModelArrays:
         )
 
     def reread(self, model: pycolmap.Reconstruction) -> ModelArrays:
-        """The same observations, by the poses and points that the model has by now."""
+        """Read the poses and points that the model has by now; the observations stay."""
         poses, points = _poses(model, self.image_ids.tolist()), _positions(model, self.point_ids.tolist())
         return replace(self, cam_from_world=poses, points=points)
 

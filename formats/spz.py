@@ -103,7 +103,7 @@ def read_spz_stream(plain: BinaryIO, size: int, path: Path) -> GaussianCloud:
         magic, version, count, degree, fraction_bits, _, _ = _HEADER.unpack(file.read(_HEADER.size))
         _require_sane(path, magic == _MAGIC and version in (2, 3), count, degree, fraction_bits, most)
         streams = [_fields(file, count, width) for width in (9, 1, 3, 3, 3 if version == 2 else 4)]
-    return _unpacked(streams, degree, fraction_bits)
+    return _unpacked(streams, fraction_bits)
 
 
 def _read_version_4(file: BinaryIO, path: Path, most: int) -> GaussianCloud:
@@ -116,7 +116,7 @@ def _read_version_4(file: BinaryIO, path: Path, most: int) -> GaussianCloud:
         data = io.BytesIO(file.read(min(packed, most)))
         with zstandard.ZstdDecompressor().stream_reader(data) as stream:
             streams.append(_fields(stream, count, width))
-    return _unpacked(streams, degree, fraction_bits)
+    return _unpacked(streams, fraction_bits)
 
 
 def _require_sane(path: Path, known: bool, count: int, degree: int, fraction_bits: int, most: int) -> None:
@@ -126,7 +126,7 @@ def _require_sane(path: Path, known: bool, count: int, degree: int, fraction_bit
         raise InputError(f"{path} declares {count} Gaussians, more than it can contain: it is damaged")
 
 
-def _unpacked(streams: list[NDArray[np.uint8]], degree: int, fraction_bits: int) -> GaussianCloud:
+def _unpacked(streams: list[NDArray[np.uint8]], fraction_bits: int) -> GaussianCloud:
     """Positions, opacities, colours, scales, rotations as bytes (M, 9), (M, 1), (M, 3), (M, 3), (M, 3 or 4)."""
     positions, opacities, colors, scales, rotations = streams
     quat_xyzw = _first_three(rotations) if rotations.shape[1] == 3 else _smallest_three(rotations)
@@ -137,7 +137,6 @@ def _unpacked(streams: list[NDArray[np.uint8]], degree: int, fraction_bits: int)
         quat_wxyz=unit_quaternions((quat_xyzw * np.append(_FLIP, 1))[:, [3, 0, 1, 2]]),
         opacity_logits=np.log(inside / (1 - inside)).astype(np.float32),
         colors=((colors / 255.0 - 0.5) / _COLOR_SCALE * SH_C0 + 0.5).astype(np.float32),
-        dropped_sh_degree=degree,
     )
 
 

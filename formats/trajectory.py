@@ -140,11 +140,3 @@ def clean_poses(matrices: NDArray[np.float64], name: str) -> NDArray[np.float64]
     result[known, :3, :3] = nearest_rotation(rotations)
     result[known, 3] = [0, 0, 0, 1]
     return result
-
-
-def write_matrices(path: Path, world_from_cam: NDArray[np.float64]) -> None:
-    """Write (N, 4, 4) as one row-major matrix of 16 numbers a line, with all digits of float64."""
-    if world_from_cam.ndim != 3 or world_from_cam.shape[1:] != (4, 4):
-        raise ValueError(f"write_matrices: got shape {world_from_cam.shape}, expected (N, 4, 4)")
-    lines = (" ".join(repr(float(value)) for value in matrix.ravel()) for matrix in world_from_cam)
-    write_text(path, "".join(line + "\n" for line in lines))

@@ -13,15 +13,11 @@ from msgs_slam.msgs_cli.options import (
     UNTIL,
     engine_options,
     require_engine,
-    set_up_logging,
     settings_options,
     source_options,
     source_settings,
-    stopping_softly,
-    tell_result,
-    verbosity_options,
-    worker_setup,
 )
+from msgs_slam.msgs_cli.output import Output, verbosity_options
 from msgs_slam.msgs_cli.text import say
 
 if TYPE_CHECKING:
@@ -46,8 +42,7 @@ def batch(
     config_file: Path | None,
     overrides: tuple[str, ...],
     until: str,
-    quiet: bool,
-    verbose: bool,
+    output: Output,
     **about_source: str | None,
 ) -> None:
     """Reconstruct every video, image folder and data set in FOLDER, a run each, and go on after failures.
@@ -56,7 +51,6 @@ def batch(
     goes on where it was stopped. With --shard many machines share the work over one disk (SLURM arrays, Kubernetes
     indexed jobs, AWS Batch: docs/batch.md).
     """
-    set_up_logging(quiet, verbose)
     require_engine(engine_name, address)
     from msgs_slam.formats.jsonfile import read_toml
     from msgs_slam.pipelines.batch import find_recordings, run_batch, table_rows, write_table
@@ -71,18 +65,18 @@ def batch(
     out.mkdir(parents=True, exist_ok=True)
     engine, cpus, threads = _open_engine(engine_name, address, config.run.threads)
     gpus = int(config.run.device == "cuda")
-    prepare = worker_setup(quiet, verbose, engine_name == "ray")
+    prepare = output.worker_setup(remote=engine_name == "ray")
     try:
-        with stopping_softly("The same command goes on with it."):
+        with output.stopping_softly("The same command goes on with it."):
             failed = run_batch(mine, engine, settings, texts, until, prepare, cpus, gpus, threads)
     finally:
         rows = table_rows(recordings)
         write_table(out, rows)
         if engine_name == "ray":
             engine.close()  # type: ignore[union-attr]
-    if not quiet:
+    if not output.quiet:
         _print(rows)
-    tell_result(quiet, table=out / "batch.json", runs=[r.run for r in mine], failed=[r.run for r in failed])
+    output.tell_result(table=out / "batch.json", runs=[r.run for r in mine], failed=[r.run for r in failed])
     if failed:
         say(f"{len(failed)} of {len(mine)} recordings failed; {out}/NAME.failed.txt says why", err=True)
         sys.exit(1)

@@ -6,22 +6,16 @@ from pathlib import Path
 
 import click
 
-from msgs_slam.msgs_cli.options import (
-    RUN_ARGUMENT,
-    make_progress,
-    set_up_logging,
-    stopping_softly,
-    tell_result,
-    verbosity_options,
-)
-from msgs_slam.msgs_cli.summary import print_summary, result_paths
+from msgs_slam.msgs_cli.options import RUN_ARGUMENT
+from msgs_slam.msgs_cli.output import Output, verbosity_options
+from msgs_slam.msgs_cli.summary import tell_run
 
 
 @click.command()
 @RUN_ARGUMENT
 @click.argument("videos", metavar="VIDEO...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @verbosity_options
-def extend(run_path: Path, videos: tuple[Path, ...], quiet: bool, verbose: bool) -> None:
+def extend(run_path: Path, videos: tuple[Path, ...], output: Output) -> None:
     """Add VIDEO, by the same camera and of the same place, to the finished RUN.
 
     First a few images of it are looked for in the run: where nothing is recognised, or the camera is another one, that
@@ -29,13 +23,10 @@ def extend(run_path: Path, videos: tuple[Path, ...], quiet: bool, verbose: bool)
     together, and the map is grown where the added frames look. Coordinates stay what they were, as near as the
     adjustment allows. Stopped, the same command or `msgs-slam resume RUN` goes on.
     """
-    set_up_logging(quiet, verbose)
     from msgs_slam.pipelines.reconstruct import extend as extend_run
     from msgs_slam.pipelines.run.folder import RunFolder
 
     run = RunFolder(run_path)
-    with stopping_softly(f"Resume with: msgs-slam resume {run.root}"):
-        records = extend_run(run, videos, make_progress(quiet))
-    if not quiet:
-        print_summary(run.root, records)
-    tell_result(quiet, **result_paths(run.root, records))
+    with output.stopping_softly(f"Resume with: msgs-slam resume {run.root}"):
+        records = extend_run(run, videos, output.progress())
+    tell_run(output, run.root, records)

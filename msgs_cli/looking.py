@@ -4,21 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 from pathlib import Path
 from typing import Any
 
 import click
 
-from msgs_slam.msgs_cli.options import (
-    RUN_ARGUMENT,
-    ending_quietly,
-    like_ctrl_c,
-    make_progress,
-    open_run,
-    set_up_logging,
-    tell_result,
-    verbosity_options,
-)
+from msgs_slam.msgs_cli.options import RUN_ARGUMENT, open_run
+from msgs_slam.msgs_cli.output import Output, on_sigterm, verbosity_options
 from msgs_slam.msgs_cli.text import say
 
 
@@ -60,9 +53,8 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
     help="A TOML of the run's classes to the truth's. Default: one that comes with the program, where it fits.",
 )  # fmt: skip
 @verbosity_options
-def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | None, quiet: bool, verbose: bool) -> None:
+def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | None, output: Output) -> None:
     """Compare RUN with the truth: poses, images, depth, labels, mesh. Writes RUN/evaluation/."""
-    set_up_logging(quiet, verbose)
     from msgs_slam.formats.datasets import open_sequence
     from msgs_slam.pipelines.evaluation.class_map import open_class_map
     from msgs_slam.pipelines.evaluation.table import evaluation_table
@@ -71,10 +63,10 @@ def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | No
     joins = open_class_map(class_map) if class_map else None
     run = open_run(run_path)
     sequence = open_sequence(truth, truth_format)
-    with ending_quietly():
-        figures = write_evaluation(run, sequence, make_progress(quiet), class_map=joins)
+    with on_sigterm(signal.SIG_DFL):
+        figures = write_evaluation(run, sequence, output.progress(), class_map=joins)
     say(evaluation_table(figures))
-    tell_result(quiet, evaluation=run.evaluation_file.parent)
+    output.tell_result(evaluation=run.evaluation_file.parent)
 
 
 @click.command()
@@ -84,21 +76,20 @@ def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | No
 )
 @click.option("--pdf", is_flag=True, help="Print it beside as a PDF, too; needs Chromium or Chrome.")
 @verbosity_options
-def report(run_path: Path, to: Path | None, pdf: bool, quiet: bool, verbose: bool) -> None:
+def report(run_path: Path, to: Path | None, pdf: bool, output: Output) -> None:
     """Write one HTML file that says what was found, how good it is, and what to film better."""
-    set_up_logging(quiet, verbose)
     from msgs_slam.pipelines.evaluation.pdf import find_browser, print_pdf
     from msgs_slam.pipelines.evaluation.report import write_report
 
     browser = find_browser() if pdf else ""
-    with ending_quietly():
-        made = [write_report(open_run(run_path), to, make_progress(quiet))]
+    with on_sigterm(signal.SIG_DFL):
+        made = [write_report(open_run(run_path), to, output.progress())]
         if pdf:
             made.append(made[0].with_suffix(".pdf"))
             print_pdf(made[0], made[1], browser)
     for path in made:
         say(path)
-    tell_result(quiet, report=made[0], **dict(zip(["pdf"], made[1:], strict=False)))
+    output.tell_result(report=made[0], **dict(zip(["pdf"], made[1:], strict=False)))
 
 
 SPLAT_FILES = (".ply", ".spz", ".glb", ".splat", ".safetensors")
@@ -138,7 +129,7 @@ class Size(click.ParamType):
 @verbosity_options
 def render(
     source: Path, target: Path, kind: str, camera_path: str, fps: float | None, size: tuple[int, int] | None,
-    quiet: bool, verbose: bool,
+    output: Output,
 ) -> None:  # fmt: skip
     """Draw the map of RUN along a camera path, or any splat FILE (.ply, .spz, .glb, .splat) along an orbit or a
     recorded path, into a video or a folder of images.
@@ -146,19 +137,18 @@ def render(
     An .mp4 is H.264 where PyAV is installed (pip install 'msgs-slam[hdr]'), else VP9: browsers play both. An .avi or
     .mkv loses nothing (FFV1).
     """
-    set_up_logging(quiet, verbose)
     from msgs_slam.pipelines.render_run import render_file, render_run
 
     is_file = source.is_file() and source.suffix.lower() in SPLAT_FILES
     if is_file and (kind != "color" or camera_path == "own"):
         raise click.UsageError("a splat file has colours and no cameras: --kind color, --path orbit or FILE")
-    with ending_quietly():
+    with on_sigterm(signal.SIG_DFL):
         if is_file:
-            made = render_file(source, target, fps, 0, make_progress(quiet), size, camera_path)
+            made = render_file(source, target, fps, output.progress(), size, camera_path)
         else:
-            made = render_run(open_run(source), target, kind, camera_path, fps, 0, make_progress(quiet), size)
+            made = render_run(open_run(source), target, kind, camera_path, fps, output.progress(), size)
     say(made)
-    tell_result(quiet, video=made)
+    output.tell_result(video=made)
 
 
 @click.command()
@@ -175,7 +165,7 @@ def view(path: Path, port: int, host: str) -> None:
     from msgs_slam.pipelines.viewer.server import open_viewer
 
     try:
-        with like_ctrl_c():
+        with on_sigterm(signal.default_int_handler):
             viewer = open_viewer(path, host, port)
             say(f"open {viewer.url} in a browser; Ctrl-C ends it", err=True)
             try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,19 +28,14 @@ from msgs_slam.msgs_cli.options import (
     UNTIL,
     cluster_workers,
     device_option,
-    ending_quietly,
     engine_options,
-    make_progress,
     open_run,
-    set_up_logging,
     settings_options,
     source_options,
     source_settings,
-    stopping_softly,
-    tell_result,
-    verbosity_options,
 )
-from msgs_slam.msgs_cli.summary import print_summary, result_paths
+from msgs_slam.msgs_cli.output import Output, on_sigterm, verbosity_options
+from msgs_slam.msgs_cli.summary import print_summary, tell_run
 from msgs_slam.msgs_cli.text import flush_output, prepare_streams, printable, say
 from msgs_slam.msgs_cli.work import work
 from msgs_slam.pipelines.run.names import EXPORTS
@@ -50,7 +46,7 @@ class FriendlyGroup(click.Group):
     traceback. Where `--log-format json` is asked for, all that is JSON lines."""
 
     def main(self, args: Sequence[str] | None = None, *rest: Any, **more: Any) -> Any:
-        """As click's."""
+        """Run the command line, as click does."""
         words = sys.argv[1:] if args is None else list(args)
         if not is_asked_for(words):
             return super().main(args, *rest, **more)
@@ -146,8 +142,7 @@ def reconstruct(
     hold_out: int | None,
     engine_name: str,
     address: str,
-    quiet: bool,
-    verbose: bool,
+    output: Output,
     **about_source: str | None,
 ) -> None:
     """Reconstruct SOURCE, a video, a folder of images or a data set, into a run folder; of several videos by one camera
@@ -156,7 +151,6 @@ def reconstruct(
     No option is needed. Stopped at any moment, the same command, or `msgs-slam resume RUN`, goes on where it was; with
     a changed setting only the stages that depend on it run again.
     """
-    set_up_logging(quiet, verbose)
     from msgs_slam.pipelines.read_config import load_config
     from msgs_slam.pipelines.reconstruct import default_run_folder, existing_config, one_source
     from msgs_slam.pipelines.reconstruct import reconstruct as run_reconstruct
@@ -167,13 +161,11 @@ def reconstruct(
     texts += [f"mapping.hold_out={hold_out}"] if hold_out is not None else []
     config = load_config(config_file, [*overrides, *texts], base=existing_config(run))
     with (
-        cluster_workers(engine_name, address, config, quiet, verbose) as (workers, config),
-        stopping_softly(f"Resume with: msgs-slam resume {run.root}"),
+        cluster_workers(engine_name, address, config, output) as workers,
+        output.stopping_softly(f"Resume with: msgs-slam resume {run.root}"),
     ):
-        records = run_reconstruct(one_source(sources, run), run, config, make_progress(quiet), until, workers)
-    if not quiet:
-        print_summary(run.root, records)
-    tell_result(quiet, **result_paths(run.root, records))
+        records = run_reconstruct(one_source(sources, run), run, config, output.progress(), until, workers)
+    tell_run(output, run.root, records)
 
 
 @main.command()
@@ -190,12 +182,10 @@ def resume(
     until: str,
     engine_name: str,
     address: str,
-    quiet: bool,
-    verbose: bool,
+    output: Output,
     **about_source: str | None,
 ) -> None:
     """Resume RUN where it stopped. Finished stages are kept unless one of their settings is changed."""
-    set_up_logging(quiet, verbose)
     from msgs_slam.pipelines.read_config import load_config
     from msgs_slam.pipelines.reconstruct import require_run
     from msgs_slam.pipelines.reconstruct import resume as run_resume
@@ -206,13 +196,11 @@ def resume(
     require_run(run)
     config = load_config(config_file, [*overrides, *source_settings(about_source)], base=load_settings(run))
     with (
-        cluster_workers(engine_name, address, config, quiet, verbose) as (workers, config),
-        stopping_softly(f"Resume with: msgs-slam resume {run.root}"),
+        cluster_workers(engine_name, address, config, output) as workers,
+        output.stopping_softly(f"Resume with: msgs-slam resume {run.root}"),
     ):
-        records = run_resume(run, make_progress(quiet), config, until, workers)
-    if not quiet:
-        print_summary(run.root, records)
-    tell_result(quiet, **result_paths(run.root, records))
+        records = run_resume(run, output.progress(), config, until, workers)
+    tell_run(output, run.root, records)
 
 
 @main.command()
@@ -230,8 +218,7 @@ def export(
     to: Path | None,
     config_file: Path | None,
     overrides: tuple[str, ...],
-    quiet: bool,
-    verbose: bool,
+    output: Output,
 ) -> None:
     """Write the files for other programs: COLMAP model, Gaussian PLY, SPZ, SOG or GLB, labelled mesh, the same with
     a texture, TUM trajectory; `--only html`: one web page that shows the map, to send to somebody; `--only tiles`: 3D
@@ -241,7 +228,6 @@ def export(
     Other settings than the run's own (--set export.voxel=0.02, --set export.spz=true) need --to; `msgs-slam resume RUN
     --set ...` changes them in the run itself.
     """
-    set_up_logging(quiet, verbose)
     if (config_file or overrides) and to is None:
         raise click.UsageError("add --to DIR: files of other settings (--set, --config) do not go into the run")
     from msgs_slam.pipelines.export.stage import export_run
@@ -251,12 +237,12 @@ def export(
     run = open_run(run_path)
     settings = load_config(config_file, overrides, base=made_with(run)).export
     kind, folder = _COMES_WITH.get(only or "", only), to or run.stage("export")
-    with ending_quietly():
-        written = export_run(run, folder, kind, make_progress(quiet), settings)
+    with on_sigterm(signal.SIG_DFL):
+        written = export_run(run, folder, kind, output.progress(), settings)
     for path in written:
-        if not quiet:
+        if not output.quiet:
             say(path)
-    tell_result(quiet, export=folder, files=written)
+    output.tell_result(export=folder, files=written)
 
 
 @main.command()
@@ -276,12 +262,10 @@ def demo(
     out: Path,
     config_file: Path | None,
     overrides: tuple[str, ...],
-    quiet: bool,
-    verbose: bool,
+    output: Output,
     **about_source: str | None,
 ) -> None:
     """Reconstruct a short video of a made-up room, compare with its known truth, print the errors and where to look."""
-    set_up_logging(quiet, verbose)
     from msgs_slam.pipelines.demo import demo_summary, run_demo
     from msgs_slam.pipelines.read_config import load_config
     from msgs_slam.pipelines.reconstruct import reconstruct as run_reconstruct
@@ -290,17 +274,17 @@ def demo(
     config = load_config(config_file, [*overrides, *source_settings(about_source)])
 
     def reconstruct_clip(video: Path, run: RunFolder) -> None:
-        with stopping_softly(f"Resume with: msgs-slam resume {run.root}"):
-            records = run_reconstruct(video, run, config, make_progress(quiet))
-        if not quiet:
+        with output.stopping_softly(f"Resume with: msgs-slam resume {run.root}"):
+            records = run_reconstruct(video, run, config, output.progress())
+        if not output.quiet:
             print_summary(run.root, records)
 
-    result = run_demo(out, reconstruct_clip, make_progress(quiet))
+    result = run_demo(out, reconstruct_clip, output.progress())
     say("\nAgainst the known truth:")
     for line in demo_summary(result):
         say(f"  {line}")
     root = result.run.root
-    tell_result(quiet, run=root, export=root / "export", evaluation=root / "evaluation")
+    output.tell_result(run=root, export=root / "export", evaluation=root / "evaluation")
 
 
 @main.command()

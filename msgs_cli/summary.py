@@ -5,8 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from msgs_slam.msgs_cli.options import is_said
+from msgs_slam.msgs_cli.output import Output, is_said
 from msgs_slam.msgs_cli.text import say
+
+
+def tell_run(output: Output, root: Path, records: dict[str, Any]) -> None:
+    """Say how the run is now, for people unless they want errors only, and for programs."""
+    if not output.quiet:
+        print_summary(root, records)
+    output.tell_result(run=root, **({"export": root / "export"} if "export" in records else {}))
 
 
 def print_summary(root: Path, records: dict[str, Any]) -> None:
@@ -21,8 +28,3 @@ def print_summary(root: Path, records: dict[str, Any]) -> None:
         say(line)
     if "export" in records:
         say(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")
-
-
-def result_paths(root: Path, records: dict[str, Any]) -> dict[str, Path]:
-    """Return the folders of the run and, where it got that far, of its exports."""
-    return {"run": root} | ({"export": root / "export"} if "export" in records else {})

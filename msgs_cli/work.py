@@ -6,16 +6,8 @@ from pathlib import Path
 
 import click
 
-from msgs_slam.msgs_cli.options import (
-    RUN_ARGUMENT,
-    UNTIL,
-    open_run,
-    set_up_logging,
-    stopping_softly,
-    tell_result,
-    verbosity_options,
-    worker_setup,
-)
+from msgs_slam.msgs_cli.options import RUN_ARGUMENT, UNTIL, open_run
+from msgs_slam.msgs_cli.output import Output, verbosity_options
 
 
 @click.command()
@@ -23,7 +15,7 @@ from msgs_slam.msgs_cli.options import (
 @click.option("--shard", required=True, metavar="K/N", help="This process is the K-th, from 0 on, of about N.")
 @UNTIL
 @verbosity_options
-def work(run_path: Path, shard: str, until: str, quiet: bool, verbose: bool) -> None:
+def work(run_path: Path, shard: str, until: str, output: Output) -> None:
     """Work on RUN beside other processes that do the same, on this machine or others that see the folder.
 
     Begin the run with `msgs-slam reconstruct SOURCE --out RUN --until frames`, with all settings, run.threads among
@@ -31,12 +23,11 @@ def work(run_path: Path, shard: str, until: str, quiet: bool, verbose: bool) -> 
     of the tasks first; one alone would do all. What a killed one was at is done by the others. For SLURM arrays,
     Kubernetes indexed jobs and AWS Batch: docs/batch.md.
     """
-    set_up_logging(quiet, verbose)
     from msgs_slam.pipelines.engine.shards import Shard
     from msgs_slam.pipelines.run.settings_file import load_settings
     from msgs_slam.pipelines.work import work_on_run
 
     chosen, run = Shard.parse(shard), open_run(run_path)
-    with stopping_softly(f"The same command goes on, or without others: msgs-slam resume {run.root}"):
-        work_on_run(run, chosen, load_settings(run), worker_setup(quiet, verbose, True), until)
-    tell_result(quiet, run=run.root)
+    with output.stopping_softly(f"The same command goes on, or without others: msgs-slam resume {run.root}"):
+        work_on_run(run, chosen, load_settings(run), output.worker_setup(remote=True), until)
+    output.tell_result(run=run.root)

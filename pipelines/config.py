@@ -143,11 +143,6 @@ class MappingConfig:
     )  # fmt: skip
     depth_weight: float = setting(4.8, "λ_D of eq. (18); 0 = no depth loss", within=(0, 1000))
     use_proxy_depth: bool = setting(True, "false: the proxies only seed the map, no loss and no condition uses them")
-    split_error: float = setting(
-        0.1,
-        "Gaussians that answer for more colour error 0..1 than this, summed over a view's pixels, are split; 0 = none",
-        within=(0, 1_000_000),
-    )
     refine_poses: bool = setting(True, "refine keyframe poses together with the map")
     exposure: bool = setting(True, "a gain and an offset a keyframe and colour")
 
@@ -158,9 +153,7 @@ class GlobalBaConfig:
 
     use_loops: bool = setting(True, "look for places that are seen again")
     use_semantics: bool = setting(True, "propose loops by semantics too, eqs. (21) to (24)")
-    loop_gap: int = setting(8, "a loop joins keyframes at least this many apart", within=(1, 1_000_000))
     joint: str = setting("moved", "refine map and poses together", ("moved", "always", "never"))
-    joint_passes: float = setting(4.0, "how often each keyframe is visited then", within=(0, 1000))
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ CLIP = Path(__file__).with_name("demo_clip")
 
 @dataclass(frozen=True)
 class DemoResult:
-    """Files of a demo, the figures of `evaluate_run` and their table in Markdown."""
+    """Files of a demo, the figures of `evaluate_outcome` and their table in Markdown."""
 
     video: Path
     truth: Path

@@ -108,15 +108,9 @@ class Outcome:
     def load_sparse(self) -> SparseModel | None:
         """Points and their observations as the last stage that has any left them."""
         for stage in (self.pose_stage, "tracking"):
-            if self.run.holds(SPARSE, stage):
-                return self._in_this_world(self.run.load(SPARSE, stage))
+            if (model := self.run.find(SPARSE, stage)) is not None:
+                return model if self.move is None else model.moved(self.move)
         return None
-
-    def _in_this_world(self, model: SparseModel) -> SparseModel:
-        if self.move is None:
-            return model
-        points, poses = self.move.apply(model.points_in_world), self.move.apply_to_poses(model.cam_from_world)
-        return replace(model, points_in_world=points, cam_from_world=poses)
 
     def moved(self, other_from_run: Similarity) -> Outcome:
         """Transform cameras, map and points into another world. Raises ValueError where that has been done before."""

@@ -12,7 +12,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import Field, fields, replace
 from pathlib import Path
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 from msgs_slam.formats.errors import InputError, SettingError
 from msgs_slam.formats.jsonfile import read_toml
@@ -83,11 +83,6 @@ def _require_within(value: Any, known: Field[Any], where: str) -> None:
 
 
 def _checked(value: Any, wanted: Any, choices: tuple[str, ...], where: str) -> Any:
-    if get_origin(wanted) is tuple:
-        element = get_args(wanted)[0]
-        if not isinstance(value, list | tuple):
-            raise SettingError(f"{where} expects a list, got {value!r}")
-        return tuple(_checked(v, element, (), where) for v in value)
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value) if abs(value) < 2**53 else math.inf
     if wanted is str and not choices and isinstance(value, int | float) and not isinstance(value, bool):
@@ -125,8 +120,6 @@ def config_to_toml(config: Config) -> str:
 def _toml_value(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
-    if isinstance(value, tuple):
-        return "[" + ", ".join(map(_toml_value, value)) + "]"
     # JSON strings are valid TOML basic strings.
     return json.dumps(value) if isinstance(value, str) else repr(value)
 
@@ -141,10 +134,11 @@ _FIXED = {
     "edge_sharpness size_weight size_limit silhouette_weight depth_fields depth_check silhouette_threshold "
     "depth_tolerance densify_every densify_until split_radius prune_opacity prune_weight prune_radius mean_rate "
     "radius_rate opacity_rate color_rate class_rate rate_decay pose_rate exposure_rate low_trust_step time_decay "
-    "reliability_decay region_prior",
+    "reliability_decay region_prior split_error",
     "global_ba": "features words loop_shared_points richness loop_similarity miou_weight appearance_weight "
     "structure_weight loop_error loop_share loop_sure_inliers loop_rotation loop_translation loop_drift "
-    "loop_angle_drift loop_scale_drift loop_inliers drift_px joint_px loop_candidates loop_appearance",
+    "loop_angle_drift loop_scale_drift loop_inliers drift_px joint_px loop_candidates loop_appearance "
+    "loop_gap joint_passes",
     "export": "truncation least_weight least_piece",
 }
 FIXED = frozenset(f"{section}.{name}" for section, names in _FIXED.items() for name in names.split())

@@ -39,16 +39,15 @@ def render_run(
     kind: str = "color",
     path: str | Path = "smooth",
     fps: float | None = None,
-    frames: int = 0,
     progress: Progress | None = None,
     size: tuple[int, int] | None = None,
 ) -> Path:
     """Draw the map along a path into a video (.mp4, .avi, .mkv) or, for any other name, a folder of PNG files.
 
-    kind: one of `KINDS`; path: one of `PATHS`, or the file of a camera path; fps: None = 30, or as the file says;
-    frames: how many images, 0 = as long as the walk took (an orbit: ten seconds; a file: as long as it says); size:
-    (width, height) of an image, by default the run's. Returns `target`; where browsers will not play the video, a
-    warning says so. Raises InputError for an unknown kind or path, a bad file, or a run without a map.
+    kind: one of `KINDS`; path: one of `PATHS`, or the file of a camera path, which takes as long as the walk took (an
+    orbit: ten seconds; a file: as long as it says); fps: None = 30, or as the file says; size: (width, height) of an
+    image, by default the run's. Returns `target`; where browsers will not play the video, a warning says so. Raises
+    InputError for an unknown kind or path, a bad file, or a run without a map.
     """
     _require_choice("kind", kind, KINDS)
     rate = 30.0 if fps is None else fps
@@ -60,7 +59,7 @@ def render_run(
     outcome = outcome if size is None else _of_size(outcome, size)
     near, far = _depth_range(outcome)
     if flown is None:
-        poses = _path(outcome, str(path), rate, frames, (near * far) ** 0.5)
+        poses = _path(outcome, str(path), rate, (near * far) ** 0.5)
         views = [(outcome, pose) for pose in poses]
     else:
         views = [(_seeing(outcome, fov), pose) for pose, fov in zip(*flown, strict=True)]
@@ -73,7 +72,6 @@ def render_file(
     source: Path,
     target: Path,
     fps: float | None = None,
-    frames: int = 0,
     progress: Progress | None = None,
     size: tuple[int, int] | None = None,
     path: str | Path = "orbit",
@@ -91,7 +89,7 @@ def render_file(
         raise InputError(f"{source}: contains no Gaussians: nothing can be drawn. Export it again")
     scene, (width, height) = SplatScene.of(cloud), size or _FILE_SIZE
     if given is None:
-        poses = around(scene.middle, scene.size, up_of_file(source), frames or round(10 * rate))
+        poses = around(scene.middle, scene.size, up_of_file(source), round(10 * rate))
         fovs = np.full(len(poses), _FIELD_OF_VIEW)
     else:
         (poses, fovs), rate = given.flight(), given.fps
@@ -192,14 +190,14 @@ def _write_pictures(folder: Path, pictures: Iterator[Picture]) -> Path:
     return folder
 
 
-def _path(outcome: Outcome, path: str, fps: float, frames: int, scene_depth: float) -> NDArray[np.float64]:
+def _path(outcome: Outcome, path: str, fps: float, scene_depth: float) -> NDArray[np.float64]:
     t = outcome.trajectory
     own = t.world_from_cam[t.is_posed]
     times = t.timestamps[t.is_posed]
     if path == "orbit":
-        return orbit(own, scene_depth, frames or round(10 * fps), up_in_run(outcome))
+        return orbit(own, scene_depth, round(10 * fps), up_in_run(outcome))
     seconds = float(times[-1] - times[0]) if len(times) > 1 else 1.0
-    dense = resampled(own, frames or max(2, round(seconds * fps)))
+    dense = resampled(own, max(2, round(seconds * fps)))
     return dense if path == "own" else smoothed(dense, _SMOOTHING_SECONDS * len(dense) / max(seconds, 1e-6))
 
 

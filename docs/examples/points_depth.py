@@ -1,17 +1,15 @@
 """Depth provider: interpolation between the triangulated points that structure from motion left."""
 
-from typing import Any
-
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, DepthProvider
 from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.proxy.selection import ProviderContext
 from msgs_slam.pipelines.types import Frame
 
 
-class PointsDepth:
+class PointsDepth(DepthProvider):
     """Inverse depth is linear between points in the picture, as it is on any plane."""
 
     name = "points"
@@ -22,9 +20,6 @@ class PointsDepth:
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         return [f for f in frames if f.id not in self._sequence.cam_from_world]
-
-    def prepare(self, frames: list[Frame]) -> None:
-        """Nothing slow to do before."""
 
     def estimate(self, frame: Frame) -> DepthEstimate:
         model, camera = self._sequence.backbone, self._sequence.intrinsics
@@ -41,9 +36,6 @@ class PointsDepth:
         inverse = LinearNDInterpolator(xy[z > 0], 1 / z[z > 0], fill_value=0)(columns, rows)
         np.divide(1, inverse, out=depth, where=inverse > 0, casting="unsafe")
         return DepthEstimate(depth, np.where(depth > 0, np.float32(0.5), np.float32(0)))
-
-    def figures(self) -> dict[str, Any]:
-        return {}
 
 
 def open_points(around: ProviderContext) -> PointsDepth:

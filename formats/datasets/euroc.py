@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.formats.datasets.matching import poses_at
+from msgs_slam.formats.datasets.matching import poses_at, read_timed_files
 from msgs_slam.formats.datasets.sequence import Sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.safe_path import inside
-from msgs_slam.formats.textfile import read_rows, read_table, read_text
+from msgs_slam.formats.textfile import read_table, read_text
 from msgs_slam.formats.trajectory import clean_poses, poses_from_quaternions
 
 _NANOSECONDS = 1e-9
@@ -45,15 +44,8 @@ def open_euroc(path: Path) -> Sequence:
 
 
 def _images(cam: Path) -> tuple[NDArray[np.float64], list[Path]]:
-    rows = read_rows(cam / "data.csv")
-    try:
-        entries = sorted({int(row[0]): row[1] for row in rows}.items())
-    except (IndexError, ValueError) as error:
-        raise InputError(f"{cam / 'data.csv'}: a line is not `nanoseconds,file` ({error}): unpack it again") from error
-    if not entries:
-        raise InputError(f"{cam / 'data.csv'} lists no images: unpack the data set again")
-    files = [inside(cam / "data", name, cam / "data.csv") for _, name in entries]
-    return np.array([time for time, _ in entries], dtype=np.float64) * _NANOSECONDS, files
+    times, files = read_timed_files(cam / "data.csv", cam / "data", int, "`nanoseconds,file`")
+    return times * _NANOSECONDS, files
 
 
 def _poses(path: Path, times: NDArray[np.float64], body_from_cam: NDArray[np.float64]) -> NDArray[np.float64] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from msgs_slam.formats.datasets.sequence import LabelClass, used_label_ids
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.image_times import frame_number, read_image_times
 from msgs_slam.formats.images import IMAGE_SUFFIXES, natural_key
+from msgs_slam.formats.safe_path import inside
+from msgs_slam.formats.textfile import read_rows
 
 ASSUMED_RATE = 30.0
 """Frames per second where a data set does not say."""
@@ -20,6 +23,23 @@ SAME_INSTANT_SECONDS = 0.02
 """Two sensors' measurements at most this far apart belong together: half a frame at 25 a second."""
 
 _MOST_IMAGES_SEARCHED = 300
+
+
+def read_timed_files(
+    path: Path, folder: Path, read_time: Callable[[str], float], line: str
+) -> tuple[NDArray[np.float64], list[Path]]:
+    """Read a list of times and files of a `folder`: (N,) times in increasing order, and the files. Lists are not always
+    sorted, and a few times occur twice.
+
+    `line` is the form of its lines in errors. Raises InputError for another, an empty list, a file outside the folder.
+    """
+    try:
+        entries = sorted({read_time(row[0]): row[1] for row in read_rows(path)}.items())
+    except (IndexError, ValueError) as error:
+        raise InputError(f"{path}: a line is not {line} ({error}): unpack the data set again") from error
+    if not entries:
+        raise InputError(f"{path} lists no files: unpack the data set again")
+    return np.array([time for time, _ in entries], np.float64), [inside(folder, file, path) for _, file in entries]
 
 
 def files_for_images(images: list[Path], folder: Path, pattern: str = "*") -> tuple[Path | None, ...]:

@@ -11,15 +11,13 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets.camera import Camera
 from msgs_slam.formats.datasets.intrinsics_json import read_intrinsics_json
-from msgs_slam.formats.datasets.matching import SAME_INSTANT_SECONDS, nearest_index, poses_at
+from msgs_slam.formats.datasets.matching import SAME_INSTANT_SECONDS, nearest_index, poses_at, read_timed_files
 from msgs_slam.formats.datasets.sequence import Sequence
-from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import image_size
-from msgs_slam.formats.safe_path import inside
-from msgs_slam.formats.textfile import read_rows
 from msgs_slam.formats.trajectory import read_tum
 
 _DEPTH_PER_METRE = 5000.0
+_LINE = "`seconds file`"
 
 # The calibration of the three cameras that the benchmark's page publishes; its archives hold none.
 _FREIBURG = {
@@ -42,7 +40,7 @@ def open_tum_rgbd(path: Path) -> Sequence:
     there is one, else that of the freiburg camera in the folder's name, else 525. Raises InputError for lists that
     cannot be read or name files outside the folder.
     """
-    times, images = _listed(path, "rgb.txt")
+    times, images = read_timed_files(path / "rgb.txt", path, float, _LINE)
     camera, notes = _camera(path, images[0])
     truth = path / "groundtruth.txt"
     return Sequence(
@@ -59,23 +57,10 @@ def open_tum_rgbd(path: Path) -> Sequence:
     )
 
 
-def _listed(path: Path, name: str) -> tuple[NDArray[np.float64], list[Path]]:
-    """Times in increasing order, and the files: the lists are not always sorted, and a few times occur twice."""
-    rows = read_rows(path / name)
-    try:
-        entries = sorted({float(row[0]): row[1] for row in rows}.items())
-    except (IndexError, ValueError) as error:
-        raise InputError(f"{path / name}: a line is not `seconds file` ({error}): download it again") from error
-    if not entries:
-        raise InputError(f"{path / name} lists no files: download it again")
-    times = np.array([time for time, _ in entries], dtype=np.float64)
-    return times, [inside(path, file, path / name) for _, file in entries]
-
-
 def _depth_paths(path: Path, times: NDArray[np.float64]) -> tuple[Path | None, ...]:
     if not (path / "depth.txt").is_file():
         return ()
-    depth_times, files = _listed(path, "depth.txt")
+    depth_times, files = read_timed_files(path / "depth.txt", path, float, _LINE)
     index = nearest_index(depth_times, times)
     near = np.abs(depth_times[index] - times) <= SAME_INSTANT_SECONDS
     return tuple(files[i] if ok else None for i, ok in zip(index, near, strict=True))

@@ -141,9 +141,9 @@ def _nested(changes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _progress(wanted: Progress | bool) -> Progress:
-    from msgs_slam.msgs_cli.options import make_progress
+    from msgs_slam.msgs_cli.output import Output
 
-    return make_progress(quiet=not wanted, as_json=False) if isinstance(wanted, bool) else wanted
+    return Output(quiet=not wanted).progress() if isinstance(wanted, bool) else wanted
 
 
 def main() -> None:

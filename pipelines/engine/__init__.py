@@ -1,1 +1,1 @@
-"""How stages and their tasks are run: one after the other here, by other processes, by a Ray cluster."""
+"""Running of stages and their tasks: one after the other here, by other processes, by a Ray cluster."""

@@ -36,12 +36,12 @@ class Chunk:
 
     @property
     def numbers(self) -> range:
-        """Which they are."""
+        """Numbers of the things."""
         return range(self.first, self.last)
 
     @cached_property
     def known(self) -> dict[str, Any]:
-        """Of all of them."""
+        """Facts about all things of the stage, by name, from `file`."""
         return load_value(self.file)
 
     def context(self, progress: Progress) -> StageContext:
@@ -52,7 +52,7 @@ class Chunk:
 def in_chunks(
     context: StageContext, work: Callable[[Chunk, Progress], R], count: int, opened: Any = None, **known: Any
 ) -> list[R]:
-    """What `work` returns of each range of `count` things, in order, with what is `known` of all.
+    """Do `work` on ranges of `count` things, with what is `known` of all; returns its results in order.
 
     This process alone does all of them as one range; workers get several each. Either way a task has what it needs
     from files, and leaves files in the stage's folder.

@@ -1,4 +1,4 @@
-"""Where independent calls run: one after the other on this machine, or on the machines of a Ray cluster.
+"""Engines that run independent calls: one after the other on this machine, or on the machines of a Ray cluster.
 
 Either way a call has a process of its own. What it returns comes back; a bug's traceback comes back as text; a process
 that is lost (killed, out of memory) costs its own call only, which is tried once more, and one whose machine is gone is
@@ -61,7 +61,7 @@ class Engine(Protocol):
     """Runs calls and hands each out when it has ended, in any order. Raises Stopped where a signal asks for it."""
 
     def run(self, calls: Sequence[Call]) -> Iterator[Ended]:
-        """All of them."""
+        """Yield each call as it has ended."""
         ...
 
 
@@ -69,7 +69,7 @@ class LocalEngine:
     """One call after the other, each with the whole machine."""
 
     def run(self, calls: Sequence[Call]) -> Iterator[Ended]:
-        """In order."""
+        """Yield each call in order, as it has ended."""
         for call in calls:
             stop_if_asked()
             yield _in_own_process(call)
@@ -162,11 +162,11 @@ class RayEngine:
         return max(int(min((c for c in nodes if c >= 1), default=1)), 1)
 
     def room(self, cpus: int) -> int:
-        """How many calls of so many CPUs there is room for."""
+        """Count the calls of so many CPUs for which there is room."""
         return max(sum(int(n["Resources"].get("CPU", 0)) // cpus for n in self._ray.nodes() if n["Alive"]), 1)
 
     def run(self, calls: Sequence[Call]) -> Iterator[Ended]:
-        """As they end."""
+        """Yield each call as it ends, whatever the order."""
         task = self._ray.remote(_on_node)  # once: it is sent to the head, which may be gone later
         waiting = {_begin(task, c): c for c in calls}
         lost: Counter[tuple[str, str]] = Counter()

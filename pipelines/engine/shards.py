@@ -42,21 +42,21 @@ TASK_MODULES = (
 
 @dataclass(frozen=True)
 class Shard:
-    """Those of many things alike (recordings, tasks) whose number leaves the rest `index` when divided by `count`."""
+    """Share of many things alike (recordings, tasks): those whose number modulo `count` is `index`."""
 
     index: int = 0
     count: int = 1
 
     @staticmethod
     def parse(text: str) -> Shard:
-        """From `3/16`, counted from 0. Raises InputError for anything else."""
+        """Read a share such as `3/16`, counted from 0. Raises InputError for anything else."""
         index, _, count = text.partition("/")
         if not (index.isdecimal() and count.isdecimal() and int(index) < int(count)):
             raise InputError(f"--shard {text}: expected K/N with K from 0 to N - 1, for example 3/16")
         return Shard(int(index), int(count))
 
     def of(self, things: Sequence[T]) -> list[T]:
-        """Its own."""
+        """Select the things of this share."""
         return list(things[self.index :: self.count])
 
 
@@ -70,11 +70,11 @@ class SharedWorkers:
 
     @property
     def at_once(self) -> int:
-        """How many may work at the same time."""
+        """Number of processes that may work at the same time."""
         return self.shard.count
 
     def each(self, work: Callable[[T, Progress], R], tasks: Sequence[T], folder: Path) -> list[R]:
-        """As `Workers.each`: posted, worked on here and elsewhere, gathered."""
+        """Post the tasks, work on them here and elsewhere, and gather the results; see `TaskWorkers.each`."""
         posted = Posted.post(work, tasks, folder, self.threads)
         while missing := posted.missing():
             stop_if_asked()
@@ -104,11 +104,11 @@ class Posted:
         return posted
 
     def task(self, number: int) -> Path:
-        """What there is to do."""
+        """Path of the file that holds a task."""
         return self.folder / f"{number:04d}.npz"
 
     def done(self, number: int) -> Path:
-        """What it has returned."""
+        """Path of the file that holds what a task has returned."""
         return self.folder / f"{number:04d}.done.npz"
 
     def missing(self) -> list[int]:
@@ -180,6 +180,6 @@ def posted_in(run: RunFolder) -> Iterator[Posted]:
 
 
 def withdraw_all(run: RunFolder) -> None:
-    """What a leader before has left."""
+    """Withdraw the tasks that an earlier leader has posted."""
     for posted in posted_in(run):
         posted.withdraw()

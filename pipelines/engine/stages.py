@@ -53,7 +53,7 @@ def _trusted() -> None:
 
 @dataclass(frozen=True)
 class StageContext:
-    """What a stage is given.
+    """Everything that a stage is given.
 
     `folder` is the stage's own unfinished folder: it writes its result there, and may keep snapshots under
     `folder / "snapshot"`, which is removed when the stage ends well. What an interrupted attempt with the same
@@ -81,22 +81,22 @@ class StageContext:
 
     @property
     def threads(self) -> int:
-        """How many CPU threads to use."""
+        """Number of CPU threads to use."""
         return self.config.run.threads or os.cpu_count() or 1
 
     @property
     def memory_room(self) -> float:
-        """How many bytes of memory to plan with."""
+        """Bytes of memory to plan with."""
         return memory_room(self.config.run.memory_mb)
 
     @property
     def device(self) -> str:
-        """ "cpu" or "cuda"."""
+        """Device of dense work, "cpu" or "cuda"."""
         return resolve_device(self.config.run.device)
 
     def each(self, work: Callable[[T, Progress], R], tasks: Sequence[T]) -> list[R]:
-        """What `work`, a function of a module's top level, returns of every task, in their order: done here, one after
-        the other, or by the workers. A task leaves files below `folder`, and does nothing where they are."""
+        """Do `work`, a function of a module's top level, on every task, here, one after the other, or by the workers;
+        returns its results in order. A task leaves files below `folder`, and does nothing where they are."""
         if self.workers is None:
             return [self._done(work, task) for task in tasks]
         return self.workers.each(work, tasks, self.folder)
@@ -201,7 +201,7 @@ class Watch:
         self._left = TimeLeft(self._names, done)
 
     def tell(self, name: str, state: str, record: StageRecord | None = None) -> None:
-        """One event."""
+        """Report that a stage has come into a state."""
         index, figures = self._names.index(name) + 1, record.figures if record else {}
         seconds = record.seconds if record else 0.0
         self._progress.stage(StageEvent(name, index, len(self._names), state, seconds, figures, self._left.left))
@@ -322,7 +322,7 @@ def _flush_folder(folder: Path) -> None:
 
 
 def forget_peak() -> None:
-    """From now on `peak_memory_mb` is what comes, where the system can do that (Linux)."""
+    """Let `peak_memory_mb` begin anew, where the system can do that (Linux)."""
     with suppress(OSError):
         (_PROCESS / "clear_refs").write_text("5", encoding="ascii")
 

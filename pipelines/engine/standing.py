@@ -27,7 +27,7 @@ def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) 
 
 
 def next_upstream(upstream: str, record: StageRecord) -> str:
-    """What the stages after `record` are made from, as one digest."""
+    """Digest of everything that the stages after `record` are made from."""
     return hashlib.sha256((upstream + record.content).encode()).hexdigest()
 
 
@@ -57,7 +57,7 @@ def why_again(
         return f"{len(damaged)} of its files are damaged or gone"
     kept = kept_inputs(stage, config, record, inputs)
     if record.fingerprint != stage_fingerprint(stage, config, upstream, kept):
-        return _what_differs(stage, record, config, upstream, kept)
+        return _what_differs(stage, record, config, upstream)
     if stage.division is not None:
         was = recorded_config({stage.name: record}, config)
         if stage.division(run, config) != stage.division(run, was):
@@ -65,7 +65,7 @@ def why_again(
     return ""
 
 
-def _what_differs(stage: Stage, record: StageRecord, config: Config, upstream: str, inputs: Any) -> str:
+def _what_differs(stage: Stage, record: StageRecord, config: Config, upstream: str) -> str:
     differing = differing_settings(record, config)
     if (seed := record.settings.get("run", {}).get("seed", config.run.seed)) != config.run.seed:
         differing.append(f"run.seed={config.run.seed}, not {seed}")

@@ -1,10 +1,10 @@
-"""How many CPU threads the libraries that compute use."""
+"""Number of CPU threads in the libraries that compute."""
 
 from __future__ import annotations
 
 
 def set_threads(threads: int) -> None:
-    """How many CPU threads this process uses."""
+    """Let the libraries of this process use so many CPU threads."""
     import cv2
     import torch
 

@@ -1,4 +1,4 @@
-"""How long the rest of a run will take, by what its stages have taken so far."""
+"""Estimate of the time that the rest of a run will take, by what its stages have taken so far."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ _SHARES = {"frames": 16, "proxy": 33, "tracking": 5, "mapping": 37, "global_ba":
 
 
 class TimeLeft:
-    """Of the stages `wanted`, in order: `seconds` of those that are done, by this process or another, tell how fast it
-    goes here. Right to a factor of about two; as long as no stage is done nothing is known."""
+    """Time left for the stages `wanted`, in order: `seconds` of those that are done, by this process or another, tell
+    how fast it goes here. Right to a factor of about two; as long as no stage is done nothing is known."""
 
     def __init__(self, wanted: Sequence[str], seconds: Mapping[str, float]) -> None:
         self._wanted, self._seconds = list(wanted), dict(seconds)

@@ -1,4 +1,4 @@
-"""Where the tasks of one run are worked on when that is not this process alone, over a shared disk."""
+"""Workers for the tasks of one run, over a shared disk, where that is not this process alone."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ _COMPUTE = ("torch", "numpy", "scipy", "pycolmap", "numba", "opencv-python-headl
 
 
 class TaskWorkers(Protocol):
-    """What takes the tasks of a stage."""
+    """Workers that take the tasks of a stage."""
 
     @property
     def at_once(self) -> int:
-        """How many tasks may run at the same time."""
+        """Number of tasks that may run at the same time."""
         ...
 
     @property
     def threads(self) -> int:
-        """How many threads each takes: the same everywhere, or the results would differ."""
+        """Threads that each takes: the same everywhere, or the results would differ."""
         ...
 
     def each(self, work: Callable[[T, Progress], R], tasks: Sequence[T], folder: Path) -> list[R]:
-        """What `work` returns of every task, in their order; they write below `folder`, a stage's unfinished one."""
+        """Do `work` on every task, below `folder`, a stage's unfinished one; returns its results in order."""
         ...
 
 
@@ -55,7 +55,7 @@ class Workers:
     at_once: int = 1
 
     def each(self, work: Callable[[T, Progress], R], tasks: Sequence[T], folder: Path) -> list[R]:
-        """What `work` returns of every task, in their order; the tasks write below `folder`, a stage's unfinished one.
+        """Do `work` on every task, below `folder`, a stage's unfinished one; returns its results in order.
 
         Raises RecoverableError where a task was refused or lost; what the others have written stays.
         """
@@ -116,7 +116,7 @@ def require_same_world(folders: Sequence[Path], code: str) -> None:
 
 @functools.cache
 def code_identity() -> str:
-    """Of what results depend on: the program's stages, Python, the libraries that compute; name=version of each."""
+    """List what results depend on: the program's stages, Python, the libraries that compute; name=version of each."""
     stages = " ".join(stage_identity(name, stage_file(name)) for name in STAGES)
     program = hashlib.sha256(stages.encode()).hexdigest()
     found = {"msgs-slam": program, "Python": platform.python_version(), **{name: _version(name) for name in _COMPUTE}}

@@ -21,8 +21,7 @@ from msgs_slam.pipelines.evaluation.trajectory_error import (
     relative_error,
 )
 from msgs_slam.pipelines.evaluation.truth import MatchedTruth, match_truth
-from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.outcome import Outcome
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress
 
 PROTOCOL = (
@@ -43,17 +42,6 @@ PROTOCOL = (
 )
 
 
-def evaluate_run(
-    run: RunFolder, truth: Sequence, progress: Progress | None = None, max_views: int = 100
-) -> dict[str, Any]:
-    """All figures as plain JSON values; a group that cannot be had is {"missing": why}.
-
-    At most `max_views` of the keyframes, and as many of the other frames, are rendered. Raises InputError for a run
-    without poses and for a truth of which no frame belongs to the run.
-    """
-    return evaluate_outcome(load_outcome(run), truth, progress, max_views)
-
-
 def evaluate_outcome(
     outcome: Outcome,
     truth: Sequence,
@@ -61,7 +49,11 @@ def evaluate_outcome(
     max_views: int = 100,
     class_map: ClassMap | None = None,
 ) -> dict[str, Any]:
-    """Evaluate like `evaluate_run`."""
+    """Compute all figures, as plain JSON values; a group that cannot be had is {"missing": why}.
+
+    At most `max_views` of the keyframes, and as many of the other frames, are rendered. Raises InputError for a truth
+    of which no frame belongs to the run, and for a class map that does not fit.
+    """
     matched = match_truth(outcome.frames, outcome.source_is_folder, truth)
     if not matched.has_pose.any() and not (matched.image >= 0).any():
         raise InputError(

@@ -144,10 +144,8 @@ def _median_depth(sparse: SparseModel | None) -> float | None:
     """Usual distance from a camera to the points it sees."""
     if sparse is None or len(sparse.obs_frame) == 0:
         return None
-    centers = np.linalg.inv(sparse.cam_from_world)[:, :3, 3]
-    return float(
-        np.median(np.linalg.norm(sparse.points_in_world[sparse.obs_point] - centers[sparse.obs_frame], axis=1))
-    )
+    away = sparse.points_in_world[sparse.obs_point] - sparse.centers[sparse.obs_frame]
+    return float(np.median(np.linalg.norm(away, axis=1)))
 
 
 def _about_texture(capture: Capture) -> list[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from html import escape
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,11 +16,13 @@ from msgs_slam.pipelines.evaluation.pictures import depth_picture, depth_range, 
 from msgs_slam.pipelines.evaluation.plots import BLUE, GREEN, GREY, ORANGE, RED, Line, Marks, plot
 from msgs_slam.pipelines.evaluation.write import unit_name
 from msgs_slam.pipelines.outcome import Outcome, evenly
+from msgs_slam.pipelines.source.sharpness import at_most_wide
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import VOID
 
 MEASURED_VIEWS = 60
 SHOWN_VIEWS = 8
+_TILE_WIDTH = 400
 _ROWS = 3
 """Of four pictures, seen at once; the others unfold."""
 
@@ -81,11 +82,7 @@ def _reach(outcome: Outcome, ids: list[int]) -> tuple[float, float]:
 
 
 def _tile(picture: NDArray[np.uint8], caption: str) -> str:
-    width = 400
-    if picture.shape[1] > width:
-        size = (width, round(width * picture.shape[0] / picture.shape[1]))
-        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return f"<div>{image(picture, caption)}{escape(caption)}</div>"
+    return f"<div>{image(at_most_wide(picture, _TILE_WIDTH), caption)}{escape(caption)}</div>"
 
 
 def quality_section(outcome: Outcome, capture: Capture, views: RenderedViews | None) -> str:

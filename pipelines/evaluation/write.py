@@ -45,7 +45,8 @@ def write_evaluation(
 ) -> dict[str, Any]:
     """Evaluate and write RUN/evaluation/: evaluation.json, evaluation.md, two plots of the path, views.png.
 
-    Returns the figures (see `evaluate_run`). Raises InputError as that does, before anything is written.
+    Returns the figures (see `evaluate_outcome`). Raises InputError as that does, and for a run without poses, before
+    anything is written.
     """
     outcome = load_outcome(run)
     result = evaluate_outcome(outcome, truth, progress, max_views, class_map)

@@ -20,7 +20,6 @@ from msgs_slam.pipelines.export.planes import Planes
 from msgs_slam.pipelines.export.straighten import planes_of, straightened
 from msgs_slam.pipelines.export.surface import chunk_surfaces, weld
 from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid
-from msgs_slam.pipelines.gaussians.render import get_threads
 from msgs_slam.pipelines.mapping.depth_views import DrawnView, Shown, drawn_view
 from msgs_slam.pipelines.outcome import Outcome, maps_around
 from msgs_slam.pipelines.run.files import MESH
@@ -151,7 +150,7 @@ def make_region(
     """One of the regions of the grid, from the views that see it; `of` names it for the progress."""
     near = grid.views_of(chunks)
     fusing = (views[n].shown for n in progress.track(near, "fusing" + of, len(near)))
-    triangles = chunk_surfaces(fuse(grid, chunks, fusing, get_threads()), chunks, LEAST_WEIGHT)
+    triangles = chunk_surfaces(fuse(grid, chunks, fusing), chunks, LEAST_WEIGHT)
     surface = weld(triangles, chunks, grid.voxel)
     painting = (views[n] for n in progress.track(near, "painting" + of, len(near)))
     return Region(surface, *paint(surface.vertices, painting, class_ids, 2 * grid.truncation))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,17 +35,15 @@ from msgs_slam.pipelines.export.usd import write_usd
 from msgs_slam.pipelines.export.web_page import write_web_page
 from msgs_slam.pipelines.export.writers import (
     write_colmap,
-    write_glb_file,
     write_notes,
     write_ply,
     write_readme,
-    write_sog_file,
-    write_spz_file,
+    write_splats,
     write_trajectory,
     write_world,
 )
 from msgs_slam.pipelines.mapping.depth_views import Shown
-from msgs_slam.pipelines.metres.find import Machine, find_metres
+from msgs_slam.pipelines.metres.find import find_metres
 from msgs_slam.pipelines.networks.identity import card_identity
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.proxy.selection import metric_card
@@ -103,12 +102,12 @@ class MeshJob:
 
     @property
     def scratch(self) -> Path:
-        """Where views and regions lie."""
+        """Folder of the snapshots of views and regions."""
         return scratch_of(self.context)
 
     @property
     def ply(self) -> Path:
-        """Of the mesh, which a texture needs too."""
+        """Path of the mesh, which a texture needs too."""
         return (self.folder if "mesh" in self.kinds else self.scratch) / "mesh.ply"
 
     @property
@@ -118,7 +117,7 @@ class MeshJob:
 
 
 def write_meshes(job: MeshJob, outcome: Outcome, world: World) -> list[Path]:
-    """What the job asks for; `outcome` has been moved, and may be without its map."""
+    """Write what the job asks for; `outcome` has been moved, and may be without its map."""
     names, axes = outcome.classes.names, world.gltf_from_exported
     glb, count = job.folder / "mesh.glb", len(keyframe_rows(outcome))
     views = drawn_views(job.scratch, count)
@@ -143,21 +142,22 @@ def write_meshes(job: MeshJob, outcome: Outcome, world: World) -> list[Path]:
 
 
 def mesh_kinds(settings: ExportConfig) -> tuple[str, ...]:
-    """What `write_meshes` is to write when nothing in particular is asked for."""
+    """List what `write_meshes` is to write when nothing in particular is asked for."""
     return ("mesh", "texture") if settings.texture else ("mesh",)
 
 
 def guess_metres(context: StageContext, outcome: Outcome, settings: ExportConfig) -> Metres | None:
-    """How long the unit of the run's world is; what speaks against it is warned of."""
-    machine, guess = Machine(context.threads, context.device), settings.scale == "auto"
-    found = find_metres(context.run, outcome.trajectory, metric_card() if guess else None, machine, guess)
-    if found.warning:
-        context.warn(found.warning)
-    return found.metres
+    """Estimate how long the unit of the run's world is, and warn of what speaks against it."""
+    guess = settings.scale == "auto"
+    card = metric_card() if guess else None
+    metres, warning = find_metres(context.run, outcome.trajectory, guess, card, context.threads, context.device)
+    if warning:
+        context.warn(warning)
+    return metres
 
 
 def metres_figures(metres: Metres | None) -> dict[str, Any]:
-    """How long the unit is, and where that comes from."""
+    """Report how long the unit is, and where that comes from."""
     if metres is None:
         return {"metres_per_unit": None}
     return {
@@ -170,7 +170,7 @@ def metres_figures(metres: Metres | None) -> dict[str, Any]:
 
 
 def gps_metres(world: World) -> Metres | None:
-    """How long the unit of the run's own world is, by GPS."""
+    """Derive from GPS how long the unit of the run's own world is."""
     if world.earth is None:
         return None
     return Metres(world.exported_from_run.scale, max(world.earth.scale_sd, 1e-3), False, ("GPS",))
@@ -224,8 +224,8 @@ def write_all_but_mesh(outcome: Outcome, world: World, settings: ExportConfig, f
     """COLMAP model, PLYs, trajectory, notes; SPZ and GLB where the settings want them, tiles of a map that was made in
     parts. `outcome` stands in `world`."""
     paths = write_colmap(outcome, folder) + write_ply(outcome, settings.sh_rest, folder)
-    paths += write_spz_file(outcome, world, settings.spz_version, folder) if settings.spz else []
-    paths += write_glb_file(outcome, world, folder) if settings.splat_glb else []
+    paths += write_splats("spz", outcome, world, settings, folder) if settings.spz else []
+    paths += write_splats("glb", outcome, world, settings, folder) if settings.splat_glb else []
     paths += write_tiles(outcome, world, folder) if outcome.run.load(SUBMAPS) else []
     return paths + write_trajectory(outcome, folder) + write_notes(outcome, world, folder)
 
@@ -261,9 +261,7 @@ def export_run(
     writers: dict[str, Callable[[], list[Path]]] = {
         "colmap": lambda: write_colmap(outcome, folder),
         "ply": lambda: write_ply(outcome, settings.sh_rest, folder),
-        "spz": lambda: write_spz_file(outcome, world, settings.spz_version, folder),
-        "sog": lambda: write_sog_file(outcome, world, folder),
-        "glb": lambda: write_glb_file(outcome, world, folder),
+        **{k: partial(write_splats, k, outcome, world, settings, folder) for k in ("spz", "sog", "glb")},
         "tiles": lambda: write_tiles(outcome, world, folder),
         "html": lambda: write_web_page(outcome, world, folder),
         "mesh": lambda: mesh("mesh"),

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs_slam.formats.sog import morton_codes
 from msgs_slam.pipelines.depth.posed import PosedDepth
 from msgs_slam.pipelines.gaussians.render.jit import kernel
+from msgs_slam.pipelines.gaussians.render.threads import for_each, get_threads
 from msgs_slam.pipelines.geometry.camera import unproject_depth
 from msgs_slam.pipelines.types import Intrinsics
 from msgs_slam.pipelines.voxels.voxels import cells_of, voxel_keys
@@ -78,7 +79,7 @@ class Grid:
     def regions(self, at_once: int = _AT_ONCE) -> Iterator[NDArray[np.int32]]:
         """(R, 3) chunks that lie together and have about so many blocks."""
         chunks, counts = np.unique(self.blocks // CHUNK, axis=0, return_counts=True)
-        order = np.argsort(_along_curve(chunks), kind="stable")
+        order = np.argsort(morton_codes(chunks - chunks.min(axis=0, initial=0)), kind="stable")
         number = (np.cumsum(counts[order]) - 1) // at_once
         for n in np.unique(number):
             yield chunks[order[number == n]]
@@ -135,34 +136,21 @@ def chunk_keys(cells: NDArray[np.integer]) -> NDArray[np.int64]:
     return voxel_keys(cells.astype(np.float64), 1.0)
 
 
-def _along_curve(cells: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Numbers in whose order neighbours follow each other: the bits of the coordinates in turn (Morton 1966)."""
-    cells = cells.astype(np.int64) - cells.min(axis=0, initial=0)
-    number = np.zeros(len(cells), np.int64)
-    for bit in range(21):
-        for axis in range(3):
-            number |= (cells[:, axis] >> bit & 1) << 3 * bit + axis
-    return number
-
-
-def fuse(grid: Grid, chunks: NDArray[np.int32], views: Iterable[PosedDepth], threads: int) -> Volume:
+def fuse(grid: Grid, chunks: NDArray[np.int32], views: Iterable[PosedDepth]) -> Volume:
     """The weighted mean of the views' truncated distances in these chunks; views that see nothing of them may lack."""
     blocks, voxel, truncation = grid.blocks_of(chunks), grid.voxel, grid.truncation
     distance = np.zeros((len(blocks), SIDE, SIDE, SIDE), np.float32)
     weight = np.zeros_like(distance)
     centers, radius = (blocks + 0.5) * (voxel * SIDE), voxel * SIDE * 0.87
-    with ThreadPoolExecutor(threads) as pool:
-        for view in views:
-            rows = np.flatnonzero(Frustum.of(view).meets(centers, radius, truncation))
-            jobs = [
-                pool.submit(
-                    _integrate, part, blocks, distance, weight, view.depth, view.trust,
-                    np.ascontiguousarray(view.cam_from_world), view.intrinsics.numbers, voxel, truncation,
-                )
-                for part in np.array_split(rows, threads)
-            ]  # fmt: skip
-            for job in jobs:
-                job.result()
+
+    def integrate(view: PosedDepth) -> None:
+        rows = np.flatnonzero(Frustum.of(view).meets(centers, radius, truncation))
+        parts, pose = np.array_split(rows, get_threads()), np.ascontiguousarray(view.cam_from_world)
+        seen = view.depth, view.trust, pose, view.intrinsics.numbers
+        for_each(lambda n: _integrate(parts[n], blocks, distance, weight, *seen, voxel, truncation), len(parts))
+
+    for view in views:
+        integrate(view)
     return Volume(voxel, truncation, blocks, distance, weight)
 
 

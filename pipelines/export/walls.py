@@ -51,7 +51,7 @@ class Wall:
 
     @property
     def sign(self) -> str:
-        """What stands before its length: ≥ where an end was not seen, ≈ where it meets its neighbours at flat angles,
+        """Sign before its length: ≥ where an end was not seen, ≈ where it meets its neighbours at flat angles,
         as the sides of a bay do, so that its ends are uncertain."""
         return "≥ " if not self.is_whole else "≈ " if self.blur > _ROUGH * self.length else ""
 

@@ -20,6 +20,7 @@ from msgs_slam.formats.point_ply import write_point_ply
 from msgs_slam.formats.sog import write_sog
 from msgs_slam.formats.spz import write_spz
 from msgs_slam.formats.trajectory import write_tum
+from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.readme import lengths, readme
 from msgs_slam.pipelines.geometry.rig import rig_of
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
@@ -122,32 +123,23 @@ def _in_parts(outcome: Outcome) -> LruSequence[GaussianCloud]:
     return LruSequence(len(starts), lambda n: map_cloud(outcome, slice(starts[n], starts[n] + _PART)), len, 0)
 
 
-def write_spz_file(outcome: Outcome, world: World, version: int, folder: Path) -> list[Path]:
-    """The map's colours in a tenth of the space of the PLY, without classes: the format has no room for them.
+def write_splats(kind: str, outcome: Outcome, world: World, settings: ExportConfig, folder: Path) -> list[Path]:
+    """Write the map's colours as point_cloud.spz, .sog or .glb, upright in viewers: SPZ defines the gravity direction,
+    the others are turned as splat PLYs are.
 
-    SPZ defines the gravity direction, so the scene is upright in its viewers.
+    SPZ takes a tenth of the space of the PLY, SOG a fifteenth, and neither has room for classes; the last is glTF with
+    KHR_gaussian_splatting. Without Gaussians there is an empty SPZ, and nothing of the others.
     """
-    write_spz(folder / "point_cloud.spz", _turned(map_cloud(outcome), world), version)
-    return [folder / "point_cloud.spz"]
-
-
-def write_sog_file(outcome: Outcome, world: World, folder: Path) -> list[Path]:
-    """The map's colours in a fifteenth of the space of the PLY, upright in viewers that turn splat PLYs over; nothing
-    where there are no Gaussians."""
-    cloud = map_cloud(outcome)
-    if len(cloud) == 0:
+    cloud, path = map_cloud(outcome), folder / f"point_cloud.{kind}"
+    if kind == "spz":
+        write_spz(path, _turned(cloud, world), settings.spz_version)
+    elif len(cloud) == 0:
         return []
-    write_sog(folder / "point_cloud.sog", _turned(cloud, world))
-    return [folder / "point_cloud.sog"]
-
-
-def write_glb_file(outcome: Outcome, world: World, folder: Path) -> list[Path]:
-    """The map as glTF has Gaussians (KHR_gaussian_splatting), upright; nothing where there are none."""
-    cloud = map_cloud(outcome)
-    if len(cloud) == 0:
-        return []
-    write_gaussian_glb(folder / "point_cloud.glb", _turned(cloud, world), outcome.classes.names)
-    return [folder / "point_cloud.glb"]
+    elif kind == "sog":
+        write_sog(path, _turned(cloud, world))
+    else:
+        write_gaussian_glb(path, _turned(cloud, world), outcome.classes.names)
+    return [path]
 
 
 def _turned(cloud: GaussianCloud, world: World) -> GaussianCloud:

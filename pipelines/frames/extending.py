@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -18,7 +17,4 @@ def in_world_of(before: Before, model: SparseModel, frames: Sequence[Frame]) -> 
     poses = before.poses_of([frames[i] for i in model.frame_ids.tolist()])
     known = np.isfinite(poses).all(axis=(1, 2))
     agreed = agreement(model.cam_from_world[known], poses[known])
-    if agreed is None:
-        return model
-    moved = agreed.move.apply_to_poses(model.cam_from_world)
-    return replace(model, cam_from_world=moved, points_in_world=agreed.move.apply(model.points_in_world))
+    return model if agreed is None else model.moved(agreed.move)

@@ -102,7 +102,7 @@ def run(context: StageContext) -> dict[str, Any]:
 
 
 def places_figure(source: Source, frames: list[Frame]) -> dict[str, str]:
-    """How many pictures say by GPS where they were taken, where any does."""
+    """Count the images that say by GPS where they were taken, where any does."""
     if not isinstance(source, FolderSource):
         return {}
     places = photo_places([source.file(frame.source_index) for frame in frames])

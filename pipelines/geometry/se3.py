@@ -42,6 +42,13 @@ def transform(motion: ArrayT, points: ArrayT) -> ArrayT:
     return points @ rotation.T + translation
 
 
+def scaled(motion: NDArray[np.float64], scale: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    """(..., 4, 4) motion with distances `scale` (...,) times as long."""
+    out = motion.copy()
+    out[..., :3, 3] *= np.asarray(scale)[..., None]
+    return out
+
+
 def rotation_angle(motion: ArrayT) -> ArrayT:
     """(..., 4, 4) motion -> (...,) rotation angle in radians, accurate near 0 and near π."""
     return _on_tensors(_rotation_angle, motion)

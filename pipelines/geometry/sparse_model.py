@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
+from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.types import require_shape, rows_by
 
 
@@ -37,6 +38,11 @@ class SparseModel:
         require_shape("colors", self.colors, (p, 3))
         require_shape("obs_point", self.obs_point, (o,))
         require_shape("obs_xy", self.obs_xy, (o, 2))
+
+    def moved(self, other_from_world: Similarity) -> SparseModel:
+        """Transform cameras and points into another world."""
+        poses = other_from_world.apply_to_poses(self.cam_from_world)
+        return replace(self, cam_from_world=poses, points_in_world=other_from_world.apply(self.points_in_world))
 
     @cached_property
     def centers(self) -> NDArray[np.float64]:

@@ -82,7 +82,7 @@ def tape(first: Touch, second: Touch) -> tuple[float, float]:
 
 
 def area(places: Array) -> float:
-    """Of the polygon with these corners (N, 3) in order, seen from where it looks largest; 0 of fewer than three."""
+    """Area of the polygon of corners (N, 3) in order, seen from where it looks largest; 0 of fewer than three."""
     if len(places) < 3:
         return 0.0
     ways = places[1:] - places[0]

@@ -13,6 +13,8 @@ from msgs_slam.pipelines.correspondence.retrieval import GlobalDescriptors, far_
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.semantics import LabelSummary, richness, similarity
 
+GAP = 8
+"""A loop joins keyframes at least this many apart."""
 SHARED_POINTS = 15
 """Keyframes with this many points in common need no loop."""
 RICH = 0.9
@@ -45,7 +47,7 @@ def loop_candidates(
     structure from motion has refused.
     """
     ids = model.frame_ids.tolist()
-    shared, apart = shared_points(model), far_apart(len(ids), settings.loop_gap)
+    shared, apart = shared_points(model), far_apart(len(ids), GAP)
 
     def unrelated(part: slice) -> NDArray[np.bool_]:
         return apart(part) & (shared[part].toarray() < SHARED_POINTS)

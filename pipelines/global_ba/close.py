@@ -42,7 +42,7 @@ def close_loops(
 ) -> Closed:
     """Adjust `state` (changed in place) with the loops."""
     before = reprojection_error(state, intrinsics)
-    original = {i: s for i, s in state.sightings.items()}
+    original = dict(state.sightings)
     if drifted:
         straighten(state, loops)
     add_sightings(state, loops)
@@ -92,7 +92,8 @@ def _edges(poses: Array, depth: Array, loops: Sequence[Loop], place: dict[int, i
     first = [a for a, _ in chain] + [place[loop.edge.frame1_id] for loop in loops]
     second = [b for _, b in chain] + [place[loop.edge.frame2_id] for loop in loops]
     motions = [poses[b] @ se3.inverse(poses[a]) for a, b in chain]
-    motions += [_in_second_scale(loop) for loop in loops]
+    # An edge's translation comes in the first keyframe's scale.
+    motions += [se3.scaled(loop.edge.frame2_from_frame1, loop.edge.scale) for loop in loops]
     scale = np.concatenate([np.ones(len(chain)), [loop.edge.scale for loop in loops]])
     length = np.array([np.linalg.norm(m[:3, 3]) for m in motions[: len(chain)]])
     sd = np.empty((len(first), 7))
@@ -104,13 +105,6 @@ def _edges(poses: Array, depth: Array, loops: Sequence[Loop], place: dict[int, i
     sd[len(chain) :, 6] = 0.03
     robust = np.arange(len(first)) >= len(chain)
     return Edges(np.array(first), np.array(second), np.array(motions), scale, sd, robust)
-
-
-def _in_second_scale(loop: Loop) -> Array:
-    """The edge's translation came in the first keyframe's scale."""
-    motion = loop.edge.frame2_from_frame1.copy()
-    motion[:3, 3] *= loop.edge.scale
-    return motion
 
 
 def _move_points(state: TrackState, ids: list[int], old: Array, new: Array, scales: Array) -> None:

@@ -79,9 +79,7 @@ def optimise_pose_graph(
 def apply_step(poses: Array, scales: Array, step: Array) -> tuple[Array, Array]:
     """Left perturbation of every node by (translation, rotation, log scale) (N, 7); the scale acts in the camera."""
     factor = np.exp(step[:, 6])
-    moved = poses.copy()
-    moved[:, :3, 3] *= factor[:, None]
-    return se3.exp(step[:, :6]) @ moved, scales * factor
+    return se3.exp(step[:, :6]) @ se3.scaled(poses, factor), scales * factor
 
 
 def _cost(values: Array, robust: NDArray[np.bool_], width: float) -> float:

@@ -53,6 +53,8 @@ DRIFT_PX = 6.0
 """A loop that is off by more pixels starts a pose graph."""
 JOINT_PX = 0.5
 """What counts as moved."""
+JOINT_PASSES = 4.0
+"""Visits of each keyframe as map and poses are refined together."""
 _VIEWS_ROOM = 100e6
 """Bytes of features of keyframes that are kept for the next pair."""
 
@@ -86,7 +88,7 @@ def run(context: StageContext) -> dict[str, Any]:
     if settings.joint == "always" or (settings.joint == "moved" and moved_px >= JOINT_PX):
         if gaussian_map is None:
             gaussian_map = context.run.load(MAP, "mapping").to(context.device)
-        refined = refine_map(context, gaussian_map, trajectory, fields, settings.joint_passes)
+        refined = refine_map(context, gaussian_map, trajectory, fields, JOINT_PASSES)
     return save(context, model, trajectory, gaussian_map, found, closed, refined, moved_px)
 
 
@@ -133,7 +135,7 @@ def keyframe_views(context: StageContext, model: SparseModel, pictures: Pictures
 
 
 def load_summaries(run: RunFolder, model: SparseModel) -> list[LabelSummary]:
-    """What the labels say of every keyframe; nothing where it has none."""
+    """Summarise the labels of every keyframe; those of one without labels say nothing."""
     classes = len(run.load(CLASSES))
     unknown = np.full((2, 2), VOID, np.uint8)
     ids = model.frame_ids.tolist()
@@ -198,8 +200,7 @@ def correct_trajectory(trajectory: Trajectory, state: TrackState, model: SparseM
     new = np.array([state.poses[i] for i in model.frame_ids.tolist()])
     old, refined = model.cam_from_world, poses_of(trajectory, model.frame_ids)
     # new_from_refined = (new_from_old in the camera), with distances stretched by the keyframe's ratio.
-    small = refined @ se3.inverse(old)
-    small[:, :3, 3] *= ratio[:, None]
+    small = se3.scaled(refined @ se3.inverse(old), ratio)
     poses = follow_keyframes(
         trajectory.frame_ids, trajectory.cam_from_world, model.frame_ids, refined, small @ new, ratio
     )
@@ -208,7 +209,7 @@ def correct_trajectory(trajectory: Trajectory, state: TrackState, model: SparseM
 
 
 def largest_motion(context: StageContext, state: TrackState, model: SparseModel) -> float:
-    """How far, in pixels, the keyframes have moved against each other: the largest over keyframes."""
+    """Measure how far, in pixels, the keyframes have moved against each other: the largest over keyframes."""
     new = np.array([state.poses[i] for i in model.frame_ids.tolist()])
     moved = se3.inverse(new) @ model.cam_from_world
     apart = se3.inverse(moved[:1]) @ moved

@@ -73,7 +73,7 @@ def verify_loop(first: KeyframeView, second: KeyframeView, intrinsics: Intrinsic
     depth = float(np.nanmedian(second.in_cam[:, 2]))
     # Backwards the translation comes in the second keyframe's scale.
     back = se3.inverse(backward.cam_from_world)
-    disagreement = se3.inverse(back) @ _scaled(forward.cam_from_world, scale)
+    disagreement = se3.inverse(back) @ se3.scaled(forward.cam_from_world, scale)
     if not (0.5 < scale < 2.0 and se3.rotation_angle(disagreement) < np.radians(ROTATION)):
         return None
     if np.linalg.norm(disagreement[:3, 3]) > TRANSLATION * depth:
@@ -86,12 +86,6 @@ def verify_loop(first: KeyframeView, second: KeyframeView, intrinsics: Intrinsic
         _sightings(first, agreed[:, 0], second, agreed[:, 1]),
         _sightings(second, agreed[:, 1], first, agreed[:, 0]),
     )
-
-
-def _scaled(motion: Array, scale: float) -> Array:
-    out = motion.copy()
-    out[:3, 3] *= scale
-    return out
 
 
 def _locate(

@@ -34,6 +34,8 @@ DEPTH_TOLERANCE = 0.05
 """T_depth, relative: a proxy nearer than the map by more adds Gaussians."""
 SPLIT_RADIUS = 1.0
 """Pixels: smaller Gaussians are not split."""
+SPLIT_ERROR = 0.1
+"""Colour error 0..1, summed over a view's pixels: Gaussians that answer for more are split."""
 PRUNE_OPACITY, PRUNE_WEIGHT, PRUNE_RADIUS = 0.03, 0.03, 0.15
 """Gaussians go that are more transparent than this, of less blending weight in every pixel of every keyframe (a fifth
 fewer at +0.06 dB), or larger than this in units of the scene's median depth."""
@@ -87,7 +89,7 @@ class Growth:
         parameters, s = self.state.parameters, self.settings
         wrong = torch.where(found.footprint > SPLIT_RADIUS, found.error, 0.0)
         room = max(s.max_gaussians - len(parameters), 0) // (CHILDREN - 1)
-        rows = torch.argsort(wrong, descending=True, stable=True)[: min(int((wrong > s.split_error).sum()), room)]
+        rows = torch.argsort(wrong, descending=True, stable=True)[: min(int((wrong > SPLIT_ERROR).sum()), room)]
         if len(rows):
             children, trust = split(parameters.to_map(), rows), parameters.trust[rows].repeat(CHILDREN)
             kept = torch.ones(len(parameters), dtype=torch.bool, device=rows.device)

@@ -107,7 +107,7 @@ class MapOptimiser:
         rendering = self._step(step, view)
         if step.grow:
             self.growth.grow(step.view, Rendering(*(x.detach() for x in vars(rendering).values())))
-        if step.split and self.settings.split_error > 0:
+        if step.split:
             self.growth.split(self._blame())
         if step.prune:
             self.growth.prune(self._blending_weights)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +11,9 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.digest import files_sha256
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.image_times import frame_number
 from msgs_slam.formats.images import image_size, natural_key, read_rgb
 from msgs_slam.pipelines.source.opening import Source, VideoSource
-
-_LAST_NUMBER = re.compile(r"(\d+)(?!.*\d)")
 
 
 @dataclass(frozen=True)
@@ -70,10 +68,9 @@ def open_masks(folder: Path, source: Source) -> MaskFiles:
 
 
 def _by_number(files: list[Path], source: Source) -> tuple[dict[int, Path], list[Path]]:
-    numbered = [(m.group(1), p) if (m := _LAST_NUMBER.search(p.name.split(".")[0])) else ("", p) for p in files]
     last = source.expected_frames or 1 << 62
-    paths = {int(n): p for n, p in numbered if n and int(n) < last}
-    return paths, [p for n, p in numbered if not n or int(n) >= last]
+    paths = {n: p for p in files if (n := frame_number(p)) is not None and n < last}
+    return paths, [p for p in files if (n := frame_number(p)) is None or n >= last]
 
 
 def _by_name(files: list[Path], source: Source) -> tuple[dict[int, Path], list[Path]]:

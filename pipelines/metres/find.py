@@ -27,14 +27,6 @@ _CONTRADICTION = 3.0
 
 
 @dataclass(frozen=True)
-class Machine:
-    """Threads and device of the networks."""
-
-    threads: int = 1
-    device: str = "cpu"
-
-
-@dataclass(frozen=True)
 class Seen:
     """Keyframes of a run, their camera, and the names of their classes; `is_named`: whether something that knows things
     gave the names."""
@@ -46,28 +38,23 @@ class Seen:
     is_named: bool
 
 
-@dataclass(frozen=True)
-class Found:
-    """metres: None where they are unknown, or only guessed although guesses are off; warning: evidence against them."""
+def find_metres(
+    run: RunFolder, trajectory: Trajectory, guess: bool, card: Card | None, threads: int = 1, device: str = "cpu"
+) -> tuple[Metres | None, str | None]:
+    """Estimate the unit of the world of `trajectory` in metres, None where they are unknown, or could only be guessed
+    although guesses are off; and a warning where there is evidence against them.
 
-    metres: Metres | None
-    warning: str | None = None
-
-
-def find_metres(run: RunFolder, trajectory: Trajectory, card: Card | None, machine: Machine, guess: bool) -> Found:
-    """Estimate the unit of the world of `trajectory` in metres.
-
-    card: a network for metric depth, where there is one; guess: whether what is usual in the world counts. Raises
-    InputError for a network that is not what its card says.
+    guess: whether what is usual in the world counts; card: a network for metric depth, where there is one, on so many
+    threads of the device. Raises InputError for a network that is not what its card says.
     """
     given = known_evidence(run)
-    usual = usual_evidence(load_seen(run, trajectory), card, machine) if guess else []
+    usual = usual_evidence(load_seen(run, trajectory), card, threads, device) if guess else []
     # What was measured needs no guesses beside it: they can only doubt it.
     pieces = given if any(p.kind == MEASURED for p in given) else [*given, *usual]
-    return Found(describe(pieces) if pieces else None, contradiction(given, usual))
+    return describe(pieces) if pieces else None, contradiction(given, usual)
 
 
-def usual_evidence(seen: Seen, card: Card | None, machine: Machine) -> list[Evidence]:
+def usual_evidence(seen: Seen, card: Card | None, threads: int = 1, device: str = "cpu") -> list[Evidence]:
     """Collect evidence of a network, the room and the things in it; none where no frame has reliable depth."""
     scene = build_scene(seen.frames, seen.camera, seen.names, seen.is_named) if seen.frames else None
     if scene is None:
@@ -75,7 +62,7 @@ def usual_evidence(seen: Seen, card: Card | None, machine: Machine) -> list[Evid
     pieces = scene_evidence(scene)
     if card is not None:
         some = seen.frames[:: -(-len(seen.frames) // _MOST_NETWORK_FRAMES)]
-        found = network_scale(card, some, seen.camera, machine.threads, machine.device)
+        found = network_scale(card, some, seen.camera, threads, device)
         pieces += [found] if found else []
     return pieces
 

@@ -22,13 +22,20 @@ from msgs_slam.pipelines.voxels.layout import (
     floor_plane,
     name_structure,
 )
-from msgs_slam.pipelines.voxels.voxels import VOXELS_PER_DEPTH, Voxels, find, gather_frame, merge, select, voxel_keys
+from msgs_slam.pipelines.voxels.voxels import (
+    LEAST_WEIGHT,
+    VOXELS_PER_DEPTH,
+    Voxels,
+    find,
+    gather_frame,
+    merge,
+    voxel_keys,
+)
 
 Array = NDArray[np.float64]
 
 LEAST_CONFIDENCE = 0.3
 _SIDE = 200
-_LEAST_WEIGHT = 1.5
 _LEAST_PLANE = 30
 """Voxels without which a floor or a ceiling is none."""
 
@@ -86,12 +93,10 @@ def build_scene(
         return None
     median_depth = float(np.median(np.concatenate(known)))
     size = median_depth / VOXELS_PER_DEPTH
-    scale = min(1.0, _SIDE / max(intrinsics.width, intrinsics.height))
-    camera = intrinsics.resized(max(1, round(intrinsics.width * scale)), max(1, round(intrinsics.height * scale)))
+    camera = intrinsics.at_most(_SIDE)
     rows = [_gather(f, camera, size) for f in frames]
     # Votes are by the same cubes, however many.
-    voxels = merge(size, [(keys, values) for keys, values, _ in rows], sys.maxsize)
-    voxels = select(voxels, voxels.weight > _LEAST_WEIGHT)
+    voxels = merge(size, [(keys, values) for keys, values, _ in rows], sys.maxsize, LEAST_WEIGHT)
     cameras = np.array([f.world_from_cam for f in frames])
     gravity = find_gravity(voxels, -cameras[:, :3, 1].mean(0))
     kind = name_structure(voxels, gravity, cameras[:, :3, 3])

@@ -56,11 +56,6 @@ def best_classes(probabilities: NDArray[np.float32], void: Sequence[int]) -> tup
     return ids, np.where(ids < 0, 0, best).astype(np.float32)
 
 
-def network_labels(network: Network, output: NDArray, width: int, height: int) -> tuple[NDArray[np.int64], NDArray]:
-    """Return `best_classes` at the pixels of an image, from the network alone."""
-    return best_classes(network_probabilities(network, output, width, height), network.card.void)
-
-
 def _scores(network: Network, output: NDArray, box: Letterbox) -> NDArray[np.float32]:
     """(h', w', C) scores of the classes."""
     card = network.card

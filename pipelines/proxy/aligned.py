@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, DepthProvider
 from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.proxy.learned.depth import OnnxDepth
 from msgs_slam.pipelines.proxy.scale import depth_at_points
@@ -22,7 +22,7 @@ _NEIGHBOURS = 5
 """A frame with few points of its own takes those of so many neighbours in time on either side too."""
 
 
-class AlignedDepth:
+class AlignedDepth(DepthProvider):
     """A network's relative depth in the unit of the backbone: not metric, but of one scale over the whole video.
 
     Each frame's values become depth by `scale · v` ("scale"), `scale · v + shift` ("depth") or

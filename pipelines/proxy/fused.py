@@ -28,7 +28,7 @@ that miss differently are better together. Its share grows with how much the net
 fades as the two differ more (all in log depth)."""
 
 
-class FusedDepth:
+class FusedDepth(DepthProvider):
     """Depth in the learned provider's unit (metres).
 
     Where the views agree, the multi-view depth times one scale for the whole run. Elsewhere the learned depth,

@@ -65,7 +65,7 @@ class ProxyWork:
         )  # fmt: skip
 
     def posed(self, frames: list[Frame]) -> list[Frame]:
-        """Those of the frames that have a pose."""
+        """Select the frames that have a pose."""
         return [f for f in frames if f.id in self.sequence.cam_from_world]
 
     def depth(self, frame: Frame) -> DepthEstimate:
@@ -78,7 +78,7 @@ class ProxyWork:
         return found.without(cv2.resize(moved.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0)
 
     def computed_depth(self, frame: Frame) -> DepthEstimate:
-        """What `make_depths` has left."""
+        """Load the depth that `make_depths` has left."""
         found: DepthEstimate = load_value(self._depth_path(frame))
         return found
 
@@ -91,13 +91,13 @@ class ProxyWork:
         return self.context.snapshot / "depth" / f"{frame.id:06d}.npz"
 
     def labels(self, frame: Frame, seen: DepthEstimate) -> LabelEstimate:
-        """Of what the frame shows of the scene; `seen` in the unit of the backbone."""
+        """Estimate the labels of what the frame shows of the scene; `seen` in the unit of the backbone."""
         return self.semantics.estimate(frame, seen).without(self.sequence.left_out(frame))
 
     def moving_views(
         self, posed: list[Frame], scale: DepthScale
     ) -> tuple[NDArray[np.float64], Callable[[int], MovingView], Intrinsics]:
-        """What `find_moving` is to look at: poses, views, and their camera."""
+        """Inputs of `find_moving`: poses, views, and their camera."""
         sequence, camera = self.sequence, self.sequence.intrinsics.at_most(SIDE)
 
         def view(k: int) -> MovingView:
@@ -124,7 +124,7 @@ def load_sequence(context: StageContext) -> Sequence:
 
 
 def in_frames(opened: ProxyWork, work: Callable[[Chunk, Progress], R], frames: list[Frame], **known: Any) -> list[R]:
-    """What a task returns of each range of the frames."""
+    """Do a task on ranges of the frames; returns its results in order."""
     ids = np.array([f.id for f in frames], np.int64)
     return in_chunks(opened.context, work, len(frames), opened, frame_ids=ids, **known)
 
@@ -137,7 +137,7 @@ def _opened(task: Chunk, progress: Progress) -> tuple[ProxyWork, list[Frame]]:
 
 
 def look_for_depth(task: Chunk, progress: Progress) -> None:
-    """What a depth provider finds of each frame by itself: the slow passes."""
+    """Run the slow passes of the depth provider over single frames."""
     work, frames = _opened(task, progress)
     work.depths.look(frames[task.first : task.last])
 
@@ -157,7 +157,7 @@ def look_for_moving(task: Chunk, progress: Progress) -> dict[int, NDArray[np.boo
 
 
 def look_for_labels(task: Chunk, progress: Progress) -> None:
-    """What a network says of each frame by itself."""
+    """Run the network for labels over single frames."""
     work, frames = _opened(task, progress)
     work.semantics.look(frames[task.first : task.last])
 

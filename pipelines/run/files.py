@@ -33,7 +33,6 @@ from msgs_slam.pipelines.types import (
     GivenPoses,
     LoopEdge,
     Metres,
-    MetresSource,
     ProxyMaps,
     Trajectory,
     Vocabulary,
@@ -315,17 +314,12 @@ map."""
 # export ---------------------------------------------------------------------------------------------------------
 
 
-def _metres(row: Any) -> Metres | None:
-    if row is None:
-        return None
-    alone = tuple(dataclass_from_json(MetresSource, s) for s in row["alone"])
-    numbers = {k: float(row[k]) for k in ("per_unit", "relative_sd", "disagreement")}
-    sources = tuple(str(s) for s in row["sources"])
-    return Metres(**numbers, is_guess=bool(row["is_guess"]), sources=sources, alone=alone)
-
+_TOLD = ("text", "about_alone")
+"""Keys for people: what they say follows from the others."""
 
 METRES: RunFile[Metres | None] = RunFile(
-    "scale.json", ("export",), "scale", _metres,
+    "scale.json", ("export",), "scale",
+    lambda row: row if row is None else dataclass_from_json(Metres, {k: row[k] for k in row if k not in _TOLD}),
     lambda metres: None if metres is None else {"text": metres.text, **asdict(metres), "about_alone": _ALONE},
 )  # fmt: skip
 """How long the world's unit is: the value, its sentence, and what each source says; null where metres are unknown."""

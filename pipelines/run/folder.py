@@ -34,8 +34,8 @@ class RunFolder(FinishedFiles):
     """One run on disk: what its finished stages have left."""
 
     def load(self, file: RunFile[T], stage: str = "", of: int | str = "", piece: str = "") -> T:
-        """What a stage, without one the file's first, left in a file of the run's table (`run/files.py`); `of` which
-        frame, in the folder of which `piece`. Raises InputError where it did not, or the file is not as it left it."""
+        """Load a file of the run's table (`run/files.py`) as a stage, without one the file's first, left it; `of` which
+        frame, in the folder of which `piece`. Raises InputError where it left none, or the file has changed since."""
         return file.read(self.file(*_place(file, stage, of, piece)))
 
     def holds(self, file: RunFile[T], stage: str = "", of: int | str = "", piece: str = "") -> bool:
@@ -43,7 +43,7 @@ class RunFolder(FinishedFiles):
         return self.has(*_place(file, stage, of, piece))
 
     def find(self, file: RunFile[T], stage: str = "", of: int | str = "", piece: str = "") -> T | None:
-        """The same as `load`; None where the stage has left no such file."""
+        """Load the file as `load` does; None where the stage has left none."""
         return self.load(file, stage, of, piece) if self.holds(file, stage, of, piece) else None
 
     def find_proxy(self, frame_id: int) -> ProxyMaps | None:

@@ -49,31 +49,6 @@ class StageRecord:
     inputs: Any = None
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        wanted: dict[str, Any] = {
-            "fingerprint": str,
-            "content": str,
-            "seconds": int | float,
-            "peak_memory_mb": int | float,
-        }
-        wanted |= {"figures": dict, "files": dict, "settings": dict, "warnings": list}
-        for name, kind in wanted.items():
-            if not isinstance(getattr(self, name), kind):
-                raise ValueError(f"{name} is {str(getattr(self, name))[:40]!r}")
-
-    @staticmethod
-    def from_json(value: Any) -> StageRecord:
-        """Inverse of `asdict` after JSON. Raises TypeError, ValueError or KeyError for anything else."""
-        files = {str(name): (int(size), str(digest)) for name, (size, digest) in value["files"].items()}
-        return StageRecord(
-            **{
-                **value,
-                "files": files,
-                "seconds": float(value["seconds"]),
-                "peak_memory_mb": float(value["peak_memory_mb"]),
-            }
-        )
-
 
 @dataclass(frozen=True)
 class Manifest:
@@ -102,7 +77,7 @@ def _manifest(path: Path, value: dict[str, Any]) -> Manifest:
     if value.pop("check", None) != _check(value):
         raise ValueError("its checksum differs")
     stages = value["stages"]
-    records = {name: StageRecord.from_json(stages[name]) for name in STAGES if name in stages}
+    records = {name: dataclass_from_json(StageRecord, stages[name]) for name in STAGES if name in stages}
     return Manifest(dataclass_from_json(Source, value["source"]), records)
 
 

@@ -24,6 +24,14 @@ def reduced_size(width: int, height: int, max_side: int) -> tuple[int, int]:
     return max(1, round(width * max_side / longest)), max(1, round(height * max_side / longest))
 
 
+def at_most_wide(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
+    """The image (H, W, 3) at most `width` pixels wide, averaged; itself when it is narrow enough."""
+    if image.shape[1] <= width:
+        return image
+    size = (width, round(width * image.shape[0] / image.shape[1]))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def reduce_image(image: NDArray[np.uint8], max_side: int) -> NDArray[np.uint8]:
     """The image with its long side at most `max_side` pixels, averaged; itself when it is small enough."""
     height, width = image.shape[:2]

@@ -14,6 +14,7 @@ from msgs_slam.pipelines.depth import scales
 from msgs_slam.pipelines.depth.align import align_keyframes
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.depth.scales import COARSE, WorldScale
+from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.structure.bundle import Bundle, adjust_bundle, adjust_pose
 from msgs_slam.pipelines.structure.rolling import rectified_bundle, rectified_pixels, velocities
@@ -178,9 +179,7 @@ def set_scale(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics) -> Bundle
     factor = ties.world.factor
     ties.factor *= factor
     ties.fields[ties.has_depth] += np.log(factor)
-    poses = bundle.cam_from_world.copy()
-    poses[:, :3, 3] *= factor
-    return replace(bundle, cam_from_world=poses, points=bundle.points * factor)
+    return replace(bundle, cam_from_world=se3.scaled(bundle.cam_from_world, factor), points=bundle.points * factor)
 
 
 def with_depths(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics, settings: TrackingConfig) -> Bundle:
@@ -223,8 +222,7 @@ def follow_others(state: TrackState, intrinsics: Intrinsics, adjusted: set[int],
         alive[state.sightings[frame_id].point] = True
     others = sorted(set(state.poses) - adjusted)
     for frame_id in others:
-        state.poses[frame_id] = state.poses[frame_id].copy()
-        state.poses[frame_id][:3, 3] *= factor
+        state.poses[frame_id] = se3.scaled(state.poses[frame_id], factor)
     velocity = state.velocities() if state.shutter.is_rolling else {}
     for frame_id in others:
         seen = state.sightings[frame_id]

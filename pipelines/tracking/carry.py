@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -55,12 +54,13 @@ def lose_unfit(state: TrackState, given: GivenPoses) -> None:
         is_replaced = 2 * len(inside & known) > len(inside) and len(known - inside) > len(inside)
         if is_replaced and _to_given(state, given, segment) is None:
             for i in sorted(inside):
-                state.lose_frame(i, "its surroundings do not agree with the given poses")
+                state.remove_frame(i)
+                state.lost[i] = "its surroundings do not agree with the given poses"
 
 
 def join_by_given(state: TrackState, given: GivenPoses) -> int:
     """Move every segment that shares frames with the given poses to where these put it beside the largest; how many."""
-    order = [s for s, _ in sorted(Counter(state.segment.values()).items(), key=lambda item: (-item[1], item[0]))]
+    order = list(state.segment_sizes())
     main = _to_given(state, given, order[0]) if order else None
     joined = 0
     for segment in order[1:] if main is not None else []:
@@ -86,9 +86,9 @@ def pose_lost(state: TrackState, given: GivenPoses) -> list[int]:
     lost = [i for i in sorted(state.lost) if given.known[i] and i not in astray]
     if not lost:
         return []
-    counts = Counter(state.segment.values())
-    segment = min(counts, key=lambda s: (-counts[s], s)) if counts else 0
-    move = _to_given(state, given, segment) if counts else Similarity(1.0, np.eye(3), np.zeros(3))
+    is_new = not state.segment
+    segment = next(iter(state.segment_sizes()), 0)
+    move = Similarity(1.0, np.eye(3), np.zeros(3)) if is_new else _to_given(state, given, segment)
     if move is None:
         return []
     known = np.flatnonzero(given.known)
@@ -96,7 +96,7 @@ def pose_lost(state: TrackState, given: GivenPoses) -> list[int]:
     posed = [i for i in sorted(state.poses) if state.segment[i] == segment]
     off = _offs(state, here, posed)
     for i in lost:
-        state.add_frame(i, _bend(i, off) @ here[i], NO_SIGHTINGS, not counts, segment)
+        state.add_frame(i, _bend(i, off) @ here[i], NO_SIGHTINGS, is_new, segment)
     return lost
 
 

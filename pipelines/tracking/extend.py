@@ -41,9 +41,7 @@ def start_segment(frame_id: int, cam_from_world: Array, state: TrackState, pictu
     state.add_frame(frame_id, cam_from_world, NO_SIGHTINGS, True, segment)
     if _from_proxy(frame_id, state, pictures) >= MIN_INLIERS:
         return True
-    for table in (state.poses, state.sightings, state.segment):
-        del table[frame_id]
-    state.keyframes.remove(frame_id)
+    state.remove_frame(frame_id)
     state.points, state.colors = state.points[:before], state.colors[:before]
     return False
 
@@ -57,12 +55,10 @@ def _from_proxy(frame_id: int, state: TrackState, pictures: Pictures) -> int:
     count = max(NEW_POINTS - len(seen), 0)
     xy = corners(pictures.grey(frame_id), seen.xy, count, left_out=pictures.left_out(frame_id))
     depth, _ = sample_proxy(maps, xy, intrinsics)
-    motion = state.poses[frame_id]
-    z = state.points[seen.point] @ motion[2, :3] + motion[2, 3]
-    scale = scale_at_points(maps, seen.xy, z, intrinsics, MIN_INLIERS) or 1.0
+    scale = scale_at_points(maps, seen.xy, state.depths(frame_id), intrinsics, MIN_INLIERS) or 1.0
     good = depth > 0
     in_cam = unproject(xy[good], depth[good] * scale, intrinsics)
-    points = se3.transform(se3.inverse(motion), in_cam)
+    points = se3.transform(se3.inverse(state.poses[frame_id]), in_cam)
     _add(points, {frame_id: xy[good]}, state, pictures)
     return int(good.sum())
 
@@ -86,8 +82,7 @@ def _triangulate(first: int, second: int, state: TrackState, pictures: Pictures)
 
 def _nearby_depth(frame_id: int, xy: Array, state: TrackState) -> Array:
     """(Q,) depth of the nearest known point in the image: a fair first guess."""
-    seen, motion = state.sightings[frame_id], state.poses[frame_id]
-    z = state.points[seen.point] @ motion[2, :3] + motion[2, 3]
+    seen, z = state.sightings[frame_id], state.depths(frame_id)
     ahead = z > 0
     if not ahead.any() or len(xy) == 0:
         return np.ones(len(xy))

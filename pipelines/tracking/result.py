@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -16,9 +15,8 @@ from msgs_slam.pipelines.types import Frame, Trajectory
 def split_worlds(state: TrackState, least: int) -> list[TrackState]:
     """The segments, largest first, each in a world of its own that begins with its first posed camera; of those after
     the first, the ones of at least so many frames. The first has the reason why a frame is in none or in another."""
-    counts = Counter(state.segment.values())
-    # The smaller number wins a tie, so that the choice does not depend on the order of a dictionary.
-    order = sorted(counts, key=lambda s: (-counts[s], s))
+    counts = state.segment_sizes()
+    order = list(counts)
     kept = order[:1] + [s for s in order[1:] if counts[s] >= least]
     elsewhere = {s: f"in piece_{n}, which is not connected to the rest" for n, s in enumerate(kept[1:], 2)}
     short = "tracked, but this stretch could not be joined to the rest"

@@ -30,10 +30,9 @@ def join_segments(state: TrackState, pictures: Pictures, seed: int) -> int:
     joined, again = 0, True
     while again:
         again = False
-        counts = Counter(state.segment.values())
-        order = sorted(counts, key=lambda s: (-counts[s], s))
-        for segment in order[1:]:
-            if _join(segment, order[0], state, pictures, seed):
+        main, *others = state.segment_sizes() or [0]
+        for segment in others:
+            if _join(segment, main, state, pictures, seed):
                 joined, again = joined + 1, True
                 break
     return joined
@@ -43,9 +42,7 @@ def split_segments(state: TrackState) -> None:
     """Number the segments of the backbone, in place: keyframes that no chain of common points joins are of different
     ones, larger ones first. A keyframe without points is none: it will be tracked like any other frame."""
     for frame_id in [k for k in state.keyframes if len(state.sightings[k]) == 0]:
-        state.keyframes.remove(frame_id)
-        for table in (state.poses, state.sightings, state.segment):
-            del table[frame_id]
+        state.remove_frame(frame_id)
     rows = [state.sightings[k].point for k in state.keyframes]
     # Places hold views together as points do.
     rows = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -105,14 +106,13 @@ class TrackState:
             if self.keyframes[place : place + 1] != [frame_id]:
                 self.keyframes.insert(place, frame_id)
 
-    def lose_frame(self, frame_id: int, why: str) -> None:
-        """A frame that was posed, and is not."""
+    def remove_frame(self, frame_id: int) -> None:
+        """Remove a posed frame; its points stay."""
         for table in (self.poses, self.sightings, self.segment):
             del table[frame_id]
         for listed in (self.keyframes, self.rendered, self.turned):
             if frame_id in listed:
                 listed.remove(frame_id)
-        self.lost[frame_id] = why
 
     def add_segment(self, other: TrackState) -> None:
         """The keyframes of another world that are not posed yet, with their points, as a segment of their own."""
@@ -143,16 +143,24 @@ class TrackState:
         keep = np.bincount(seen.point, minlength=len(self.points))[seen.point] >= 2
         return row[keep], seen.select(keep)
 
+    def segment_sizes(self) -> dict[int, int]:
+        """Return segment → number of posed frames, the largest first, of two alike the one of the smaller number."""
+        return dict(sorted(Counter(self.segment.values()).items(), key=lambda item: (-item[1], item[0])))
+
     def velocities(self) -> dict[int, Array]:
-        """(6,) twists a second of all posed frames."""
+        """Return by posed frame (6,) twists a second."""
         ids = sorted(self.poses)
         poses, worlds = np.array([self.poses[i] for i in ids]), np.array([self.segment[i] for i in ids])
         return dict(zip(ids, velocities(poses, self.shutter.times[ids], worlds), strict=True))
 
+    def depths(self, frame_id: int) -> Array:
+        """(Q,) depth in a frame of each point that it sees."""
+        motion = self.poses[frame_id]
+        return self.points[self.sightings[frame_id].point] @ motion[2, :3] + motion[2, 3]
+
     def median_depth(self, frame_id: int) -> float:
         """Return the median depth of the points that a frame sees; 1 when it sees none."""
-        motion, seen = self.poses[frame_id], self.sightings[frame_id]
-        depth = self.points[seen.point] @ motion[2, :3] + motion[2, 3]
+        depth = self.depths(frame_id)
         return float(np.median(depth)) if len(depth) else 1.0
 
     def nearest_keyframes(self, frame_id: int, count: int) -> list[int]:

@@ -15,7 +15,7 @@ from msgs_slam.pipelines.depth.scales import scale_at_points
 from msgs_slam.pipelines.gaussians.seeding import seed_gaussians, seed_grid
 from msgs_slam.pipelines.tracking.pictures import Pictures
 from msgs_slam.pipelines.tracking.state import TrackState
-from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
+from msgs_slam.pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
 WORKING_SIDE = 320
@@ -48,7 +48,8 @@ def _seed_keyframe(keyframe: int, state: TrackState, pictures: Pictures) -> tupl
     if maps is None:
         return None
     small, motion = pictures.intrinsics.at_most(WORKING_SIDE), state.poses[keyframe]
-    scale = proxy_scale(keyframe, motion, maps, state, pictures.intrinsics) or 1.0
+    points = state.sightings[keyframe].xy, state.depths(keyframe)
+    scale = scale_at_points(maps, *points, pictures.intrinsics, MIN_POINTS) or 1.0
     maps = resize_maps(maps, small.height, small.width)
     depth = maps.depth * np.float32(scale)
     grid = torch.from_numpy(seed_grid(small.height, small.width, STRIDE))
@@ -56,17 +57,6 @@ def _seed_keyframe(keyframe: int, state: TrackState, pictures: Pictures) -> tupl
     colors, pose = reduced_image(pictures.color(keyframe), small), torch.from_numpy(np.ascontiguousarray(motion))
     seeds = seed_gaussians(grid, torch.from_numpy(depth), colors, channels, STRIDE, 1, pose, small, keyframe)
     return seeds.means, seeds.radii, seeds.opacities, seeds.colors
-
-
-def proxy_scale(
-    frame_id: int, cam_from_world: Array, maps: ProxyMaps, state: TrackState, intrinsics: Intrinsics
-) -> float | None:
-    """World over proxy depth: the median over the points that the frame sees; None for fewer than eight."""
-    if frame_id not in state.sightings:
-        return None
-    seen = state.sightings[frame_id]
-    z = state.points[seen.point] @ cam_from_world[2, :3] + cam_from_world[2, 3]
-    return scale_at_points(maps, seen.xy, z, intrinsics, MIN_POINTS)
 
 
 def reduced_image(image: NDArray[np.uint8], small: Intrinsics) -> Tensor:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.run.layouts import RunFile
+from msgs_slam.pipelines.run.layouts import RunFile, dataclass_from_json
 from msgs_slam.pipelines.upright.find import Upright, cameras_up
 from msgs_slam.pipelines.upright.georeference import Georeference
 
@@ -111,16 +111,11 @@ def _unpack(value: Any) -> World:
         has_floor=bool(value["floor_at_zero"]),
         exported_from_run=Similarity(float(move["scale"]), rotation, translation),
         against={str(name): float(v) for name, v in value["degrees_from_up"].items()},
-        earth=None if earth is None else _earth(earth),
+        earth=None
+        if earth is None
+        else dataclass_from_json(Georeference, {k: earth[k] for k in earth if k != "frame"}),
         unit=str(value["unit"]),
     )
-
-
-def _earth(value: dict[str, Any]) -> Georeference:
-    latitude, longitude, altitude = (float(v) for v in value["origin"])
-    used, fixes = int(value["used"]), int(value["fixes"])
-    origin = (latitude, longitude, altitude)
-    return Georeference(origin, float(value["residual"]), used, fixes, float(value["scale_sd"]))
 
 
 WORLD: RunFile[World] = RunFile("world.json", ("export",), "world of the exported files", _unpack, _pack)

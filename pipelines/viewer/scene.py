@@ -24,7 +24,7 @@ from msgs_slam.pipelines.proxy.interface.palette import class_colors
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, MESH
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_records
-from msgs_slam.pipelines.types import Frame, Metres
+from msgs_slam.pipelines.types import Frame, Intrinsics, Metres
 from msgs_slam.pipelines.upright.find import cameras_up
 from msgs_slam.pipelines.upright.world import WORLD, up_in_run
 from msgs_slam.pipelines.viewer.camera_path import EXPORTED, RUN
@@ -46,6 +46,12 @@ class ViewerCamera:
     world_from_cam: NDArray[np.float64]
     fov: float
     aspect: float
+
+    @staticmethod
+    def of(frame: Frame, world_from_cam: NDArray[np.float64], camera: Intrinsics) -> ViewerCamera:
+        """Place a camera of these intrinsics at a frame's pose."""
+        fov = 2 * float(np.arctan(camera.height / 2 / camera.fy))
+        return ViewerCamera(frame, world_from_cam, fov, camera.width / camera.height)
 
 
 @dataclass(frozen=True)
@@ -88,7 +94,7 @@ class ViewerScene:
 
     @cached_property
     def opacities(self) -> NDArray[np.float32]:
-        """(M, 1)."""
+        """Opacities (M, 1) in 0..1, as the page wants them."""
         return (1 / (1 + np.exp(-self.cloud.opacity_logits)))[:, None].astype(np.float32)
 
     @cached_property
@@ -142,8 +148,7 @@ def _from_run(outcome: Outcome) -> ViewerScene:
     t, k = outcome.trajectory, outcome.calibration.intrinsics
     centers = t.centers[t.is_posed]
     scale = _scale(cloud.means, centers)
-    fov, aspect = 2 * float(np.arctan(k.height / 2 / k.fy)), k.width / k.height
-    ids = evenly(t.frame_ids[t.is_keyframe].tolist(), MOST_CAMERAS)
+    rows = [outcome.frame_row(i) for i in evenly(t.frame_ids[t.is_keyframe].tolist(), MOST_CAMERAS)]
     world_from_cam = t.world_from_cam
     channels = decided_channels(m.class_logits).cpu().numpy()
     return ViewerScene(
@@ -154,10 +159,7 @@ def _from_run(outcome: Outcome) -> ViewerScene:
         labels=labels_of_channels(channels, outcome.label_of_channel) if m.class_logits.shape[1] else None,
         class_names=outcome.classes.names,
         class_colors=outcome.classes.colors,
-        cameras=[
-            ViewerCamera(outcome.frames[row], world_from_cam[row], fov, aspect)
-            for row in (outcome.frame_row(i) for i in ids)
-        ],
+        cameras=[ViewerCamera.of(outcome.frames[row], world_from_cam[row], k) for row in rows],
         path=centers * scale,
         mesh_file=outcome.run.file("export", MESH) if outcome.run.has("export", MESH) else None,
         run=outcome.run,
@@ -208,8 +210,7 @@ def _of_points(
     if not cameras:
         return shown
     frames, k = run.load(FRAMES), run.load(CALIBRATION).intrinsics
-    fov, aspect = 2 * float(np.arctan(k.height / 2 / k.fy)), k.width / k.height
-    seen = [ViewerCamera(frames[i], pose, fov, aspect) for i, pose in evenly(cameras, MOST_CAMERAS)]
+    seen = [ViewerCamera.of(frames[i], pose, k) for i, pose in evenly(cameras, MOST_CAMERAS)]
     return replace(shown, cameras=seen)
 
 

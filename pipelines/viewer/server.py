@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.pipelines.export.floor_plan import walls_of_run
+from msgs_slam.pipelines.source.sharpness import at_most_wide
 from msgs_slam.pipelines.viewer.door import guarding
 from msgs_slam.pipelines.viewer.flight import Flight
 from msgs_slam.pipelines.viewer.live import Watch
@@ -261,7 +261,7 @@ class Viewer:
         if self.scene.run is not None:
             label = f"{plain(camera.frame.name)}, {camera.frame.timestamp:.2f} s"
             try:
-                self.preview.image = _reduced(self.scene.run.image(camera.frame))
+                self.preview.image = at_most_wide(self.scene.run.image(camera.frame), _PREVIEW_WIDTH)
                 self.preview.visible = True
             except InputError as error:  # this frame alone: what else is shown was checked
                 label = plain(str(error))
@@ -324,10 +324,3 @@ def legend_html(scene: ViewerScene) -> str:
 def plain(name: str) -> str:
     """A name without what Markdown, HTML or the page's scripts could take for their own."""
     return re.sub(r"[^\w .,()-]", "?", name)
-
-
-def _reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    if picture.shape[1] <= _PREVIEW_WIDTH:
-        return picture
-    size = (_PREVIEW_WIDTH, round(_PREVIEW_WIDTH * picture.shape[0] / picture.shape[1]))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 VOXELS_PER_DEPTH = 60
 """A voxel is this fraction of the scene's median depth: 5 cm at 3 m."""
-_LEAST_WEIGHT = 1.0
-"""Of a voxel that depth images show."""
+LEAST_WEIGHT = 1.5
+"""A voxel of less, one sure pixel and a half, is noise."""
 _BITS = 21
 _HALF = 1 << (_BITS - 1)
 _WAITING = 500_000
@@ -156,13 +156,19 @@ def gather_depths(views: Iterable[PosedDepth], size: float) -> Voxels:
         world_from_cam = np.linalg.inv(view.cam_from_world).astype(np.float64)
         return gather_frame(view.depth, view.trust, black, view.intrinsics, world_from_cam, size)
 
-    voxels = merge(size, (gathered(view) for view in views))
-    return select(voxels, voxels.weight > _LEAST_WEIGHT)
+    return merge(size, (gathered(view) for view in views), least=1.0)
 
 
-def merge(size: float, frames: Iterable[tuple[NDArray[np.int64], NDArray[np.float64]]], most: int = MOST) -> Voxels:
-    """All frames' voxels together: memory grows with the scene, not with the number of frames, and where there are more
-    than `most`, they grow instead."""
+def merge(
+    size: float,
+    frames: Iterable[tuple[NDArray[np.int64], NDArray[np.float64]]],
+    most: int = MOST,
+    least: float = 0.0,
+) -> Voxels:
+    """Merge the frames' voxels, and drop those that no more than the `least` weight speaks for.
+
+    Memory grows with the scene, not with the number of frames; where there are more than `most`, they grow instead.
+    """
     gathered = _Gathered(size, most, np.empty(0, np.int64), [np.empty(0)] * 10)
     waiting: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
     for row in frames:
@@ -176,7 +182,8 @@ def merge(size: float, frames: Iterable[tuple[NDArray[np.int64], NDArray[np.floa
     normal = np.stack([sums.pop(1) for _ in range(3)], axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     color = np.stack([sums.pop(1) / weight for _ in range(3)], axis=1)
-    return Voxels(gathered.size, gathered.keys, sums[0], position, normal, color)
+    voxels = Voxels(gathered.size, gathered.keys, sums[0], position, normal, color)
+    return select(voxels, voxels.weight > least)
 
 
 @dataclass

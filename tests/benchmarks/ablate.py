@@ -28,7 +28,8 @@ from msgs_slam.formats.jsonfile import read_json_object, write_json
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import Stage
 from msgs_slam.pipelines.engine.standing import next_upstream, stage_fingerprint
-from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
+from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
+from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.read_config import config_to_toml, load_config
 from msgs_slam.pipelines.reconstruct import all_stages, reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -83,7 +84,7 @@ def ablate(
     Runs lie in folder/runs, and what is finished there is not done again: a call that was killed goes on. The table in
     ablation.md and the figures in ablation.json are brought up to date after every run. Raises InputError for an
     unknown variant, seeds that are none or occur twice, a folder that holds another ablation, and as `reconstruct` and
-    `evaluate_run` do.
+    `evaluate_outcome` do.
     """
     _require(variants, seeds)
     jobs = list(_jobs(folder, config, seeds, variants))
@@ -159,7 +160,7 @@ def _measure(job: Job, truth: Sequence, progress: Progress, max_views: int) -> N
     stamp = {name: record.content for name, record in load_records(job.run).items()} | {"views": max_views}
     if file.exists() and read_json_object(file).get("stamp") == stamp:
         return
-    write_json(file, {"stamp": stamp, "figures": evaluate_run(job.run, truth, progress, max_views)})
+    write_json(file, {"stamp": stamp, "figures": evaluate_outcome(load_outcome(job.run), truth, progress, max_views)})
 
 
 def _figures_file(job: Job) -> Path:
@@ -183,7 +184,8 @@ METRICS: dict[str, tuple[tuple[str, ...], float, str]] = {
     ),
     "Gaussians": (("cost", "gaussians"), 1, "no map"),
 }
-"""Column → where `evaluate_run` has it, the factor to its unit, and why it is missing where nothing else says so."""
+"""Column → where `evaluate_outcome` has it, the factor to its unit, and why it is missing, where nothing else says so.
+"""
 
 
 def _collected(

@@ -42,7 +42,7 @@ WITH_TASKS = {
     "export": "snapshot/draw_views.npz",
 }
 """Stages that submit tasks, and what of their unfinished folder is there once they have."""
-SETTINGS = ("global_ba.joint=always", "global_ba.joint_passes=3")
+SETTINGS = ("global_ba.joint=always",)
 """The clip has no loops, without which nothing would be refined by global_ba."""
 BETWEEN_KILLS = (0.05, 0.6)
 """Seconds."""

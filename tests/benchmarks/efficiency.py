@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 os.environ["PYTHONPATH"] = str(ROOT)  # of the nodes, as an installed program is found
 
-from msgs_slam.msgs_cli.options import worker_setup
+from msgs_slam.msgs_cli.output import Output
 from msgs_slam.pipelines.demo import unpack_demo_clip
 from msgs_slam.pipelines.engine.engines import Call, Ended, Engine, RayEngine
 from msgs_slam.pipelines.engine.workers import Workers
@@ -98,7 +98,9 @@ def with_nodes(count: int, first: Path, run: Path) -> Timed:
         shutil.rmtree(run, ignore_errors=True)
         shutil.copytree(first, run)
         timed = Timed(engine)
-        workers = Workers(timed, worker_setup(True, False, True), 1, 0, 2)  # as many portions on one node as on two
+        workers = Workers(
+            timed, Output(quiet=True).worker_setup(remote=True), 1, 0, 2
+        )  # as many portions on one node as on two
         resume(RunFolder(run), SilentProgress(), None, "mapping", workers)
     engine.close()
     cluster.shutdown()

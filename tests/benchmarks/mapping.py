@@ -31,7 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import open_sequence
-from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
+from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
+from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -65,7 +66,6 @@ CASES = {
 
 ABLATIONS = {
     **ARTICLE_ABLATIONS,
-    "without splitting": ("mapping.split_error=0.0",),
     "without exposure": ("mapping.exposure=false",),
     "without pose refinement": ("mapping.refine_poses=false",),
 }
@@ -129,7 +129,7 @@ def measure_case(case: Case, name: str, data: Path, work: Path, overrides: list[
     for stage in ("mapping", "global_ba", "export"):
         yield f"{stage} seconds", records[stage].seconds
         yield from _numbers(records[stage].figures, stage)
-    result = evaluate_run(run, truth)
+    result = evaluate_outcome(load_outcome(run), truth)
     for group in ("trajectory", "images", "depth", "labels", "mesh"):
         yield from _numbers(result[group], group)
 

@@ -26,7 +26,7 @@ from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.trajectory import read_matrices
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.metres.evidence import Evidence, combine
-from msgs_slam.pipelines.metres.find import Machine, Seen, describe, load_seen, usual_evidence
+from msgs_slam.pipelines.metres.find import Seen, describe, load_seen, usual_evidence
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.interface.sequence import Sequence
@@ -119,8 +119,8 @@ def measure(name: str, work: Path, store: ModelStore) -> list[dict[str, Any]]:
     true = true_scale(run, trajectory, DATA / JOBS[name].truth)
     seen = load_seen(run, trajectory)
     model = store.first_here("depth", metres_only=True)
-    bare = usual_evidence(seen, None, Machine())
-    pieces = usual_evidence(with_names(run, seen, store), store.card(model) if model else None, Machine())
+    bare = usual_evidence(seen, None)
+    pieces = usual_evidence(with_names(run, seen, store), store.card(model) if model else None)
     rows = [
         _row(name, source, [p for p in pieces if p.source == source], true)
         for source in dict.fromkeys(p.source for p in pieces)

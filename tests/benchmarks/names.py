@@ -45,7 +45,6 @@ from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.evaluation.pictures import Picture, label_picture
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.geometry.camera import unproject_depth
-from msgs_slam.pipelines.networks.labels import network_labels
 from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.proxy.interface.palette import class_colors
@@ -57,6 +56,7 @@ from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.source.source_pixels import FramePixels
 from msgs_slam.pipelines.types import VOID, ClassTable
 from msgs_slam.pipelines.upright.world import FIRST, WORLD
+from tests.network_labels import network_labels
 
 DATA = ROOT.parent / "shared" / "data"
 SOURCES = {

@@ -208,8 +208,8 @@ def flicker(run: RunFolder, labels_of: dict[int, NDArray[np.uint8]] | None = Non
 def measure_network(name: str, work: Path) -> dict[str, Any]:
     """DeepLab on a video: frames a second of the network alone, and its flicker before and after the votes."""
     from msgs_slam.pipelines.networks.card import read_card
-    from msgs_slam.pipelines.networks.labels import network_labels
     from msgs_slam.pipelines.networks.session import Network
+    from tests.network_labels import network_labels
 
     card_file = write_deeplab_card(work)
     run = RunFolder(work / f"{name}_deeplab.msgs")

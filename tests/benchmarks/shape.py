@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.pipelines.depth.resize import resample_nearest
-from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
+from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.outcome import load_outcome
@@ -207,7 +207,7 @@ def main() -> None:
             if arguments.sheet:
                 write_sheet(views, arguments.sheet / f"{name}_{kind}.png")
         if arguments.mesh:
-            cells = evaluate_run(run, open_sequence(Path(truth)))
+            cells = evaluate_outcome(load_outcome(run), open_sequence(Path(truth)))
             found[f"{name} evaluation"] = {k: cells[k] for k in ("images", "depth", "labels", "mesh")}
             print(f"{name} evaluation:", json.dumps(found[f"{name} evaluation"])[:2000], flush=True)
     if arguments.json:

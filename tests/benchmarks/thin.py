@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.pipelines.depth.resize import resample_nearest
-from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
+from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.read_config import load_config
@@ -129,7 +129,7 @@ def main() -> None:
         write_sheet(proxy_depths(run, truth), arguments.work / "proxies.png")
     if not arguments.proxy:
         rows["map"] = measure(map_depths(run, truth))
-        found = evaluate_run(run, truth)
+        found = evaluate_outcome(load_outcome(run), truth)
         rows["evaluation"] = {k: found[k] for k in ("trajectory", "images", "depth", "mesh")}
         if arguments.sheet:
             write_sheet(map_depths(run, truth), arguments.work / "map.png")

@@ -56,7 +56,7 @@ from msgs_slam.formats.jsonfile import read_toml, write_json
 from msgs_slam.formats.mesh import MeshArrays, MeshBlocks, read_mesh_ply, write_mesh_ply
 from msgs_slam.formats.spz import write_spz
 from msgs_slam.formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
-from msgs_slam.formats.trajectory import read_matrices, read_tum, write_matrices, write_tum
+from msgs_slam.formats.trajectory import read_matrices, read_tum, write_tum
 from msgs_slam.formats.video import VideoReader, probe_video
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.evaluation.class_map import read_class_map
@@ -73,6 +73,7 @@ from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
 from msgs_slam.pipelines.viewer.scene import load_scenes
 from tests.colmap_models import posed_images
+from tests.matrices import write_matrices
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 4
 

@@ -16,7 +16,8 @@ from msgs_slam.formats.datasets.camera import warp_nearest
 from msgs_slam.formats.datasets.matching import poses_at
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png, write_rgb
-from msgs_slam.formats.trajectory import write_matrices, write_tum
+from msgs_slam.formats.trajectory import write_tum
+from tests.matrices import write_matrices
 
 
 def _depth_disagreement(sequence: Sequence, i: int, j: int) -> float:

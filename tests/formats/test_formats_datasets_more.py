@@ -18,8 +18,8 @@ from msgs_slam.formats.datasets import VOID_LABEL, Camera, open_sequence, recogn
 from msgs_slam.formats.datasets.colmap import camera_from_colmap
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png, write_rgb
-from msgs_slam.formats.trajectory import write_matrices
 from tests.colmap_models import posed_images
+from tests.matrices import write_matrices
 
 WIDTH, HEIGHT, N = 64, 48, 5
 

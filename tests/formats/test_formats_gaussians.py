@@ -70,13 +70,12 @@ def test_round_trip(tmp_path: Path, sh_degree: int) -> None:
     for field in ("means", "log_scales", "quat_wxyz", "opacity_logits", "class_ids", "class_probs"):
         assert (getattr(back, field) == getattr(cloud, field)).all(), field
     np.testing.assert_allclose(back.colors, cloud.colors, atol=3e-7)
-    assert back.dropped_sh_degree == sh_degree
 
 
 def test_a_file_by_the_original_program(shared_data: Path) -> None:
     path = shared_data / "format_cases" / "ply_other_writers" / "test-splat.3-points-from-train.ply"
     cloud, raw = read_gaussian_ply(path), plyfile.PlyData.read(str(path))["vertex"]
-    assert (len(cloud), cloud.dropped_sh_degree, cloud.class_ids, cloud.class_probs) == (3, 3, None, None)
+    assert (len(cloud), cloud.class_ids, cloud.class_probs) == (3, None, None)
     np.testing.assert_allclose(np.linalg.norm(cloud.quat_wxyz, axis=1), 1, atol=1e-6)
     np.testing.assert_array_equal(cloud.log_scales[:, 1], raw["scale_1"])
     np.testing.assert_allclose(cloud.colors[:, 2], 0.5 + 0.28209479 * raw["f_dc_2"], atol=1e-6)

@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 from msgs_slam.formats.colmap import write_colmap_model
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.poses import read_poses
-from msgs_slam.formats.trajectory import write_matrices, write_tum
+from msgs_slam.formats.trajectory import write_tum
 from tests.colmap_models import posed_images
+from tests.matrices import write_matrices
 
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
 Poses = NDArray[np.float64]

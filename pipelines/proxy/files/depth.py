@@ -13,7 +13,7 @@ from msgs_slam.formats.images import MAX_IMAGE_PIXELS, image_size, read_depth_pn
 from msgs_slam.formats.reading import parsing, reaching, require_file
 from msgs_slam.pipelines.depth.resize import resample_nearest, resize_depth
 from msgs_slam.pipelines.proxy.files.matching import find_folder, match_files
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, DepthProvider
 from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.types import Frame
 
@@ -23,7 +23,7 @@ _CONFIDENCE_NAMES = ("confidence", "conf")
 _INVALID_U16 = 65535
 
 
-class FilesDepth:
+class FilesDepth(DepthProvider):
     """One file a frame: uint16 images in units of `unit` metres (0 and 65535 unknown), or .npy of float metres.
 
     A folder `confidence` (or `conf`) beside it, of 8 or 16 bit images, gives the confidence, first of all the one that
@@ -31,7 +31,6 @@ class FilesDepth:
     """
 
     metric = True
-    of_all = ()
 
     def __init__(self, folder: str, source: Path, sequence: Sequence, unit: float) -> None:
         """Raises InputError unless the folder is there, frames find their files, and the first file fits the frames."""
@@ -44,12 +43,6 @@ class FilesDepth:
         self._files = match_files(path, _SUFFIXES, _NAMES, sequence.frames, is_video)
         self._confidences = _match_confidence(path, sequence, is_video)
         self.estimate(next(f for f in sequence.frames if f.id in self._files))
-
-    def look(self, frames: list[Frame]) -> None:
-        """Do nothing: files need no pass over single frames."""
-
-    def prepare(self, frames: list[Frame]) -> None:
-        """Do nothing: files need no pass over all frames."""
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames without a file."""

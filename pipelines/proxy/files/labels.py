@@ -16,7 +16,7 @@ from msgs_slam.pipelines.networks.classes import MAX_ID, NamedClass, find_class_
 from msgs_slam.pipelines.proxy.files.depth import require_aspect
 from msgs_slam.pipelines.proxy.files.matching import find_folder, match_files
 from msgs_slam.pipelines.proxy.interface.palette import class_colors
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate, SemanticsProvider
 from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import VOID, ClassTable, Frame
@@ -25,7 +25,7 @@ _SUFFIXES = (".png", ".tif", ".tiff")
 _NAMES = ("labels", "label", "semantic_class", "semantic", "semantics", "segmentation")
 
 
-class FilesLabels:
+class FilesLabels(SemanticsProvider):
     """One 8 or 16 bit image of class ids a frame; only the classes that occur in the video are kept.
 
     Ids named void, none, unknown … are void. Without a table of classes beside the images, every id is a class
@@ -46,9 +46,6 @@ class FilesLabels:
         self._classes = ClassTable((), ())
         self._outside: dict[int, int] = {}
         self._read(next(iter(self._files.values())))
-
-    def look(self, frames: list[Frame]) -> None:
-        """Do nothing: files need no pass over single frames."""
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Count the ids of all frames and give labels to those that are classes. InputError for more than 254."""

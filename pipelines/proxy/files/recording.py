@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,12 @@ from numpy.typing import NDArray
 from msgs_slam.formats.datasets import Sequence as Recording
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.proxy.interface.palette import class_colors
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.interface.providers import (
+    DepthEstimate,
+    DepthProvider,
+    LabelEstimate,
+    SemanticsProvider,
+)
 from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.source.source_pixels import FramePixels
 from msgs_slam.pipelines.system.progress import Progress
@@ -37,23 +41,16 @@ class _RecordingMaps:
         return np.zeros((self._sequence.intrinsics.height, self._sequence.intrinsics.width), np.float32)
 
 
-class RecordingDepth(_RecordingMaps):
+class RecordingDepth(_RecordingMaps, DepthProvider):
     """Metric depth, its unit, unknown values and camera as the data set's reader settles them; confidence 1."""
 
     metric = True
-    of_all = ()
 
     def __init__(self, recording: Recording, sequence: Sequence) -> None:
         """Raises InputError for a data set without depth."""
         if not recording.has_depth:
             raise InputError(f"{recording.root}: this {recording.format} recording has no depth: --depth files:FOLDER")
         super().__init__(recording, sequence)
-
-    def look(self, frames: list[Frame]) -> None:
-        """Do nothing: files need no pass over single frames."""
-
-    def prepare(self, frames: list[Frame]) -> None:
-        """Do nothing: files need no pass over all frames."""
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames without depth."""
@@ -73,12 +70,8 @@ class RecordingDepth(_RecordingMaps):
         """Every file that it may read."""
         return [self._recording.root] if self._recording.store else [p for p in self._recording.depth_paths if p]
 
-    def figures(self) -> dict[str, Any]:
-        """Return {}: a data set's depth has no figures."""
-        return {}
 
-
-class RecordingLabels(_RecordingMaps):
+class RecordingLabels(_RecordingMaps, SemanticsProvider):
     """The classes of the data set that occur in the frames, with its names and colours."""
 
     of_all = ("_label_of",)
@@ -93,9 +86,6 @@ class RecordingLabels(_RecordingMaps):
         self._progress = progress
         self._label_of = np.full(256, VOID, np.uint8)
         self._classes = ClassTable((), ())
-
-    def look(self, frames: list[Frame]) -> None:
-        """Do nothing: files need no pass over single frames."""
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Find the classes that occur. Raises InputError where there is none."""
@@ -112,10 +102,6 @@ class RecordingLabels(_RecordingMaps):
         self._classes = ClassTable(
             tuple(c.name for c in chosen), tuple(c.color or colors[k] for k, c in enumerate(chosen))
         )
-
-    def warnings(self) -> list[str]:
-        """None: ids that are no class of the data set are void to its reader."""
-        return []
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames without labels."""
@@ -136,7 +122,3 @@ class RecordingLabels(_RecordingMaps):
     def files(self) -> list[Path]:
         """Every file that it may read."""
         return [p for p in self._recording.label_paths if p]
-
-    def figures(self) -> dict[str, Any]:
-        """Return {}: a data set's labels have no figures."""
-        return {}

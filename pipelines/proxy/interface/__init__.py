@@ -1,1 +1,1 @@
-"""What a provider of depth or labels is given (the frames with their cameras) and what it returns."""
+"""Interface of providers of depth and labels: the frames with their cameras in, estimates out."""

@@ -1,4 +1,4 @@
-"""Interfaces of providers of proxy depth and proxy semantics."""
+"""Interfaces of providers of proxy depth and proxy semantics, with what one has that says nothing else."""
 
 from __future__ import annotations
 
@@ -66,9 +66,24 @@ class LabelEstimate:
 class Provider(Protocol):
     """Common part of all providers: a pass over all frames first, then estimates frame by frame."""
 
+    name: str
+
     @property
     def of_all(self) -> tuple[str, ...]:
         """The names of what `prepare` finds out of all frames together, and of the providers inside this one."""
+        return ()
+
+    def missing(self, frames: list[Frame]) -> list[Frame]:
+        """The frames it will know nothing of."""
+        return []
+
+    def look(self, frames: list[Frame]) -> None:
+        """Do the part of `prepare` that concerns single frames, for these; results are kept."""
+        return
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures of the pass for the report, as plain values."""
+        return {}
 
 
 def prepared(provider: Provider) -> dict[str, Any]:
@@ -89,48 +104,32 @@ def take_prepared(provider: Provider, found: dict[str, Any]) -> None:
 class DepthProvider(Provider, Protocol):
     """Depth of every frame. What can be refused without slow work is refused when the provider is made."""
 
-    name: str
     metric: bool
     """Whether depths are metres; else they are in the unit of the run's backbone."""
 
-    def missing(self, frames: list[Frame]) -> list[Frame]:
-        """The frames it will know nothing of."""
-
-    def look(self, frames: list[Frame]) -> None:
-        """Do the part of `prepare` that concerns single frames, for these; results are kept."""
-
     def prepare(self, frames: list[Frame]) -> None:
         """Slow passes over all frames that `estimate` builds on; goes on where it was interrupted."""
+        return
 
     def estimate(self, frame: Frame) -> DepthEstimate:
         """Depth at the size of the proxy maps."""
-
-    def figures(self) -> dict[str, Any]:
-        """Return the figures of the pass for the report, as plain values."""
+        ...
 
 
 class SemanticsProvider(Provider, Protocol):
     """Class of every pixel of every frame."""
-
-    name: str
-
-    def missing(self, frames: list[Frame]) -> list[Frame]:
-        """The frames it will know nothing of."""
-
-    def look(self, frames: list[Frame]) -> None:
-        """Do the part of `prepare` that concerns single frames, for these; results are kept."""
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Slow passes over all frames that `estimate` and `classes` build on."""
 
     def warnings(self) -> list[str]:
         """Return the problems that `prepare` found, for the report."""
+        return []
 
     def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
         """Labels at the size of the proxy maps."""
+        ...
 
     def classes(self) -> ClassTable:
         """Return the table of classes; valid after `prepare`."""
-
-    def figures(self) -> dict[str, Any]:
-        """Return the figures of the pass for the report, as plain values."""
+        ...

@@ -12,16 +12,15 @@ from msgs_slam.pipelines.networks.card import Card
 from msgs_slam.pipelines.networks.depth import network_depth
 from msgs_slam.pipelines.networks.identity import card_identity
 from msgs_slam.pipelines.networks.session import Network
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, DepthProvider
 from msgs_slam.pipelines.proxy.learned.network_pass import Arrays, NetworkPass, Workplace
 from msgs_slam.pipelines.types import Frame
 
 
-class OnnxDepth:
+class OnnxDepth(DepthProvider):
     """Depth in metres, frame by frame, whether or not the frame has a pose."""
 
     metric = True
-    of_all = ()
 
     def __init__(self, card: Card, place: Workplace) -> None:
         """Opens the network. Raises InputError when it cannot be what the card says."""
@@ -34,10 +33,6 @@ class OnnxDepth:
         self._frames: list[Frame] = []
         identity = f"{card_identity(card)} {place.sequence.intrinsics}"
         self._pass = NetworkPass(self.name, identity, place, self._compute)
-
-    def missing(self, frames: list[Frame]) -> list[Frame]:
-        """None: a network sees every frame."""
-        return []
 
     def look(self, frames: list[Frame]) -> None:
         """Run the network; what is on disk stays."""

@@ -15,7 +15,7 @@ from msgs_slam.pipelines.networks.identity import card_identity
 from msgs_slam.pipelines.networks.labels import best_classes, class_token, network_probabilities
 from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.proxy.interface.palette import class_colors
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate, SemanticsProvider
 from msgs_slam.pipelines.proxy.interface.sequence import resample_linear
 from msgs_slam.pipelines.proxy.learned.network_pass import Arrays, NetworkPass, Workplace
 from msgs_slam.pipelines.proxy.regions.named import NamedScene, Vocabulary
@@ -30,7 +30,7 @@ _STEPS = 16
 """Steps of the stored probabilities in each halving: 4 %; 255 of them reach down to 2e-5."""
 
 
-class OnnxLabels:
+class OnnxLabels(SemanticsProvider):
     """Only the classes that occur in the video are kept."""
 
     of_all: tuple[str, ...] = ("_label_of", "_scene")
@@ -56,14 +56,6 @@ class OnnxLabels:
         if card.text is not None:  # no file says whether an image's features are as long as a word's
             camera = place.sequence.intrinsics
             self._compute(np.full((camera.height, camera.width, 3), 128, np.uint8))
-
-    def warnings(self) -> list[str]:
-        """Nothing is ever amiss."""
-        return []
-
-    def missing(self, frames: list[Frame]) -> list[Frame]:
-        """None: a network sees every frame."""
-        return []
 
     def look(self, frames: list[Frame]) -> None:
         """Run the network; what is on disk stays."""

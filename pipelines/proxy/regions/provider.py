@@ -16,7 +16,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.geometry.camera import unproject_depth
 from msgs_slam.pipelines.proxy.interface.palette import class_colors
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate, SemanticsProvider
 from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.proxy.regions.parts import cut_parts
 from msgs_slam.pipelines.proxy.regions.spread import spread_votes
@@ -26,6 +26,7 @@ from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.types import VOID, ClassTable, Frame
 from msgs_slam.pipelines.voxels.layout import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
 from msgs_slam.pipelines.voxels.voxels import (
+    LEAST_WEIGHT,
     VOXELS_PER_DEPTH,
     Voxels,
     find_near,
@@ -40,10 +41,9 @@ _LEAST_CONFIDENCE = 0.3
 _REACH = 40.0
 _COLOR_SD = 40.0
 _LEAST_VOTE = 1e-3
-_LEAST_WEIGHT = 1.5
 
 
-class SegmentLabels:
+class SegmentLabels(SemanticsProvider):
     """Unsupervised regions; needs poses (a backbone), because they make the regions consistent over the video."""
 
     name = "segments"
@@ -64,16 +64,9 @@ class SegmentLabels:
         self._gravity: list[float] = []
         self._world_from_cam = {k: np.linalg.inv(v).astype(np.float64) for k, v in sequence.cam_from_world.items()}
 
-    def warnings(self) -> list[str]:
-        """Nothing is ever amiss."""
-        return []
-
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames without a pose."""
         return [f for f in frames if f.id not in self._world_from_cam]
-
-    def look(self, frames: list[Frame]) -> None:
-        """Do nothing: segments need all frames together."""
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Gather all frames and cut the scene."""
@@ -90,8 +83,8 @@ class SegmentLabels:
         self._size = _scene_depth([depth_of(f) for f in posed[:: max(1, len(posed) // 12)]]) / VOXELS_PER_DEPTH
         release_free_memory()  # what depths and moving things have needed
         tracked = self._progress.track(posed, "regions", len(posed))
-        voxels = merge(self._size, (self._gather(f, depth_of(f)) for f in tracked))
-        voxels, self._size = select(voxels, voxels.weight > _LEAST_WEIGHT), voxels.size
+        voxels = merge(self._size, (self._gather(f, depth_of(f)) for f in tracked), least=LEAST_WEIGHT)
+        self._size = voxels.size
         cameras = np.array([self._world_from_cam[f.id] for f in posed])
         gravity = find_gravity(voxels, -cameras[:, :3, 1].mean(0))
         return voxels, gravity, name_structure(voxels, gravity, cameras[:, :3, 3])

@@ -34,7 +34,7 @@ def folder(truth: Sequence, config: Config, tmp_path_factory: pytest.TempPathFac
     """Two seeds of three rows; stopped once in the middle and called again."""
     folder = tmp_path_factory.mktemp("work") / "room.ablation"
     measured: list[str] = []
-    measure = ablation.evaluate_run
+    measure = ablation.evaluate_outcome
 
     def stop_at_the_third(*arguments: object, **named: object) -> object:
         measured.append(str(arguments[0]))
@@ -43,7 +43,7 @@ def folder(truth: Sequence, config: Config, tmp_path_factory: pytest.TempPathFac
         return measure(*arguments, **named)  # type: ignore[arg-type]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ablation, "evaluate_run", stop_at_the_third)
+        patch.setattr(ablation, "evaluate_outcome", stop_at_the_third)
         with pytest.raises(KeyboardInterrupt):
             run(truth, folder, config)
         assert len(json.loads((folder / "ablation.json").read_text())["rows"]) == 2
@@ -94,7 +94,7 @@ def test_table_has_means_and_spreads(folder: Path) -> None:
 def test_what_is_done_is_not_done_again(
     folder: Path, truth: Sequence, config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ablation, "evaluate_run", None)
+    monkeypatch.setattr(ablation, "evaluate_outcome", None)
     assert run(truth, folder, config) == json.loads((folder / "ablation.json").read_text())
 
 

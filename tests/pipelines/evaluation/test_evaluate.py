@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.evaluation.evaluate import evaluate_run, trajectory_cells
+from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome, trajectory_cells
 from msgs_slam.pipelines.evaluation.mesh_cells import mesh_cells
 from msgs_slam.pipelines.evaluation.truth import match_truth, true_trajectory
 from msgs_slam.pipelines.evaluation.write import write_evaluation
@@ -62,7 +62,9 @@ def test_every_cell_of_a_true_run(oracle_run: OracleRun, truth: Sequence) -> Non
 
 
 def test_a_similarity_of_the_whole_run_changes_no_figure_but_the_scale(oracle_run: OracleRun, truth: Sequence) -> None:
-    plain, moved = (evaluate_run(oracle_run(m, metric=False, mesh=True), truth, max_views=2) for m in (None, MOVE))
+    plain, moved = (
+        evaluate_outcome(load_outcome(oracle_run(m, metric=False, mesh=True)), truth, max_views=2) for m in (None, MOVE)
+    )
     assert moved["trajectory"]["sim3 all"]["scale"] == pytest.approx(0.4, rel=1e-6)
     assert moved["trajectory"]["sim3 all"]["max"] < 1e-6
     assert "missing" in moved["trajectory"]["se3 all"]
@@ -74,14 +76,14 @@ def test_a_similarity_of_the_whole_run_changes_no_figure_but_the_scale(oracle_ru
     assert moved["labels"]["mean_iou"] == pytest.approx(plain["labels"]["mean_iou"], abs=0.005)
     assert moved["mesh"]["completeness"] == pytest.approx(plain["mesh"]["completeness"], rel=0.02)
     # A metric run of the wrong scale is not forgiven.
-    wrong = evaluate_run(oracle_run(MOVE, metric=True), truth, max_views=1)
+    wrong = evaluate_outcome(load_outcome(oracle_run(MOVE, metric=True)), truth, max_views=1)
     assert wrong["trajectory"]["se3 all"]["rmse"] > 0.5
     assert wrong["depth"]["metric_l1"] > 2
 
 
 def test_noise_on_the_poses_is_found_in_ate_and_costs_picture_quality(oracle_run: OracleRun, truth: Sequence) -> None:
     noise = np.random.default_rng(0).normal(scale=0.06, size=(32, 3))
-    result = evaluate_run(oracle_run(wrong_centers=noise), truth, max_views=3)
+    result = evaluate_outcome(load_outcome(oracle_run(wrong_centers=noise)), truth, max_views=3)
     # 96 numbers, 7 fitted: 0.06 sqrt(3) sqrt(89 / 96), give or take 1 / sqrt(2 x 89).
     assert result["trajectory"]["sim3 all"]["rmse"] == pytest.approx(0.06 * np.sqrt(3) * 0.963, rel=0.2)
     own, true = (result["images"][k]["psnr"] for k in ("between", "between at true poses"))
@@ -89,15 +91,15 @@ def test_noise_on_the_poses_is_found_in_ate_and_costs_picture_quality(oracle_run
 
 
 def test_labels_without_names_are_a_clustering_and_stand_apart(oracle_run: OracleRun, truth: Sequence) -> None:
-    by_name = evaluate_run(oracle_run(), truth, max_views=2)["labels"]
-    renamed = evaluate_run(oracle_run(rename=True), truth, max_views=2)["labels"]
+    by_name = evaluate_outcome(load_outcome(oracle_run()), truth, max_views=2)["labels"]
+    renamed = evaluate_outcome(load_outcome(oracle_run(rename=True)), truth, max_views=2)["labels"]
     assert "mean_iou" not in renamed
     assert renamed["clustering"]["one to one"]["mean_iou"] == pytest.approx(by_name["mean_iou"], abs=1e-9)
     assert renamed["clustering"]["majority"]["pixel_accuracy"] >= renamed["clustering"]["one to one"]["pixel_accuracy"]
 
 
 def test_a_video_is_matched_by_time_and_a_shifted_clock_too(oracle_run: OracleRun, truth: Sequence) -> None:
-    result = evaluate_run(oracle_run(video=True), part_of(truth, range(0, 32, 2)), max_views=1)
+    result = evaluate_outcome(load_outcome(oracle_run(video=True)), part_of(truth, range(0, 32, 2)), max_views=1)
     assert result["frames"]["with true pose"] == 32  # traj.txt keeps the poses of the images left out
     assert result["frames"]["with true image"] == 16
     assert result["trajectory"]["sim3 all"]["max"] < 1e-6
@@ -122,10 +124,10 @@ def test_the_truth_of_another_recording_and_an_unfinished_run_are_refused(
     run = oracle_run(video=True)
     late = replace(truth, timestamps=truth.timestamps + 0.05, root=tmp_path)
     with pytest.raises(InputError, match="truth of another recording"):
-        evaluate_run(run, late)
+        evaluate_outcome(load_outcome(run), late)
     note_finished(run, ("frames",))
     with pytest.raises(InputError, match="tracking is not done"):
-        evaluate_run(run, truth)
+        evaluate_outcome(load_outcome(run), truth)
 
 
 def test_without_a_map_the_poses_are_still_judged(oracle_run: OracleRun, truth: Sequence) -> None:

@@ -15,10 +15,11 @@ import torch
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
+from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.evaluation.perceptual import Lpips, open_lpips
 from msgs_slam.pipelines.evaluation.table import evaluation_table
 from msgs_slam.pipelines.networks.registry import ModelStore
+from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 
 OracleRun = Callable[..., RunFolder]
@@ -148,11 +149,11 @@ def test_a_cell_of_the_evaluation(
     oracle_run: OracleRun, truth: Sequence, installed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = oracle_run()
-    figures = evaluate_run(run, truth, max_views=2)
+    figures = evaluate_outcome(load_outcome(run), truth, max_views=2)
     assert "weights" in figures["images"]["keyframes"]["lpips"]["missing"]
     assert "| LPIPS | – | AlexNet's weights" in evaluation_table(figures)
     installed.write_bytes(b"")
-    figures = evaluate_run(run, truth, max_views=2)
+    figures = evaluate_outcome(load_outcome(run), truth, max_views=2)
     assert 0 < figures["images"]["keyframes"]["lpips"] < 1
     assert f"keyframes {figures['images']['keyframes']['lpips']:.4f}" in evaluation_table(figures)
     assert all(v["lpips"] > 0 for v in figures["views"])

@@ -25,7 +25,7 @@ OracleRun = Callable[..., RunFolder]
 
 
 def test_own_path_in_colour_shows_the_frames(oracle_run: OracleRun, truth: Sequence, tmp_path: Path) -> None:
-    folder = render_run(oracle_run(), tmp_path / "pictures", kind="color", path="own", frames=5)
+    folder = render_run(oracle_run(), tmp_path / "pictures", kind="color", path="own", fps=1.6)
     pictures = [read_rgb(p) for p in list_images(folder)]
     assert len(pictures) == 5
     # Frames 0 and 31 are the ends of the path; 0 is a keyframe.
@@ -34,7 +34,7 @@ def test_own_path_in_colour_shows_the_frames(oracle_run: OracleRun, truth: Seque
 
 
 def test_side_by_side_video_of_an_orbit(oracle_run: OracleRun, tmp_path: Path) -> None:
-    video = render_run(oracle_run(), tmp_path / "orbit.mp4", "side-by-side", "orbit", frames=4)
+    video = render_run(oracle_run(), tmp_path / "orbit.mp4", "side-by-side", "orbit", fps=0.4)
     frames = [f.rgb for f in VideoReader(video)]
     assert len(frames) == 4
     assert frames[0].shape == (180, 3 * 240, 3)

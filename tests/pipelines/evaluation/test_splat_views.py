@@ -69,7 +69,7 @@ def test_a_file_becomes_pictures_from_all_sides(tmp_path: Path) -> None:
     colors = (means - means.min(axis=0)) / 2
     cloud = isotropic_cloud(means, np.full(400, -2.5, np.float32), np.full(400, 2.0, np.float32), colors)
     write_gaussian_ply(tmp_path / "scene.ply", cloud)
-    folder = render_file(tmp_path / "scene.ply", tmp_path / "out", frames=4, size=(96, 64))
+    folder = render_file(tmp_path / "scene.ply", tmp_path / "out", fps=0.4, size=(96, 64))
     images = [read_rgb(p).astype(float) for p in list_images(folder)]
     assert [i.shape for i in images] == 4 * [(64, 96, 3)]
     assert all(i[16:48, 32:64].mean() > 2 * i[:, :8].mean() + 10 for i in images)  # the scene is in the middle

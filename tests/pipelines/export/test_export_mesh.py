@@ -15,6 +15,7 @@ from msgs_slam.pipelines.export.joined import Region, joined
 from msgs_slam.pipelines.export.paint import paint
 from msgs_slam.pipelines.export.surface import Surface, chunk_surfaces, weld
 from msgs_slam.pipelines.export.volume import CHUNK, Grid, Volume, fuse, make_grid
+from msgs_slam.pipelines.gaussians.render import get_threads, set_threads
 from msgs_slam.pipelines.mapping.depth_views import DrawnView
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.types import VOID, Intrinsics
@@ -79,10 +80,10 @@ class Corridor(Sequence[PosedDepth]):
         return PosedDepth(CAMERA, pose, depth, (depth < 5).astype(np.float32))
 
 
-def fused(count: int = 24, max_blocks: int = 100_000, threads: int = 2) -> Volume:
+def fused(count: int = 24, max_blocks: int = 100_000) -> Volume:
     views = [sphere(p) for p in orbit(count)]
     grid = make_grid(views, VOXEL, 4.0, max_blocks)
-    return fuse(grid, all_chunks(grid), views, threads)
+    return fuse(grid, all_chunks(grid), views)
 
 
 def all_chunks(grid: Grid) -> NDArray[np.int32]:
@@ -97,7 +98,7 @@ def extracted(views: Sequence[PosedDepth], voxel: float, at_once: int, least: fl
 
 
 def surface_of(grid: Grid, views: Sequence[PosedDepth], chunks: NDArray[np.int32], least: float) -> Surface:
-    volume = fuse(grid, chunks, (views[n] for n in grid.views_of(chunks)), 1)
+    volume = fuse(grid, chunks, (views[n] for n in grid.views_of(chunks)))
     return weld(chunk_surfaces(volume, chunks, least), chunks, grid.voxel)
 
 
@@ -170,7 +171,14 @@ def test_voxels_grow_until_the_blocks_fit() -> None:
 
 
 def test_threads_do_not_change_a_byte() -> None:
-    one, two = fused(6, threads=1), fused(6, threads=2)
+    before = get_threads()
+    try:
+        set_threads(1)
+        one = fused(6)
+        set_threads(2)
+        two = fused(6)
+    finally:
+        set_threads(before)
     assert one.distance.tobytes() == two.distance.tobytes()
     assert one.weight.tobytes() == two.weight.tobytes()
 
@@ -180,7 +188,7 @@ def test_nothing_seen_gives_an_empty_surface() -> None:
     nothing = PosedDepth(CAMERA, view.cam_from_world, view.depth * 0, view.trust * 0)
     grid = make_grid([nothing, nothing], VOXEL, 4.0, 1000)
     assert list(grid.regions()) == []
-    assert len(fuse(grid, all_chunks(grid), [nothing], 1).blocks) == 0
+    assert len(fuse(grid, all_chunks(grid), [nothing]).blocks) == 0
     assert len(whole([], 0.01).faces) == 0
     assert len(whole([weld([], np.zeros((0, 3), np.int32), VOXEL)], 0.01).faces) == 0
 
@@ -226,7 +234,7 @@ def test_a_view_is_fused_wherever_it_sees_anything() -> None:
     for chunks in grid.regions(1):
         near = grid.views_of(chunks)
         left_away += len(views) - len(near)
-        some, all_of_them = fuse(grid, chunks, (views[n] for n in near), 1), fuse(grid, chunks, views, 1)
+        some, all_of_them = fuse(grid, chunks, (views[n] for n in near)), fuse(grid, chunks, views)
         assert some.weight.tobytes() == all_of_them.weight.tobytes()
         assert some.distance.tobytes() == all_of_them.distance.tobytes()
     assert left_away > 10

@@ -14,8 +14,9 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
+from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.frames.tasks import known_camera
+from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.proxy.files.recording import RecordingDepth, RecordingLabels
 from msgs_slam.pipelines.proxy.inputs import proxy_inputs
 from msgs_slam.pipelines.proxy.interface.sequence import Sequence as ProxySequence
@@ -174,7 +175,7 @@ def test_a_data_set_is_reconstructed_with_what_it_knows(truth: Sequence, tmp_pat
     assert truth.camera is not None
     assert calibration.intrinsics.fx == pytest.approx(truth.camera.fx)
     assert run.load(FRAMES)[0].timestamp > START - 1
-    result = evaluate_run(run, open_sequence(path))
+    result = evaluate_outcome(load_outcome(run), open_sequence(path))
     assert result["frames"]["with true pose"] == result["frames"]["posed"] == len(run.load(FRAMES))
     assert 0 < result["trajectory"]["se3 all"]["rmse"] < 0.03
     # The same pictures under another name are another source.

@@ -41,7 +41,7 @@ from tests.world.clip import WorldFrame
 __all__ = ["make_run", "open_stage", "room_frames"]
 Array = NDArray[np.float64]
 GROWTH = 1.12
-SETTINGS = ["global_ba.loop_gap=2", "mapping.max_side=128"]
+SETTINGS = ["mapping.max_side=128"]
 
 
 def grown_about(center: Array) -> Similarity:
@@ -109,6 +109,7 @@ def close(
 ) -> Callable[[str], tuple[RunFolder, dict]]:
     """close(joint): a run whose loop is closed, and the stage's figures."""
     monkeypatch.setattr("msgs_slam.pipelines.global_ba.candidates.LEAST_ALIKE", -1.0)
+    monkeypatch.setattr("msgs_slam.pipelines.global_ba.candidates.GAP", 2)
 
     def run(joint: str) -> tuple[RunFolder, dict]:
         made = make_run(tmp_path / joint, keyframes=tuple(range(0, 24, 2)), backbone_scale=1.0, metric=False)

@@ -28,7 +28,6 @@ from msgs_slam.pipelines.types import Features, Intrinsics
 
 Array = NDArray[np.float64]
 CAMERA = Intrinsics(640, 480, 400, 400, 320, 240)
-SETTINGS = GlobalBaConfig(loop_gap=6)
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class Walk:
         nothing = [summarise_labels(np.full((4, 4), 255, np.uint8), 3)] * len(self.features)
         vocabulary = learn_vocabulary(self.features, 0)
         looks = GlobalDescriptors((np.stack([describe(f, vocabulary) for f in self.features]),))
-        return loop_candidates(self.model, looks, nothing, refused, SETTINGS)
+        return loop_candidates(self.model, looks, nothing, refused, GlobalBaConfig())
 
     def find(self) -> FoundLoops:
         return find_loops(self.pairs(), self.views(), self.model.cam_from_world, CAMERA, 0)

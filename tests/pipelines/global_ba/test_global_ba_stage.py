@@ -44,14 +44,6 @@ __all__ = ["make_run", "open_stage", "room_frames"]
 Array = NDArray[np.float64]
 FIRST_AGAIN = 12
 """From this keyframe on the points carry new numbers, as after a walk that came back without noticing."""
-CONFIG = load_config(
-    overrides=[
-        "global_ba.loop_gap=2",
-        "global_ba.joint_passes=1",
-        "mapping.max_side=128",
-        "global_ba.joint=always",
-    ]
-)
 
 
 def finish_mapping(made: MadeRun, frames: list[WorldFrame]) -> None:
@@ -124,9 +116,13 @@ def seeded_map(
 
 @pytest.fixture
 def mapped(
-    tmp_path: Path, make_run: Callable[..., MadeRun], room_frames: tuple[object, list[WorldFrame]]
+    tmp_path: Path,
+    make_run: Callable[..., MadeRun],
+    room_frames: tuple[object, list[WorldFrame]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> Callable[[str], MadeRun]:
-    """mapped(name): a run whose mapping is done."""
+    """mapped(name): a run whose mapping is done, in which keyframes near each other may make a loop."""
+    monkeypatch.setattr("msgs_slam.pipelines.global_ba.candidates.GAP", 2)
 
     def make(name: str) -> MadeRun:
         made = make_run(tmp_path / name, keyframes=tuple(range(0, 24, 2)), backbone_scale=1.0)
@@ -155,7 +151,7 @@ def test_a_loop_is_closed_and_the_map_goes_along(
     monkeypatch.setattr("msgs_slam.pipelines.global_ba.candidates.LEAST_ALIKE", -1.0)
     made = mapped("run")
     before = error(made.run.load(TRAJECTORY, "mapping").cam_from_world, made.cam_from_world)
-    config = load_config(overrides=["global_ba.loop_gap=2", "global_ba.joint=never"])
+    config = load_config(overrides=["global_ba.joint=never"])
     figures = finish(open_stage(made.run, "global_ba", config))
     assert figures["loops"] >= 1
     assert figures["moved_px"] > 0.5
@@ -181,12 +177,12 @@ def test_without_loops_nothing_moves(mapped: Callable[[str], MadeRun], open_stag
 
 
 def test_joint_refinement_is_kept_only_where_it_helps_and_survives_interruption(
-    mapped: Callable[[str], MadeRun], open_stage: Callable[..., StageContext]
+    mapped: Callable[[str], MadeRun], open_stage: Callable[..., StageContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("msgs_slam.pipelines.global_ba.stage.JOINT_PASSES", 2.0)
     whole, broken = mapped("a"), mapped("b")
     config: Config = load_config(
-        overrides=["mapping.snapshot_every=4", "global_ba.joint_passes=2"],
-        base=CONFIG,
+        overrides=["mapping.max_side=128", "mapping.snapshot_every=4", "global_ba.joint=always"]
     )
     figures = finish(open_stage(whole.run, "global_ba", config))
     assert figures["joint"] in ("kept", "thrown away")

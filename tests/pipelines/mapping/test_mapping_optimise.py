@@ -59,16 +59,18 @@ def test_splitting_sharpens_a_coarse_map(room: MappingInput, monkeypatch: pytest
     monkeypatch.setattr(growth, "FINE_SHARE", 0.0)
     # The room has no exposures to find, and so coarse a map mistakes its own blur for some.
     coarse = replace(SETTINGS, seed_stride=4, passes=8.0, exposure=False)
-    split, unsplit = (
-        optimise_map(room.views, len(room.class_ids), replace(coarse, split_error=e), seed=0) for e in (0.1, 0.0)
-    )
+    split = optimise_map(room.views, len(room.class_ids), coarse, seed=0)
+    monkeypatch.setattr(growth, "SPLIT_ERROR", np.inf)
+    unsplit = optimise_map(room.views, len(room.class_ids), coarse, seed=0)
     assert len(split.gaussian_map) > 1.3 * len(unsplit.gaussian_map)
     for views in (room.views, room.held_out):
         assert mean(split, views, "psnr") > mean(unsplit, views, "psnr") + 1
 
 
-def test_splitting_stops_at_the_largest_map(room: MappingInput) -> None:
-    few = optimise_map(room.views, len(room.class_ids), replace(SETTINGS, seed_stride=4, split_error=0.0), seed=0)
+def test_splitting_stops_at_the_largest_map(room: MappingInput, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(growth, "SPLIT_ERROR", np.inf)
+        few = optimise_map(room.views, len(room.class_ids), replace(SETTINGS, seed_stride=4), seed=0)
     classes, most = len(room.class_ids), len(few.gaussian_map) + 31
     state = OptimiserState.fresh(room.views, classes, few.gaussian_map, None)
     optimiser = MapOptimiser(room.views, classes, replace(SETTINGS, max_gaussians=most), state)

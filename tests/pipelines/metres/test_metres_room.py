@@ -16,8 +16,6 @@ from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.export.stage import run as export
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.metres.find import (
-    Found,
-    Machine,
     contradiction,
     find_metres,
     known_evidence,
@@ -30,6 +28,7 @@ from msgs_slam.pipelines.metres.things import sizes_of_things
 from msgs_slam.pipelines.run.files import DEPTH_FIELDS, FIGURES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.types import Metres
 from msgs_slam.pipelines.voxels.layout import FLOOR, OTHER, Gravity
 from msgs_slam.pipelines.voxels.voxels import Voxels
 
@@ -56,13 +55,13 @@ def rescale_depth(run: RunFolder, factor: float) -> None:
     note_finished(run, STAGES_DONE)
 
 
-def found_in(run: RunFolder, guess: bool = True) -> Found:
-    return find_metres(run, run.load(TRAJECTORY, "mapping"), None, Machine(), guess)
+def found_in(run: RunFolder, guess: bool = True) -> tuple[Metres | None, str | None]:
+    return find_metres(run, run.load(TRAJECTORY, "mapping"), guess, None)
 
 
 def test_the_scale_is_found_within_its_sigmas_and_says_from_what(run: RunFolder) -> None:
     rescale_depth(run, 2.5)
-    metres = found_in(run).metres
+    metres, _ = found_in(run)
     assert metres is not None
     assert metres.is_guess
     assert abs(np.log(metres.per_unit / 0.4)) < 2 * metres.relative_sd
@@ -76,15 +75,15 @@ def test_it_follows_the_unit_of_the_world(run: RunFolder, oracle_run: OracleRun)
     rescale_depth(run, 2.5)
     other = oracle_run(moved(40.0), metric=False, pixel_stride=6)
     rescale_depth(other, 40.0)
-    first, second = found_in(run).metres, found_in(other).metres
+    (first, _), (second, _) = found_in(run), found_in(other)
     assert first is not None
     assert second is not None
     assert first.per_unit / second.per_unit == pytest.approx(16.0, rel=0.03)
 
 
 def test_free_units_stay_free_and_metric_ones_are_known(run: RunFolder, oracle_run: OracleRun) -> None:
-    assert found_in(run, guess=False).metres is None
-    metric = found_in(oracle_run(pixel_stride=6), guess=False).metres
+    assert found_in(run, guess=False)[0] is None
+    metric, _ = found_in(oracle_run(pixel_stride=6), guess=False)
     assert metric is not None
     assert not metric.is_guess
     assert metric.per_unit == pytest.approx(1.0, abs=0.01)
@@ -94,12 +93,12 @@ def test_free_units_stay_free_and_metric_ones_are_known(run: RunFolder, oracle_r
 def test_depth_in_a_wrong_unit_is_doubted(oracle_run: OracleRun) -> None:
     run = oracle_run(moved(12.0), pixel_stride=6)
     rescale_depth(run, 12.0)
-    found = found_in(run)
-    assert found.warning is not None
-    assert "Check its unit" in found.warning
+    _, warning = found_in(run)
+    assert warning is not None
+    assert "Check its unit" in warning
     seen = load_seen(run, run.load(TRAJECTORY, "mapping"))
-    assert contradiction(known_evidence(run), usual_evidence(seen, None, Machine())) == found.warning
-    assert found_in(oracle_run(pixel_stride=6)).warning is None
+    assert contradiction(known_evidence(run), usual_evidence(seen, None)) == warning
+    assert found_in(oracle_run(pixel_stride=6))[1] is None
 
 
 def test_a_reference_wins_over_what_is_usual(run: RunFolder) -> None:
@@ -108,7 +107,7 @@ def test_a_reference_wins_over_what_is_usual(run: RunFolder) -> None:
     try:
         write_json(run.stage("proxy") / "proxy.json", report | given)
         rescale_depth(run, 2.5)
-        metres = found_in(run).metres
+        metres, _ = found_in(run)
     finally:
         write_json(run.stage("proxy") / "proxy.json", report)
         note_finished(run, STAGES_DONE)

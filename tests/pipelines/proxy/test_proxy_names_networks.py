@@ -16,7 +16,6 @@ from msgs_slam.pipelines.evaluation.class_map import match_classes
 from msgs_slam.pipelines.evaluation.label_score import count_labels, score
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.networks.card import Card
-from msgs_slam.pipelines.networks.labels import network_labels
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
@@ -25,6 +24,7 @@ from msgs_slam.pipelines.proxy.learned.labels import OnnxLabels
 from msgs_slam.pipelines.proxy.learned.network_pass import ResultCache, Workplace
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics
+from tests.network_labels import network_labels
 from tests.world.room import CLASSES
 
 KINDS = ("wall", "floor", "furniture")

@@ -15,12 +15,12 @@ from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.networks.card import Card, read_card
 from msgs_slam.pipelines.networks.depth import network_depth
 from msgs_slam.pipelines.networks.identity import card_identity
-from msgs_slam.pipelines.networks.labels import network_labels
 from msgs_slam.pipelines.networks.person import person_probability
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.proxy.selection import choose_depth, choose_semantics, missing_networks
 from msgs_slam.pipelines.types import Intrinsics
+from tests.network_labels import network_labels
 
 COLOURS = [[8.0, -4.0, -4.0], [-4.0, 8.0, -4.0], [-4.0, -4.0, 8.0]]
 CARD = Card(

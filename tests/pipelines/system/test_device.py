@@ -13,13 +13,14 @@ import torch
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.pipelines.config import Config, ExportConfig, GlobalBaConfig, MappingConfig, ProxyConfig
 from msgs_slam.pipelines.engine.stages import StageContext, run_stages
-from msgs_slam.pipelines.evaluation.evaluate import evaluate_run
+from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.mapping import growth
 from msgs_slam.pipelines.mapping import stage as mapping_stage
 from msgs_slam.pipelines.mapping.move_map import move_map
 from msgs_slam.pipelines.mapping.parameters import MapParameters, empty_map
+from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.render_run import render_run
 from msgs_slam.pipelines.run.files import MAP, SPARSE, TRAJECTORY
@@ -36,7 +37,7 @@ from tests.pretend_device import DEVICE, PretendTensor, WrongDeviceError, preten
 CONFIG = Config(
     proxy=ProxyConfig(max_side=96, stereo_side=80, stereo_planes=24),
     mapping=MappingConfig(passes=2.0, min_iterations=0, max_side=40, hold_out=4),
-    global_ba=GlobalBaConfig(use_loops=False, joint="always", joint_passes=1.0),
+    global_ba=GlobalBaConfig(use_loops=False, joint="always"),
     export=ExportConfig(voxel=0.05, mesh_side=40),
 )
 
@@ -87,13 +88,13 @@ def test_what_was_made_there_can_be_exported_again(run: RunFolder, tmp_path: Pat
 
 
 def test_it_is_measured_there(run: RunFolder, world_sequence: Path) -> None:
-    result = evaluate_run(run, open_sequence(world_sequence), max_views=2)
+    result = evaluate_outcome(load_outcome(run), open_sequence(world_sequence), max_views=2)
     assert result["images"]["keyframes"]["psnr"] > 15
     assert "held out at refined poses" in result["images"]
 
 
 def test_it_is_drawn_there(run: RunFolder, tmp_path: Path) -> None:
-    render_run(run, tmp_path / "pictures", path="own", frames=2)
+    render_run(run, tmp_path / "pictures", path="own", fps=0.1)
     assert len(list((tmp_path / "pictures").iterdir())) == 2
 
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_rgb
-from msgs_slam.formats.trajectory import write_matrices
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.read_config import load_config
@@ -21,6 +20,7 @@ from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.tracking.carry import lose_unfit, pose_lost
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 from msgs_slam.pipelines.types import GivenPoses
+from tests.matrices import write_matrices
 from tests.pipelines.frames.conftest import FOCAL, HEIGHT, QUICK, WIDTH, render, sideways
 
 FRAMES, BLANK = 18, range(7, 11)

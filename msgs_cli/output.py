@@ -1,0 +1,153 @@
+"""Output of a command: logs, progress, its result and how it ends, as text or as JSON lines."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial, wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from msgs_slam.msgs_cli.json_lines import JsonHandler, JsonProgress, write_line
+from msgs_slam.msgs_cli.text import TextHandler, say
+
+if TYPE_CHECKING:
+    from msgs_slam.pipelines.system.progress import Progress
+
+_STOPPING = (
+    "Stopping at the next snapshot. Press Ctrl-C again to stop now (what was done since the last snapshot is lost)."
+)
+_said: set[str] = set()
+"""The warnings shown since logging was set up."""
+
+
+def verbosity_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add -q, -v and --log-format to a command, which is given an `output` instead; its logging is set up."""
+
+    @wraps(command)
+    def run(quiet: bool, verbose: bool, log_format: str, **others: Any) -> None:
+        if quiet and verbose:
+            raise click.UsageError("-q and -v exclude each other")
+        output = Output(quiet, verbose, log_format == "json")
+        output.set_up_logging()
+        command(output=output, **others)
+
+    with_format = click.option(
+        "--log-format", type=click.Choice(["text", "json"]), default="text",
+        help="json: progress, logs and errors on stderr as one JSON object a line.",
+    )(run)  # fmt: skip
+    with_verbose = click.option("-v", "--verbose", is_flag=True, help="Log what is decided and why.")(with_format)
+    return click.option("-q", "--quiet", is_flag=True, help="Print errors only.")(with_verbose)
+
+
+@dataclass(frozen=True)
+class Output:
+    """Amount and form of what a command prints: errors only, or what is decided and why, too; text or JSON lines."""
+
+    quiet: bool = False
+    verbose: bool = False
+    as_json: bool = False
+
+    def set_up_logging(self) -> None:
+        """Send logs to stderr: warnings, or everything, or errors only."""
+        level = logging.ERROR if self.quiet else logging.INFO if self.verbose else logging.WARNING
+        handler: logging.Handler = JsonHandler() if self.as_json else TextHandler()
+        handler.addFilter(SaidOnce())
+        logging.basicConfig(level=level, handlers=[handler], force=True)
+
+    def progress(self) -> Progress:
+        """Bars on a terminal, a line a stage in a file or pipe, JSON lines, or nothing."""
+        from msgs_slam.msgs_cli.progress import BarProgress
+        from msgs_slam.pipelines.system.progress import LineProgress, SilentProgress
+
+        if self.quiet:
+            return SilentProgress()
+        if self.as_json:
+            return JsonProgress()
+        return BarProgress() if sys.stderr.isatty() else LineProgress()
+
+    def worker_setup(self, remote: bool) -> Callable[[str], Progress]:
+        """Return a picklable function that sets up logging in a process that works on one recording of many, and
+        returns its progress: bars here, lines from elsewhere."""
+        return partial(_worker_progress, self, remote)
+
+    def tell_result(self, **paths: Path | list[Path] | bool) -> None:
+        """Write the last event of a command that went well, for programs: where its results are."""
+        if self.as_json and not self.quiet:
+            texts = {k: [str(p) for p in v] if isinstance(v, list) else str(v) for k, v in paths.items()}
+            write_line("result", **texts, exit_code=0)
+
+    @contextmanager
+    def stopping_softly(self, how_to_go_on: str) -> Iterator[None]:
+        """End the work in this block at its next snapshot on the first SIGINT, SIGTERM or SIGHUP, at once on the
+        second; then the process ends with 128 plus the signal's number, as shells expect."""
+        from msgs_slam.pipelines.system.stopping import soft_stop
+
+        try:
+            with soft_stop(self._tell_stopping):
+                yield
+        except KeyboardInterrupt as error:
+            number = getattr(error, "number", signal.SIGINT)
+            if self.as_json:
+                write_line("stopped", signal=int(number), message=how_to_go_on, exit_code=128 + number)
+            else:
+                say(f"\nStopped. {how_to_go_on}", err=True)
+            sys.exit(128 + number)
+
+    def _tell_stopping(self, number: int) -> None:
+        if self.as_json:
+            write_line("stopping", signal=number, message=_STOPPING)
+        else:  # not through click: a signal may come while it prints
+            os.write(2, f"\n{_STOPPING}\n".encode())
+
+
+def _worker_progress(output: Output, remote: bool, name: str) -> Progress:
+    from msgs_slam.pipelines.system.progress import LineProgress
+
+    output.set_up_logging()
+    if remote and not output.quiet and not output.as_json:
+        return LineProgress(name)
+    logging.getLogger("msgs_slam").info("%s: begins", name)
+    return output.progress()
+
+
+class SaidOnce(logging.Filter):
+    """Shows a warning once, however often it comes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        _said.clear()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether it is news."""
+        text = record.getMessage()
+        is_news = record.levelno != logging.WARNING or text not in _said
+        if record.levelno == logging.WARNING:
+            _said.add(text)
+        return is_news
+
+
+def is_said(warning: str) -> bool:
+    """Whether it has been shown already."""
+    return warning in _said
+
+
+@contextmanager
+def on_sigterm(handler: Any) -> Iterator[None]:
+    """Handle SIGTERM (docker stop, systemd) otherwise inside this block. SIG_DFL ends the process at once, without a
+    library's stack trace; `signal.default_int_handler` raises KeyboardInterrupt, as Ctrl-C does."""
+    from msgs_slam.pipelines.system.stopping import let_libraries_take_signals
+
+    let_libraries_take_signals()
+    before = signal.signal(signal.SIGTERM, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
