@@ -155,11 +155,6 @@ def _about_texture(capture: Capture) -> list[str]:
             f"{poor} of {len(capture.points)} keyframes see fewer than 60 points: bare walls give nothing to hold on "
             "to; keep furniture, corners or pictures in view."
         )
-    if len(capture.reliability) and (usual := float(np.median(capture.reliability))) < 0.3:
-        found.append(
-            f"The depth is reliable on few pixels (mean reliability {usual:.2f}): a learned depth network helps on "
-            "bare walls (--depth onnx:CARD)."
-        )
     return found
 
 

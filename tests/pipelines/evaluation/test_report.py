@@ -145,13 +145,11 @@ def test_advice_says_what_is_wrong_and_nothing_else(oracle_run: OracleRun) -> No
     swinging = replace(fine, brightness=np.linspace(60, 180, 32))
     dark = replace(fine, brightness=np.full(32, 20.0))
     bare = replace(fine, points=np.full(32, 20))
-    unsure = replace(fine, reliability=np.full(32, 0.1))
     for capture, words in (
         (blurred, "8 of 32 frames are blurred"),
         (swinging, "lock the exposure"),
         (dark, "very dark"),
         (bare, "bare walls"),
-        (unsure, "learned depth"),
     ):
         lines = advice(outcome, capture, model, loop, 30.0)
         assert len(lines) == 1

@@ -63,6 +63,14 @@ def test_embedded_providers_go_end_to_end(room: Room, make_context: Make) -> Non
     assert 0 < np.mean(errors) < 0.02
 
 
+@pytest.mark.parametrize(("planes", "is_warned"), [(32, False), (4, True)])
+def test_depth_that_is_mostly_filled_in_is_said_to_be(make_context: Make, planes: int, is_warned: bool) -> None:
+    context = make_context("proxy.stereo_side=128", f"proxy.stereo_planes={planes}")
+    share = run(context)["reliable_pixels"]
+    said = [w for w in context.warnings if f"only {share:.0%} of the pixels could be matched" in w]
+    assert bool(said) == is_warned
+
+
 class Killed(Exception):
     """Stands for SIGKILL."""
 
