@@ -103,7 +103,7 @@ class DepthProvider(Provider, Protocol):
         """Slow passes over all frames that `estimate` builds on; goes on where it was interrupted."""
 
     def estimate(self, frame: Frame) -> DepthEstimate:
-        """Depth at the size of the proxy maps."""
+        """Depth at the size of the proxy maps. May be asked from two threads at once."""
 
     def figures(self) -> dict[str, Any]:
         """Return the figures of the pass for the report, as plain values."""
@@ -127,7 +127,7 @@ class SemanticsProvider(Provider, Protocol):
         """Return the problems that `prepare` found, for the report."""
 
     def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
-        """Labels at the size of the proxy maps."""
+        """Labels at the size of the proxy maps. May be asked from two threads at once."""
 
     def classes(self) -> ClassTable:
         """Return the table of classes; valid after `prepare`."""
