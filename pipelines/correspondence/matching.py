@@ -18,6 +18,8 @@ _SIFT, _LEARNED = (0.8, 0.7), (1.0, 0.555)
 Descriptors = NDArray[np.uint8] | NDArray[np.int8]
 _MAX_ERROR, _MIN_INLIERS = 2.0, 15
 """Pixels within which a match obeys a geometry, and how many have to."""
+_ABREAST = 32
+"""Columns that are compared side by side: two vectors of the widest there are."""
 _FIRST_LOOK, _NEARLY = 300, 0.8
 """Trials of the first look at a pair, and its share of the least inliers: chosen on two recordings."""
 
@@ -62,23 +64,52 @@ def match_descriptors(
 
 @kernel
 def _two_nearest(similarity):  # type: ignore[no-untyped-def]
-    """Best column, its value and the second value of every row, and the best row of every column, in one pass."""
+    """Best column, its value and the second value of every row, and the best row of every column, in one pass; of
+    equal ones the first.
+
+    Columns lie in `_ABREAST` lanes, each with a best of its own, and nothing branches on a number: loops over the lanes
+    become vector instructions.
+    """
     rows, columns = similarity.shape
     best = np.zeros(rows, np.int64)
     score = np.full(rows, np.float32(-1))
     runner_up = np.full(rows, np.float32(-1))
     column_score = np.full(columns, np.float32(-1))
-    column_best = np.zeros(columns, np.int64)
+    column_best = np.zeros(columns, np.int32)
+    tops, seconds = np.empty(_ABREAST, np.float32), np.empty(_ABREAST, np.float32)
+    places = np.empty(_ABREAST, np.int32)
+    whole = columns - columns % _ABREAST
     for i in range(rows):
-        top, second, at = np.float32(-1), np.float32(-1), 0
-        for j in range(columns):
+        own = np.int32(i)
+        for k in range(_ABREAST):
+            tops[k], seconds[k], places[k] = np.float32(-1), np.float32(-1), 0
+        for j in range(0, whole, _ABREAST):
+            for k in range(_ABREAST):
+                value, top = similarity[i, j + k], tops[k]
+                less = top if value > top else value
+                seconds[k] = less if less > seconds[k] else seconds[k]
+                places[k] = np.int32(j) if value > top else places[k]
+                tops[k] = value if value > top else top
+            for k in range(_ABREAST):
+                value, before = similarity[i, j + k], column_score[j + k]
+                column_best[j + k] = own if value > before else column_best[j + k]
+                column_score[j + k] = value if value > before else before
+        top, second, at = np.float32(-1), np.float32(-1), np.int64(0)
+        for k in range(_ABREAST):
+            place = places[k] + k
+            if tops[k] > top or (tops[k] == top and place < at and top > -1):
+                second = max(top, max(second, seconds[k]))
+                top, at = tops[k], place
+            else:
+                second = max(second, max(seconds[k], tops[k]))
+        for j in range(whole, columns):
             value = similarity[i, j]
             if value > top:
                 second, top, at = top, value, j
             elif value > second:
                 second = value
             if value > column_score[j]:
-                column_score[j], column_best[j] = value, i
+                column_score[j], column_best[j] = value, own
         best[i], score[i], runner_up[i] = at, top, second
     return best, score, runner_up, column_best
 

@@ -20,10 +20,12 @@ from msgs_slam.pipelines.export.planes import Planes
 from msgs_slam.pipelines.export.straighten import planes_of, straightened
 from msgs_slam.pipelines.export.surface import chunk_surfaces, weld
 from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid
+from msgs_slam.pipelines.gaussians.render import get_threads, host_threads
 from msgs_slam.pipelines.mapping.depth_views import DrawnView, Shown, drawn_view
 from msgs_slam.pipelines.outcome import Outcome, maps_around
 from msgs_slam.pipelines.run.files import MESH
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
+from msgs_slam.pipelines.system.parallel import abreast
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps, SemanticMesh
@@ -68,13 +70,18 @@ def draw(outcome: Outcome, settings: ExportConfig, scratch: Path, progress: Prog
     """Render the map in the `keyframe_rows` with these numbers into `scratch`; existing files are kept."""
     rows, t, near = keyframe_rows(outcome), outcome.trajectory, maps_around(outcome)
     camera = outcome.calibration.intrinsics.at_most(settings.mesh_side)
-    for number in progress.track(numbers, "drawing", len(numbers)):
+
+    def draw_one(number: int) -> None:
         if not (file := _view_file(scratch, number)).exists():
             row = rows[number]
             frame_id = int(t.frame_ids[row])
             view = drawn_view(near(frame_id), t.cam_from_world[row], camera)
             maps = outcome.run.find_proxy(frame_id) if settings.planes else None
             save_value(file, view if maps is None else replace(view, unsure=_unsure(maps, camera)))
+
+    done = abreast(draw_one, numbers, host_threads(outcome.require_map().means))
+    for _ in progress.track(done, "drawing", len(numbers)):
+        pass
 
 
 def _unsure(maps: ProxyMaps, camera: Intrinsics) -> NDArray[np.bool_]:
@@ -83,10 +90,15 @@ def _unsure(maps: ProxyMaps, camera: Intrinsics) -> NDArray[np.bool_]:
 
 def straighten(scratch: Path, planes: Planes, progress: Progress, numbers: range) -> None:
     """Move unsure depths of the views of `draw` onto the planes; a view that is done stays."""
-    for number in progress.track(numbers, "straightening", len(numbers)):
+
+    def straighten_one(number: int) -> None:
         view: DrawnView = load_value(file := _view_file(scratch, number))
         if view.unsure is not None:
             save_value(file, straightened(view, planes))
+
+    done = abreast(straighten_one, numbers, get_threads())
+    for _ in progress.track(done, "straightening", len(numbers)):
+        pass
 
 
 def planes_in(scratch: Path, count: int) -> Planes:

@@ -59,8 +59,9 @@ from msgs_slam.pipelines.structure.calibration import read_intrinsics
 from msgs_slam.pipelines.structure.lens import Lens, distortion_of, make_lens
 from msgs_slam.pipelines.structure.parallax import require_motion
 from msgs_slam.pipelines.structure.rolling import read_readout
-from msgs_slam.pipelines.structure.sfm import Structure, parallel_map
+from msgs_slam.pipelines.structure.sfm import Structure
 from msgs_slam.pipelines.structure.window_size import window_size, windows_of
+from msgs_slam.pipelines.system.parallel import parallel_map
 from msgs_slam.pipelines.types import Calibration, Frame, GivenPoses
 
 _SIGNIFICANT_SHIFT_PX = 0.3

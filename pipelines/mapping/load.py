@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.depth.fields import DepthFields
+from msgs_slam.pipelines.depth.posed import PosedDepth
 from msgs_slam.pipelines.depth.see_through import contradicted
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes
@@ -20,6 +21,9 @@ from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.memory import VIEWS_SHARE, room_on
 from msgs_slam.pipelines.types import Frame, Intrinsics, ProxyMaps, Trajectory
+
+_COMPARED_ROOM = 60e6
+"""Bytes of depths and trust that are kept while each view is compared with some others, mostly those beside it."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +97,11 @@ def survey(run: RunFolder, frame_ids: Iterable[int]) -> tuple[tuple[int, ...], i
 
 def without_contradicted_depth(views: LruSequence[View]) -> LruSequence[View]:
     """The views, their depth unknown where others see through it."""
-    posed = LruSequence(len(views), lambda i: views[i].posed_depth(), lambda p: p.depth.nbytes, 0)
+
+    def size_of(posed: PosedDepth) -> int:
+        return posed.depth.nbytes + posed.trust.nbytes
+
+    posed = LruSequence(len(views), lambda i: views[i].posed_depth(), size_of, _COMPARED_ROOM)
     wrong = [np.packbits(w) for w in contradicted(posed)]
 
     def masked(index: int, view: View) -> View:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.gaussians.render import Rendering, render
@@ -34,10 +35,11 @@ def measure_view(
     cam_from_world: NDArray[np.float64],
     log_gain: NDArray[np.float32],
     offset: NDArray[np.float32],
+    features: Tensor | None = None,
 ) -> ViewFigures:
     """Compare the map, seen from `cam_from_world` (4, 4) with the given exposure (3,), with what the view shows of the
-    scene."""
-    rendering = draw_map(gaussian_map, view, cam_from_world)
+    scene; `features`: as of `features_of`, who measures several views makes them once."""
+    rendering = draw_map(gaussian_map, view, cam_from_world, features)
     colors = rendering.features[..., :3] * torch.exp(torch.tensor(log_gain)).to(view.image.device)
     colors = (colors + torch.tensor(offset).to(view.image.device)).clamp(0, 1)
     photo = view.of_scene(view.colors, colors)
@@ -59,12 +61,18 @@ def _label_agreement(rendering: Rendering, view: View) -> float:
     return float((logits.argmax(-1) == view.channels)[known].float().mean())
 
 
-def draw_map(gaussian_map: GaussianMap, view: View, cam_from_world: NDArray[np.float64]) -> Rendering:
+def features_of(gaussian_map: GaussianMap) -> Tensor:
+    """(M, 3 + C) colours ++ class logits."""
+    return torch.cat([gaussian_map.colors, gaussian_map.class_logits], dim=1)
+
+
+def draw_map(
+    gaussian_map: GaussianMap, view: View, cam_from_world: NDArray[np.float64], features: Tensor | None = None
+) -> Rendering:
     """Colours ++ class logits, depth and silhouette from a camera."""
     pose = torch.tensor(cam_from_world, dtype=torch.float64)  # a copy: workers get arrays to read only
-    features = torch.cat([gaussian_map.colors, gaussian_map.class_logits], dim=1)
-    m = gaussian_map
-    return render(m.means, m.radii, m.opacities, features, pose, view.intrinsics)
+    m, drawn = gaussian_map, features_of(gaussian_map) if features is None else features
+    return render(m.means, m.radii, m.opacities, drawn, pose, view.intrinsics)
 
 
 def mean_figures(figures: Sequence[ViewFigures], prefix: str) -> dict[str, float]:

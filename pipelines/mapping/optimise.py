@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial, reduce
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -14,7 +15,14 @@ import msgs_slam.pipelines.gaussians.render.cards as cards
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.gaussians.adam import gradients_of
-from msgs_slam.pipelines.gaussians.render import Rendering, blending_weights, in_view, marked_in_view, render
+from msgs_slam.pipelines.gaussians.render import (
+    Rendering,
+    blending_weights,
+    host_threads,
+    in_view,
+    marked_in_view,
+    render,
+)
 from msgs_slam.pipelines.mapping.card_loss import color_errors_on_card, fit_exposure_on_card
 from msgs_slam.pipelines.mapping.exposure import SOLID, expose, fit_exposure
 from msgs_slam.pipelines.mapping.growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
@@ -26,9 +34,11 @@ from msgs_slam.pipelines.mapping.splitting import DensificationError, densificat
 from msgs_slam.pipelines.mapping.state import Exposures, OptimisedMap, OptimiserState
 from msgs_slam.pipelines.mapping.views import View, halved
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
+from msgs_slam.pipelines.system.parallel import abreast
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress
 from msgs_slam.pipelines.system.stopping import is_asked
 
+T = TypeVar("T")
 MAP_RATES = {"means": 0.1, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2}
 """Learning rates of Adam, of positions in radii of the Gaussian: what is small has to be placed finely."""
 HALVES_ROOM = 250e6
@@ -153,11 +163,17 @@ class MapOptimiser:
     def _blame(self) -> DensificationError:
         """What each Gaussian answers for in the view where that is most."""
         gaussian_map, state = self.state.parameters.to_map(), self.state
-        found = (
-            densification_error(gaussian_map, state.cam_from_world(i, v), v.intrinsics, partial(self._color_errors, i))
-            for i, v in enumerate(self.views)
-        )
-        return reduce(DensificationError.worst_of, found)
+
+        def of_view(i: int) -> DensificationError:
+            view, errors = self.views[i], partial(self._color_errors, i)
+            return densification_error(gaussian_map, state.cam_from_world(i, view), view.intrinsics, errors)
+
+        return reduce(DensificationError.worst_of, self._of_views(of_view))
+
+    def _of_views(self, look: Callable[[int], T]) -> Iterator[T]:
+        """Look at each view in turn; on a card, whose kernels wait for each other anyway, one by one."""
+        self.state.settle_poses()
+        return abreast(look, range(len(self.views)), host_threads(self.state.parameters["means"]))
 
     @torch.no_grad()
     def _color_errors(self, index: int, colors: Tensor) -> Tensor:
@@ -181,14 +197,15 @@ class MapOptimiser:
         views show no part of the scene has none: nothing tells it where to be."""
         p = self.state.parameters
         arguments = (p["means"], torch.exp(p["log_radii"]), torch.sigmoid(p["opacity_logits"]))
-        largest = torch.zeros(len(p), device=p["means"].device)
-        for index, view in enumerate(self.views):
+
+        def of_view(index: int) -> Tensor:
+            view = self.views[index]
             pose = self.state.cam_from_world(index, view)
             counts = None if view.scene is None else view.scene.float()
             found = blending_weights(*arguments, pose, view.intrinsics, counts=counts)
-            seen = found.largest if counts is None else torch.minimum(found.largest, found.total)
-            largest = torch.maximum(largest, seen)
-        return largest
+            return found.largest if counts is None else torch.minimum(found.largest, found.total)
+
+        return reduce(torch.maximum, self._of_views(of_view))
 
     def draw(self, view: View, cam_from_world: Tensor, values: Mapping[str, Tensor]) -> Rendering:
         """Gaussians of raw parameters as the view sees them from (4, 4)."""

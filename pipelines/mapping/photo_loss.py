@@ -67,9 +67,11 @@ class _PhotoLoss(torch.autograd.Function):
         sums = np.zeros((bands, 2))
 
         def blur(first: int) -> None:
-            for k in range(first, 5):
-                pictures = (x[: target.size].reshape(target.shape) for x in (planes[k], moments[k - first]))
+            def of_plane(k: int) -> None:
+                pictures = (x[: target.size].reshape(shape) for x in (planes[first + k], moments[k]))
                 blur_array(*pictures)
+
+            for_each(of_plane, 5 - first)  # OpenCV's filter takes one thread
 
         def rows(band: int) -> slice:
             return slice(band * _ROWS, min((band + 1) * _ROWS, height))

@@ -24,7 +24,7 @@ from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.gaussians.render import blending_weights, median_depth
 from msgs_slam.pipelines.mapping.gauge import SeenExposures, common_exposure
 from msgs_slam.pipelines.mapping.load import MappingInput, load_views
-from msgs_slam.pipelines.mapping.measure import ViewFigures, measure_view
+from msgs_slam.pipelines.mapping.measure import ViewFigures, features_of, measure_view
 from msgs_slam.pipelines.mapping.optimise import optimise_map
 from msgs_slam.pipelines.mapping.parameters import KEYS
 from msgs_slam.pipelines.mapping.state import Exposures, OptimisedMap
@@ -230,11 +230,12 @@ def measure_submap(task: SubmapTask, progress: Progress) -> tuple[list[ViewFigur
     given = task.views(task.trajectory, task.config.mapping.hold_out)
     rows = {int(i): row for row, i in enumerate(task.trajectory.frame_ids)}
     whole = together(maps)
+    features = features_of(whole)
     log_gains, offsets = task.exposure or _no_exposure(len(rows))
 
     def figures(view: View) -> ViewFigures:
         row = rows[view.frame_id]
-        return measure_view(whole, view, task.trajectory.cam_from_world[row], log_gains[row], offsets[row])
+        return measure_view(whole, view, task.trajectory.cam_from_world[row], log_gains[row], offsets[row], features)
 
     measured = [figures(v) for v in progress.track(given.views, "measuring", len(given.views))]
     return measured, [figures(v) for v in given.held_out]

@@ -29,6 +29,7 @@ from msgs_slam.pipelines.proxy.scale import DepthScale
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth, open_semantics
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, LEFT_OUT, PROXY_MAPS
 from msgs_slam.pipelines.source.recording import open_recording
+from msgs_slam.pipelines.system.parallel import abreast
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.types import Frame, Intrinsics, ProxyMaps, any_of
@@ -146,8 +147,9 @@ def make_depths(task: Chunk, progress: Progress) -> None:
     """The depths of the frames."""
     work, frames = _opened(task, progress)
     take_prepared(work.depths, task.known["depths"])
-    for frame in progress.track(frames[task.first : task.last], "depth", len(task.numbers)):
-        work.save_depth(frame)
+    done = abreast(work.save_depth, frames[task.first : task.last], work.context.threads)
+    for _ in progress.track(done, "depth", len(task.numbers)):
+        pass
 
 
 def look_for_moving(task: Chunk, progress: Progress) -> dict[int, NDArray[np.bool_]]:
@@ -168,15 +170,17 @@ def make_maps(task: Chunk, progress: Progress) -> dict[int, NDArray[np.float32]]
     work, frames = _opened(task, progress)
     take_prepared(work.semantics, task.known["semantics"])
     scale, metres = task.known["scale"], np.float32(task.known["metres"])
-    descriptors = {}
-    for frame in progress.track(frames[task.first : task.last], "classes", len(task.numbers)):
+
+    def make(frame: Frame) -> tuple[int, NDArray[np.float32] | None]:
         depth = work.depth(frame)
         labels = work.labels(frame, scale.in_backbone_unit(depth))
-        if labels.descriptor is not None:
-            descriptors[frame.id] = labels.descriptor
         if not PROXY_MAPS.path(work.context.folder, frame.id).exists():
             u = reliability(depth.depth, depth.confidence)
             scaled = (depth.depth * metres).astype(np.float32)
             maps = compact(ProxyMaps(scaled, u, labels.labels, labels.confidence))
             PROXY_MAPS.save(work.context.folder, maps, frame.id)
-    return descriptors
+        return frame.id, labels.descriptor
+
+    made = abreast(make, frames[task.first : task.last], work.context.threads)
+    looks = progress.track(made, "classes", len(task.numbers))
+    return {frame_id: descriptor for frame_id, descriptor in looks if descriptor is not None}

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import pycolmap
@@ -44,14 +42,13 @@ from msgs_slam.pipelines.structure.window_size import SIZE, windows_of
 from msgs_slam.pipelines.structure.windows import Joined, adjust_joined
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.memory import release_free_memory
+from msgs_slam.pipelines.system.parallel import parallel_map
 from msgs_slam.pipelines.types import Features, Vocabulary
 
 _PAIRS_PER_BLOCK = 64
 _FEATURES_SHARE = 0.25
 """Of the memory that there is: what has no room there is read again from the snapshot."""
 Divide = Callable[[str, int, dict[str, NDArray]], None]
-T = TypeVar("T")
-R = TypeVar("R")
 
 
 def when_asked(name: str, count: int, known: dict[str, NDArray]) -> None:
@@ -304,13 +301,3 @@ class StructureFromMotion(Candidates):
 
 def _blocks(proposed: Sequence[tuple[int, int]]) -> list[Sequence[tuple[int, int]]]:
     return [proposed[i : i + _PAIRS_PER_BLOCK] for i in range(0, len(proposed), _PAIRS_PER_BLOCK)]
-
-
-def parallel_map(function: Callable[[T], R], items: Iterable[T], threads: int) -> Iterator[R]:
-    """`map` on threads, in order; at most a few results wait in memory."""
-    items = iter(items)
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        waiting = [pool.submit(function, item) for item in itertools.islice(items, 2 * max(1, threads))]
-        while waiting:
-            yield waiting.pop(0).result()
-            waiting.extend(pool.submit(function, item) for item in itertools.islice(items, 1))

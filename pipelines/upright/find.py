@@ -8,8 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs_slam.pipelines.depth.posed import PosedDepth
+from msgs_slam.pipelines.gaussians.render import get_threads, host_threads
 from msgs_slam.pipelines.mapping.depth_views import depth_view
 from msgs_slam.pipelines.outcome import Outcome, evenly, maps_around
+from msgs_slam.pipelines.system.parallel import abreast
 from msgs_slam.pipelines.upright.lines import up_of_lines
 from msgs_slam.pipelines.voxels.layout import Gravity, find_gravity, floor_plane, name_structure
 from msgs_slam.pipelines.voxels.voxels import VOXELS_PER_DEPTH, Voxels, gather_depths
@@ -56,7 +59,7 @@ def find_upright(outcome: Outcome) -> Upright:
     rows = evenly(np.flatnonzero(trajectory.is_keyframe).tolist(), _PICTURES)
     poses = trajectory.cam_from_world[rows]
     pictures = (outcome.run.image(outcome.frames[row]) for row in rows)
-    lines = up_of_lines(pictures, poses, outcome.calibration.intrinsics, prior)
+    lines = up_of_lines(pictures, poses, outcome.calibration.intrinsics, prior, get_threads())
     voxels = surface_voxels(outcome, evenly(rows, _VIEWS))
     level = find_gravity(voxels, prior) if len(voxels) else Gravity(prior, False)
     if not (lines.is_sure or level.is_sure):
@@ -84,7 +87,11 @@ def _verdict(witnesses: dict[str, Array]) -> tuple[Array, str]:
 def surface_voxels(outcome: Outcome, rows: Sequence[int]) -> Voxels:
     """The surface that the map shows in keyframes of the trajectory, as voxels a sixtieth of its usual depth wide."""
     t, camera, near = outcome.trajectory, outcome.calibration.intrinsics.at_most(_SIDE), maps_around(outcome)
-    views = [depth_view(near(int(t.frame_ids[row])), t.cam_from_world[row], camera) for row in rows]
+
+    def view(row: int) -> PosedDepth:
+        return depth_view(near(int(t.frame_ids[row])), t.cam_from_world[row], camera)
+
+    views = list(abreast(view, rows, host_threads(outcome.require_map().means)))
     seen = np.concatenate([np.zeros(0), *(v.depth[v.trust > 0] for v in views)])
     size = float(np.median(seen)) / VOXELS_PER_DEPTH if len(seen) else 1.0
     return gather_depths(views, size)

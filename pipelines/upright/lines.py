@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs_slam.pipelines.system.parallel import parallel_map
 from msgs_slam.pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
@@ -67,10 +68,10 @@ def line_planes(picture: NDArray[np.uint8], intrinsics: Intrinsics) -> tuple[Arr
 
 
 def up_of_lines(
-    pictures: Iterable[NDArray[np.uint8]], cam_from_world: Array, intrinsics: Intrinsics, prior: Array
+    pictures: Iterable[NDArray[np.uint8]], cam_from_world: Array, intrinsics: Intrinsics, prior: Array, threads: int = 1
 ) -> Vertical:
     """Up by the lines of images at poses cam_from_world (N, 4, 4), near the unit vector `prior` (3,)."""
-    found = [line_planes(picture, intrinsics) for picture in pictures]
+    found = list(parallel_map(lambda picture: line_planes(picture, intrinsics), pictures, threads))
     normals = np.concatenate(
         [np.zeros((0, 3)), *(n @ p[:3, :3] for (n, _), p in zip(found, cam_from_world, strict=True))]
     )

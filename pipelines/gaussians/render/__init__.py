@@ -15,7 +15,7 @@ from msgs_slam.pipelines.gaussians.render.inspection import (
     median_depth,
 )
 from msgs_slam.pipelines.gaussians.render.rendering import Rendering, render
-from msgs_slam.pipelines.gaussians.render.threads import get_threads, set_threads
+from msgs_slam.pipelines.gaussians.render.threads import get_threads, host_threads, set_threads
 from msgs_slam.pipelines.gaussians.render.tracking import PoseFit, track_gn
 
 __all__ = [
@@ -28,6 +28,7 @@ __all__ = [
     "composite",
     "error_shares",
     "get_threads",
+    "host_threads",
     "in_view",
     "marked_in_view",
     "median_and_seen",

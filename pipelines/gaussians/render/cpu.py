@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from msgs_slam.pipelines.gaussians.render.cpu_backward import COLORS, backward_band, sum_shared
-from msgs_slam.pipelines.gaussians.render.cpu_bands import split_into_bands
+from msgs_slam.pipelines.gaussians.render.cpu_bands import for_each_band, split_into_bands
 from msgs_slam.pipelines.gaussians.render.cpu_forward import draw_bands
 from msgs_slam.pipelines.gaussians.render.cpu_inspect import class_weights, inspect, weighted_errors
 from msgs_slam.pipelines.gaussians.render.threads import for_each
@@ -68,7 +68,9 @@ class _Composite(torch.autograd.Function):
         shared = np.empty((int(bands.slots[-1]), 5 + COLORS), F32)
         results = (d_geometry, d_features, shared)
         places = (bands.first, bands.slots)
-        for_each(lambda b: backward_band(b, bands.own(b), *places, *bands.prepared[b], *job, *results), len(bands))
+        for_each_band(
+            lambda b: backward_band(b, bands.own(b), *places, *bands.prepared[b], *job, *results), bands.starts
+        )
         for_each(
             lambda n: sum_shared(n * _ROWS, _ROWS, bands.slots, shared, d_geometry, d_features), -(-count // _ROWS)
         )

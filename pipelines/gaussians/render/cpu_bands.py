@@ -6,6 +6,7 @@ Everything is sized by a first counting pass, so a Gaussian may cover any number
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,8 @@ from msgs_slam.pipelines.gaussians.render.threads import for_each
 F32 = np.float32
 TILE = 16
 BAND_ROWS = 32  # two rows of tiles: more would leave threads idle at the end, fewer would split more Gaussians
+_PART = 16384
+"""Gaussians that a thread assigns to bands at a time."""
 RECORD = 6
 """Numbers kept per Gaussian of a band: u, v, sigma_px, z, opacity, reach."""
 
@@ -67,6 +70,12 @@ class Bands:
         return np.flatnonzero(np.diff(self.slots))
 
 
+def for_each_band(task: Callable[[int], None], starts: NDArray[np.int64]) -> None:
+    """Call task(0) .. task(B - 1), those of the most Gaussians first: at the end no thread waits long for another."""
+    order = np.argsort(starts[:-1] - starts[1:], kind="stable").tolist()
+    for_each(lambda n: task(order[n]), len(order))
+
+
 def split_into_bands(
     projected: tuple[NDArray[np.float32], ...],
     features: NDArray[np.float32],
@@ -76,7 +85,7 @@ def split_into_bands(
     near: float,
 ) -> Bands:
     """Everything about the Gaussians u, v, sigma_px, z, opacity (M,) and features (M, C) that bands need to know."""
-    reach, first, starts, entries, slots = bin_gaussians(*projected, width, height, F32(near))
+    reach, first, starts, entries, slots = bin_gaussians(projected, width, height, near)
     bands = Bands(first, starts, entries, slots, [None] * (len(starts) - 1))  # type: ignore[list-item]
 
     def prepare(band: int) -> None:
@@ -86,12 +95,39 @@ def split_into_bands(
         records, padded = gather_band(own, *projected, reach, features, channels)
         bands.prepared[band] = (records, padded, *list_tiles(records, top, width, min(BAND_ROWS, height - top)))
 
-    for_each(prepare, len(bands))
+    for_each_band(prepare, starts)
     return bands
 
 
-@kernel
 def bin_gaussians(
+    projected: tuple[NDArray[np.float32], ...], width: int, height: int, near: float
+) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
+    """How far from its centre each Gaussian is seen, in pixels (M,), 0 where it is not seen at all; and the first four
+    fields of `Bands`, entries in the order of their indices."""
+    count, bands, parts = len(projected[0]), -(-height // BAND_ROWS), -(-len(projected[0]) // _PART)
+    reach, first, last = np.zeros(count, np.float32), np.zeros(count, np.int32), np.full(count, -1, np.int32)
+    counts = np.zeros((parts, bands), np.int64)
+
+    def own(part: int) -> slice:
+        return slice(part * _PART, (part + 1) * _PART)
+
+    def find(part: int) -> None:
+        here, size = own(part), (width, height, F32(near))
+        find_bands(*(x[here] for x in projected), *size, reach[here], first[here], last[here], counts[part])
+
+    for_each(find, parts)
+    spans = last.astype(np.int64) - first + 1
+    slots = np.concatenate([[0], np.cumsum(np.where(spans > 1, spans, 0))])
+    starts = np.concatenate([[0], np.cumsum(counts.sum(0))])
+    # Of each band the part's own place follows those of the parts before it.
+    places = starts[:-1] + np.cumsum(counts, axis=0) - counts
+    entries = np.empty(starts[-1], np.int32)
+    for_each(lambda part: list_bands(part * _PART, first[own(part)], last[own(part)], places[part], entries), parts)
+    return reach, first, starts, entries, slots
+
+
+@kernel
+def find_bands(
     u: NDArray[np.float32],
     v: NDArray[np.float32],
     sigma_px: NDArray[np.float32],
@@ -100,15 +136,15 @@ def bin_gaussians(
     width: int,
     height: int,
     near: np.float32,
-) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
-    """How far from its centre each Gaussian is seen, in pixels (M,), 0 where it is not seen at all; and the first four
-    fields of `Bands`, entries in the order of their indices."""
-    count, bands = len(u), (height + BAND_ROWS - 1) // BAND_ROWS
-    reach, first, last = np.zeros(count, np.float32), np.zeros(count, np.int32), np.zeros(count, np.int32)
-    slots, starts = np.zeros(count + 1, np.int64), np.zeros(bands + 2, np.int64)
+    reach: NDArray[np.float32],
+    first: NDArray[np.int32],
+    last: NDArray[np.int32],
+    counts: NDArray[np.int64],
+) -> None:
+    """Fill in what is not 0 of `reach`, and the `first` and `last` band, of those that are seen; counts (B,): how many
+    are seen in each band."""
     right, bottom = F32(width) - _HALF, F32(height) - _HALF
-    for i in range(count):
-        spans = 0
+    for i in range(len(u)):
         if z[i] > near and opacity[i] > _ALPHA_MIN:
             r = sigma_px[i] * np.sqrt(min(_CUT2, _TWO * np.log(opacity[i] / _ALPHA_MIN)))
             if r > 0 and u[i] + r >= _HALF and u[i] - r <= right and v[i] + r >= _HALF and v[i] - r <= bottom:
@@ -116,19 +152,20 @@ def bin_gaussians(
                 if low >= top:  # else it lies between two rows of pixels
                     reach[i] = r
                     first[i], last[i] = top // BAND_ROWS, low // BAND_ROWS
-                    spans = last[i] - first[i] + 1
                     for band in range(first[i], last[i] + 1):
-                        starts[band + 2] += 1
-        slots[i + 1] = slots[i] + (spans if spans > 1 else 0)
-    for band in range(bands):
-        starts[band + 2] += starts[band + 1]
-    entries = np.empty(starts[bands + 1], np.int32)
-    for i in range(count):
-        if reach[i] > 0:
-            for band in range(first[i], last[i] + 1):
-                entries[starts[band + 1]] = i
-                starts[band + 1] += 1
-    return reach, first, starts[: bands + 1], entries, slots
+                        counts[band] += 1
+
+
+@kernel
+def list_bands(
+    start: int, first: NDArray[np.int32], last: NDArray[np.int32], places: NDArray[np.int64], entries: NDArray[np.int32]
+) -> None:
+    """The indices, from `start` on, of Gaussians with a `first` and `last` band into the `entries` of these bands, from
+    the band's own of `places` (B,) on, which move along."""
+    for i in range(len(first)):
+        for band in range(first[i], last[i] + 1):
+            entries[places[band]] = start + i
+            places[band] += 1
 
 
 def near_to_far(entries: NDArray[np.int32], z: NDArray[np.float32]) -> NDArray[np.int32]:

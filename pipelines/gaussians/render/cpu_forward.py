@@ -19,6 +19,7 @@ from msgs_slam.pipelines.gaussians.render.cpu_bands import (
     TILE,
     Bands,
     first_pixel,
+    for_each_band,
     last_pixel,
 )
 from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
@@ -33,7 +34,6 @@ from msgs_slam.pipelines.gaussians.render.lanes import (
     store,
     where,
 )
-from msgs_slam.pipelines.gaussians.render.threads import for_each
 
 F32 = np.float32
 PIXELS = TILE * TILE
@@ -137,7 +137,7 @@ def draw_bands(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The image (H, W, channels) of all bands, and depth sum, depth silhouette and silhouette (3, H, W)."""
     features, planes = np.empty((height, width, channels), F32), np.empty((3, height, width), F32)
-    for_each(lambda b: forward_band(vectors, b, *bands.prepared[b], features, planes), len(bands))
+    for_each_band(lambda b: forward_band(vectors, b, *bands.prepared[b], features, planes), bands.starts)
     return features, planes
 
 

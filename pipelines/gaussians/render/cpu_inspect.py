@@ -15,6 +15,7 @@ from msgs_slam.pipelines.gaussians.render.cpu_bands import (
     TILE,
     Bands,
     first_pixel,
+    for_each_band,
     last_pixel,
     split_into_bands,
 )
@@ -41,7 +42,6 @@ from msgs_slam.pipelines.gaussians.render.lanes import (
     total,
     where,
 )
-from msgs_slam.pipelines.gaussians.render.threads import for_each
 
 F32 = np.float32
 _HALF, _ZERO = F32(0.5), F32(0)
@@ -96,7 +96,7 @@ def _walk(bands: Bands, counts: Tensor, channels: Tensor, classes: int) -> tuple
     shared = np.empty((int(bands.slots[-1]), 2 + classes), F32)
     given = (counts.contiguous().numpy(), channels.contiguous().numpy(), median, found, shared)
     places = (bands.first, bands.slots)
-    for_each(lambda b: inspect_band(b, bands.own(b), *places, *bands.prepared[b], *given), len(bands))
+    for_each_band(lambda b: inspect_band(b, bands.own(b), *places, *bands.prepared[b], *given), bands.starts)
     if len(straddling := bands.straddling):
         starts = bands.slots[straddling]
         found[straddling] = np.add.reduceat(shared, starts)

@@ -11,10 +11,13 @@ import msgs_slam.pipelines.gaussians.render.cards as cards
 import msgs_slam.pipelines.gaussians.render.rules as rules
 from msgs_slam.pipelines.gaussians.render.compositing import require_finite
 from msgs_slam.pipelines.gaussians.render.jit import kernel
+from msgs_slam.pipelines.gaussians.render.threads import for_each
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project_gaussians
 from msgs_slam.pipelines.types import Intrinsics
 
+_PART = 16384
+"""Gaussians that a thread looks at at a time."""
 NEAR = 0.01
 """Gaussians whose centre is nearer than this (or behind the camera) are not drawn; in the unit of the map."""
 
@@ -27,8 +30,16 @@ def in_view(means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: In
     k, pose = intrinsics, cam_from_world.to(means)
     if means.device.type == "cpu" and means.dtype == torch.float32:
         camera = np.array([k.fx, k.fy, k.cx, k.cy, k.width, k.height, near], np.float32)
-        arrays = (x.detach().contiguous().numpy() for x in (means, radii, pose))
-        return torch.from_numpy(_list_in_view(*arrays, camera))
+        centers, sizes, motion = (x.detach().contiguous().numpy() for x in (means, radii, pose))
+        parts = -(-len(centers) // _PART)
+        found = [np.empty(0, np.int64)] * parts
+
+        def find(part: int) -> None:
+            own = slice(part * _PART, (part + 1) * _PART)
+            found[part] = _list_in_view(centers[own], sizes[own], motion, camera, own.start)
+
+        for_each(find, parts)
+        return torch.from_numpy(np.concatenate([np.empty(0, np.int64), *found]))
     if cards.takes_kernels(means):
         return torch.nonzero(marked_in_view(means, radii, pose, k, near))[:, 0]
     u, v, sigma_px, z = project_gaussians(se3.transform(pose, means), radii, k, near)
@@ -48,9 +59,10 @@ def marked_in_view(
 
 @kernel
 def _list_in_view(
-    means: NDArray[np.float32], radii: NDArray[np.float32], pose: NDArray[np.float32], camera: NDArray[np.float32]
-) -> NDArray[np.int64]:
-    """See `in_view`; camera: fx, fy, cx, cy, width, height, near."""
+    means: NDArray[np.float32], radii: NDArray[np.float32], pose: NDArray[np.float32], camera: NDArray[np.float32],
+    start: int,
+) -> NDArray[np.int64]:  # fmt: skip
+    """See `in_view`; camera: fx, fy, cx, cy, width, height, near; the first of these is Gaussian number `start`."""
     fx, fy, cx, cy, width, height, near = camera
     focal = np.sqrt(fx * fy) * np.float32(rules.CUT_SIGMAS)
     out, count = np.empty(len(means), np.int64), 0
@@ -63,6 +75,6 @@ def _list_in_view(
             u = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) + cx * depth
             v = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) + cy * depth
             if u > -reach and v > -reach and u < width * depth + reach and v < height * depth + reach:
-                out[count] = i
+                out[count] = start + i
                 count += 1
     return out[:count].copy()

@@ -7,6 +7,8 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
+from torch import Tensor
+
 _state: dict[str, int] = {"threads": 0}
 _pools: dict[int, ThreadPoolExecutor] = {}
 
@@ -23,6 +25,12 @@ def get_threads() -> int:
     if _state["threads"]:
         return _state["threads"]
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def host_threads(example: Tensor) -> int:
+    """The number of threads in use where tensors like `example` lie on the host; 1 where they lie on a card, whose
+    kernels wait for each other anyway."""
+    return get_threads() if example.device.type == "cpu" else 1
 
 
 def for_each(task: Callable[[int], None], count: int) -> None:

@@ -112,7 +112,7 @@ class DepthProvider(Provider, Protocol):
         return
 
     def estimate(self, frame: Frame) -> DepthEstimate:
-        """Depth at the size of the proxy maps."""
+        """Depth at the size of the proxy maps. May be asked from two threads at once."""
         ...
 
 
@@ -127,7 +127,7 @@ class SemanticsProvider(Provider, Protocol):
         return []
 
     def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
-        """Labels at the size of the proxy maps."""
+        """Labels at the size of the proxy maps. May be asked from two threads at once."""
         ...
 
     def classes(self) -> ClassTable:

@@ -8,7 +8,7 @@ and hold only a few frames at a time.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -30,6 +30,7 @@ from msgs_slam.pipelines.proxy.stereo.matching import StereoImages, match_planes
 from msgs_slam.pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
 from msgs_slam.pipelines.proxy.stereo.sweep import warps_to
 from msgs_slam.pipelines.proxy.stereo.upsample import upsample_depth
+from msgs_slam.pipelines.system.parallel import Kept, abreast
 from msgs_slam.pipelines.system.progress import Progress
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.types import Frame, Intrinsics
@@ -79,15 +80,15 @@ class MultiviewDepth:
         self._model: SparseModel = sequence.backbone
         self._index = {int(f): i for i, f in enumerate(self._model.frame_ids)}
         self._frame = {f.id: f for f in sequence.frames}
-        self._bands, self._device = Bands(threads), device
+        self._bands, self._threads, self._device = Bands(threads), threads if device == "cpu" else 1, device
         self._camera: Intrinsics = sequence.calibration.intrinsics.at_most(side)
-        self._grey = lru_cache(_CACHED_FRAMES)(self._read_grey)
-        self._raw = lru_cache(_CACHED_FRAMES)(self._load_raw)
-        self._fused = lru_cache(_CACHED_LENDERS)(self._fuse)
-        self._small = lru_cache(_CACHED_LENDERS)(self._read_small)
-        self._contrast = lru_cache(_CACHED_LENDERS)(self._measure_contrast)
-        self._lab = lru_cache(_CACHED_LENDERS)(lambda index: to_lab(self._small(index)))
-        self._nearest = lru_cache(_CACHED_FRAMES)(self._choose_nearest)
+        self._grey = Kept(self._read_grey, _CACHED_FRAMES)
+        self._raw = Kept(self._load_raw, _CACHED_FRAMES)
+        self._fused = Kept(self._fuse, _CACHED_LENDERS)
+        self._small = Kept(self._read_small, _CACHED_LENDERS)
+        self._contrast = Kept(self._measure_contrast, _CACHED_LENDERS)
+        self._lab: Kept[int, NDArray[np.float32]] = Kept(lambda index: to_lab(self._small(index)), _CACHED_LENDERS)
+        self._nearest = Kept(self._choose_nearest, _CACHED_FRAMES)
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames that are no keyframes of the backbone."""
@@ -101,10 +102,13 @@ class MultiviewDepth:
 
     def look(self, frames: list[Frame]) -> None:
         """A raw depth map of every keyframe, on disk."""
-        for frame in self._progress.track([f for f in frames if f.id in self._index], "stereo"):
-            path = self._path(frame.id)
-            if not path.exists():
-                save_value(path, self._sweep(self._index[frame.id]))
+        known = [f for f in frames if f.id in self._index]
+        for _ in self._progress.track(abreast(self._look_at, known, self._threads), "stereo", len(known)):
+            pass
+
+    def _look_at(self, frame: Frame) -> None:
+        if not (path := self._path(frame.id)).exists():
+            save_value(path, self._sweep(self._index[frame.id]))
 
     def _sweep(self, index: int) -> NDArray[np.float32]:
         """(H, W) inverse depth of one keyframe from its neighbours alone; 0 where nothing matches."""

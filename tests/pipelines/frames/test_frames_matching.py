@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from msgs_slam.pipelines.correspondence import retrieval
+from msgs_slam.pipelines.correspondence import matching, retrieval
 from msgs_slam.pipelines.correspondence.database import write_database
 from msgs_slam.pipelines.correspondence.features import extract_features
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair, match_descriptors, verify_matches
@@ -70,6 +70,17 @@ def test_matching_equals_its_definition() -> None:
             expected.append((i, j))
     assert match_descriptors(first, second, (0.9, 1.2)).tolist() == [list(map(int, m)) for m in expected]
     assert 20 < len(expected) < 40
+
+
+@pytest.mark.parametrize("columns", [2, 31, 32, 33, 100])
+def test_the_two_nearest_are_those_of_numpy(columns: int) -> None:
+    """Of few different numbers, so that many are equal: the first of those is the nearest, the next the second."""
+    similarity = np.random.default_rng(columns).integers(0, 9, (40, columns)).astype(np.float32)
+    best, score, runner_up, best_back = matching._two_nearest(similarity)
+    np.testing.assert_array_equal(best, similarity.argmax(1))
+    np.testing.assert_array_equal(score, similarity.max(1))
+    np.testing.assert_array_equal(runner_up, np.sort(similarity, axis=1)[:, -2])
+    np.testing.assert_array_equal(best_back, similarity.argmax(0))
 
 
 def test_too_few_descriptors_match_nothing() -> None:

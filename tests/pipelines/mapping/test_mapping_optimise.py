@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from msgs_slam.pipelines.config import MappingConfig
+from msgs_slam.pipelines.gaussians.render import get_threads, set_threads
 from msgs_slam.pipelines.gaussians.seeding import SEED_LOGIT
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project_gaussians
@@ -108,6 +109,29 @@ def test_a_gaussian_takes_the_classes_of_the_pixels_it_fills(room: MappingInput,
     assert logits[changed][:, 0].abs().max() == 0
     unknown = replace(same, channels=torch.full_like(view.channels, VOID))
     assert torch.equal(voted_logits(m, [(unknown, view.cam_from_world)]), m.class_logits)
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_views_that_are_looked_at_side_by_side_say_the_same(
+    room: MappingInput, mapped: OptimisedMap, threads: int
+) -> None:
+    """What prunes, splits and names Gaussians, byte by byte."""
+
+    def looked() -> list[torch.Tensor]:
+        state = OptimiserState.fresh(room.views, len(room.class_ids), mapped.gaussian_map, None)
+        optimiser = MapOptimiser(room.views, len(room.class_ids), SETTINGS, state)
+        blame, weights = optimiser._blame(), optimiser._blending_weights()
+        optimiser.count_labels()
+        return [blame.error, blame.footprint, weights, state.parameters.class_logits]
+
+    before = get_threads()
+    try:
+        set_threads(1)
+        alone = looked()
+        set_threads(threads)
+        assert all(torch.equal(a, b) for a, b in zip(alone, looked(), strict=True))
+    finally:
+        set_threads(before)
 
 
 class Killed(Exception):

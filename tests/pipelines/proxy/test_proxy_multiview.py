@@ -1,5 +1,6 @@
 """Multi-view depth, fused depth and regions on the synthetic room, against its exact truth."""
 
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 
@@ -73,6 +74,16 @@ def test_multiview_gives_the_same_bytes_with_other_threads(room: Room, stereo: M
     for frame in room.frames[4:8]:
         ours, theirs = (p._path(frame.id).read_bytes() for p in (few, stereo))
         assert ours == theirs
+
+
+def test_two_threads_may_ask_for_depths_at_once(room: Room, stereo: MultiviewDepth) -> None:
+    """Each needs the depths of others, which the other thread may just be making."""
+    alone = [stereo.estimate(frame) for frame in room.frames[:6]]
+    fresh = MultiviewDepth(room.sequence(), SIDE, PLANES, stereo._folder, 2, SilentProgress())
+    with ThreadPoolExecutor(2) as pool:
+        for own, found in zip(alone, pool.map(fresh.estimate, room.frames[:6]), strict=True):
+            np.testing.assert_array_equal(own.depth, found.depth)
+            np.testing.assert_array_equal(own.confidence, found.confidence)
 
 
 def test_multiview_without_parallax_says_so(room: Room) -> None:
