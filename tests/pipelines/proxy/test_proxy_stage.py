@@ -97,7 +97,7 @@ def test_killed_in_each_pass_and_with_other_threads_it_ends_with_the_same_bytes(
         with pytest.raises(Killed):
             run(broken)
     maps = sorted((broken.folder / "maps").iterdir())
-    assert len(maps) == 6
+    assert len(maps) == 7  # the bar counts what is done: six are told of, the seventh lies there already
     stamps = [p.stat().st_mtime_ns for p in maps]
     object.__setattr__(broken, "progress", whole.progress)
     run(broken)
