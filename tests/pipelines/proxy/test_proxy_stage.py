@@ -152,7 +152,7 @@ def test_what_a_network_says_of_normals_and_looks_reaches_the_run(
     monkeypatch.setattr(FilesLabels, "estimate", with_descriptor)
     context = make_context(*FILES)
     run(context)
-    assert seen == [f.id for f in room.frames]
+    assert sorted(seen) == [f.id for f in room.frames]  # two are in work at once
     found = context.run.find(DESCRIPTORS)
     assert sorted(found) == [f.id for f in room.frames]
     np.testing.assert_array_equal(found[5], np.eye(4)[1])
