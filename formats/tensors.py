@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from threading import Lock
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +25,10 @@ _DTYPES = {
     "uint64": "U64", "uint32": "U32", "uint16": "U16", "uint8": "U8", "bool": "BOOL",
 }  # fmt: skip
 
+_READ_HEADER = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+HEADERS = Lock()
+"""Held while numpy reads the header of an array: it parses it as Python, and CPython 3.11 raises SystemError where
+two threads of different depth parse at once (python/cpython#106905)."""
 MAX_UNPACKED_BYTES = 1024**3
 """A foreign packed file whose arrays would take more memory in total is refused: a few kilobytes can unpack to
 anything."""
@@ -54,16 +60,32 @@ def load_arrays(path: Path, *, own: bool = False) -> dict[str, NDArray]:
     `MAX_UNPACKED_BYTES`: what was written of a long recording has to be read again, however large.
     """
     require_file(path)
-    with parsing(path, ".npz file of plain arrays", "make it again"):
-        with zipfile.ZipFile(path) as archive:
-            total = sum(entry.file_size for entry in archive.infolist())
+    with parsing(path, ".npz file of plain arrays", "make it again"), zipfile.ZipFile(path) as archive:
+        entries = archive.infolist()
+        total = sum(entry.file_size for entry in entries)
         if total > MAX_UNPACKED_BYTES and not own:
             raise InputError(f"{path} would unpack to {total / 1e9:.0f} GB: it is not a file of this program")
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        if not all(isinstance(array, np.ndarray) for array in arrays.values()):
-            raise ValueError("a member of it is no array")
+        arrays = {}
+        for entry in entries:
+            with archive.open(entry) as stream:
+                arrays[entry.filename.removesuffix(".npy")] = _read_array(stream, entry.file_size)
         return arrays
+
+
+def _read_array(stream: IO[bytes], size: int) -> NDArray:
+    """The array in .npy format that a stream of `size` bytes holds. Raises ValueError for anything else."""
+    version = np.lib.format.read_magic(stream)
+    if version not in _READ_HEADER:
+        raise ValueError(f"version {version} of an array is not known")
+    with HEADERS:
+        shape, is_fortran, dtype = _READ_HEADER[version](stream)
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != size - stream.tell():
+        raise ValueError("a member of it is no plain array")
+    flat = np.empty(math.prod(shape), dtype)
+    bytes_of = flat.view(np.uint8).data
+    if stream.readinto(bytes_of) != len(bytes_of) or stream.read(1):  # type: ignore[attr-defined]
+        raise ValueError("a member of it ends too early")
+    return flat.reshape(shape[::-1]).T if is_fortran else flat.reshape(shape)
 
 
 def save_tensors(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:

@@ -7,6 +7,7 @@ import pickle
 import subprocess
 import sys
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +65,7 @@ def test_npz_round_trip(tmp_path: Path) -> None:
 
 def test_bytes_do_not_depend_on_process_or_order(tmp_path: Path) -> None:
     program = (
-        "import sys; import numpy as np; from pathlib import Path; from msgs_slam.formats.tensors import *\n"
+        "import sys; import numpy as np; from pathlib import Path; from msgs_slam.formats.tensors import *\n", HEADERS, load_arrays, save_arrays
         "names = sys.argv[2].split(',')\n"
         "arrays = {n: np.arange(ord(n)) for n in names}\n"
         "save_safetensors(Path(sys.argv[1] + '.safetensors'), arrays)\n"
@@ -122,3 +123,16 @@ def test_a_header_that_claims_more_than_the_entry(tmp_path: Path) -> None:
         archive.writestr("a.npy", header + b"few")
     with pytest.raises(InputError, match="damaged"):
         load_arrays(tmp_path / "liar.npz")
+
+
+def test_headers_of_arrays_are_read_one_at_a_time(tmp_path: Path) -> None:
+    """Two threads that parse at once end CPython 3.11's parser with a SystemError."""
+    save_arrays(tmp_path / "a.npz", {"a": np.arange(6).reshape(2, 3).T, "b": np.array(2.5)})
+    with ThreadPoolExecutor(1) as pool:
+        with HEADERS:
+            loading = pool.submit(load_arrays, tmp_path / "a.npz")
+            with pytest.raises(TimeoutError):
+                loading.result(0.3)
+        found = loading.result()
+    np.testing.assert_array_equal(found["a"], [[0, 3], [1, 4], [2, 5]])
+    assert found["b"] == 2.5

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import MAX_IMAGE_PIXELS, image_size, read_depth_png, read_grey_png
 from msgs_slam.formats.reading import parsing, reaching, require_file
+from msgs_slam.formats.tensors import HEADERS
 from msgs_slam.pipelines.depth.resize import resample_nearest, resize_depth
 from msgs_slam.pipelines.proxy.files.matching import find_folder, match_files
 from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, DepthProvider
@@ -119,7 +120,8 @@ def _open_npy(path: Path) -> NDArray[np.floating]:
     """Mapped, not read: (h, w) floats. Raises InputError for anything else."""
     require_file(path)
     with parsing(path, ".npy of an array", "save it again with numpy.save"):
-        stored = np.load(path, mmap_mode="r", allow_pickle=False)
+        with HEADERS:
+            stored = np.load(path, mmap_mode="r", allow_pickle=False)
         if not isinstance(stored, np.ndarray):
             raise ValueError("an archive of several")
     shape = stored.shape
