@@ -17,6 +17,7 @@ import torch
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.tensors import (
+    HEADERS,
     load_arrays,
     load_tensors,
     save_arrays,
@@ -65,7 +66,7 @@ def test_npz_round_trip(tmp_path: Path) -> None:
 
 def test_bytes_do_not_depend_on_process_or_order(tmp_path: Path) -> None:
     program = (
-        "import sys; import numpy as np; from pathlib import Path; from msgs_slam.formats.tensors import *\n", HEADERS, load_arrays, save_arrays
+        "import sys; import numpy as np; from pathlib import Path; from msgs_slam.formats.tensors import *\n"
         "names = sys.argv[2].split(',')\n"
         "arrays = {n: np.arange(ord(n)) for n in names}\n"
         "save_safetensors(Path(sys.argv[1] + '.safetensors'), arrays)\n"
