@@ -9,6 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 from torch import Tensor
 
+import msgs_slam.pipelines.gaussians.render.cards as cards
+
 _state: dict[str, int] = {"threads": 0}
 _pools: dict[int, ThreadPoolExecutor] = {}
 
@@ -28,9 +30,10 @@ def get_threads() -> int:
 
 
 def host_threads(example: Tensor) -> int:
-    """The number of threads in use where tensors like `example` lie on the host; 1 where they lie on a card, whose
-    kernels wait for each other anyway."""
-    return get_threads() if example.device.type == "cpu" else 1
+    """The number of threads in use where our loops on the host take tensors like `example`; 1 where Triton's kernels
+    take them or they lie on a card: kernels there wait for each other anyway, and Triton's interpreter has one state
+    for all threads."""
+    return get_threads() if example.device.type == "cpu" and not cards.takes_kernels(example) else 1
 
 
 def for_each(task: Callable[[int], None], count: int) -> None:
