@@ -19,7 +19,7 @@ from msgs_slam.pipelines.proxy.interface.palette import class_colors
 from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate, SemanticsProvider
 from msgs_slam.pipelines.proxy.interface.sequence import Sequence
 from msgs_slam.pipelines.proxy.regions.parts import cut_parts
-from msgs_slam.pipelines.proxy.regions.spread import spread_votes
+from msgs_slam.pipelines.proxy.regions.spread import spread_in_place
 from msgs_slam.pipelines.system.jit import kernel
 from msgs_slam.pipelines.system.memory import release_free_memory
 from msgs_slam.pipelines.system.progress import Progress
@@ -155,9 +155,11 @@ class SegmentLabels(SemanticsProvider):
 
 def label_pixels(votes: NDArray[np.float32], trust: NDArray[np.float32], image: NDArray[np.uint8]) -> LabelEstimate:
     """Labels (h, w) from votes (h, w, C) that count by the `trust` (h, w) in the place they are of, spread along like
-    colours of the image to where it is low; VOID where nothing is known from near or far."""
-    total = spread_votes(votes * (_LEAST_VOTE + trust**2)[..., None], image, _REACH, _COLOR_SD)
-    return LabelEstimate(*_settle(total))
+    colours of the image to where it is low; VOID where nothing is known from near or far. The votes are spread in
+    place: of a network's classes each copy takes as much memory as all else of a frame."""
+    votes *= (_LEAST_VOTE + trust**2)[..., None]
+    spread_in_place(votes, image, _REACH, _COLOR_SD)
+    return LabelEstimate(*_settle(votes))
 
 
 @kernel

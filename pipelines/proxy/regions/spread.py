@@ -14,11 +14,16 @@ def spread_votes(
     """(h, w, C) votes smoothed along the image (h, w, 3) by the domain transform (Gastal and Oliveira, SIGGRAPH 2011):
     a vote fades over `reach` pixels of like colour, and faster where the colour changes by about `color_sd`."""
     out = np.array(votes, np.float32, order="C")
+    spread_in_place(out, image, reach, color_sd)
+    return out
+
+
+def spread_in_place(votes: NDArray[np.float32], image: NDArray[np.uint8], reach: float, color_sd: float) -> None:
+    """Do what `spread_votes` does to votes that nobody else has, without a second copy of all classes."""
     for iteration in range(2):
         fade = np.exp(-np.sqrt(2.0) / (reach * 0.5**iteration))
-        _pass_rows(out, _fading(image, 1, fade, reach / color_sd))
-        _pass_columns(out, _fading(image, 0, fade, reach / color_sd))
-    return out
+        _pass_rows(votes, _fading(image, 1, fade, reach / color_sd))
+        _pass_columns(votes, _fading(image, 0, fade, reach / color_sd))
 
 
 def _fading(image: NDArray[np.uint8], axis: int, fade: float, stretch: float) -> NDArray[np.float32]:

@@ -61,15 +61,21 @@ def _local_planes(inverse: Array, weight: Array, image: NDArray[np.uint8]) -> tu
     plane is linear), and the evidence's mass: weighted least squares whose weights fade along like colours."""
     height, width = inverse.shape
     y, x = np.mgrid[:height, :width] / width
-    products = (np.ones_like(x), x, y, x * x, x * y, y * y, inverse, inverse * x, inverse * y)
-    votes = np.stack([weight * p for p in products], axis=-1).astype(np.float32)
-    sums = np.zeros(votes.shape)
+    one = np.ones_like(x)
+    factors = ((one, one), (x, one), (y, one), (x, x), (x, y), (y, y), (inverse, one), (inverse, x), (inverse, y))
+    votes, sums = np.empty((height, width, len(factors)), np.float32), np.zeros((height, width, len(factors)))
+    for k, (a, b) in enumerate(factors):
+        votes[..., k] = weight * (a * b)
     for reach, color_sd, share in _REACHES:
-        sums += share * spread_votes(votes, image, reach * width, color_sd).astype(np.float64)
+        spread = spread_votes(votes, image, reach * width, color_sd)
+        for k in range(len(factors)):  # one by one: all as float64 were the most memory that the stage needed
+            sums[..., k] += share * spread[..., k].astype(np.float64)
     mass = sums[..., 0].copy()
-    sums += _ANYWHERE * _spread_anywhere(votes)
+    for k in range(len(factors)):
+        sums[..., k] += _ANYWHERE * _spread_anywhere(votes[..., k]).astype(np.float64)
     total = np.maximum(sums[..., 0], 1e-30)
-    mx, my, xx, xy, yy, mean, xv, yv = np.moveaxis(sums[..., 1:] / total[..., None], -1, 0)
+    sums[..., 1:] /= total[..., None]
+    mx, my, xx, xy, yy, mean, xv, yv = np.moveaxis(sums[..., 1:], -1, 0)
     xx, yy, xy = xx - mx * mx + _RIDGE, yy - my * my + _RIDGE, xy - mx * my
     xv, yv = xv - mx * mean, yv - my * mean
     determinant = xx * yy - xy * xy
@@ -78,14 +84,10 @@ def _local_planes(inverse: Array, weight: Array, image: NDArray[np.uint8]) -> tu
     return np.clip(plane, _LEAST_SLOPE * mean, _MOST_SLOPE * mean), mass
 
 
-def _spread_anywhere(votes: NDArray[np.float32]) -> Array:
-    """(h, w, C) votes blurred widely; at an eighth of the size, for it is smooth."""
-    height, width = votes.shape[:2]
+def _spread_anywhere(votes: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(h, w) votes blurred widely; at an eighth of the size, for it is smooth."""
+    height, width = votes.shape
     size, sd = (max(1, width // 8), max(1, height // 8)), max(width * _ANYWHERE_REACH / 8, 1.0)
-
-    def blur(channel: NDArray[np.float32]) -> NDArray[np.float32]:
-        small = cv2.resize(channel, size, interpolation=cv2.INTER_AREA)
-        small = cv2.GaussianBlur(small, (0, 0), sd, borderType=cv2.BORDER_REPLICATE)
-        return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
-
-    return np.stack([blur(votes[..., k]) for k in range(votes.shape[-1])], axis=-1).astype(np.float64)
+    small = cv2.resize(votes, size, interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), sd, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
