@@ -85,6 +85,10 @@ def project_map(
     """u, v, sigma_px, z (M,) of the Gaussians in the camera; raises ValueError for NaN in what lies on the CPU."""
     for name, tensor in (("means", means), ("radii", radii), ("cam_from_world", cam_from_world)):
         require_finite(name, tensor)
+    if means.device.type == "cpu" and means.dtype == torch.float32:
+        from msgs_slam.pipelines.gaussians.render.cpu_projection import project  # imports numba
+
+        return project(means, radii, beside(cam_from_world, means), intrinsics, near)
     points_in_cam = se3.transform(beside(cam_from_world, means), means)
     return project_gaussians(points_in_cam, radii, intrinsics, near)
 

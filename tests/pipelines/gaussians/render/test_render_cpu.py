@@ -8,6 +8,7 @@ from torch import Tensor
 from msgs_slam.pipelines.gaussians.render import composite, get_threads, render, set_threads
 from msgs_slam.pipelines.gaussians.render.rendering import moved, project_map
 from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.types import Intrinsics
 
 
 @pytest.fixture(autouse=True)
@@ -106,6 +107,28 @@ def test_full_size_room():
     u, v, sigma, z = project_map(scene.means, scene.radii, MOVED, scene.intrinsics)
     for features in (scene.colors, torch.cat([scene.colors, scene.logits], 1)):
         assert_agrees(dict(zip(NAMES, (u, v, sigma, z, scene.opacities, features), strict=True)), 320, 240)
+
+
+def test_the_projection_is_that_of_torch():
+    """Values and gradients beside autograd's in float64, also of centres too near and behind; the same bytes for any
+    number of threads."""
+    generator = torch.Generator().manual_seed(2)
+    means = torch.randn(40_000, 3, generator=generator) + torch.tensor([0.0, 0.0, 1.0])
+    radii = torch.rand(40_000, generator=generator)
+    upstream = [torch.randn(40_000, generator=generator) for _ in range(4)]
+    camera, found = Intrinsics(64, 48, 50, 60, 31, 25), []
+    for dtype, threads in ((torch.float64, 1), (torch.float32, 1), (torch.float32, 3)):
+        set_threads(threads)
+        given = [means.to(dtype).clone().requires_grad_(), radii.to(dtype).clone().requires_grad_()]
+        twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+        shown = project_map(*given, moved(MOVED, twist), camera, near=0.3)
+        torch.autograd.backward(list(shown), [x.to(dtype) for x in upstream])
+        found.append([*(x.detach() for x in shown), *(x.grad for x in (*given, twist))])
+    exact, ours, threaded = found
+    assert 0.1 < (exact[3] <= 0.3).double().mean() < 0.9
+    for a, b, c in zip(exact, ours, threaded, strict=True):
+        assert (b.double() - a).norm() < 1e-5 * a.norm()
+        assert torch.equal(b, c)
 
 
 def test_map_and_pose_gradients_through_the_projection():
