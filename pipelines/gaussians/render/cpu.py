@@ -6,19 +6,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from msgs_slam.pipelines.gaussians.render.cpu_backward import COLORS, backward_band, sum_shared
 from msgs_slam.pipelines.gaussians.render.cpu_bands import for_each_band, split_into_bands
 from msgs_slam.pipelines.gaussians.render.cpu_forward import draw_bands
 from msgs_slam.pipelines.gaussians.render.cpu_inspect import class_weights, inspect, weighted_errors
-from msgs_slam.pipelines.gaussians.render.threads import for_each
+from msgs_slam.pipelines.gaussians.render.jit import as_array
+from msgs_slam.pipelines.gaussians.render.threads import PART, for_each
 
 __all__ = ["class_weights", "composite", "inspect", "weighted_errors"]
 
 F32 = np.float32
-_ROWS = 16384
 
 
 def composite(
@@ -39,7 +38,7 @@ def composite(
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        *projected, values = (_array(tensor) for tensor in arguments[:6])
+        *projected, values = (as_array(tensor) for tensor in arguments[:6])
         width, height, near = arguments[6:]
         vectors = None if values.shape[1] == 3 else channel_vectors(values.shape[1])
         channels = 3 if vectors is None else 16 * len(vectors)
@@ -54,12 +53,12 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         bands, planes = ctx.state
-        features = _array(ctx.saved_tensors[0])
+        features = as_array(ctx.saved_tensors[0])
         if features.shape[2] != COLORS:
             raise ValueError(f"the cpu backend has gradients of {COLORS} features, got {features.shape[2]}")
         images = (features, *planes)
         upstream = [
-            np.zeros_like(image) if gradient is None else _array(gradient)
+            np.zeros_like(image) if gradient is None else as_array(gradient)
             for image, gradient in zip(images, gradients, strict=True)
         ]
         job = (features, planes, upstream[0], np.stack(upstream[1:]))
@@ -71,19 +70,10 @@ class _Composite(torch.autograd.Function):
         for_each_band(
             lambda b: backward_band(b, bands.own(b), *places, *bands.prepared[b], *job, *results), bands.starts
         )
-        for_each(
-            lambda n: sum_shared(n * _ROWS, _ROWS, bands.slots, shared, d_geometry, d_features), -(-count // _ROWS)
-        )
+        for_each(lambda n: sum_shared(n * PART, PART, bands.slots, shared, d_geometry, d_features), -(-count // PART))
         return (*torch.from_numpy(d_geometry).unbind(0), torch.from_numpy(d_features), *[None] * 3)
 
 
 def channel_vectors(channels: int) -> tuple[int, ...]:
     """See `cpu_forward.Vectors`."""
     return (0,) * max(1, (channels + 15) // 16)
-
-
-def _array(tensor: Tensor) -> NDArray[np.float32]:
-    array = tensor.detach().contiguous().numpy()
-    if array.dtype != np.float32:
-        raise ValueError(f"the cpu backend renders float32, got {array.dtype}")
-    return array

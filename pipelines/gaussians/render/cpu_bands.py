@@ -14,13 +14,11 @@ from numpy.typing import NDArray
 
 import msgs_slam.pipelines.gaussians.render.rules as rules
 from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
-from msgs_slam.pipelines.gaussians.render.threads import for_each
+from msgs_slam.pipelines.gaussians.render.threads import PART, for_each
 
 F32 = np.float32
 TILE = 16
 BAND_ROWS = 32  # two rows of tiles: more would leave threads idle at the end, fewer would split more Gaussians
-_PART = 16384
-"""Gaussians that a thread assigns to bands at a time."""
 RECORD = 6
 """Numbers kept per Gaussian of a band: u, v, sigma_px, z, opacity, reach."""
 
@@ -104,12 +102,12 @@ def bin_gaussians(
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
     """How far from its centre each Gaussian is seen, in pixels (M,), 0 where it is not seen at all; and the first four
     fields of `Bands`, entries in the order of their indices."""
-    count, bands, parts = len(projected[0]), -(-height // BAND_ROWS), -(-len(projected[0]) // _PART)
+    count, bands, parts = len(projected[0]), -(-height // BAND_ROWS), -(-len(projected[0]) // PART)
     reach, first, last = np.zeros(count, np.float32), np.zeros(count, np.int32), np.full(count, -1, np.int32)
     counts = np.zeros((parts, bands), np.int64)
 
     def own(part: int) -> slice:
-        return slice(part * _PART, (part + 1) * _PART)
+        return slice(part * PART, (part + 1) * PART)
 
     def find(part: int) -> None:
         here, size = own(part), (width, height, F32(near))
@@ -122,7 +120,7 @@ def bin_gaussians(
     # Of each band the part's own place follows those of the parts before it.
     places = starts[:-1] + np.cumsum(counts, axis=0) - counts
     entries = np.empty(starts[-1], np.int32)
-    for_each(lambda part: list_bands(part * _PART, first[own(part)], last[own(part)], places[part], entries), parts)
+    for_each(lambda part: list_bands(part * PART, first[own(part)], last[own(part)], places[part], entries), parts)
     return reach, first, starts, entries, slots
 
 

@@ -1,4 +1,4 @@
-"""World Gaussians to an image on CPUs (MSGS-SLAM eq. 5): one pass there, one back, where autograd needs thirty."""
+"""World Gaussians to an image on CPUs (MSGS-SLAM eq. 5): one pass there and one back."""
 
 from __future__ import annotations
 
@@ -9,12 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render.jit import kernel
-from msgs_slam.pipelines.gaussians.render.threads import for_each
+from msgs_slam.pipelines.gaussians.render.jit import as_array, kernel
+from msgs_slam.pipelines.gaussians.render.threads import PART, for_each
 from msgs_slam.pipelines.types import Intrinsics
-
-_PART = 16384
-"""Gaussians that a thread looks at at a time."""
 
 
 def project(
@@ -31,26 +28,22 @@ class _Projected(torch.autograd.Function):
         k, near = arguments[3:]
         ctx.save_for_backward(*arguments[:3])
         ctx.camera = np.array([k.fx, k.fy, k.cx, k.cy, (k.fx * k.fy) ** 0.5, near], np.float32)
-        given = [_array(x) for x in arguments[:3]]
+        given = [as_array(x) for x in arguments[:3]]
         out = np.empty((4, len(given[0])), np.float32)
-        for_each(lambda part: _project(part * _PART, *given, ctx.camera, out), -(-out.shape[1] // _PART))
+        for_each(lambda part: _project(part * PART, *given, ctx.camera, out), -(-out.shape[1] // PART))
         return torch.from_numpy(out).unbind(0)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        means, radii, pose = (_array(x) for x in ctx.saved_tensors)
-        pull = [_array(x) for x in gradients]
-        d_means, d_radii, parts = np.empty_like(means), np.empty_like(radii), -(-len(means) // _PART)
+        means, radii, pose = (as_array(x) for x in ctx.saved_tensors)
+        pull = [as_array(x) for x in gradients]
+        d_means, d_radii, parts = np.empty_like(means), np.empty_like(radii), -(-len(means) // PART)
         d_pose = np.zeros((parts, 4, 4))
         for_each(
-            lambda n: _pull_back(n * _PART, means, radii, pose, ctx.camera, *pull, d_means, d_radii, d_pose[n]), parts
+            lambda n: _pull_back(n * PART, means, radii, pose, ctx.camera, *pull, d_means, d_radii, d_pose[n]), parts
         )
         moved = torch.from_numpy(d_pose.sum(0).astype(np.float32)) if ctx.needs_input_grad[2] else None
         return torch.from_numpy(d_means), torch.from_numpy(d_radii), moved, None, None
-
-
-def _array(tensor: Tensor) -> NDArray[np.float32]:
-    return np.asarray(tensor.detach().contiguous().numpy())
 
 
 @kernel
@@ -62,10 +55,10 @@ def _project(
     camera: NDArray[np.float32],
     out: NDArray[np.float32],
 ) -> None:
-    """Project one part, from Gaussian `start` on; camera: fx, fy, cx, cy, their geometric mean, near."""
+    """Project one part, from Gaussian `start` on; camera: fx, fy, cx, cy, the mean of the focal lengths, near."""
     fx, fy, cx, cy, focal, near = camera
     one = np.float32(1)
-    for i in range(start, min(start + _PART, len(means))):
+    for i in range(start, min(start + PART, len(means))):
         a, b, c = means[i]
         z = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2] * c + pose[2, 3]
         inverse = one / (z if z > near else one)
@@ -93,7 +86,7 @@ def _pull_back(
     """Gradients of one part by those of u, v, sigma_px and z; its share of the pose's is added in float64."""
     fx, fy, _, _, focal, near = camera
     one, none = np.float32(1), np.float32(0)
-    for i in range(start, min(start + _PART, len(means))):
+    for i in range(start, min(start + PART, len(means))):
         a, b, c = means[i]
         x = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * c + pose[0, 3]
         y = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * c + pose[1, 3]

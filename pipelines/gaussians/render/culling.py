@@ -11,13 +11,11 @@ import msgs_slam.pipelines.gaussians.render.cards as cards
 import msgs_slam.pipelines.gaussians.render.rules as rules
 from msgs_slam.pipelines.gaussians.render.compositing import require_finite
 from msgs_slam.pipelines.gaussians.render.jit import kernel
-from msgs_slam.pipelines.gaussians.render.threads import for_each
+from msgs_slam.pipelines.gaussians.render.threads import PART, for_each
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project_gaussians
 from msgs_slam.pipelines.types import Intrinsics
 
-_PART = 16384
-"""Gaussians that a thread looks at at a time."""
 NEAR = 0.01
 """Gaussians whose centre is nearer than this (or behind the camera) are not drawn; in the unit of the map."""
 
@@ -31,11 +29,11 @@ def in_view(means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: In
     if means.device.type == "cpu" and means.dtype == torch.float32:
         camera = np.array([k.fx, k.fy, k.cx, k.cy, k.width, k.height, near], np.float32)
         centers, sizes, motion = (x.detach().contiguous().numpy() for x in (means, radii, pose))
-        parts = -(-len(centers) // _PART)
+        parts = -(-len(centers) // PART)
         found = [np.empty(0, np.int64)] * parts
 
         def find(part: int) -> None:
-            own = slice(part * _PART, (part + 1) * _PART)
+            own = slice(part * PART, (part + 1) * PART)
             found[part] = _list_in_view(centers[own], sizes[own], motion, camera, own.start)
 
         for_each(find, parts)

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from numba.extending import register_jitable
+from numpy.typing import NDArray
+from torch import Tensor
 
 from msgs_slam.pipelines.system import jit
 
@@ -17,6 +20,14 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """As `pipelines.system.jit.kernel`, with fused sums."""
     compiled: Callable[..., Any] = jit.kernel(function, **_OPTIONS)
     return compiled
+
+
+def as_array(tensor: Tensor) -> NDArray[np.float32]:
+    """The numbers of a float32 tensor of the CPU, in rows, as kernels take them; raises ValueError for other types."""
+    array = tensor.detach().contiguous().numpy()
+    if array.dtype != np.float32:
+        raise ValueError(f"the cpu backend renders float32, got {array.dtype}")
+    return array
 
 
 def inner(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -11,6 +11,9 @@ from torch import Tensor
 
 import msgs_slam.pipelines.gaussians.render.cards as cards
 
+PART = 16384
+"""Gaussians that a thread takes at a time."""
+
 _state: dict[str, int] = {"threads": 0}
 _pools: dict[int, ThreadPoolExecutor] = {}
 
