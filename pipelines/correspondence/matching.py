@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -20,6 +21,10 @@ _MAX_ERROR, _MIN_INLIERS = 2.0, 15
 """Pixels within which a match obeys a geometry, and how many have to."""
 _ABREAST = 32
 """Columns that are compared side by side: two vectors of the widest there are."""
+_LEAST = -(2**24)
+"""Below all products of descriptors, which are whole numbers that a float has exactly."""
+_ROWS = 512
+"""Of the table of all products: with as many columns as an image has features they stay in the cache."""
 _FIRST_LOOK, _NEARLY = 300, 0.8
 """Trials of the first look at a pair, and its share of the least inliers: chosen on two recordings."""
 
@@ -43,67 +48,105 @@ def match_descriptors(
     first: Descriptors, second: Descriptors, limits: tuple[float, float] | None = None
 ) -> NDArray[np.uint32]:
     """(M, 2) mutual nearest neighbours that pass Lowe's ratio test, sorted by the first index; `limits` are the largest
-    ratio and angle, those of the kind of descriptor unless given.
-
-    The products of byte descriptors are whole numbers below 2^24, so the float matrix product is exact and the
-    result does not depend on the order in which a BLAS adds.
-    """
+    ratio and angle, those of the kind of descriptor unless given."""
     if len(first) < 2 or len(second) < 2:
         return np.zeros((0, 2), np.uint32)
-    similarity = first.astype(np.float32) @ second.astype(np.float32).T
-    best, score, runner_up, best_back = _two_nearest(similarity)
+    best, score, runner_up, best_back = _two_nearest(first, second)
     is_sift = first.dtype == np.uint8
     max_ratio, max_angle = limits or (_SIFT if is_sift else _LEARNED)
     norm = Features.NORM if is_sift else Features.SIGNED_NORM
-    angle = np.arccos(np.clip(score / norm**2, 0, 1))
-    next_angle = np.arccos(np.clip(runner_up / norm**2, 0, 1))
+    angle = np.arccos(np.clip(score / np.float32(norm**2), 0, 1))
+    next_angle = np.arccos(np.clip(runner_up / np.float32(norm**2), 0, 1))
     index = np.arange(len(first))
     good = (best_back[best] == index) & (angle < max_angle) & (angle < max_ratio * next_angle)
     return np.stack([index[good], best[good]], axis=1).astype(np.uint32)
 
 
+def _two_nearest(
+    first: Descriptors, second: Descriptors
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
+    """Of every row of `first` the nearest of `second`, its product and the next one's; of every one of `second` the
+    nearest row. Of equal ones the first. Both kinds of product give the same."""
+    table, of_row, of_column = (_byte_products if has_byte_products() else _float_products)(first, second)
+    rows, columns = len(first), len(second)
+    found = np.zeros(rows, np.int64), *np.full((2, rows), _LEAST, np.float32)
+    back = np.full(columns, _LEAST, of_column.dtype), np.zeros(columns, np.int32)
+    for start in range(0, rows, _ROWS):
+        part = slice(start, start + _ROWS)
+        _look(table(part), start, of_row[part], of_column, *(values[part] for values in found), *back)
+    return *found, back[1]
+
+
+@functools.cache
+def has_byte_products() -> bool:
+    """Whether the processor adds products of bytes as whole numbers (VNNI): four times as fast as those of floats.
+    Others would do it in pairs that overflow."""
+    import torch
+
+    return bool(getattr(torch.cpu, "_is_vnni_supported", bool)()) and hasattr(torch, "_int_mm")
+
+
+_Products = tuple[Callable[[slice], NDArray], NDArray, NDArray]
+"""The table of products of some rows with all columns, and what is added to each row (N,) and column (M,) of it."""
+
+
+def _float_products(first: Descriptors, second: Descriptors) -> _Products:
+    rows, columns = first.astype(np.float32), second.astype(np.float32).T
+    return lambda part: rows[part] @ columns, np.zeros(len(first), np.float32), np.zeros(len(second), np.float32)
+
+
+def _byte_products(first: Descriptors, second: Descriptors) -> _Products:
+    """Of bytes without sign less 128, so that they have one: (a - 128)(b - 128) = ab - 128a - 128b + 128²."""
+    import torch
+
+    shift = 128 if first.dtype == np.uint8 else 0
+    rows, columns = ((d.astype(np.int16) - shift).astype(np.int8) for d in (first, second))
+    sums = [shift * d.sum(axis=1, dtype=np.int32) for d in (rows, columns)]
+    left, right = torch.from_numpy(rows), torch.from_numpy(columns).T
+
+    def table(part: slice) -> NDArray[np.int32]:
+        return np.asarray(torch._int_mm(left[part], right).numpy())
+
+    return table, sums[0] + np.int32(shift**2 * first.shape[1]), sums[1]
+
+
 @kernel
-def _two_nearest(similarity):  # type: ignore[no-untyped-def]
-    """Best column, its value and the second value of every row, and the best row of every column, in one pass; of
-    equal ones the first.
+def _look(table, start, of_row, of_column, best, score, runner_up, column_score, column_best):  # type: ignore[no-untyped-def]
+    """See `_two_nearest`: a part of the rows, in one pass.
 
     Columns lie in `_ABREAST` lanes, each with a best of its own, and nothing branches on a number: loops over the lanes
     become vector instructions.
     """
-    rows, columns = similarity.shape
-    best = np.zeros(rows, np.int64)
-    score = np.full(rows, np.float32(-1))
-    runner_up = np.full(rows, np.float32(-1))
-    column_score = np.full(columns, np.float32(-1))
-    column_best = np.zeros(columns, np.int32)
-    tops, seconds = np.empty(_ABREAST, np.float32), np.empty(_ABREAST, np.float32)
+    rows, columns = table.shape
+    least = of_column.dtype.type(_LEAST)
+    tops, seconds = np.empty((2, _ABREAST), of_column.dtype)
     places = np.empty(_ABREAST, np.int32)
     whole = columns - columns % _ABREAST
     for i in range(rows):
-        own = np.int32(i)
+        own, more = np.int32(start + i), of_row[i]
         for k in range(_ABREAST):
-            tops[k], seconds[k], places[k] = np.float32(-1), np.float32(-1), 0
+            tops[k], seconds[k], places[k] = least, least, 0
         for j in range(0, whole, _ABREAST):
             for k in range(_ABREAST):
-                value, top = similarity[i, j + k], tops[k]
+                value, top = table[i, j + k] + of_column[j + k] + more, tops[k]
                 less = top if value > top else value
                 seconds[k] = less if less > seconds[k] else seconds[k]
                 places[k] = np.int32(j) if value > top else places[k]
                 tops[k] = value if value > top else top
             for k in range(_ABREAST):
-                value, before = similarity[i, j + k], column_score[j + k]
+                value, before = table[i, j + k] + of_column[j + k] + more, column_score[j + k]
                 column_best[j + k] = own if value > before else column_best[j + k]
                 column_score[j + k] = value if value > before else before
-        top, second, at = np.float32(-1), np.float32(-1), np.int64(0)
+        top, second, at = least, least, np.int64(0)
         for k in range(_ABREAST):
             place = places[k] + k
-            if tops[k] > top or (tops[k] == top and place < at and top > -1):
+            if tops[k] > top or (tops[k] == top and place < at and top > least):
                 second = max(top, max(second, seconds[k]))
                 top, at = tops[k], place
             else:
                 second = max(second, max(seconds[k], tops[k]))
         for j in range(whole, columns):
-            value = similarity[i, j]
+            value = table[i, j] + of_column[j] + more
             if value > top:
                 second, top, at = top, value, j
             elif value > second:
@@ -111,7 +154,6 @@ def _two_nearest(similarity):  # type: ignore[no-untyped-def]
             if value > column_score[j]:
                 column_score[j], column_best[j] = value, own
         best[i], score[i], runner_up[i] = at, top, second
-    return best, score, runner_up, column_best
 
 
 def match_features(first: Features, second: Features) -> NDArray[np.uint32]:

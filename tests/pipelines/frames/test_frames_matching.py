@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -72,11 +73,24 @@ def test_matching_equals_its_definition() -> None:
     assert 20 < len(expected) < 40
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.int8])
+@pytest.mark.parametrize("products", [matching._float_products, matching._byte_products])
 @pytest.mark.parametrize("columns", [2, 31, 32, 33, 100])
-def test_the_two_nearest_are_those_of_numpy(columns: int) -> None:
-    """Of few different numbers, so that many are equal: the first of those is the nearest, the next the second."""
-    similarity = np.random.default_rng(columns).integers(0, 9, (40, columns)).astype(np.float32)
-    best, score, runner_up, best_back = matching._two_nearest(similarity)
+def test_the_two_nearest_are_those_of_numpy(
+    columns: int, products: Callable[..., Any], dtype: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of few different numbers, so that many are equal: the first of those is the nearest, the next the second. Rows
+    come in parts, and all there is between bytes occurs."""
+    monkeypatch.setattr(matching, "_byte_products", products)
+    monkeypatch.setattr(matching, "_float_products", products)
+    monkeypatch.setattr(matching, "_ROWS", 16)
+    rng, limits = np.random.default_rng(columns), np.iinfo(dtype)
+    first, second = (np.full((n, 8), 1, dtype) for n in (40, columns))
+    for table in (first, second):
+        table[:, :2] = rng.integers(0, 3, (len(table), 2))
+        table[0], table[1] = limits.min, limits.max
+    similarity = first.astype(np.int64) @ second.astype(np.int64).T
+    best, score, runner_up, best_back = matching._two_nearest(first, second)
     np.testing.assert_array_equal(best, similarity.argmax(1))
     np.testing.assert_array_equal(score, similarity.max(1))
     np.testing.assert_array_equal(runner_up, np.sort(similarity, axis=1)[:, -2])
