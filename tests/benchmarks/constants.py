@@ -1,6 +1,6 @@
 """What each constant of stereo does when it is doubled and halved: proxies of whole recordings against truth.
 
-    python tests/benchmarks/constants.py RUN=TRUTH [RUN=TRUTH ...] --work DIR [--only NAME] [--json FILE]
+    python tests/benchmarks/constants.py RUN=TRUTH [RUN=TRUTH ...] --work DIR [--only NAME] [--factors F ...]
 
 RUN is a run folder with the frames stage done, TRUTH a data set with depth. A row is the depth of all keyframes with
 one constant changed in a copy of the source, measured as `shape.py` does. Raw matches are kept in DIR: constants of
@@ -52,7 +52,7 @@ AFTER = {
     "clear variance": ("evidence.py", "_CLEAR = 2e-4", "2e-4"),
     "colours of borrowing": ("borrow.py", "_COLOR_SD = 3.0", "3.0"),
     "borrowed depths agree": ("borrow.py", "_AGREE = 0.02", "0.02"),
-    "views to borrow": ("borrow.py", "_LEAST = 1.0", "1.0"),
+    "likeness to borrow": ("borrow.py", "_LEAST = 0.5", "0.5"),
 }
 """Name → file, its line, and the number in the line that is changed."""
 WITHIN = {
@@ -67,15 +67,14 @@ WITHIN = {
     "near margin": ("neighbours.py", "_NEAR_MARGIN, _FAR_MARGIN = 0.45, 1.5", "0.45"),
     "far margin": ("neighbours.py", "_NEAR_MARGIN, _FAR_MARGIN = 0.45, 1.5", "1.5"),
 }
-FACTORS = (2.0, 0.5)
 
 
-def variants(only: str) -> Iterator[tuple[str, tuple[str, str, str] | None, float]]:
+def variants(only: str, factors: list[float]) -> Iterator[tuple[str, tuple[str, str, str] | None, float]]:
     """Name, place and factor of every row."""
     yield AS_IT_IS, None, 1.0
     for name, place in (AFTER | WITHIN).items():
         if only in name:
-            for factor in FACTORS:
+            for factor in factors:
                 yield f"{name} x {factor:g}", place, factor
 
 
@@ -125,6 +124,7 @@ def main() -> None:
     parser.add_argument("pairs", nargs="+", metavar="RUN=TRUTH")
     parser.add_argument("--work", type=Path, required=True, metavar="DIR")
     parser.add_argument("--only", default="", help="the constants whose name holds this")
+    parser.add_argument("--factors", type=float, nargs="+", default=[2.0, 0.5])
     parser.add_argument("--json", type=Path)
     parser.add_argument("--matches", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -138,7 +138,7 @@ def main() -> None:
     arguments.work.mkdir(parents=True, exist_ok=True)
     table = arguments.json or arguments.work / "rows.json"
     rows = json.loads(table.read_text()) if table.exists() else {}
-    for name, place, factor in variants(arguments.only):
+    for name, place, factor in variants(arguments.only, arguments.factors):
         if name not in rows:
             rows[name] = _in_copy(arguments, place, factor)
             table.write_text(json.dumps(rows, indent=1))
