@@ -55,8 +55,8 @@ def match_descriptors(
     is_sift = first.dtype == np.uint8
     max_ratio, max_angle = limits or (_SIFT if is_sift else _LEARNED)
     norm = Features.NORM if is_sift else Features.SIGNED_NORM
-    angle = np.arccos(np.clip(score / np.float32(norm**2), 0, 1))
-    next_angle = np.arccos(np.clip(runner_up / np.float32(norm**2), 0, 1))
+    angle = np.arccos(np.clip(score / norm**2, 0, 1))
+    next_angle = np.arccos(np.clip(runner_up / norm**2, 0, 1))
     index = np.arange(len(first))
     good = (best_back[best] == index) & (angle < max_angle) & (angle < max_ratio * next_angle)
     return np.stack([index[good], best[good]], axis=1).astype(np.uint32)
@@ -67,7 +67,7 @@ def _two_nearest(
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
     """Of every row of `first` the nearest of `second`, its product and the next one's; of every one of `second` the
     nearest row. Of equal ones the first. Both kinds of product give the same."""
-    table, of_row, of_column = (_byte_products if has_byte_products() else _float_products)(first, second)
+    table, of_row, of_column = (_byte_products if _has_byte_products() else _float_products)(first, second)
     rows, columns = len(first), len(second)
     found = np.zeros(rows, np.int64), *np.full((2, rows), _LEAST, np.float32)
     back = np.full(columns, _LEAST, of_column.dtype), np.zeros(columns, np.int32)
@@ -78,7 +78,7 @@ def _two_nearest(
 
 
 @functools.cache
-def has_byte_products() -> bool:
+def _has_byte_products() -> bool:
     """Whether the processor adds products of bytes as whole numbers (VNNI): four times as fast as those of floats.
     Others would do it in pairs that overflow."""
     import torch

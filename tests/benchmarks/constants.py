@@ -5,7 +5,7 @@
 RUN is a run folder with the frames stage done, TRUTH a data set with depth. A row is the depth of all keyframes with
 one constant changed in a copy of the source, measured as `shape.py` does. Raw matches are kept in DIR: constants of
 what follows the matching (`AFTER`) cost a second pass only. Stopped at any moment, the same command goes on where it
-was.
+was: DIR is for one state of the code and one choice of runs.
 """
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
@@ -130,10 +130,8 @@ def main() -> None:
     arguments = parser.parse_args()
     pairs = [(Path(run), Path(truth)) for run, _, truth in (p.partition("=") for p in arguments.pairs)]
     if arguments.matches:
-        rows = {
-            run.stem: measure_depth(run, truth, arguments.work / arguments.matches / run.stem) for run, truth in pairs
-        }
-        print(json.dumps(rows))
+        kept = arguments.work / arguments.matches
+        print(json.dumps({run.stem: measure_depth(run, truth, kept / run.stem) for run, truth in pairs}))
         return
     arguments.work.mkdir(parents=True, exist_ok=True)
     table = arguments.json or arguments.work / "rows.json"
@@ -156,13 +154,9 @@ def _in_copy(arguments: argparse.Namespace, place: tuple[str, str, str] | None, 
     shutil.rmtree(arguments.work / "changed", ignore_errors=True)
     command = [sys.executable, str(tree / "tests/benchmarks/constants.py"), *arguments.pairs]
     command += ["--work", str(arguments.work), "--matches", matches]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=_path_to(tree))
+    environment = {**os.environ, "PYTHONPATH": str(tree.resolve())}
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment)
     return dict(json.loads(done.stdout.splitlines()[-1]))
-
-
-def _path_to(tree: Path) -> dict[str, str]:
-
-    return {**os.environ, "PYTHONPATH": str(tree.resolve())}
 
 
 if __name__ == "__main__":

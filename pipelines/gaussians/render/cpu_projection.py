@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render.jit import as_array, kernel
+from msgs_slam.pipelines.gaussians.render.jit import as_array, inner, kernel
 from msgs_slam.pipelines.gaussians.render.threads import PART, for_each
 from msgs_slam.pipelines.types import Intrinsics
 
@@ -46,6 +46,16 @@ class _Projected(torch.autograd.Function):
         return torch.from_numpy(d_means), torch.from_numpy(d_radii), moved, None, None
 
 
+@inner
+def _in_camera(pose: NDArray[np.float32], center: NDArray[np.float32]) -> tuple[np.float32, np.float32, np.float32]:
+    """The centre (3,) seen from cam_from_world (4, 4)."""
+    a, b, c = center
+    x = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * c + pose[0, 3]
+    y = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * c + pose[1, 3]
+    z = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2] * c + pose[2, 3]
+    return x, y, z
+
+
 @kernel
 def _project(
     start: int,
@@ -59,11 +69,10 @@ def _project(
     fx, fy, cx, cy, focal, near = camera
     one = np.float32(1)
     for i in range(start, min(start + PART, len(means))):
-        a, b, c = means[i]
-        z = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2] * c + pose[2, 3]
+        x, y, z = _in_camera(pose, means[i])
         inverse = one / (z if z > near else one)
-        out[0, i] = fx * ((pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * c + pose[0, 3]) * inverse) + cx
-        out[1, i] = fy * ((pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * c + pose[1, 3]) * inverse) + cy
+        out[0, i] = fx * (x * inverse) + cx
+        out[1, i] = fy * (y * inverse) + cy
         out[2, i] = focal * (radii[i] * inverse)
         out[3, i] = z
 
@@ -88,9 +97,7 @@ def _pull_back(
     one, none = np.float32(1), np.float32(0)
     for i in range(start, min(start + PART, len(means))):
         a, b, c = means[i]
-        x = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * c + pose[0, 3]
-        y = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * c + pose[1, 3]
-        z = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2] * c + pose[2, 3]
+        x, y, z = _in_camera(pose, means[i])
         inverse = one / (z if z > near else one)
         by_u, by_v, by_sigma = fx * pull_u[i], fy * pull_v[i], focal * pull_sigma[i]
         by_inverse = (by_u * x + by_v * y + by_sigma * radii[i]) * inverse * inverse

@@ -81,6 +81,8 @@ def test_the_two_nearest_are_those_of_numpy(
 ) -> None:
     """Of few different numbers, so that many are equal: the first of those is the nearest, the next the second. Rows
     come in parts, and all there is between bytes occurs."""
+    if products is matching._byte_products and not matching._has_byte_products():
+        pytest.skip("this processor has no products of bytes, and the program does not use them here")
     monkeypatch.setattr(matching, "_byte_products", products)
     monkeypatch.setattr(matching, "_float_products", products)
     monkeypatch.setattr(matching, "_ROWS", 16)
