@@ -129,4 +129,4 @@ def _sightings(
     point = source.point[source_index]
     known = point >= 0
     xy = target.features.xy[target_index[known]]
-    return Sightings(point[known], xy, np.full(int(known.sum()), 1.0))
+    return Sightings.of(point[known], xy, 1.0)

@@ -35,7 +35,9 @@ class Bundle:
 
     cam_from_world (N, 4, 4), points (P, 3) in the world; observations: obs_cam (O,), obs_point (O,) indices,
     obs_xy (O, 2) pixels, obs_sd (O,) their standard deviation in pixels, obs_depth (O,) the proxy depth at that pixel
-    in the world's unit (0 = none) and obs_depth_sd (O,) its relative standard deviation.
+    in the world's unit (0 = none), obs_depth_sd (O,) its relative standard deviation, and obs_source (O,) the camera
+    from whose observation of the same point it was followed, -1 for none. One followed is as far off as the one it
+    comes from, so that its `obs_sd` is of the difference between both.
     """
 
     cam_from_world: Array
@@ -46,17 +48,18 @@ class Bundle:
     obs_sd: Array
     obs_depth: Array
     obs_depth_sd: Array
+    obs_source: NDArray[np.int64]
 
     def __post_init__(self) -> None:
         require_shape("cam_from_world", self.cam_from_world, (None, 4, 4))
         require_shape("points", self.points, (None, 3))
         require_shape("obs_xy", self.obs_xy, (len(self.obs_cam), 2))
-        for name in ("obs_point", "obs_sd", "obs_depth", "obs_depth_sd"):
+        for name in ("obs_point", "obs_sd", "obs_depth", "obs_depth_sd", "obs_source"):
             require_shape(name, getattr(self, name), (len(self.obs_cam),))
 
     def select(self, keep: NDArray) -> Bundle:
         """Only the observations of a mask or of indices (O,); cameras and points stay."""
-        names = ("obs_cam", "obs_point", "obs_xy", "obs_sd", "obs_depth", "obs_depth_sd")
+        names = ("obs_cam", "obs_point", "obs_xy", "obs_sd", "obs_depth", "obs_depth_sd", "obs_source")
         return replace(self, **{name: getattr(self, name)[keep] for name in names})
 
     def points_in_cam(self) -> Array:
@@ -64,17 +67,40 @@ class Bundle:
         motions, points = self.cam_from_world[self.obs_cam], self.points[self.obs_point]
         return np.einsum("oij,oj->oi", motions[:, :3, :3], points) + motions[:, :3, 3]
 
+    def source_rows(self) -> NDArray[np.int64]:
+        """(O,) the observation that each was followed from, -1 for none, or where that one is not there."""
+        key = self.obs_point * len(self.cam_from_world) + self.obs_cam
+        order = np.argsort(key, kind="stable")
+        wanted = self.obs_point * len(self.cam_from_world) + self.obs_source
+        rows = order[np.minimum(np.searchsorted(key, wanted, sorter=order), max(len(key) - 1, 0))]
+        return np.where((self.obs_source >= 0) & (key[rows] == wanted), rows, -1)
+
     def reprojection_errors(self, intrinsics: Intrinsics) -> Array:
         """(O,) pixels; infinite behind the camera."""
         return reprojection_errors(self.points_in_cam(), self.obs_xy, intrinsics)
 
+    def errors(self, intrinsics: Intrinsics) -> Array:
+        """(O,) the errors that the adjustment minimises, in standard deviations: of what was followed the difference to
+        where it was followed from. Infinite behind a camera."""
+        off, source = _offsets(self.points_in_cam(), self.obs_xy, intrinsics), self.source_rows()
+        off -= np.where(source[:, None] >= 0, off[source], 0.0)
+        return np.nan_to_num(np.hypot(*off.T), nan=np.inf) / self.obs_sd
+
 
 def reprojection_errors(points_in_cam: Array, xy: Array, intrinsics: Intrinsics) -> Array:
     """(O,) distances in pixels between projected points (O, 3) and pixels (O, 2); infinite behind the camera."""
+    return np.nan_to_num(np.hypot(*_offsets(points_in_cam, xy, intrinsics).T), nan=np.inf)
+
+
+def _offsets(points_in_cam: Array, xy: Array, intrinsics: Intrinsics) -> Array:
+    """(O, 2) from pixels to the points projected, NaN behind the camera."""
     z = np.where(points_in_cam[:, 2] > kernels.MIN_DEPTH, points_in_cam[:, 2], np.nan)
-    dx = intrinsics.fx * points_in_cam[:, 0] / z + intrinsics.cx - xy[:, 0]
-    dy = intrinsics.fy * points_in_cam[:, 1] / z + intrinsics.cy - xy[:, 1]
-    return np.nan_to_num(np.hypot(dx, dy), nan=np.inf)
+    return np.column_stack(
+        [
+            intrinsics.fx * points_in_cam[:, 0] / z + intrinsics.cx - xy[:, 0],
+            intrinsics.fy * points_in_cam[:, 1] / z + intrinsics.cy - xy[:, 1],
+        ]
+    )
 
 
 @dataclass(frozen=True)
@@ -139,17 +165,18 @@ class Problem:
         log_depth = np.log(np.where(known, b.obs_depth, 1.0))
         weight = np.where(known, 1 / np.where(known, b.obs_depth_sd, 1.0), 0.0)
         self.obs_cam, self.obs_point = b.obs_cam.astype(np.int64), b.obs_point.astype(np.int64)
-        self.data = (intrinsics.numbers, self.obs_cam, self.obs_point, b.obs_xy, 1 / b.obs_sd, log_depth, weight, width)
+        places = self.obs_cam, self.obs_point, b.source_rows()
+        self.data = (intrinsics.numbers, *places, b.obs_xy, 1 / b.obs_sd, log_depth, weight, width)
         self.starts = np.searchsorted(self.obs_point, np.arange(len(b.points) + 1))
         self.rows, columns = kernels.number_blocks(self.starts, self.obs_cam, len(b.cam_from_world))
         self.pairs = np.column_stack([np.repeat(np.arange(len(b.cam_from_world)), np.diff(self.rows)), columns])
         self.ids, self.rig = np.arange(len(b.cam_from_world)) if ids is None else ids, rig
 
     def cost(self, motions: Array, points: Array) -> float:
-        return float(kernels.total_cost(motions, points, *self.data))
+        return float(kernels.total_cost(motions, points, self.data))
 
     def linearise(self, motions: Array, points: Array) -> tuple[Array, ...]:
-        return kernels.linearise(motions, points, *self.data)
+        return kernels.linearise(motions, points, self.data)
 
     def solve(
         self, at: tuple[Array, Array], normal: tuple[Array, ...], damping: float
@@ -166,7 +193,7 @@ class Problem:
             blocks[own, i, i] += damping * diagonal[:, i] + 1e-9
         inverse = kernels.invert_points(point_block, damping)
         index = self.rows, np.ascontiguousarray(self.pairs[:, 1])
-        kernels.eliminate_points(*at, *self.data, self.starts, inverse, point_right, *index, blocks, right)
+        kernels.eliminate_points(*at, self.data, self.starts, inverse, point_right, *index, blocks, right)
         pairs, turns, place = self.pairs, None, np.arange(n)
         if len(self.rig) > 1:
             blocks, pairs, right, place, turns = tie_cameras(blocks, pairs, right, self.ids, self.rig)
@@ -176,7 +203,7 @@ class Problem:
         cam_step = solved.reshape(-1, 6)[place]
         if turns is not None:
             cam_step = np.einsum("nij,nj->ni", turns, cam_step)
-        shift = kernels.point_steps(*at, *self.data, inverse, point_right, cam_step)
+        shift = kernels.point_steps(*at, self.data, inverse, point_right, cam_step)
         return cam_step, shift
 
 
@@ -227,14 +254,15 @@ def adjust_pose(
     """Motion-only adjustment: (4, 4) pose of one camera that sees known points (Q, 3) at pixels (Q, 2) of sd (Q,)."""
     motion = np.ascontiguousarray(cam_from_world, dtype=np.float64)
     index, none = np.zeros(len(points), np.int64), np.zeros(len(points))
-    data = (intrinsics.numbers, index, np.arange(len(points)), np.ascontiguousarray(xy), 1 / sd, none, none, width)
+    places = index, np.arange(len(points)), index - 1
+    data = (intrinsics.numbers, *places, np.ascontiguousarray(xy), 1 / sd, none, none, width)
     points = np.ascontiguousarray(points)
-    cost, damping = kernels.total_cost(motion[None], points, *data), 1e-4
+    cost, damping = kernels.total_cost(motion[None], points, data), 1e-4
     for _ in range(iterations):
-        block, right, *_ = kernels.linearise(motion[None], points, *data)
+        block, right, *_ = kernels.linearise(motion[None], points, data)
         step = np.linalg.solve(block[0] + np.diag(damping * np.diag(block[0]) + 1e-9), right[0])
         moved = se3.exp(step) @ motion
-        tried = kernels.total_cost(moved[None], points, *data)
+        tried = kernels.total_cost(moved[None], points, data)
         if tried < cost:
             motion, gain, cost, damping = moved, (cost - tried) / cost, tried, damping / 5
             if gain < 1e-6:

@@ -1,8 +1,12 @@
 """Compiled loops of bundle adjustment: residuals, normal equations, elimination of the points.
 
 An observation has three residuals: x and y of its reprojection in units of its standard deviation, and, where the
-camera has a proxy depth there, log(z) - log(depth), likewise. A camera moves by a left twist (translation first).
-Loops run in the order of the observations, in one thread: the same input gives the same bytes.
+camera has a proxy depth there, log(z) - log(depth), likewise. Of a point that was followed from one image into another,
+x and y are those of its motion between the two. A camera moves by a left twist (translation first). Loops run in the
+order of the observations, in one thread: the same input gives the same bytes.
+
+`data`, of all of them: camera (4,), obs_cam (O,), obs_point (O,), source (O,) the observation that each was followed
+from (-1 for none), xy (O, 2), inverse_sd (O,), log_depth (O,), depth_weight (O,) and the width of the robust loss.
 """
 
 from __future__ import annotations
@@ -46,6 +50,40 @@ def _residual(motion, point, camera, xy, inverse_sd, log_depth, depth_weight, re
 
 
 @kernel
+def _scratch():  # type: ignore[no-untyped-def]
+    """Make a row for `_observe`: residual (3,), its derivatives by the twist (3, 6), the point (3, 3) and the twist of
+    the camera it was followed from (3, 6), weights (3,); then, of that camera's own residual, the point's and it."""
+    return np.empty(3), np.empty((3, 6)), np.empty((3, 3)), np.empty((3, 6)), np.empty(3), np.empty((3, 3)), np.empty(3)
+
+
+@kernel
+def _observe(o, motions, points, data, row):  # type: ignore[no-untyped-def]
+    """Fill a row with an observation, without its weights; False if the point is behind a camera."""
+    camera, obs_cam, obs_point, source, xy, inverse_sd, log_depth, depth_weight, _ = data
+    residual, jac_cam, jac_point, jac_source, _, point_there, there = row
+    point, s = points[obs_point[o]], source[o]
+    if not _residual(
+        motions[obs_cam[o]], point, camera, xy[o], inverse_sd[o], log_depth[o], depth_weight[o],
+        residual, jac_cam, jac_point,
+    ):  # fmt: skip
+        return False
+    if s < 0:
+        return True
+    if not _residual(
+        motions[obs_cam[s]], point, camera, xy[s], inverse_sd[o], 0.0, 0.0, there, jac_source, point_there
+    ):  # fmt: skip
+        return False
+    for i in range(2):
+        residual[i] -= there[i]
+        for j in range(3):
+            jac_point[i, j] -= point_there[i, j]
+        for j in range(6):
+            jac_source[i, j] = -jac_source[i, j]
+    jac_source[2, :] = 0.0
+    return True
+
+
+@kernel
 def _cauchy(squared, width):  # type: ignore[no-untyped-def]
     """Cauchy's loss of a squared residual."""
     return width * width * np.log1p(squared / (width * width))
@@ -58,74 +96,68 @@ def _cauchy_weight(squared, width):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def total_cost(motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_depth, depth_weight, width):  # type: ignore[no-untyped-def]
+def total_cost(motions, points, data):  # type: ignore[no-untyped-def]
     """Robust cost of all observations; one behind its camera costs what a residual of ten widths does."""
-    residual, jac_cam, jac_point = np.empty(3), np.empty((3, 6)), np.empty((3, 3))
-    cost = 0.0
+    obs_cam, width, row, cost = data[1], data[8], _scratch(), 0.0
+    residual = row[0]
     for o in range(len(obs_cam)):
-        if not _residual(
-            motions[obs_cam[o]], points[obs_point[o]], camera, xy[o], inverse_sd[o], log_depth[o], depth_weight[o],
-            residual, jac_cam, jac_point,
-        ):  # fmt: skip
+        if _observe(o, motions, points, data, row):
+            cost += _cauchy(residual[0] ** 2 + residual[1] ** 2, width) + _cauchy(residual[2] ** 2, width)
+        else:
             cost += _cauchy(100.0 * width * width, width)
-            continue
-        cost += _cauchy(residual[0] ** 2 + residual[1] ** 2, width) + _cauchy(residual[2] ** 2, width)
     return cost
 
 
 @kernel
-def _weighted(  # type: ignore[no-untyped-def]
-    motion, point, camera, xy, inverse_sd, log_depth, depth_weight, width, residual, jac_cam, jac_point, weight
-):  # fmt: skip
-    """`_residual`, and the weights (3,) that the robust loss gives its rows: all zero behind the camera."""
+def _weighted(o, motions, points, data, row):  # type: ignore[no-untyped-def]
+    """`_observe`, and the weights that the robust loss gives its residuals: all zero behind the camera."""
+    residual, weight, depth_weight, width = row[0], row[4], data[7], data[8]
     weight[:] = 0.0
-    if _residual(motion, point, camera, xy, inverse_sd, log_depth, depth_weight, residual, jac_cam, jac_point):
+    if _observe(o, motions, points, data, row):
         weight[0] = _cauchy_weight(residual[0] ** 2 + residual[1] ** 2, width)
         weight[1] = weight[0]
-        if depth_weight != 0.0:
+        if depth_weight[o] != 0.0:
             weight[2] = _cauchy_weight(residual[2] ** 2, width)
 
 
 @kernel
-def _mix(weight, jac_cam, jac_point, block):  # type: ignore[no-untyped-def]
-    """Fill block (6, 3) with what mixes camera and point in an observation."""
-    block[:] = 0.0
+def _add_product(weight, left, right, block):  # type: ignore[no-untyped-def]
+    """Add left^T W right to a block, of derivatives (3, n) and (3, m)."""
     for k in range(3):
         if weight[k] != 0.0:
-            for i in range(6):
-                wi = weight[k] * jac_cam[k, i]
-                for j in range(3):
-                    block[i, j] += wi * jac_point[k, j]
+            for i in range(block.shape[0]):
+                wi = weight[k] * left[k, i]
+                for j in range(block.shape[1]):
+                    block[i, j] += wi * right[k, j]
 
 
 @kernel
-def linearise(motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_depth, depth_weight, width):  # type: ignore[no-untyped-def]
-    """Normal equations: camera blocks (N, 6, 6), (N, 6), point blocks (P, 3, 3), (P, 3). What mixes a camera and a
-    point is made again where it is needed: as many blocks as observations would be most of the memory."""
-    n, p, o_count = len(motions), len(points), len(obs_cam)
+def _subtract_gradient(weight, jacobian, residual, right):  # type: ignore[no-untyped-def]
+    """Subtract J^T W r from a right side (n,)."""
+    for k in range(3):
+        if weight[k] != 0.0:
+            for i in range(len(right)):
+                right[i] -= weight[k] * jacobian[k, i] * residual[k]
+
+
+@kernel
+def linearise(motions, points, data):  # type: ignore[no-untyped-def]
+    """Normal equations: camera blocks (N, 6, 6), (N, 6), point blocks (P, 3, 3), (P, 3). What mixes two of them is made
+    again where it is needed: as many blocks as observations would be most of the memory."""
+    n, p, obs_cam, obs_point, source, row = len(motions), len(points), data[1], data[2], data[3], _scratch()
+    residual, jac_cam, jac_point, jac_source, weight = row[0], row[1], row[2], row[3], row[4]
     cam_block, cam_right = np.zeros((n, 6, 6)), np.zeros((n, 6))
     point_block, point_right = np.zeros((p, 3, 3)), np.zeros((p, 3))
-    residual, jac_cam, jac_point, weight = np.empty(3), np.empty((3, 6)), np.empty((3, 3)), np.empty(3)
-    for o in range(o_count):
-        c, q = obs_cam[o], obs_point[o]
-        _weighted(
-            motions[c], points[q], camera, xy[o], inverse_sd[o], log_depth[o], depth_weight[o], width,
-            residual, jac_cam, jac_point, weight,
-        )  # fmt: skip
-        for k in range(3):
-            w, r = weight[k], residual[k]
-            if w == 0.0:
-                continue
-            for i in range(6):
-                wi = w * jac_cam[k, i]
-                cam_right[c, i] -= wi * r
-                for j in range(6):
-                    cam_block[c, i, j] += wi * jac_cam[k, j]
-            for i in range(3):
-                wi = w * jac_point[k, i]
-                point_right[q, i] -= wi * r
-                for j in range(3):
-                    point_block[q, i, j] += wi * jac_point[k, j]
+    for o in range(len(obs_cam)):
+        c, q, s = obs_cam[o], obs_point[o], source[o]
+        _weighted(o, motions, points, data, row)
+        _add_product(weight, jac_cam, jac_cam, cam_block[c])
+        _subtract_gradient(weight, jac_cam, residual, cam_right[c])
+        _add_product(weight, jac_point, jac_point, point_block[q])
+        _subtract_gradient(weight, jac_point, residual, point_right[q])
+        if s >= 0:
+            _add_product(weight, jac_source, jac_source, cam_block[obs_cam[s]])
+            _subtract_gradient(weight, jac_source, residual, cam_right[obs_cam[s]])
     return cam_block, cam_right, point_block, point_right
 
 
@@ -144,17 +176,16 @@ def displacement(motions, points, camera, obs_cam, obs_point, velocity, late):  
 
 
 @kernel
-def border(  # type: ignore[no-untyped-def]
-    motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_depth, depth_weight, width, moved
-):  # fmt: skip
+def border(motions, points, data, moved):  # type: ignore[no-untyped-def]
     """Normal equations of one more unknown, of which a unit moves every observation by `moved` (O, 2) pixels: mixed
-    with cameras (N, 6) and points (P, 3), its own, and its right side."""
+    with cameras (N, 6) and points (P, 3), its own, and its right side. None of the observations was followed."""
+    obs_cam, obs_point, inverse_sd, width, row = data[1], data[2], data[5], data[8], _scratch()
+    residual, jac_cam, jac_point = row[0], row[1], row[2]
     cams, on_points = np.zeros((len(motions), 6)), np.zeros((len(points), 3))
     own, right = 0.0, 0.0
-    residual, jac_cam, jac_point = np.empty(3), np.empty((3, 6)), np.empty((3, 3))
     for o in range(len(obs_cam)):
         c, q = obs_cam[o], obs_point[o]
-        if not _residual(motions[c], points[q], camera, xy[o], inverse_sd[o], 0.0, 0.0, residual, jac_cam, jac_point):
+        if not _observe(o, motions, points, data, row):
             continue
         weight = _cauchy_weight(residual[0] ** 2 + residual[1] ** 2, width)
         for i in range(2):
@@ -228,29 +259,45 @@ def _list_partners(a, order, place, ends, obs_cam, seen, columns, used):  # type
 
 
 @kernel
+def _block_of(a, b, rows, columns):  # type: ignore[no-untyped-def]
+    """Number of the block of cameras a <= b."""
+    number = rows[a]
+    while columns[number] < b:
+        number += 1
+    return number
+
+
+@kernel
 def eliminate_points(  # type: ignore[no-untyped-def]
-    motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_depth, depth_weight, width,
-    starts, inverse_block, point_right, rows, columns, blocks, right,
+    motions, points, data, starts, inverse_block, point_right, rows, columns, blocks, right
 ):  # fmt: skip
-    """Subtract the points' share from the blocks (B, 6, 6) of the reduced camera system and its right side (6N,).
+    """Complete the blocks (B, 6, 6) of the reduced camera system and its right side (6N,): what mixes a followed
+    observation's two cameras is added, and the points' share subtracted.
 
     Observations are sorted by point, then camera; starts (P + 1,) are their ranges; `rows` and `columns` as of
     `number_blocks`.
     """
-    residual, jac_cam, jac_point, weight = np.empty(3), np.empty((3, 6)), np.empty((3, 3)), np.empty(3)
+    obs_cam, source, row = data[1], data[3], _scratch()
+    jac_cam, jac_point, jac_source, weight = row[1], row[2], row[3], row[4]
     most = 0
     for q in range(len(starts) - 1):
         most = max(most, starts[q + 1] - starts[q])
     left, mixed = np.empty((6, 3)), np.empty((most, 6, 3))
     for q in range(len(starts) - 1):
         first, count = starts[q], starts[q + 1] - starts[q]
+        mixed[:count] = 0.0
         for a in range(count):
-            o = first + a
-            _weighted(
-                motions[obs_cam[o]], points[q], camera, xy[o], inverse_sd[o], log_depth[o], depth_weight[o], width,
-                residual, jac_cam, jac_point, weight,
-            )  # fmt: skip
-            _mix(weight, jac_cam, jac_point, mixed[a])
+            _weighted(first + a, motions, points, data, row)
+            _add_product(weight, jac_cam, jac_point, mixed[a])
+            s = source[first + a]
+            if s >= 0:
+                _add_product(weight, jac_source, jac_point, mixed[s - first])
+                if s < first + a:
+                    block = blocks[_block_of(obs_cam[s], obs_cam[first + a], rows, columns)]
+                    _add_product(weight, jac_source, jac_cam, block)
+                else:
+                    block = blocks[_block_of(obs_cam[first + a], obs_cam[s], rows, columns)]
+                    _add_product(weight, jac_cam, jac_source, block)
         for a in range(count):
             cam = obs_cam[first + a]
             for i in range(6):
@@ -277,26 +324,22 @@ def eliminate_points(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def point_steps(  # type: ignore[no-untyped-def]
-    motions, points, camera, obs_cam, obs_point, xy, inverse_sd, log_depth, depth_weight, width,
-    inverse_block, point_right, cam_step,
-):  # fmt: skip
+def point_steps(motions, points, data, inverse_block, point_right, cam_step):  # type: ignore[no-untyped-def]
     """Back substitution: steps (P, 3) of the points for the cameras' steps (N, 6)."""
-    residual, jac_cam, jac_point, weight = np.empty(3), np.empty((3, 6)), np.empty((3, 3)), np.empty(3)
+    obs_cam, obs_point, source, row = data[1], data[2], data[3], _scratch()
+    jac_cam, jac_point, jac_source, weight = row[1], row[2], row[3], row[4]
+    moved = row[0]  # by the cameras' steps, instead of the residual
     rest = point_right.copy()
     for o in range(len(obs_cam)):
-        c, q = obs_cam[o], obs_point[o]
-        _weighted(
-            motions[c], points[q], camera, xy[o], inverse_sd[o], log_depth[o], depth_weight[o], width,
-            residual, jac_cam, jac_point, weight,
-        )  # fmt: skip
+        c, q, s = obs_cam[o], obs_point[o], source[o]
+        _weighted(o, motions, points, data, row)
+        moved[:] = 0.0
         for k in range(3):
-            moved = 0.0
             for i in range(6):
-                moved += jac_cam[k, i] * cam_step[c, i]
-            moved *= weight[k]
-            for j in range(3):
-                rest[q, j] -= moved * jac_point[k, j]
+                moved[k] += jac_cam[k, i] * cam_step[c, i]
+                if s >= 0:
+                    moved[k] += jac_source[k, i] * cam_step[obs_cam[s], i]
+        _subtract_gradient(weight, jac_point, moved, rest[q])
     out = np.zeros_like(rest)
     for q in range(len(rest)):
         for i in range(3):

@@ -133,7 +133,7 @@ def estimate(bundle: Bundle, xy: Array, camera: Intrinsics, times: Array, direct
     problem = Problem(bundle, camera)
     at = bundle.cam_from_world, bundle.points
     blocks, cam_right, point_blocks, point_right = problem.linearise(*at)
-    cams, points, own, right = kernels.border(bundle.cam_from_world, bundle.points, *problem.data, moved)
+    cams, points, own, right = kernels.border(bundle.cam_from_world, bundle.points, problem.data, moved)
     solved = problem.solve(at, (blocks, cams, point_blocks, points), 1e-7)
     if solved is None:
         return 0.0, 0.0
@@ -168,7 +168,7 @@ class RollingModel:
         bundle = Bundle(
             np.ascontiguousarray(at.cam_from_world), at.points, at.obs_cam, at.obs_point,
             np.asarray(camera.cam_from_img(self.now)) * focal + half,
-            *(np.broadcast_to(value, count) for value in (FEATURE_SD, 0.0, 1.0)),
+            *(np.broadcast_to(value, count) for value in (FEATURE_SD, 0.0, 1.0, -1)),
         )  # fmt: skip
         return bundle, np.asarray(camera.cam_from_img(self.plain)) * focal + half, pinhole
 

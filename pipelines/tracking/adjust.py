@@ -15,11 +15,12 @@ from msgs_slam.pipelines.depth.align import align_keyframes
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.depth.scales import COARSE, WorldScale
 from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.structure.bundle import Bundle, adjust_bundle, adjust_pose
 from msgs_slam.pipelines.structure.rolling import rectified_bundle, rectified_pixels, velocities
 from msgs_slam.pipelines.tracking.rig_poses import sync_rig_poses
-from msgs_slam.pipelines.tracking.state import TrackState
+from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps, rows_by
 
 Array = NDArray[np.float64]
@@ -71,7 +72,7 @@ def without_dependent_depth(settings: TrackingConfig, proxy_report: Mapping[str,
 def adjust_state(
     state: TrackState, intrinsics: Intrinsics, load_proxy: LoadProxy, metric: bool, settings: TrackingConfig
 ) -> Report:
-    """Adjust `state` in place: rounds of scale fields, bundle adjustment and removal of outliers.
+    """Adjust `state` in place: rounds of scale fields, removal of outliers and bundle adjustment.
 
     With more than MOST_FRAMES only keyframes and points are adjusted together, and every other
     frame follows by itself: the cost grows with the number of keyframes, not of frames.
@@ -82,14 +83,14 @@ def adjust_state(
     initial, in_frame = None, bundle.obs_xy
     for round_number in range(ROUNDS):
         bundle = undo_rolling_shutter(set_scale(bundle, ties, intrinsics), in_frame, frame_ids, state, intrinsics)
+        # At first, links between joined segments are far off and right; what was followed into a neighbour is not.
+        keep = consistent(bundle, intrinsics, bundle.obs_source >= (0 if round_number == 0 else -1))
+        bundle, in_frame = bundle.select(keep), in_frame[keep]
+        ties.depth, ties.reliability = ties.depth[keep], ties.reliability[keep]
         tied = with_depths(bundle, ties, intrinsics, settings)
         result = adjust_bundle(tied, intrinsics, ITERATIONS, ids=np.array(frame_ids), rig=state.rig)
         initial = result.initial_cost if initial is None else initial
         bundle = result.bundle
-        if round_number < ROUNDS - 1:
-            keep = consistent(bundle, intrinsics)
-            bundle, in_frame = bundle.select(keep), in_frame[keep]
-            ties.depth, ties.reliability = ties.depth[keep], ties.reliability[keep]
     bundle = set_scale(bundle, ties, intrinsics)
     errors = bundle.reprojection_errors(intrinsics)
     seen = np.isfinite(errors)  # not so of points that the last round has left behind a camera
@@ -131,7 +132,11 @@ def make_bundle(state: TrackState, frame_ids: list[int]) -> Bundle:
     """All sightings of the given frames, in their order; points seen only once are left out."""
     cam, seen = state.shared_sightings(frame_ids)
     poses, zeros = np.array([state.poses[i] for i in frame_ids]), np.zeros(len(seen))
-    return Bundle(poses, state.points.copy(), cam, seen.point, seen.xy, seen.sd, zeros, zeros + 1)
+    number = np.full(max(frame_ids) + 2, -1)  # the last one for those of no source
+    number[frame_ids] = np.arange(len(frame_ids))
+    return Bundle(
+        poses, state.points.copy(), cam, seen.point, seen.xy, seen.sd, zeros, zeros + 1, number[seen.source]
+    )  # fmt: skip
 
 
 def sample_depths(
@@ -196,12 +201,14 @@ def with_depths(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics, setting
     return replace(bundle, obs_depth=np.where(trusted, ties.depth * np.exp(log_scale), 0.0), obs_depth_sd=sd)
 
 
-def consistent(bundle: Bundle, intrinsics: Intrinsics) -> NDArray[np.bool_]:
-    """(O,) observations to keep: no outliers, and of points that at least two cameras still see."""
-    errors = bundle.reprojection_errors(intrinsics) / bundle.obs_sd
+def consistent(bundle: Bundle, intrinsics: Intrinsics, judged: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(O,) observations to keep: no outliers among those `judged`, nothing followed from one, and of points that at
+    least two cameras still see."""
+    errors, source = bundle.errors(intrinsics), bundle.source_rows()
     # 1.1774: the median of a Rayleigh variable of sigma 1.
-    sigma = max(float(np.median(errors)) / 1.1774, 0.5)
-    keep = errors < OUTLIER_SD * sigma
+    sigma = max(float(np.median(errors[judged])) / 1.1774, 0.5) if judged.any() else 0.5
+    keep = (errors < OUTLIER_SD * sigma) | ~judged
+    keep &= (bundle.obs_source < 0) | (keep[source] & (source >= 0))
     keep &= np.bincount(bundle.obs_point[keep], minlength=len(bundle.points))[bundle.obs_point] >= 2
     return keep
 
@@ -227,9 +234,34 @@ def follow_others(state: TrackState, intrinsics: Intrinsics, adjusted: set[int],
     for frame_id in others:
         seen = state.sightings[frame_id]
         seen = seen.select(alive[seen.point])
+        xy = seen_at_once(frame_id, seen, state, intrinsics, velocity)
+        xy -= source_errors(seen, state, intrinsics, velocity)
+        known = np.asarray(np.isfinite(xy).all(1))
+        seen, xy = seen.select(known), xy[known]
         state.sightings[frame_id] = seen
         if len(seen) >= 6:
-            pose, points, xy = state.poses[frame_id], state.points[seen.point], seen.xy
-            if velocity:
-                xy = rectified_pixels(pose, points, xy, intrinsics, velocity[frame_id], state.shutter.readout)
-            state.poses[frame_id] = adjust_pose(pose, points, xy, seen.sd, intrinsics)
+            points = state.points[seen.point]
+            state.poses[frame_id] = adjust_pose(state.poses[frame_id], points, xy, seen.sd, intrinsics)
+
+
+def source_errors(seen: Sightings, state: TrackState, intrinsics: Intrinsics, velocity: dict[int, Array]) -> Array:
+    """(Q, 2) pixels by which the sightings that these were followed from are off, 0 for those found by themselves; NaN
+    where they are no longer there."""
+    out = np.where(seen.source[:, None] < 0, 0.0, np.full((len(seen), 2), np.nan))
+    for source in np.unique(seen.source[seen.source >= 0]).tolist():
+        mine = np.flatnonzero(seen.source == source)
+        _, followed, rows = np.intersect1d(seen.point[mine], state.sightings[source].point, return_indices=True)
+        there = state.sightings[source].select(rows)
+        modelled, _ = project(se3.transform(state.poses[source], state.points[there.point]), intrinsics)
+        out[mine[followed]] = seen_at_once(source, there, state, intrinsics, velocity) - modelled
+    return out
+
+
+def seen_at_once(
+    frame_id: int, seen: Sightings, state: TrackState, intrinsics: Intrinsics, velocity: dict[int, Array]
+) -> Array:
+    """(Q, 2) pixels of a frame's sightings, but for what a rolling shutter adds: velocity by frame, empty for none."""
+    if not velocity:
+        return seen.xy.copy()
+    pose, points = state.poses[frame_id], state.points[seen.point]
+    return rectified_pixels(pose, points, seen.xy, intrinsics, velocity[frame_id], state.shutter.readout)

@@ -11,7 +11,7 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project, unproject
 from msgs_slam.pipelines.tracking.pictures import Pictures
 from msgs_slam.pipelines.tracking.pnp import MIN_INLIERS, POSE_ERROR
-from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
+from msgs_slam.pipelines.tracking.state import FEATURE_SD, NO_SIGHTINGS, Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]
@@ -116,10 +116,12 @@ def triangulate(
 
 
 def _add(points: Array, seen_at: dict[int, Array], state: TrackState, pictures: Pictures) -> None:
-    """New points (Q, 3) with the pixels (Q, 2) at which keyframes see them; colours from the first of these."""
+    """New points (Q, 3) with the pixels (Q, 2) at which keyframes see them: the first, of which the colours are, found
+    them, and they were followed into the others."""
     first, xy = next(iter(seen_at.items()))
     colors = pictures.color(first)[xy[:, 1].astype(int), xy[:, 0].astype(int)]
     index = state.add_points(points, colors)
     for frame_id, pixels in seen_at.items():
-        extra = Sightings(index, pixels, np.full(len(index), FLOW_SD))
+        is_first = frame_id == first
+        extra = Sightings.of(index, pixels, FEATURE_SD if is_first else FLOW_SD, -1 if is_first else first)
         state.sightings[frame_id] = state.sightings[frame_id].joined(extra)

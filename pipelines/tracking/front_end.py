@@ -131,7 +131,7 @@ class FrontEnd:
             guess, _ = project(points @ start[:3, :3].T + start[:3, 3], self.pictures.intrinsics)
             xy, found = follow(self.pictures.grey(keyframe), grey, known.xy, guess)
             found &= self.pictures.is_scene(frame_id, xy)
-            seen = seen.joined(Sightings(known.point[found], xy[found], np.full(int(found.sum()), FLOW_SD)))
+            seen = seen.joined(Sightings.of(known.point[found], xy[found], FLOW_SD, keyframe))
         return seen
 
     def solve(self, frame_id: int, seen: Sightings, start: Array | None) -> FramePose | None:

@@ -78,7 +78,7 @@ def match_keyframe(frame_id: int, keyframe: int, state: TrackState, pictures: Pi
     points, pairs = points[points >= 0], pairs[points >= 0]
     _, first = np.unique(points, return_index=True)
     first = np.sort(first)
-    return Sightings(points[first], ours.xy[pairs[first, 1]], np.full(len(first), 1.0))
+    return Sightings.of(points[first], ours.xy[pairs[first, 1]], 1.0)
 
 
 def _candidate_groups(frame_id: int, state: TrackState, pictures: Pictures, count: int) -> list[list[int]]:

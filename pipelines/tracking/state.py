@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import chain
 
 import numpy as np
@@ -21,18 +21,28 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sightings:
-    """Points seen by one frame: point (Q,) indices, xy (Q, 2) pixels, sd (Q,) their standard deviation in pixels."""
+    """Points seen by one frame: point (Q,) indices, xy (Q, 2) pixels, sd (Q,) their standard deviation in pixels.
+
+    source (Q,) is the frame from whose sighting of the point each was followed, -1 where it was found by itself. One
+    that was followed inherits the error of its source: its `sd` is of the motion between the two.
+    """
 
     point: NDArray[np.int64]
     xy: Array
     sd: Array
+    source: NDArray[np.int64]
+
+    @staticmethod
+    def of(point: NDArray[np.int64], xy: Array, sd: float, source: int = -1) -> Sightings:
+        """Sightings that are equally exact, all found by themselves or followed from one frame."""
+        return Sightings(point, xy, np.full(len(point), sd), np.full(len(point), source))
 
     def __len__(self) -> int:
         return len(self.point)
 
     def select(self, keep: NDArray) -> Sightings:
         """Select sightings by a mask or by indices."""
-        return Sightings(self.point[keep], self.xy[keep], self.sd[keep])
+        return Sightings(self.point[keep], self.xy[keep], self.sd[keep], self.source[keep])
 
     def points_at(self, xy: Array) -> NDArray[np.int64]:
         """(F,) the point that is seen within 2 px of each of the pixels (F, 2), -1 for none."""
@@ -47,6 +57,7 @@ class Sightings:
             np.concatenate([self.point, other.point]),
             np.concatenate([self.xy, other.xy]),
             np.concatenate([self.sd, other.sd]),
+            np.concatenate([self.source, other.source]),
         )
 
 
@@ -55,7 +66,7 @@ FEATURE_SD = 0.5
 _NEAR_KEYFRAMES = 8
 _SNAP_PX = 2.0
 """A feature within so many pixels of a frame's sighting is the same point."""
-NO_SIGHTINGS = Sightings(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
+NO_SIGHTINGS = Sightings.of(np.zeros(0, np.int64), np.zeros((0, 2)), 1.0)
 
 
 @dataclass
@@ -88,7 +99,7 @@ class TrackState:
         state = TrackState(model.points_in_world.copy(), model.colors.copy(), rig=rig, shutter=shutter or Shutter())
         for k, frame_id in enumerate(int(i) for i in model.frame_ids):
             mine = model.observations_of(k)
-            seen = Sightings(model.obs_point[mine].astype(np.int64), model.obs_xy[mine], np.full(len(mine), sd))
+            seen = Sightings.of(model.obs_point[mine].astype(np.int64), model.obs_xy[mine], sd)
             state.add_frame(frame_id, model.cam_from_world[k], seen, is_keyframe=True, segment=0)
         return state
 
@@ -139,7 +150,7 @@ class TrackState:
         (O,) which of the frames each is of."""
         rows = [self.sightings[i] for i in frame_ids]
         row = np.repeat(np.arange(len(rows)), [len(r) for r in rows])
-        seen = Sightings(*(np.concatenate([getattr(r, name) for r in rows]) for name in ("point", "xy", "sd")))
+        seen = Sightings(*(np.concatenate([getattr(r, f.name) for r in rows]) for f in fields(Sightings)))
         keep = np.bincount(seen.point, minlength=len(self.points))[seen.point] >= 2
         return row[keep], seen.select(keep)
 

@@ -48,7 +48,7 @@ Array = NDArray[np.float64]
 LAST = Path(__file__).with_suffix(".json")
 FORMS = ("video", "plain", "set", "given")
 METRES, DEGREES = 0.05, 3.0
-MADE = ("corridor", "turn", "fast", "kitchen_twice", "two_rooms", "corridor_half_blank", "corridor_blank")
+MADE = ("corridor", "classroom", "turn", "fast", "kitchen_twice", "two_rooms", "corridor_half_blank", "corridor_blank")
 
 
 def recordings(work: Path) -> dict[str, dict[str, Case]]:

@@ -43,6 +43,19 @@ from parted_sequences import LONG, PARTED, kitchen_two_row, write_parted
 DATA = ROOT.parent / "shared" / "data"
 PLAIN = ("run.format=images",)
 """Pictures named like a data set's, but without what that says of their camera."""
+WALKS: dict[str, dict[str, Any]] = {
+    "corridor": {"frames": 150, "laps": 1.08},
+    "classroom": {
+        "texel": 0.005,
+        "frames": 100,
+        "laps": 0.33,
+        "width": 640,
+        "height": 480,
+        "noise": 1.5,
+        "shutter": 0.3,
+    },
+}
+"""Layouts of the made-up world, and how a camera walks through each."""
 COARSE = ("proxy.stereo_side=160", "proxy.stereo_planes=32")
 """Quick proxies where only poses are judged: multi-view depth takes no part in them."""
 Truth = Callable[[str, int], NDArray[np.float64] | None]
@@ -130,7 +143,10 @@ def cases(work: Path) -> dict[str, Case]:
         "whiteroom_video": Case(white / "video.mp4", (), room),
         "whiteroom_files": Case(white / "rgb", (*PLAIN, files), room),
         "fr1_rpy": Case(DATA / "tum_fr1_rpy" / "rgb", (*PLAIN, *COARSE), of_set(DATA / "tum_fr1_rpy")),
-        "corridor": Case(work / "corridor" / "rgb", (*PLAIN, *COARSE), written_truth(work / "corridor" / "traj.txt")),
+        **{
+            name: Case(work / name / "rgb", (*PLAIN, *COARSE), written_truth(work / name / "traj.txt"))
+            for name in WALKS
+        },
         "bedroom": Case(DATA / "videos/bedroom_848x364_58fps.mp4", (), lambda *_: None),
         "house_portrait": Case(DATA / "videos/house_portrait_540x960_30fps.mp4", (), lambda *_: None),
         "kitchen_long": Case(DATA / LONG, (), by_number(long)),
@@ -149,8 +165,8 @@ def prepare(name: str, case: Case, work: Path) -> Path:
     """The source to reconstruct: written or cut where the case asks for it."""
     if name == "replica_files":
         write_noisy_depth(DATA / "replica_office0" / "depth", work / "noisy")
-    if name == "corridor":
-        return write_walk(work / "corridor", "corridor", frames=150, laps=1.08)
+    if name in WALKS:
+        return write_walk(work / name, name, **WALKS[name])
     if name in HARD:
         return write_hard(name, work / name, DATA)
     if name in PARTED:
@@ -166,14 +182,13 @@ def prepare(name: str, case: Case, work: Path) -> Path:
     return folder
 
 
-def write_walk(folder: Path, layout: str, frames: int, laps: float) -> Path:
+def write_walk(folder: Path, layout: str, texel: float = 0.006, **options: Any) -> Path:
     """A walk in the made-up world as a folder of pictures, with traj.txt beside it."""
     from tests.world.clip import ClipOptions, make_world
     from tests.world.write import write_sequence
 
     if not (folder / "traj.txt").exists():
-        options = ClipOptions(frames=frames, width=480, height=360, laps=laps)
-        write_sequence(folder, make_world(layout, texel=0.006), options)
+        write_sequence(folder, make_world(layout, texel=texel), ClipOptions(**{"width": 480, "height": 360} | options))
     return folder / "rgb"
 
 

@@ -58,7 +58,9 @@ def seen_by(readout: float) -> tuple[Bundle, Array]:
     inside = (depth > 0) & (xy >= 0).all(1) & (xy < [CAMERA.width, CAMERA.height]).all(1)
     xy = (xy + rng.normal(0, 0.5, xy.shape))[inside]
     zeros = np.zeros(len(xy))
-    return Bundle(path(TIMES), points, cam[inside], point[inside], xy, zeros + 0.5, zeros, zeros + 1), points
+    return Bundle(
+        path(TIMES), points, cam[inside], point[inside], xy, zeros + 0.5, zeros, zeros + 1, cam[inside] * 0 - 1
+    ), points
 
 
 def as_model(bundle: Bundle) -> tuple[pycolmap.Reconstruction, list[Array]]:
@@ -149,7 +151,7 @@ def test_tracked_frames_are_adjusted_with_the_readout(together: bool, monkeypatc
         state = TrackState(points.copy(), np.zeros((len(points), 3), np.uint8), shutter=shutter)
         for k, pose in enumerate(bundle.cam_from_world):
             mine = bundle.obs_cam == k
-            seen = Sightings(bundle.obs_point[mine], bundle.obs_xy[mine], bundle.obs_sd[mine])
+            seen = Sightings.of(bundle.obs_point[mine], bundle.obs_xy[mine], 0.5)
             state.add_frame(k, pose, seen, is_keyframe=k % 2 == 0, segment=0)
         adjust_state(state, CAMERA, lambda _: None, False, TrackingConfig())
         errors.append(off_by(np.array([state.poses[i] for i in range(COUNT)])))

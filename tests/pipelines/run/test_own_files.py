@@ -30,7 +30,7 @@ def test_a_snapshot_of_many_sightings_is_read_again(tmp_path: Path, monkeypatch:
     monkeypatch.setattr("msgs_slam.formats.tensors.MAX_UNPACKED_BYTES", 10_000)
     state = TrackState(np.ones((10, 3)), np.zeros((10, 3), np.uint8))
     for k in range(20):
-        seen = Sightings(np.arange(10), np.full((10, 2), float(k)), np.ones(10))
+        seen = Sightings.of(np.arange(10), np.full((10, 2), float(k)), 1.0)
         state.add_frame(k, np.eye(4), seen, is_keyframe=k % 2 == 0, segment=0)
     save_value(tmp_path / "state.npz", state)
     back = load_value(tmp_path / "state.npz")

@@ -68,7 +68,7 @@ def known_bundle() -> KnownBundle:
     n = len(cam)
     noisy = np.array([small_motion(rng, 0.01, 0.03) @ p for p in truth])
     moved = points + rng.normal(size=points.shape) * 0.05
-    bundle = Bundle(noisy, moved, cam, point, xy, np.full(n, 0.5), z, np.full(n, 0.02))
+    bundle = Bundle(noisy, moved, cam, point, xy, np.full(n, 0.5), z, np.full(n, 0.02), np.full(n, -1))
     return KnownBundle(bundle, truth, points, intrinsics)
 
 

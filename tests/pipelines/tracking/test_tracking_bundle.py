@@ -8,7 +8,7 @@ import pytest
 
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
-from msgs_slam.pipelines.structure import bundle_kernels as kernels
+from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.structure.bundle import Bundle, Problem, adjust_bundle, adjust_pose
 from msgs_slam.pipelines.tracking.pnp import colmap_camera
 from msgs_slam.pipelines.types import Intrinsics
@@ -29,25 +29,71 @@ def aligned_error(poses: np.ndarray, truth: np.ndarray, scale: bool) -> float:
     return float(np.sqrt(((moved - wanted) ** 2).sum(1).mean()))
 
 
-def test_gradient_agrees_with_differences_of_the_cost(known_bundle: KnownBundle) -> None:
-    b = known_bundle.bundle
-    camera = np.array([500.0, 500, 320, 240])
-    data = (
-        camera, b.obs_cam, b.obs_point, b.obs_xy, 1 / b.obs_sd, np.log(b.obs_depth), 1 / b.obs_depth_sd, 2.0
-    )  # fmt: skip
-    _, cam_right, _, point_right = kernels.linearise(b.cam_from_world, b.points, *data)
+def followed(bundle: Bundle) -> Bundle:
+    """Of four cameras the first found its points; they were followed into the third, and from there into the others."""
+    to_source = np.array([0, 1, -2, -1])[bundle.obs_cam % 4]
+    return replace(bundle, obs_source=np.where(bundle.obs_cam % 4 == 0, -1, bundle.obs_cam + to_source))
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_gradient_agrees_with_differences_of_the_cost(known_bundle: KnownBundle, alone: bool) -> None:
+    b = known_bundle.bundle if alone else followed(known_bundle.bundle)
+    problem = Problem(b, known_bundle.intrinsics)
+    _, cam_right, _, point_right = problem.linearise(b.cam_from_world, b.points)
     for c, k in ((0, 0), (3, 2), (7, 3), (11, 5), (5, 4)):
         step = np.zeros((12, 6))
         step[c, k] = 1e-6
-        up = kernels.total_cost(se3.exp(step) @ b.cam_from_world, b.points, *data)
-        down = kernels.total_cost(se3.exp(-step) @ b.cam_from_world, b.points, *data)
+        up = problem.cost(se3.exp(step) @ b.cam_from_world, b.points)
+        down = problem.cost(se3.exp(-step) @ b.cam_from_world, b.points)
         assert -2 * cam_right[c, k] == pytest.approx((up - down) / 2e-6, rel=1e-4)
     for p, k in ((0, 0), (40, 1), (149, 2)):
         step = np.zeros((150, 3))
         step[p, k] = 1e-6
-        up = kernels.total_cost(b.cam_from_world, b.points + step, *data)
-        down = kernels.total_cost(b.cam_from_world, b.points - step, *data)
+        up = problem.cost(b.cam_from_world, b.points + step)
+        down = problem.cost(b.cam_from_world, b.points - step)
         assert -2 * point_right[p, k] == pytest.approx((up - down) / 2e-6, rel=1e-4)
+
+
+def test_step_is_that_of_the_whole_system_of_normal_equations(known_bundle: KnownBundle) -> None:
+    bundle = without_depth(followed(known_bundle.bundle))
+    few = bundle.select((bundle.obs_cam < 4) & (bundle.obs_point < 15))
+    bundle = replace(few, cam_from_world=few.cam_from_world[:4], points=few.points[:15])
+    camera, seen = known_bundle.intrinsics, zip(few.obs_cam, few.obs_point, strict=True)
+    row = {(c, p): o for o, (c, p) in enumerate(seen)}
+    sources = [row[c, p] if c >= 0 else -1 for c, p in zip(few.obs_source, few.obs_point, strict=True)]
+
+    def residuals(step: np.ndarray) -> np.ndarray:
+        motions = se3.exp(step[:24].reshape(4, 6)) @ bundle.cam_from_world
+        points = bundle.points + step[24:].reshape(15, 3)
+        at = np.einsum("oij,oj->oi", motions[few.obs_cam, :3, :3], points[few.obs_point]) + motions[few.obs_cam, :3, 3]
+        off = at[:, :2] / at[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy] - few.obs_xy
+        return ((off - [off[s] if s >= 0 else (0, 0) for s in sources]) / few.obs_sd[:, None]).ravel()
+
+    units = np.eye(24 + 45) * 1e-6
+    jacobian = np.array([(residuals(u) - residuals(-u)) / 2e-6 for u in units]).T
+    normal, damping = jacobian.T @ jacobian, 1e-2
+    step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -jacobian.T @ residuals(np.zeros(24 + 45)))
+    problem, at = Problem(bundle, camera, width=1e6), (bundle.cam_from_world, bundle.points)
+    found = problem.solve(at, problem.linearise(*at), damping)
+    assert found is not None
+    np.testing.assert_allclose(np.concatenate([found[0].ravel(), found[1].ravel()]), step, rtol=1e-3, atol=1e-6)
+
+
+def test_error_of_a_feature_that_was_followed_counts_once(known_bundle: KnownBundle) -> None:
+    bundle, truth, camera = without_depth(followed(known_bundle.bundle)), known_bundle, known_bundle.intrinsics
+    motions, own, rows = truth.cam_from_world[bundle.obs_cam], bundle.obs_source < 0, bundle.source_rows()
+    in_cam = np.einsum("oij,oj->oi", motions[:, :3, :3], truth.points[bundle.obs_point]) + motions[:, :3, 3]
+    errors = []
+    for seed in range(4):
+        off = np.where(own[:, None], 1.0, 0.05) * np.random.default_rng(seed).normal(size=bundle.obs_xy.shape)
+        for last in (2, 1, 3):
+            off += np.where((bundle.obs_cam % 4 == last)[:, None], off[rows], 0.0)
+        seen = replace(bundle, obs_xy=project(in_cam, camera)[0] + off, obs_sd=np.where(own, 1.0, 0.05))
+        alike = replace(seen, obs_sd=np.ones(len(own)), obs_source=np.full(len(own), -1))
+        found = [adjust_bundle(b, camera, 50).bundle.cam_from_world for b in (seen, alike)]
+        errors.append([aligned_error(poses, truth.cam_from_world, scale=True) for poses in found])
+    once, each_time = np.mean(errors, axis=0)
+    assert 0 < once < 0.8 * each_time
 
 
 def test_what_a_picture_sees_twice_counts_as_what_it_sees_once_but_surer(known_bundle: KnownBundle) -> None:

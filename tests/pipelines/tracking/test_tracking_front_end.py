@@ -15,7 +15,7 @@ from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.tracking.extend import triangulate
 from msgs_slam.pipelines.tracking.motion import interpolate_pose, predict_pose
 from msgs_slam.pipelines.tracking.pnp import solve_pose
-from msgs_slam.pipelines.tracking.state import Sightings, TrackState
+from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics
 from tests.pipelines.tracking.conftest import KnownBundle
 
@@ -126,8 +126,8 @@ def test_features_match_a_turned_picture_and_not_another() -> None:
 def test_state_comes_back_from_disk(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     state = TrackState(rng.normal(size=(5, 3)), rng.integers(0, 255, (5, 3)).astype(np.uint8))
-    state.add_frame(4, np.eye(4), Sightings(np.array([1, 1, 3]), rng.normal(size=(3, 2)), np.ones(3)), True, 0)
-    state.add_frame(6, 2 * np.eye(4), Sightings(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)), False, 1)
+    state.add_frame(4, np.eye(4), Sightings.of(np.array([1, 1, 3]), rng.normal(size=(3, 2)), 1.0), True, 0)
+    state.add_frame(6, 2 * np.eye(4), NO_SIGHTINGS, False, 1)
     state.lost[5] = "too dark, ½"
     state.done = 7
     save_value(tmp_path / "s.npz", state)

@@ -98,7 +98,7 @@ def walked(count: int) -> NDArray[np.float64]:
 def stretch_at(frames: range, poses: NDArray[np.float64]) -> TrackState:
     """A state of these frames alone, each seeing one point; the others are lost."""
     state = TrackState(np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
-    seen = Sightings(np.zeros(1, np.int64), np.zeros((1, 2)), np.ones(1))
+    seen = Sightings.of(np.zeros(1, np.int64), np.zeros((1, 2)), 1.0)
     for i in frames:
         state.add_frame(i, poses[i], seen, True, 0)
     state.lost = {i: "blank" for i in range(len(poses)) if i not in frames}

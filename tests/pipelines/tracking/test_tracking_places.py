@@ -44,8 +44,10 @@ def _bundle(poses: NDArray[np.float64], rng: np.random.Generator, noise: float) 
         point.append(np.flatnonzero(inside))
         xy.append(at[inside] + rng.normal(0, noise, (int(inside.sum()), 2)))
     count = sum(map(len, cam))
-    zeros, ones = np.zeros(count), np.ones(count)
-    return Bundle(poses, points, np.concatenate(cam), np.concatenate(point), np.concatenate(xy), ones, zeros, ones)
+    zeros, ones, none = np.zeros(count), np.ones(count), np.full(count, -1)
+    return Bundle(
+        poses, points, np.concatenate(cam), np.concatenate(point), np.concatenate(xy), ones, zeros, ones, none
+    )
 
 
 def _spread(poses: NDArray[np.float64]) -> float:
@@ -105,7 +107,7 @@ def _state(true: NDArray[np.float64], posed: list[int]) -> TrackState:
     state = TrackState(rng.normal(size=(100, 3)), np.zeros((100, 3), np.uint8), rig=RIG)
     for i in posed:
         points = np.arange(10 * (i // STATIONS), 10 * (i // STATIONS) + 5 + i % STATIONS)
-        seen = Sightings(points, np.full((len(points), 2), 3.0), np.ones(len(points)))
+        seen = Sightings.of(points, np.full((len(points), 2), 3.0), 1.0)
         state.add_frame(i, true[i], seen, i % 2 == 0, 0)
     return state
 

@@ -44,7 +44,7 @@ def add_place(state: TrackState, frame_id: int, cam_from_world: np.ndarray) -> N
     depth = np.random.default_rng(1).uniform(2, 4, len(xy))
     points = se3.transform(se3.inverse(cam_from_world), unproject(xy, depth, CAMERA))
     index = state.add_points(points, np.zeros((len(xy), 3), np.uint8))
-    state.add_frame(frame_id, cam_from_world, Sightings(index, xy, np.full(len(xy), 0.5)), True, 0)
+    state.add_frame(frame_id, cam_from_world, Sightings.of(index, xy, 0.5), True, 0)
 
 
 HERE, FAR = se3.exp(np.array([0.1, 0.2, 0, 0, 0.1, 0])), se3.exp(np.array([6.0, 0, 0, 0, 1.5, 0]))
@@ -76,7 +76,7 @@ def test_two_ways_to_join_are_as_near_or_far_wherever_the_origin_is(away: float,
 
 
 def test_a_feature_is_the_point_whose_sighting_is_within_two_pixels() -> None:
-    seen = Sightings(np.array([7, 3]), np.array([[10.0, 10.0], [50.0, 20.0]]), np.ones(2))
+    seen = Sightings.of(np.array([7, 3]), np.array([[10.0, 10.0], [50.0, 20.0]]), 1.0)
     assert seen.points_at(np.array([[11.0, 11.0], [50.0, 22.5], [49.0, 20.0]])).tolist() == [7, -1, 3]
     assert seen.points_at(np.zeros((0, 2))).tolist() == []
     assert NO_SIGHTINGS.points_at(np.array([[1.0, 1.0]])).tolist() == [-1]
