@@ -53,10 +53,10 @@ def _residual(motion, point, camera, xy, inverse_sd, log_depth, depth_weight, re
 def _scratch():  # type: ignore[no-untyped-def]
     """Make a row for `_observe`: residual (3,), its derivatives by the twist (3, 6), the point (3, 3) and the twist of
     the camera it was followed from (3, 6), weights (3,); then, of that camera's own residual, the point's and it."""
-    return np.empty(3), np.empty((3, 6)), np.empty((3, 3)), np.empty((3, 6)), np.empty(3), np.empty((3, 3)), np.empty(3)
+    return np.zeros(3), np.zeros((3, 6)), np.zeros((3, 3)), np.zeros((3, 6)), np.zeros(3), np.zeros((3, 3)), np.zeros(3)
 
 
-@kernel
+@kernel(inline="always")
 def _observe(o, motions, points, data, row):  # type: ignore[no-untyped-def]
     """Fill a row with an observation, without its weights; False if the point is behind a camera."""
     camera, obs_cam, obs_point, source, xy, inverse_sd, log_depth, depth_weight, _ = data
@@ -108,7 +108,7 @@ def total_cost(motions, points, data):  # type: ignore[no-untyped-def]
     return cost
 
 
-@kernel
+@kernel(inline="always")
 def _weighted(o, motions, points, data, row):  # type: ignore[no-untyped-def]
     """`_observe`, and the weights that the robust loss gives its residuals: all zero behind the camera."""
     residual, weight, depth_weight, width = row[0], row[4], data[7], data[8]
@@ -123,21 +123,19 @@ def _weighted(o, motions, points, data, row):  # type: ignore[no-untyped-def]
 @kernel
 def _add_product(weight, left, right, block):  # type: ignore[no-untyped-def]
     """Add left^T W right to a block, of derivatives (3, n) and (3, m)."""
-    for k in range(3):
-        if weight[k] != 0.0:
-            for i in range(block.shape[0]):
-                wi = weight[k] * left[k, i]
-                for j in range(block.shape[1]):
-                    block[i, j] += wi * right[k, j]
+    n, m = block.shape
+    for i in range(n):
+        a, b, c = weight[0] * left[0, i], weight[1] * left[1, i], weight[2] * left[2, i]
+        for j in range(m):
+            block[i, j] += a * right[0, j] + b * right[1, j] + c * right[2, j]
 
 
 @kernel
 def _subtract_gradient(weight, jacobian, residual, right):  # type: ignore[no-untyped-def]
     """Subtract J^T W r from a right side (n,)."""
-    for k in range(3):
-        if weight[k] != 0.0:
-            for i in range(len(right)):
-                right[i] -= weight[k] * jacobian[k, i] * residual[k]
+    a, b, c = weight[0] * residual[0], weight[1] * residual[1], weight[2] * residual[2]
+    for i in range(len(right)):
+        right[i] -= a * jacobian[0, i] + b * jacobian[1, i] + c * jacobian[2, i]
 
 
 @kernel
