@@ -41,7 +41,7 @@ def run(context: StageContext) -> dict[str, Any]:
     frames = _frames_to_do(work)
     _warn_of_missing(work, frames)
     _compute_depths(work, frames)
-    scale = measure_scale(work.sequence, frames, work.depth)
+    scale = measure_scale(work.sequence, frames, work.computed_depth)
     moving = _leave_out_moving(work, frames, scale)
     reference = reference_scale(context, work.sequence, frames, work.depths, scale, work.depth)
     _compute_maps(work, frames, scale, reference)

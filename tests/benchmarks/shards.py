@@ -1,10 +1,11 @@
 """Many processes at one run (`msgs-slam work`): in any order, twice at a time, killed; the run is that of one process.
 
     python tests/benchmarks/shards.py --work DIR --shards 16 --seed 0
+    python tests/benchmarks/shards.py --work DIR --source VIDEO --shards 2 --kills 0 --set mapping.submap=15
 
-A clip of the demo's room is reconstructed by one process, then by processes of which each takes one shard: begun in
-random order, at most --beside at the same time, each second one of them twice, some killed (SIGKILL) after a random
-time and begun again later. What all stages have left is compared by its bytes.
+A clip of the demo's room, or another recording, is reconstructed by one process, then by processes of which each takes
+one shard: begun in random order, at most --beside at the same time, each second one of them twice, some killed
+(SIGKILL) after a random time and begun again later. What all stages have left is compared by its bytes.
 """
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
@@ -89,15 +90,14 @@ def main() -> None:
     parser.add_argument("--beside", type=int, default=4, help="processes at the same time")
     parser.add_argument("--kills", type=int, default=8)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--source", type=Path, help="a recording in place of the demo's clip")
+    parser.add_argument("--set", dest="settings", action="append", default=[], metavar="SECTION.KEY=VALUE")
     arguments = parser.parse_args()
-    (video, _), whole, shared = (
-        unpack_demo_clip(arguments.work),
-        arguments.work / "whole.msgs",
-        arguments.work / "shared.msgs",
-    )
-    begin(video, whole, STAGES[-1])
+    video = arguments.source or unpack_demo_clip(arguments.work)[0]
+    whole, shared = arguments.work / "whole.msgs", arguments.work / "shared.msgs"
+    begin(video, whole, STAGES[-1], *arguments.settings)
     shutil.rmtree(shared, ignore_errors=True)
-    begin(video, shared, "frames")
+    begin(video, shared, "frames", *arguments.settings)
     started = time.monotonic()
     told = by_shards(shared, arguments.shards, arguments.beside, arguments.kills, random.Random(arguments.seed))
     seconds, (one, many) = time.monotonic() - started, (contents(r) for r in (whole, shared))

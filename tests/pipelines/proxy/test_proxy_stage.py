@@ -12,6 +12,7 @@ from proxy_room import UNIT, Room
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.jsonfile import read_json
 from msgs_slam.pipelines.engine.stages import StageContext
+from msgs_slam.pipelines.masks.moving import MovingView
 from msgs_slam.pipelines.proxy.files.depth import FilesDepth
 from msgs_slam.pipelines.proxy.files.labels import FilesLabels
 from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate
@@ -88,7 +89,17 @@ class Stops:
             yield item
 
 
-def test_killed_in_each_pass_and_with_other_threads_it_ends_with_the_same_bytes(make_context: Make) -> None:
+def something_moved(_: Any, view: Callable[[int], MovingView], *more: Any) -> dict[int, np.ndarray]:
+    """In the upper half of one keyframe."""
+    moved = np.zeros(view(2).depth.shape, np.bool_)
+    moved[: len(moved) // 2] = True
+    return {2: moved}
+
+
+def test_killed_in_each_pass_and_with_other_threads_it_ends_with_the_same_bytes(
+    make_context: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("msgs_slam.pipelines.proxy.stage.find_moving", something_moved)
     whole = make_context(*EMBEDDED, name="whole")
     run(whole)
     broken = make_context(*EMBEDDED, "run.threads=1", name="broken")
