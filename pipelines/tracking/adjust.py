@@ -132,7 +132,8 @@ def make_bundle(state: TrackState, frame_ids: list[int]) -> Bundle:
     """All sightings of the given frames, in their order; points seen only once are left out."""
     cam, seen = state.shared_sightings(frame_ids)
     poses, zeros = np.array([state.poses[i] for i in frame_ids]), np.zeros(len(seen))
-    number = np.full(max(frame_ids) + 2, -1)  # the last one for those of no source
+    # The last one stands for those of no source.
+    number = np.full(max(max(frame_ids), int(seen.source.max(initial=-1))) + 2, -1)
     number[frame_ids] = np.arange(len(frame_ids))
     return Bundle(
         poses, state.points.copy(), cam, seen.point, seen.xy, seen.sd, zeros, zeros + 1, number[seen.source]

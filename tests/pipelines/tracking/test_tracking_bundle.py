@@ -6,11 +6,14 @@ import numpy as np
 import pycolmap
 import pytest
 
+from msgs_slam.pipelines.config import TrackingConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.structure.bundle import Bundle, Problem, adjust_bundle, adjust_pose
+from msgs_slam.pipelines.tracking.adjust import adjust_state
 from msgs_slam.pipelines.tracking.pnp import colmap_camera
+from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics
 from tests.pipelines.tracking.conftest import KnownBundle
 
@@ -94,6 +97,31 @@ def test_error_of_a_feature_that_was_followed_counts_once(known_bundle: KnownBun
         errors.append([aligned_error(poses, truth.cam_from_world, scale=True) for poses in found])
     once, each_time = np.mean(errors, axis=0)
     assert 0 < once < 0.8 * each_time
+
+
+@pytest.mark.parametrize(("together", "share"), [(True, 0.3), (False, 0.7)])
+def test_frames_follow_their_keyframes_but_for_the_errors_of_its_features(
+    known_bundle: KnownBundle, monkeypatch: pytest.MonkeyPatch, together: bool, share: float
+) -> None:
+    if not together:
+        monkeypatch.setattr("msgs_slam.pipelines.tracking.adjust.MOST_FRAMES", 4)
+    truth, points = known_bundle.cam_from_world, known_bundle.points
+    errors = []
+    for is_known in (True, False):
+        state = TrackState(points.copy(), np.zeros((len(points), 3), np.uint8))
+        for k, pose in enumerate(truth):
+            exact, _ = project(se3.transform(pose, points), known_bundle.intrinsics)
+            off = np.random.default_rng(k // 3).normal(size=exact.shape)  # the keyframe's, and of those that follow it
+            keyframe, is_keyframe = k - k % 3, k % 3 == 0
+            known = (0.5, -1) if is_keyframe or not is_known else (0.05, keyframe)
+            seen = Sightings.of(np.arange(len(points)), exact + off, *known)
+            state.add_frame(k, pose, seen if is_keyframe else seen.select(slice(None, None, 7)), is_keyframe, segment=0)
+        adjust_state(state, known_bundle.intrinsics, lambda _: None, False, TrackingConfig())
+        found = np.array([state.poses[i] for i in range(12)])
+        after = np.array([1, 2, 4, 5, 7, 8, 10, 11])
+        ours, theirs = (p[after] @ se3.inverse(p[after - after % 3]) for p in (found, truth))
+        errors.append(float(np.sqrt((se3.rotation_angle(ours @ se3.inverse(theirs)) ** 2).mean())))
+    assert 0 < errors[0] < share * errors[1]
 
 
 def test_what_a_picture_sees_twice_counts_as_what_it_sees_once_but_surer(known_bundle: KnownBundle) -> None:
