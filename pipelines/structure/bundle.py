@@ -17,6 +17,7 @@ from scipy.sparse import bsr_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
 from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.rig import ONE_CAMERA, Rig, tie_cameras
 from msgs_slam.pipelines.structure import bundle_kernels as kernels
 from msgs_slam.pipelines.types import Intrinsics, require_shape
@@ -94,13 +95,8 @@ def reprojection_errors(points_in_cam: Array, xy: Array, intrinsics: Intrinsics)
 
 def _offsets(points_in_cam: Array, xy: Array, intrinsics: Intrinsics) -> Array:
     """(O, 2) from pixels to the points projected, NaN behind the camera."""
-    z = np.where(points_in_cam[:, 2] > kernels.MIN_DEPTH, points_in_cam[:, 2], np.nan)
-    return np.column_stack(
-        [
-            intrinsics.fx * points_in_cam[:, 0] / z + intrinsics.cx - xy[:, 0],
-            intrinsics.fy * points_in_cam[:, 1] / z + intrinsics.cy - xy[:, 1],
-        ]
-    )
+    shown, z = project(points_in_cam, intrinsics)
+    return np.where(z[:, None] > kernels.MIN_DEPTH, shown - xy, np.nan)
 
 
 @dataclass(frozen=True)

@@ -248,7 +248,7 @@ def follow_others(state: TrackState, intrinsics: Intrinsics, adjusted: set[int],
 def source_errors(seen: Sightings, state: TrackState, intrinsics: Intrinsics, velocity: dict[int, Array]) -> Array:
     """(Q, 2) pixels by which the sightings that these were followed from are off, 0 for those found by themselves; NaN
     where they are no longer there."""
-    out = np.where(seen.source[:, None] < 0, 0.0, np.full((len(seen), 2), np.nan))
+    out = np.repeat(np.where(seen.source < 0, 0.0, np.nan)[:, None], 2, axis=1)
     for source in np.unique(seen.source[seen.source >= 0]).tolist():
         mine = np.flatnonzero(seen.source == source)
         _, followed, rows = np.intersect1d(seen.point[mine], state.sightings[source].point, return_indices=True)
