@@ -12,8 +12,8 @@ WINDOW, LEVELS = 21, 3
 """Side in pixels of the patch that is followed, and pyramid levels."""
 RETURN_ERROR = 0.7
 """Pixels within which a followed point must come back."""
-FLOW_SD = 0.3
-"""Pixels: how exactly its motion is then known. It is 0.06 to 0.25, but the errors of one point are alike in
+FLOW_SD = 0.2
+"""Pixels: how exactly its motion is then known. It is 0.06 to 0.25, and the errors of one point are alike in
 neighbouring frames (correlation of 0.3)."""
 
 

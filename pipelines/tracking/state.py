@@ -61,8 +61,9 @@ class Sightings:
         )
 
 
-FEATURE_SD = 0.5
-"""Pixels: how exactly a feature of structure from motion is known."""
+FEATURE_SD = 0.35
+"""Pixels: how exactly a feature of structure from motion is known. Measured 0.2 to 0.3, for small scales and large ones;
+chosen on seven recordings, six of which have shorter errors than with 0.5, by 3 to 24 %."""
 _NEAR_KEYFRAMES = 8
 _SNAP_PX = 2.0
 """A feature within so many pixels of a frame's sighting is the same point."""
