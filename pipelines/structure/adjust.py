@@ -17,6 +17,8 @@ _MAX_REPROJECTION_PX = 4.0
 _MIN_ANGLE_DEG = 1.0
 _MIN_KEYFRAMES_TO_SPLIT = 8
 _SPLIT_VIEWS = 60
+_FINE, _ROUGH = 1e-6, 1e-4
+"""An adjustment ends with a step that lowers the cost by less, relatively."""
 
 
 def adjust(model: pycolmap.Reconstruction, refine_camera: bool, narrowly: bool = False) -> float:
@@ -38,8 +40,8 @@ def adjust(model: pycolmap.Reconstruction, refine_camera: bool, narrowly: bool =
         focal_sd = _calibrate(model, images)
     else:
         focal_sd = 0.0
-        for _ in range(2):
-            solve(model, images, refine_camera=False)
+        for roughly in (True, False):
+            solve(model, images, refine_camera=False, roughly=roughly)
             filter_outliers(model)
     if narrowly:
         solve(model, images, refine_camera=False, width=min(median_error(model), CAUCHY_PX))
@@ -49,12 +51,11 @@ def adjust(model: pycolmap.Reconstruction, refine_camera: bool, narrowly: bool =
 
 def _calibrate(model: pycolmap.Reconstruction, images: Sequence[int]) -> float:
     """The adjustment with the camera; the standard deviation of its focal length, see `adjust`."""
-    solve(model, images, refine_camera=True)
+    solve(model, images, refine_camera=True, roughly=True)
     filter_outliers(model)
-    solve(model, images, refine_camera=True)
     simple_focal = float(model.cameras[1].focal_length)
     set_lens(model.cameras[1], 2)
-    solve(model, images, refine_camera=True)
+    solve(model, images, refine_camera=True, roughly=True)
     filter_outliers(model)
     # Before points are removed: the adjuster keeps pointers into the model.
     formal = _formal_sd(model, solve(model, images, refine_camera=True))
@@ -69,10 +70,10 @@ def solve(
     refine_camera: bool,
     width: float = CAUCHY_PX,
     bend_lens: bool = True,
-    iterations: int = 50,
+    roughly: bool = False,
 ) -> pycolmap.CeresBundleAdjuster:
     """Robust adjustment of these images, in place, under Cauchy's loss of so many pixels; deterministic. A camera that
-    is refined keeps its distortion unless `bend_lens`; `iterations` at most."""
+    is refined keeps its distortion unless `bend_lens`. `roughly`: for one that another adjustment follows."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = refine_camera
     options.refine_extra_params = refine_camera and bend_lens
@@ -84,8 +85,8 @@ def solve(
     solver = options.ceres.solver_options
     # Ceres adds up in the order its threads finish; one thread gives the same bytes every time.
     solver.num_threads = 1
-    solver.max_num_iterations = iterations
-    solver.function_tolerance = 1e-6
+    solver.max_num_iterations = 50
+    solver.function_tolerance = _ROUGH if roughly else _FINE
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in images:
         config.add_image(image_id)
@@ -147,5 +148,5 @@ def _focal_of(model: pycolmap.Reconstruction, images: Sequence[int]) -> float:
     part = pycolmap.Reconstruction(model)
     for image_id in sorted(set(model.reg_image_ids()) - set(images)):
         part.deregister_frame(part.images[image_id].frame_id)
-    solve(part, images, refine_camera=True)
+    solve(part, images, refine_camera=True, roughly=True)
     return float(part.cameras[1].focal_length)

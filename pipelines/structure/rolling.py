@@ -37,8 +37,8 @@ LEAST_GAIN = 0.01
 """Share of the robust cost that a readout must explain. Of three cameras that take all rows at once it was less than
 0.00002, of a phone that holds still 0.001; of a Kinect 0.03 at first and 0.054 in the end."""
 REACH = (-2, -1, 1, 2)
-_ROUNDS, _ROUND_ITERATIONS = 3, 15
-"""Readout and adjustment by turns; the last adjustment, after them, goes to its end."""
+_ROUNDS = 3
+"""Of readout and rough adjustment by turns; the last adjustment comes after them."""
 FEATURE_SD = 0.5
 
 
@@ -221,7 +221,7 @@ def adjust_rolling(
         axis = readout[0] / seconds, readout[1] / seconds
     for _ in range(_ROUNDS):
         rolling.straighten(*seen, (axis[0] * seconds, axis[1] * seconds))
-        solve(rolling.model, rolling.images, refine_camera, iterations=_ROUND_ITERATIONS)
+        solve(rolling.model, rolling.images, refine_camera, roughly=True)
         seen = rolling.bundle()
         if readout is None:
             step, share = estimate(*seen, rolling.times, axis)

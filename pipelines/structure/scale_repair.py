@@ -17,7 +17,7 @@ from msgs_slam.formats.reconstruction import pose_of, set_pose
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair
 from msgs_slam.pipelines.structure.adjust import filter_outliers, solve
 from msgs_slam.pipelines.structure.consistency import ModelReport, judge
-from msgs_slam.pipelines.structure.seams import LEAST_POINTS, tracks_of
+from msgs_slam.pipelines.structure.seams import LEAST_POINTS, parts_of, tracks_of
 from msgs_slam.pipelines.structure.tracks import complete_tracks
 
 _LEAST_ANGLE = 0.01
@@ -44,7 +44,10 @@ def mended(
             resize_behind(tried, shared, ratio)
             filter_outliers(tried)
             complete_tracks(tried, pairs, seed)
-            solve(tried, sorted(tried.reg_image_ids()), refine_camera=False)
+            # What follows only takes observations away.
+            if len(parts_of(tried, total, reach)) >= len(report.parts):
+                continue
+            solve(tried, sorted(tried.reg_image_ids()), refine_camera=False, roughly=True)
             filter_outliers(tried)
             found = judge(tried, pairs, xy, total, reach)
             if len(found.parts) < len(report.parts) and found.pairs_agreeing >= report.pairs_agreeing:

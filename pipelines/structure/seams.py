@@ -80,9 +80,9 @@ def find_seams(
 
     for track in tracks:
         for near in _near(track, place, reach):
-            cross(points, int(near[0]), int(near[-1]))
+            cross(points, near[0], near[-1])
             if len(near) > 2:
-                cross(ties, int(near[0]) + 1, int(near[-1]))
+                cross(ties, near[0] + 1, near[-1])
     for check in checks:
         a, b = place[check.first], place[check.second]
         if b - a <= reach:
@@ -101,10 +101,15 @@ def find_seams(
     return [Seam(*row) for row in zip(placed[:-1], placed[1:], *crossing, strict=True)]
 
 
-def _near(track: Sequence[int], place: dict[int, int], reach: int) -> list[NDArray[np.int64]]:
+def _near(track: Sequence[int], place: dict[int, int], reach: int) -> list[list[int]]:
     """A track's places in runs, within which no step is longer than `reach`."""
-    seen = np.array([place[k] for k in track])
-    return np.split(seen, np.flatnonzero(np.diff(seen) > reach) + 1)
+    runs: list[list[int]] = []
+    for at in (place[k] for k in track):
+        if runs and at - runs[-1][-1] <= reach:
+            runs[-1].append(at)
+        else:
+            runs.append([at])
+    return runs
 
 
 def worst_contradictions(seams: Iterable[Seam]) -> list[Seam]:
@@ -150,11 +155,11 @@ def find_parts(
     than `reach` places later, holds them together."""
     place = {k: n for n, k in enumerate(placed)}
     loose = {s.after for s in seams if s.is_weak_link}
-    run = np.cumsum([k in loose for k in placed])
-    number = int(run[-1])
+    run = np.cumsum([k in loose for k in placed]).tolist()
+    number = run[-1]
     shared = np.zeros((number + 1, number + 1), np.int64)
     for track in tracks:
-        for first, second in combinations([set(run[near].tolist()) for near in _near(track, place, reach)], 2):
+        for first, second in combinations([{run[n] for n in near} for near in _near(track, place, reach)], 2):
             for a, b in product(first, second):
                 shared[min(a, b), max(a, b)] += 1
     label = list(range(number + 1))
@@ -164,6 +169,12 @@ def find_parts(
     for k in placed:
         parts.setdefault(label[run[place[k]]], []).append(k)
     return sorted(parts.values(), key=lambda p: (-len(p), p[0]))
+
+
+def parts_of(model: pycolmap.Reconstruction, total: int, reach: int) -> list[list[int]]:
+    """Divide the placed keyframes of a model as `find_parts` does; image i + 1 is keyframe i, at place i % total."""
+    placed, tracks = sorted({(i - 1) % total for i in model.reg_image_ids()}), tracks_of(model, total)
+    return find_parts(placed, find_seams(placed, (), tracks, reach), tracks, reach)
 
 
 def tracks_of(model: pycolmap.Reconstruction, total: int) -> list[list[int]]:
