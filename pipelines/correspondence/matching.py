@@ -17,7 +17,7 @@ from msgs_slam.pipelines.types import Features
 _SIFT, _LEARNED = (0.8, 0.7), (1.0, 0.555)
 """Of the angle between two descriptors that match: as a share of the next best one's (Lowe), and in radians."""
 Descriptors = NDArray[np.uint8] | NDArray[np.int8]
-_MAX_ERROR, _MIN_INLIERS = 2.0, 15
+_MAX_ERROR, MIN_INLIERS = 2.0, 15
 """Pixels within which a match obeys a geometry, and how many have to."""
 _ABREAST = 32
 """Columns that are compared side by side: two vectors of the widest there are."""
@@ -173,7 +173,7 @@ def match_pair(
     The random choices depend on the seed and the pair alone, so pairs may be verified in any order on any thread.
     """
     matches = match(*features)
-    if len(matches) < _MIN_INLIERS:
+    if len(matches) < MIN_INLIERS:
         return None
     return verify_matches(pair, matches, (features[0].xy, features[1].xy), camera, seed)
 
@@ -192,7 +192,7 @@ def verify_matches(
         camera, xy[0], camera, xy[1], matches, _verification_options(pair_seed(seed, pair))
     )
     inliers = np.asarray(geometry.inlier_matches, dtype=np.uint32).reshape(-1, 2)
-    if len(inliers) < _MIN_INLIERS:
+    if len(inliers) < MIN_INLIERS:
         return None
     matrices = np.stack([_matrix(m) for m in (geometry.F, geometry.E, geometry.H)])
     return VerifiedPair(*pair, inliers, int(geometry.config), matrices)
@@ -208,7 +208,7 @@ def _may_agree(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:
         _, inliers = cv2.findFundamentalMat(first, second, cv2.USAC_FAST, _MAX_ERROR, 0.99, _FIRST_LOOK)
     except cv2.error:  # it finds no model at all where a camera only turns: that is for the full look to say
         return True
-    return inliers is not None and int(inliers.sum()) >= _NEARLY * _MIN_INLIERS
+    return inliers is not None and int(inliers.sum()) >= _NEARLY * MIN_INLIERS
 
 
 def pair_seed(seed: int, pair: tuple[int, int]) -> int:
@@ -222,7 +222,7 @@ def _matrix(value: NDArray[np.float64] | None) -> NDArray[np.float64]:
 
 def _verification_options(seed: int) -> pycolmap.TwoViewGeometryOptions:
     chosen = pycolmap.TwoViewGeometryOptions()
-    chosen.min_num_inliers = _MIN_INLIERS
+    chosen.min_num_inliers = MIN_INLIERS
     chosen.detect_watermark = False
     chosen.compute_relative_pose = True
     chosen.ransac.max_error = _MAX_ERROR

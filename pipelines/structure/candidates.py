@@ -21,10 +21,11 @@ from msgs_slam.pipelines.correspondence.snapshots import Snapshots
 from msgs_slam.pipelines.geometry.rig import ONE_CAMERA
 from msgs_slam.pipelines.structure.adjust import CAUCHY_PX, adjust, filter_outliers, solve
 from msgs_slam.pipelines.structure.consistency import ModelReport, judge, without_misplaced
+from msgs_slam.pipelines.structure.focal import calibrated
 from msgs_slam.pipelines.structure.freeing import LEAST_BETTER, LEAST_GAIN_OF_FREEING, gain_of_freeing, unexplained
 from msgs_slam.pipelines.structure.given import posed_model
 from msgs_slam.pipelines.structure.lens import FOCAL_GUESS, unknown_camera
-from msgs_slam.pipelines.structure.mappers import calibrate_focal, map_globally, map_incrementally
+from msgs_slam.pipelines.structure.mappers import map_globally, map_incrementally
 from msgs_slam.pipelines.structure.rolling import (
     FEATURE_SD,
     NO_READOUT,
@@ -154,8 +155,8 @@ class Candidates:
             if best is not None and (best[2].is_sound or (best[1].startswith(NEIGHBOURS) and name != GIVEN)):
                 continue
             found = self._tried(name, views, pairs, pairs)
-            if name == GIVEN:
-                found = found and self._grown(found, views, pairs, pairs)
+            if found is not None and (name == GIVEN or (found[2].is_consistent and not found[2].is_whole)):
+                found = self._grown(found, views, pairs, pairs)
             unfolded = None if found is None or not found[2].contradicted else self._unfolded(views, pairs)
             # Of two alike the one before, but the given poses are evidence that no match is.
             best = max(filter(None, (best, found, unfolded)), key=_worth, default=None)
@@ -184,7 +185,7 @@ class Candidates:
                 return found
             images = sorted(model.reg_image_ids())
             for width in (WIDE * FEATURE_SD, CAUCHY_PX):
-                solve(model, images, refine_camera=False, width=width)
+                solve(model, images, refine_camera=False, width=width, roughly=True)
             filter_outliers(model)
             closed = self._judged(f"{NEIGHBOURS}-closed", model, views, pairs)
             if closed[2].score <= found[2].score:
@@ -238,12 +239,11 @@ class Candidates:
             return posed_model(self.camera, views.xy, views.given, pairs, not self.is_fixed, self.seed)
         features, database = views.features, work / "database.db"
         names = [f"{i:06d}" for i in range(len(features))]
-        write_database(database, self.camera, names, features, pairs, self.cam_from_rig)
+        camera, pairs = (self.camera, pairs) if start is not None else calibrated(self.camera, pairs, views.xy)
+        write_database(database, camera, names, features, pairs, self.cam_from_rig)
         features.forget()  # the mapper needs the memory, and no descriptor
         if start is not None:
             return map_incrementally(database, work, False, self.seed, start)
-        if not self.camera.has_prior_focal_length:
-            calibrate_focal(database, self.seed)
         if name == "incremental":
             return map_incrementally(database, work, not self.is_fixed, self.seed)
         return map_globally(database, work, not self.is_fixed, self.seed)

@@ -59,9 +59,14 @@ class ModelReport:
         return max(runs) / self.total * self.agreement * self.pairs_agreeing
 
     @property
+    def is_whole(self) -> bool:
+        """Whether hardly any keyframe is missing."""
+        return len(self.parts[0]) >= 0.95 * self.total
+
+    @property
     def is_sound(self) -> bool:
-        """Whether the other mapper need not be asked."""
-        return len(self.parts[0]) >= 0.95 * self.total and self.is_consistent
+        """Whether the other mapper need not be asked: what another one finds of the rest is a piece beside this."""
+        return len(self.parts[0]) >= 0.5 * self.total and self.is_consistent
 
     @property
     def is_consistent(self) -> bool:

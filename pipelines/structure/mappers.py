@@ -18,13 +18,6 @@ if threading.current_thread() is threading.main_thread() and signal.getsignal(si
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
 
 
-def calibrate_focal(database: Path, seed: int) -> None:
-    """Estimate the focal length in `database` from the fundamental matrices, and make its pairs calibrated ones."""
-    options = pycolmap.ViewGraphCalibrationOptions()
-    options.random_seed = seed
-    pycolmap.calibrate_view_graph(database, options)
-
-
 def map_globally(database: Path, work: Path, refine_camera: bool, seed: int) -> pycolmap.Reconstruction | None:
     """Poses of all images at once (Pan et al., Global Structure-from-Motion Revisited, ECCV 2024); None on failure."""
     options = pycolmap.GlobalPipelineOptions()
@@ -38,7 +31,7 @@ def map_globally(database: Path, work: Path, refine_camera: bool, seed: int) -> 
     # and the last adjustment has all of them again.
     mapper.bundle_adjustment.refine_extra_params = refine_camera
     mapper.refine_sensor_from_rig = mapper.bundle_adjustment.refine_sensor_from_rig = False
-    mapper.track_required_tracks_per_view, mapper.ba_num_iterations = 300, 2
+    mapper.track_required_tracks_per_view, mapper.ba_num_iterations = 150, 2
     if not refine_camera:
         mapper.retriangulation.max_extra_param = _ANY_DISTORTION
     return _largest(pycolmap.global_mapping(database, work, work, options))
@@ -64,7 +57,7 @@ def map_incrementally(
         )
     if start is None:
         return _largest(pycolmap.incremental_mapping(database, work, work, options))
-    options.fix_existing_frames = True
+    options.fix_existing_frames, options.multiple_models = True, False
     (before := work / "start").mkdir()
     start.write_binary(before)
     return _largest(pycolmap.incremental_mapping(database, work, work, options, before))

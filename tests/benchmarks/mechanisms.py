@@ -69,7 +69,7 @@ def _first_mapper(self: Any, views: Any, pairs: Any, names: tuple[str, ...] = ("
 MECHANISMS = {
     "second mapper": Mechanism(
         candidates.Candidates, "_map", _first_mapper,
-        lambda found, _: found is not None and found[1] != "global",
+        lambda found, _: found is not None and not found[1].startswith("global"),
     ),
     "misplaced removed": Mechanism(
         candidates, "without_misplaced", _same(0), lambda out, a: out.num_reg_images() < a[0].num_reg_images()

@@ -1,0 +1,73 @@
+"""The focal length from pairs of views alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.pipelines.structure.focal import _errors, _rotation, calibrated, two_view_focal
+from msgs_slam.pipelines.structure.lens import to_pycolmap, unknown_camera
+from tests.pipelines.frames.made_views import walk_round
+
+SIZE = (640, 480)
+GUESS = unknown_camera(*SIZE, 768.0, is_prior=False)
+
+
+@pytest.mark.parametrize("focal", [330.0, 520.0, 1100.0])
+def test_the_focal_length_is_found_without_poses(focal: float) -> None:
+    made = walk_round(to_pycolmap(Camera(*SIZE, focal, focal, 320.0, 240.0)))
+    pairs, xy = made.pairs(GUESS), [f.xy for f in made.features]
+    found = two_view_focal(pairs, xy, SIZE)
+    assert found == pytest.approx(focal, rel=0.06)
+    assert two_view_focal(pairs, xy, SIZE) == found
+    camera, posed = calibrated(GUESS, pairs, xy)
+    assert (camera.mean_focal_length(), camera.has_prior_focal_length) == (found, True)
+    assert (GUESS.mean_focal_length(), GUESS.has_prior_focal_length) == (768.0, False)
+    kept = sum(len(p.matches) for p in posed) / sum(len(p.matches) for p in pairs)
+    assert 0.8 < kept < 1  # the noise is of 0.3 pixels
+    turns, off = made.cam_from_world[:, :3, :3], []
+    for pair in posed:
+        true = turns[pair.second] @ turns[pair.first].T
+        found = cv2.decomposeEssentialMat(pair.matrices[1])[:2]
+        off.append(min(np.arccos(np.clip((np.trace(r.T @ true) - 1) / 2, -1, 1)) for r in found))
+    assert np.degrees(np.median(off)) < 0.5
+
+
+def test_false_pairs_do_not_turn_it() -> None:
+    made = walk_round(to_pycolmap(Camera(*SIZE, 520.0, 520.0, 320.0, 240.0)))
+    pairs, xy, rng = made.pairs(GUESS), [f.xy for f in made.features], np.random.default_rng(0)
+    false = [
+        replace(p, matches=np.column_stack([p.matches[:, 0], rng.permutation(p.matches[:, 1])])) for p in pairs[::4]
+    ]
+    assert two_view_focal([*pairs, *false], xy, SIZE) == pytest.approx(520, rel=0.08)
+
+
+def test_a_known_focal_length_is_kept_and_none_is_made_of_nothing() -> None:
+    known = unknown_camera(*SIZE, 700.0, is_prior=True)
+    made = walk_round(known)
+    pairs, xy = made.pairs(known), [f.xy for f in made.features]
+    assert calibrated(known, pairs, xy) == (known, pairs)
+    assert two_view_focal([], xy, SIZE) is None
+    camera, none = calibrated(GUESS, [], xy)
+    assert (camera.mean_focal_length(), none) == (768.0, [])
+
+
+def test_derivatives_of_the_epipolar_error() -> None:
+    """But for the change of Sampson's denominator, which Gauss-Newton leaves out: so of matches that obey the pose."""
+    rng = np.random.default_rng(0)
+    u, v = _rotation(rng.normal(size=(1, 3))), _rotation(rng.normal(size=(1, 3)))
+    x, y = (np.pad(rng.normal(size=(1, 30, 2)), ((0, 0), (0, 0), (0, 1)), constant_values=1.0) for _ in "xy")
+    # Moved along the second view's line until they agree: y^T E x = 0.
+    line = x @ v * [1, 1, 0] @ u.transpose(0, 2, 1)
+    y[..., 1] = -(line[..., 0] * y[..., 0] + line[..., 2]) / line[..., 1]
+    error, jacobian = _errors(u, v, x, y)
+    assert np.abs(error).max() < 1e-12
+    for k in range(5):
+        turn = np.zeros((1, 5))
+        turn[0, k] = 1e-6
+        moved = u @ _rotation(turn[:, :3]), v @ _rotation(np.pad(turn[:, 3:], ((0, 0), (0, 1))))
+        assert (_errors(*moved, x, y)[0] - error) / 1e-6 == pytest.approx(jacobian[..., k], abs=1e-4)
