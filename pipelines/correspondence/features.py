@@ -1,7 +1,7 @@
 """SIFT features of an image: the only extractor there is.
 
-COLMAP's: OpenCV's takes 40 % of its time and gives keyframes that are as good, but the path of all frames is 4 to 20 %
-worse, and of a noisy classroom 40 % (tests/benchmarks/README.md).
+COLMAP's: OpenCV's takes 40 % of its time, and the path of all frames is as good on six recordings, but of a noisy
+classroom half as far off again (tests/benchmarks/README.md).
 """
 
 from __future__ import annotations
