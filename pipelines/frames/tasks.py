@@ -116,6 +116,7 @@ def structure_from_motion(
         window=window_size(context.config.run.memory_mb, camera.width * camera.height),
         cam_from_rig=rig.cam_from_rig,
         divide=divide,
+        warn=context.warn,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -32,17 +32,15 @@ from msgs_slam.pipelines.structure.consistency import ModelReport, judge
 from msgs_slam.pipelines.structure.given import bare_model, set_best_focal
 from msgs_slam.pipelines.structure.lens import set_lens
 from msgs_slam.pipelines.structure.parallax import HOW_TO_FILM, require_parallax
-from msgs_slam.pipelines.structure.rolling import (
-    NO_READOUT,
-    Readout,
-    adjust_rolling,
-)
+from msgs_slam.pipelines.structure.rolling import NO_READOUT, Readout, adjust_rolling, read_readout
 from msgs_slam.pipelines.structure.seams import cut, remove_keyframes
+from msgs_slam.pipelines.structure.window_models import WindowModels
 from msgs_slam.pipelines.structure.window_size import SIZE, windows_of
-from msgs_slam.pipelines.structure.windows import Joined, adjust_joined
+from msgs_slam.pipelines.structure.windows import adjust_joined
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.memory import release_free_memory
 from msgs_slam.pipelines.system.parallel import parallel_map
+from msgs_slam.pipelines.system.progress import log
 from msgs_slam.pipelines.types import Features, Vocabulary
 
 _PAIRS_PER_BLOCK = 64
@@ -92,6 +90,7 @@ class StructureFromMotion(Candidates):
     window: int = SIZE
     divide: Divide = when_asked
     given: NDArray[np.float64] | None = None
+    warn: Callable[[str], None] = log.warning
 
     def run(self, keyframe_ids: Sequence[int]) -> Structure:
         """Raises InputError when the keyframes have no parallax or too little in common."""
@@ -109,13 +108,15 @@ class StructureFromMotion(Candidates):
         known_focal = self.camera.mean_focal_length() if self.camera.has_prior_focal_length else None
         if self.given is None:
             require_parallax(pairs, views.xy, (self.camera.width, self.camera.height), known_focal)
-        found = self._solved(windows, views, pairs) or self._as_given(views, pairs)
+        at_once = len(windows) == 1
+        found, apart = (self._calibrated(views, pairs), []) if at_once else self._in_windows(windows, views, pairs)
+        found = found or self._as_given(views, pairs)
         if found is None:
             raise InputError(
                 f"no structure could be found among {len(features)} views; pairs that match: {len(pairs)}. They have "
                 f"too little texture or overlap, or are blurred. {HOW_TO_FILM}, slowly and in good light"
             )
-        found, pieces = self._largest_first(found, self._pieces(views, pairs, found.model), views)
+        found, pieces = self._largest_first(found, self._pieces(views, pairs, found.model, apart), views)
         report = judge(found.model, pairs, views.xy, self._places(features), self.config.overlap)
         cut(found.model, report.parts, report.total)
         return Structure(
@@ -138,24 +139,34 @@ class StructureFromMotion(Candidates):
         """Which keyframes are mapped at once: of panoramas all."""
         return windows_of(count, self.window) if len(self.cam_from_rig) == 1 else [range(count)]
 
-    def _solved(self, windows: Sequence[range], views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
-        """The model of one window; of several theirs, joined, in the camera of the one that is surest of it. Where they
-        do not hang together, all are one window after all."""
-        if len(windows) == 1:
-            return self._calibrated(views, pairs)
+    def _in_windows(
+        self, windows: Sequence[range], views: Views, pairs: Sequence[VerifiedPair]
+    ) -> tuple[Adjusted | None, list[pycolmap.Reconstruction]]:
+        """The models of the windows of a long recording, joined, in the camera that all of them determine; and the
+        parts that are not connected to the largest."""
         views.features.forget()
-        joined, surest = Joined(), None
+        made, surest = WindowModels(), None
         for window in self.progress.track(windows, "windows", len(windows)):
-            found = self._window(window, views, pairs)
-            if found is None or not joined.add(found.model, window.start):
-                return self._solved([range(len(views.xy))], views, pairs)
-            surest = found if surest is None or found.focal_sd < surest.focal_sd else surest
-        assert surest is not None
-        whole = replace(surest, model=joined.model(surest.model.cameras[1], views.xy))
-        del joined, surest, found  # not beside the model of all
+            if (found := self._window(window, views, pairs)) is not None:
+                made.add(found.model, window.start, found.focal_sd, found.readout)
+                surest = found if surest is None or found.focal_sd < surest.focal_sd else surest
+        if surest is None:
+            return None, []
+        if complaint := made.complaint(len(windows)):
+            self.warn(complaint)
+        camera, given = surest.model.cameras[1], read_readout(self.config.rolling_shutter)
+        focal_sd = 0.0 if self.is_fixed else made.calibrate(camera)
+        readout = made.readout() if given is None else given
+        whole = replace(surest, model=made.largest().model(camera, views.xy), focal_sd=focal_sd)
+        camera = whole.model.cameras[1]
+        del surest, found  # not beside the model of all
         release_free_memory()
-        adjust_joined(whole.model, views.xy, views.times, whole.readout, pairs, windows, bool(views.weak))
-        return whole
+        together = partial(adjust_joined, pairs=pairs, windows=windows, narrowly=bool(views.weak))
+        readout = together(whole.model, views.xy, views.times, readout, find_readout=given is None)
+        others = made.others(camera, views.xy, whole.model, self.config.least_piece)
+        for other in others:
+            together(other, views.xy, views.times, readout)
+        return replace(whole, readout=readout), others
 
     def _window(self, window: range, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
         """The model of one of several, made unless it is stored."""
@@ -187,16 +198,33 @@ class StructureFromMotion(Candidates):
             self._window(self._windows(len(keyframe_ids))[number], views, pairs)
 
     def _pieces(
-        self, views: Views, pairs: Sequence[VerifiedPair], model: pycolmap.Reconstruction
+        self,
+        views: Views,
+        pairs: Sequence[VerifiedPair],
+        model: pycolmap.Reconstruction,
+        apart: Sequence[pycolmap.Reconstruction],
     ) -> list[pycolmap.Reconstruction]:
-        """Sound models of the keyframes that `model` leaves, in its camera, until there is none of the least size."""
-        camera = model.cameras[1]
+        """Sound models of the keyframes that `model` leaves, those `apart` that are there already and others in its
+        camera, until there is none of the least size; of a long recording no more at once than a window may have."""
+        camera, pieces = model.cameras[1], [*apart]
         camera.has_prior_focal_length = True
-        left = set(range(len(views.xy))) - {i - 1 for i in model.reg_image_ids()}
+        placed = {i - 1 for m in (model, *apart) for i in m.reg_image_ids()}
+        left, count = [k for k in range(len(views.xy)) if k not in placed], len(views.xy)
+        most, numbers = len(self._windows(count)[0]), itertools.count(2)
+        for first in range(0, len(left), most):
+            pieces += self._pieces_of(set(left[first : first + most]), views, pairs, camera, numbers)
+        return pieces
+
+    def _pieces_of(
+        self,
+        left: set[int],
+        views: Views,
+        pairs: Sequence[VerifiedPair],
+        camera: pycolmap.Camera,
+        numbers: Iterator[int],
+    ) -> list[pycolmap.Reconstruction]:
         pieces: list[pycolmap.Reconstruction] = []
-        number = 1
-        while True:
-            number += 1
+        for number in numbers:
             rest = [p for p in pairs if p.first in left and p.second in left]
             if len({k for p in rest for k in (p.first, p.second)}) < self.config.least_piece:
                 return pieces
@@ -216,6 +244,7 @@ class StructureFromMotion(Candidates):
             if self._is_piece(report):
                 remove_keyframes(piece, [k for part in report.parts[1:] for k in part])
                 pieces.append(piece)
+        return pieces
 
     def _is_piece(self, report: ModelReport) -> bool:
         return len(report.parts[0]) >= self.config.least_piece and report.is_consistent

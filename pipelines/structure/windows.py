@@ -6,6 +6,7 @@ one window is in work at any time. What is joined is adjusted by `pipelines.stru
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -20,7 +21,16 @@ from msgs_slam.pipelines.geometry.alignment import Similarity, best_rotation
 from msgs_slam.pipelines.structure.adjust import filter_outliers, median_error
 from msgs_slam.pipelines.structure.bundle import adjust_bundle
 from msgs_slam.pipelines.structure.given import bare_model
-from msgs_slam.pipelines.structure.rolling import FEATURE_SD, Readout, RollingModel, rectified_bundle, velocities
+from msgs_slam.pipelines.structure.rolling import (
+    FEATURE_SD,
+    LEAST_GAIN,
+    NO_READOUT,
+    Readout,
+    RollingModel,
+    estimate,
+    rectified_bundle,
+    velocities,
+)
 
 Array = NDArray[np.float64]
 
@@ -28,6 +38,8 @@ _LEAST_SHARED = 30
 _LEAST_MATCHES, _NEAR, _OUTLIER = 12, 0.05, 3.0
 """A loop between windows: its least matches, their median error as a share of the image's width, from where it is
 left to `global_ba`, and how many medians a match may be off. On made-up walks only."""
+_READOUT_ROUNDS = 3
+"""Each step falls a little short."""
 WIDE = 40.0
 """Of the loss of the adjustment that pulls loops together: standard deviations."""
 
@@ -128,16 +140,39 @@ def close_loops(
 
 def adjust_joined(
     model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout, pairs: Iterable[VerifiedPair],
-    windows: Sequence[range], narrowly: bool,
-) -> None:  # fmt: skip
-    """The joined windows adjusted as one, with the loops between them, in place; `narrowly` as of `adjust`."""
+    windows: Sequence[range], narrowly: bool, find_readout: bool = False,
+) -> Readout:  # fmt: skip
+    """The joined windows adjusted as one, with the loops between them, in place; `narrowly` as of `adjust`. Returns the
+    readout: that given, or with `find_readout` what all keyframes together tell."""
     adjust_together(model, xy, times, readout)
     if close_loops(model, pairs, windows, xy):
         adjust_together(model, xy, times, readout, WIDE)
         adjust_together(model, xy, times, readout)
+    if find_readout and any(readout):
+        readout = found_readout(model, xy, times, readout)
     if narrowly:
         adjust_together(model, xy, times, readout, median_error(model) / FEATURE_SD)
     filter_outliers(model)
+    return readout
+
+
+def found_readout(model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, start: Readout) -> Readout:
+    """The readout of a model, from a first guess; none where it explains too little. The model is adjusted with it, in
+    place."""
+    seconds = math.hypot(*start)
+    axis, share = (start[0] / seconds, start[1] / seconds), 0.0
+    for _ in range(_READOUT_ROUNDS):
+        rolling = RollingModel(model, xy, times)
+        bundle, plain, pinhole = rolling.bundle()
+        velocity = velocities(bundle.cam_from_world, rolling.times)
+        straight = rectified_bundle(bundle, plain, pinhole, velocity, (axis[0] * seconds, axis[1] * seconds))
+        step, share = estimate(straight, plain, pinhole, rolling.times, axis)
+        seconds += step
+        adjust_together(model, xy, times, (axis[0] * seconds, axis[1] * seconds))
+    if seconds**2 * share >= LEAST_GAIN:
+        return axis[0] * seconds, axis[1] * seconds
+    adjust_together(model, xy, times, NO_READOUT)
+    return NO_READOUT
 
 
 def adjust_together(
