@@ -76,9 +76,11 @@ def batch(
             engine.close()  # type: ignore[union-attr]
     if not output.quiet:
         _print(rows)
-    output.tell_result(table=out / "batch.json", runs=[r.run for r in mine], failed=[r.run for r in failed])
     if failed:
         say(f"{len(failed)} of {len(mine)} recordings failed; {out}/NAME.failed.txt says why", err=True)
+    paths = {"table": out / "batch.json", "runs": [r.run for r in mine], "failed": [r.run for r in failed]}
+    output.tell_result(int(bool(failed)), **paths)
+    if failed:
         sys.exit(1)
 
 

@@ -57,7 +57,10 @@ class Interrupted(click.ClickException):
 
 class JsonProgress:
     """{"event": "stage", "name", "index", "of", "state", ...} and {"event": "progress", "label", "done", "total"}, of
-    these at most five a second and one at each end."""
+    these at most five a second and one at each end; with {"job"} where it is one of several."""
+
+    def __init__(self, job: str = "") -> None:
+        self._job = {"job": job} if job else {}
 
     def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
         """Yield the items, and write a progress line every so often."""
@@ -71,7 +74,7 @@ class JsonProgress:
         self._tell(label, done, total, ended=True)
 
     def _tell(self, label: str, done: int, total: int | None, **more: Any) -> None:
-        write_line("progress", **_stage, label=label, done=done, total=total, **more)
+        write_line("progress", **self._job, **_stage, label=label, done=done, total=total, **more)
 
     def stage(self, event: StageEvent) -> None:
         """Write a line for the start or the end of a stage."""
@@ -82,7 +85,7 @@ class JsonProgress:
         values: dict[str, Any] = {"name": event.name, "index": event.index, "of": event.of, "state": event.state}
         if event.seconds:
             values |= {"seconds": round(event.seconds, 2), "figures": event.figures}
-        write_line("stage", **values, seconds_left=None if left is None else round(left))
+        write_line("stage", **self._job, **values, seconds_left=None if left is None else round(left))
 
 
 class JsonHandler(logging.Handler):

@@ -62,27 +62,27 @@ class Output:
         handler.addFilter(SaidOnce())
         logging.basicConfig(level=level, handlers=[handler], force=True)
 
-    def progress(self) -> Progress:
-        """Bars on a terminal, a line a stage in a file or pipe, JSON lines, or nothing."""
+    def progress(self, job: str = "") -> Progress:
+        """Bars on a terminal, a line a stage in a file or pipe, JSON lines, or nothing; of a `job` among others."""
         from msgs_slam.msgs_cli.progress import BarProgress
         from msgs_slam.pipelines.system.progress import LineProgress, SilentProgress
 
         if self.quiet:
             return SilentProgress()
         if self.as_json:
-            return JsonProgress()
-        return BarProgress() if sys.stderr.isatty() else LineProgress()
+            return JsonProgress(job)
+        return BarProgress() if sys.stderr.isatty() else LineProgress(job)
 
     def worker_setup(self, remote: bool) -> Callable[[str], Progress]:
         """Return a picklable function that sets up logging in a process that works on one recording of many, and
         returns its progress: bars here, lines from elsewhere."""
         return partial(_worker_progress, self, remote)
 
-    def tell_result(self, **paths: Path | list[Path] | bool) -> None:
-        """Write the last event of a command that went well, for programs: where its results are."""
+    def tell_result(self, exit_code: int = 0, /, **paths: Path | list[Path]) -> None:
+        """Write the last event of a command that came to its end, for programs: where its results are."""
         if self.as_json and not self.quiet:
             texts = {k: [str(p) for p in v] if isinstance(v, list) else str(v) for k, v in paths.items()}
-            write_line("result", **texts, exit_code=0)
+            write_line("result", **texts, exit_code=exit_code)
 
     @contextmanager
     def stopping_softly(self, how_to_go_on: str) -> Iterator[None]:
@@ -115,7 +115,7 @@ def _worker_progress(output: Output, remote: bool, name: str) -> Progress:
     if remote and not output.quiet and not output.as_json:
         return LineProgress(name)
     logging.getLogger("msgs_slam").info("%s: begins", name)
-    return output.progress()
+    return output.progress(name)
 
 
 class SaidOnce(logging.Filter):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cli_runs import FinishedRun
+from cli_runs import QUICK, FinishedRun
 
 COMMAND = [sys.executable, "-m", "msgs_slam"]
 JSON = ("--log-format", "json")
@@ -123,6 +123,23 @@ def test_the_other_commands_end_with_their_result(finished_run: FinishedRun, tmp
     last = lines_of(done.stderr)[-1]
     assert (done.returncode, last["event"]) == (0, "result")
     assert str(tmp_path / "given" / "transforms.json") in last["files"]
+
+
+def test_a_batch_whose_recordings_have_processes_of_their_own(finished_run: FinishedRun, tmp_path: Path) -> None:
+    videos = tmp_path / "videos"
+    videos.mkdir()
+    (videos / "room.avi").symlink_to(finished_run.video)
+    (videos / "broken.mp4").write_bytes(b"no video" * 100)
+    settings = [word for text in QUICK for word in ("--set", text)]
+    done = run("batch", videos, "-o", tmp_path / "runs", "--until", "frames", *settings, *JSON)
+    assert done.returncode == 1
+    lines = lines_of(done.stderr)
+    states = [(x["job"], x["name"], x["of"], x["state"]) for x in lines if x["event"] == "stage"]
+    assert states == [("room", "frames", 1, "begun"), ("room", "frames", 1, "done")]
+    result = next(x for x in lines if x["event"] == "result")
+    assert result["failed"] == [str(tmp_path / "runs" / "broken.msgs")]
+    assert result["exit_code"] == 1
+    assert Path(result["table"]).exists()
 
 
 def test_without_it_a_file_gets_a_line_a_stage(copied_run: Callable[[str], Path]) -> None:
