@@ -41,7 +41,8 @@ _TURNS = {
     8: Image.Transpose.ROTATE_90,
 }
 """What makes an image upright, by EXIF's orientation."""
-_UNREADABLE_SUFFIXES = frozenset({".dng", ".cr2", ".nef", ".arw", ".raw"})
+RAW_SUFFIXES = frozenset({".dng", ".cr2", ".nef", ".arw", ".raw"})
+"""Of photos that are not read: raw sensor data."""
 _FULL_FRAME_WIDTH_MM = 36.0
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
 _MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}
@@ -70,7 +71,7 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def _why_no_images(folder: Path, files: list[Path]) -> str:
-    raw = sorted({p.suffix.lower() for p in files} & _UNREADABLE_SUFFIXES)
+    raw = sorted({p.suffix.lower() for p in files} & RAW_SUFFIXES)
     if raw:
         return f"no readable image in {folder}: {', '.join(raw)} files are not supported, export them as JPEG first"
     return (

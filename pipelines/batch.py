@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from msgs_slam.formats.atomic import write_text
+from msgs_slam.formats.atomic import own_temporaries, write_text
+from msgs_slam.formats.datasets import looks_like_recording
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import list_images
 from msgs_slam.formats.jsonfile import write_json
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.engines import Call, Engine
@@ -25,14 +25,15 @@ from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import RunBusyError
 from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.run.records import load_records
-from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.system.progress import Progress, log
 from msgs_slam.pipelines.system.wording import markdown_table
 
 _VIDEOS = {
-    ".3gp", ".avi", ".flv", ".insv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".sens",
-    ".ts", ".videos", ".webm", ".wmv",
+    ".264", ".265", ".360", ".3g2", ".3gp", ".asf", ".avi", ".divx", ".dv", ".flv", ".gif", ".h264", ".h265", ".hevc",
+    ".insv", ".ivf", ".m2t", ".m2ts", ".m2v", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg",
+    ".mts", ".mxf", ".nut", ".ogg", ".ogv", ".qt", ".sens", ".ts", ".videos", ".vob", ".webm", ".wmv", ".y4m",
 }  # fmt: skip
+_MOST_NAMED = 5
 DONE, FAILED, ELSEWHERE, UNFINISHED, NOT_YET = "done", "failed", "in another process", "unfinished", "not yet"
 _FIGURES = (("frames", "frames"), ("tracking", "posed"), ("tracking", "keyframes"), ("mapping", "keyframe_psnr"))
 
@@ -72,10 +73,19 @@ class Job:
 
 
 def find_recordings(folder: Path, runs: Path) -> list[Recording]:
-    """The videos, image folders and data sets directly in a folder, by name. Raises InputError where there is none."""
+    """The videos, image folders and data sets directly in a folder, by name, damaged ones too: each says itself why it
+    fails. Other folders are reported. Raises InputError where there is none."""
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder. `batch` takes a folder of videos, image folders or data sets")
-    sources = [p for p in sorted(folder.iterdir()) if p.resolve() != runs.resolve() and _is_recording(p)]
+    visible = [p for p in sorted(folder.iterdir()) if not p.name.startswith(".") and not _is_run(p, runs)]
+    sources = [p for p in visible if _is_recording(p)]
+    others = [p.name for p in visible if p not in sources and p.is_dir() and any(p.iterdir())]
+    if others:
+        log.warning(
+            "left out, no images and no data set directly in them: %s (%d in all). Give each such folder to `batch` "
+            "itself, or move what it holds up",
+            ", ".join(others[:_MOST_NAMED]), len(others),
+        )  # fmt: skip
     if not sources:
         raise InputError(f"{folder} holds no video, image folder or data set")
     stems = [p.stem if p.is_file() else p.name for p in sources]
@@ -83,15 +93,17 @@ def find_recordings(folder: Path, runs: Path) -> list[Recording]:
     return [Recording(n, p, runs / f"{n}.msgs") for n, p in zip(names, sources, strict=True)]
 
 
+def _is_run(path: Path, runs: Path) -> bool:
+    return path.suffix == ".msgs" or path.resolve() == runs.resolve() or RunFolder(path).manifest_file.exists()
+
+
 def _is_recording(path: Path) -> bool:
     if path.is_file():
         return path.suffix.lower() in _VIDEOS
-    if path.suffix == ".msgs" or path.name.startswith("."):
-        return False
     try:
-        return open_recording(path, "auto") is not None or bool(list_images(path))
-    except InputError:
-        return False
+        return path.is_dir() and looks_like_recording(path)
+    except InputError:  # it may not be read, which its own attempt reports
+        return True
 
 
 def run_batch(
@@ -116,7 +128,7 @@ def run_batch(
     for ended in engine.run(calls):
         recording = jobs[ended.call.name].recording
         if ended.failure:
-            write_text(recording.failure_file, ended.failure.rstrip() + "\n")
+            _write_failure(recording, ended.failure)
         state = FAILED if ended.failure else ended.value
         log.info("%s: %s", recording.name, state)
         if state == FAILED:
@@ -135,13 +147,18 @@ def work_on(job: Job) -> str:
     except RunBusyError:
         return ELSEWHERE
     except InputError as error:
-        write_text(recording.failure_file, f"{error}\n")
+        _write_failure(recording, str(error))
         return FAILED
     except Exception:
-        write_text(recording.failure_file, traceback.format_exc())
+        _write_failure(recording, traceback.format_exc())
         return FAILED
     recording.failure_file.unlink(missing_ok=True)
     return DONE
+
+
+def _write_failure(recording: Recording, reason: str) -> None:
+    with own_temporaries():  # a shard that is started twice may fail twice at the same moment
+        write_text(recording.failure_file, reason.rstrip() + "\n")
 
 
 def table_rows(recordings: Iterable[Recording]) -> list[dict[str, Any]]:
@@ -180,5 +197,6 @@ def write_table(runs: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """batch.json and batch.md beside the runs."""
     columns = list(dict.fromkeys(key for row in rows for key in row))
     lines = markdown_table(columns, ([str(row.get(c, "")) for c in columns] for row in rows))
-    write_json(runs / "batch.json", list(rows))
-    write_text(runs / "batch.md", "\n".join(lines) + "\n")
+    with own_temporaries():  # all shards write them, often at the same moment
+        write_json(runs / "batch.json", list(rows))
+        write_text(runs / "batch.md", "\n".join(lines) + "\n")

@@ -1,7 +1,7 @@
 """Readers of the data sets that the field uses, all giving the same `Sequence`."""
 
 from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.formats.datasets.opening import FORMATS, open_sequence, recognise, recognise_source
+from msgs_slam.formats.datasets.opening import FORMATS, looks_like_recording, open_sequence, recognise, recognise_source
 from msgs_slam.formats.datasets.sequence import VOID_LABEL, LabelClass, Sequence
 
 __all__ = [
@@ -10,6 +10,7 @@ __all__ = [
     "Camera",
     "LabelClass",
     "Sequence",
+    "looks_like_recording",
     "open_sequence",
     "recognise",
     "recognise_source",

@@ -20,7 +20,7 @@ from msgs_slam.formats.datasets import (
 )
 from msgs_slam.formats.datasets.sequence import Sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import IMAGE_SUFFIXES
+from msgs_slam.formats.images import IMAGE_SUFFIXES, RAW_SUFFIXES
 from msgs_slam.formats.reading import reaching
 
 
@@ -47,6 +47,11 @@ _IMAGE_FOLDERS = frozenset({"rgb", "images", "color", "results"})
 # An earlier reconstruction beside images is no part of their recording.
 _NOT_FROM_INSIDE = frozenset({"folder", "colmap"})
 
+_TRACES = frozenset({
+    *_IMAGE_FOLDERS, "frames", "mav0", "cam0", "pose", "sparse", "transforms.json", "rgb.txt",
+    *(f"{name}{suffix}" for name in ("cameras", "points3D") for suffix in (".bin", ".txt")),
+})  # fmt: skip
+"""Names that a data set has in its folder, complete or not."""
 FORMATS = ("auto", *_READERS)
 """What `open_sequence` accepts as a format."""
 
@@ -69,6 +74,17 @@ def recognise_source(path: Path) -> str | None:
         names = [name for name, reader in _READERS.items() if path.exists() and reader.recognises(path)]
         holds_images = path.is_dir() and any(p.suffix.lower() in IMAGE_SUFFIXES for p in path.iterdir())
     return next((name for name in names if not (holds_images and name in _NOT_FROM_INSIDE)), None)
+
+
+def looks_like_recording(path: Path) -> bool:
+    """Whether a folder holds images, or a data set, or what is left of one: opening it may still fail, with the reason.
+
+    Raises InputError where the folder may not be read.
+    """
+    with reaching(path):
+        names = [p.name for p in path.iterdir() if not p.name.startswith(".")]
+    is_image = any(Path(name).suffix.lower() in IMAGE_SUFFIXES | RAW_SUFFIXES for name in names)
+    return is_image or not _TRACES.isdisjoint(names) or recognise_source(path) is not None
 
 
 def _recognise(path: Path) -> tuple[str, Path] | None:

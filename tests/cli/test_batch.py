@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
+from msgs_slam.formats import atomic
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.msgs_cli.main import main
@@ -128,6 +129,54 @@ def test_recordings_of_one_name_have_runs_of_their_own(tmp_path: Path) -> None:
     (tmp_path / "none").mkdir()
     with pytest.raises(InputError, match="holds no video"):
         find_recordings(tmp_path / "none", tmp_path)
+
+
+def test_damaged_recordings_are_listed_with_the_reason(recordings: Path, tmp_path: Path) -> None:
+    folder, runs = tmp_path / "scans", tmp_path / "runs"
+    folder.mkdir()
+    (folder / "good").symlink_to(recordings / "walk")
+    for name, files in {
+        "moved": {"transforms.json": '{"fl_x": 100, "frames": [{"file_path": "gone/0.jpg"}]}'},
+        "half_a_table": {"rgb.txt": "0.0 rgb/0.png\n"},  # of TUM, whose rgb/ was not copied
+        "no_model": {"sparse/0/cameras.bin": "x"},
+        "pointers": {f"{i}.jpg": "version https://git-lfs.github.com/spec/v1\noid sha256:00\n" for i in range(3)},
+        "pointer": {"transforms.json": "version https://git-lfs.github.com/spec/v1\n", "images/0.jpg": "x"},
+        "raw": {"0.dng": "x", "1.dng": "x"},
+        "notes": {"of the day.txt": "sunny"},
+        "other.run": {"manifest.json": "{}", "frames/0.jpg": "x"},
+    }.items():
+        for file, text in files.items():
+            (folder / name / file).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name / file).write_text(text)
+    done = run_batch(folder, runs)
+    assert done.exit_code == 1
+    assert "6 of 7 recordings failed" in done.stderr
+    assert "left out, no images and no data set directly in them: notes (1 in all)" in done.stderr
+    found = rows(runs)
+    assert found["good"]["state"] == "unfinished (frames)"
+    errors = {name: str(row.get("error")) for name, row in found.items() if row["state"] == FAILED}
+    assert set(errors) == {"moved", "half_a_table", "no_model", "pointers", "pointer", "raw"}
+    assert all(str(folder / name) in text for name, text in errors.items())
+    assert "git-LFS" in errors["pointer"]
+    assert ".dng files are not supported" in errors["raw"]
+
+
+def test_two_shards_write_the_table_at_the_same_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other one writes all of its table between the last byte of this one and its renaming."""
+    replace, others = atomic.os.replace, []
+
+    def interrupted(temporary: Path, path: Path) -> None:
+        if not others:
+            others.append(temporary)
+            with monkeypatch.context() as other:
+                other.setattr(atomic, "process_mark", lambda: "of the other")
+                batch.write_table(tmp_path, [{"recording": "b", "state": DONE}])
+        replace(temporary, path)
+
+    monkeypatch.setattr(atomic.os, "replace", interrupted)
+    batch.write_table(tmp_path, [{"recording": "a", "state": DONE}])
+    assert set(rows(tmp_path)) == {"a"}
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["batch.json", "batch.md"]
 
 
 def test_wrong_settings_are_refused_before_anything(recordings: Path, tmp_path: Path) -> None:
