@@ -27,6 +27,7 @@ from msgs_slam.pipelines.frames.keyframes import KeyframeChoice, choose_keyframe
 from msgs_slam.pipelines.frames.learned import learned_inputs, open_learned
 from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
 from msgs_slam.pipelines.frames.picking import pick_frames
+from msgs_slam.pipelines.frames.priors import solve
 from msgs_slam.pipelines.frames.tasks import (
     TASKS,
     AnySource,
@@ -85,7 +86,7 @@ def run(context: StageContext) -> dict[str, Any]:
     masks = masks_of(context, source, faces, rig)
     keyframes = _keyframes(context, frames, masks, rig)
     masks.find_people(frames, keyframes, context.progress)
-    structure = _structure(context, (camera, origin), frames, keyframes, masks, rig, given)
+    structure, origin = _structure(context, (camera, origin), frames, keyframes, masks, rig, given)
     lens = make_lens(structure.model.cameras[1])
     origin = settled_origin(context, origin, camera, structure)
     calibration = replace(_calibration(context, lens, origin, structure.focal_sd, faces), readout=structure.readout)
@@ -196,15 +197,17 @@ def _structure(
     masks: FrameMasks,
     rig: Rig,
     given: GivenPoses | None,
-) -> Structure:
+) -> tuple[Structure, str]:
+    """The structure, and the origin of its camera."""
+
     def divide(name: str, count: int, known: dict[str, NDArray]) -> None:
         if count:
             in_chunks(context, TASKS[name], count, motion, frames=frames, keyframes=keyframes, **known)
 
     motion = structure_from_motion(context, *camera, frames, masks, rig, given, divide)
-    structure = motion.run(keyframes)
+    structure, origin = solve(context, motion, camera[1], keyframes)
     warn_of_structure(context, structure, [frames[k].id for k in keyframes])
-    return structure
+    return structure, origin
 
 
 def _calibration(context: StageContext, lens: Lens, origin: str, focal_sd: float, faces: Faces | None) -> Calibration:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -12,8 +13,12 @@ import pytest
 
 from msgs_slam.formats.datasets.camera import Camera
 from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.engine.stages import StageContext
+from msgs_slam.pipelines.frames.stage import run
+from msgs_slam.pipelines.source.opening import FolderSource
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
 from msgs_slam.pipelines.structure.lens import distortion_of, make_lens, set_lens, to_pycolmap, unknown_camera
+from tests.pipelines.frames.conftest import Walk
 
 
 def test_numbers_on_the_command_line() -> None:
@@ -151,3 +156,17 @@ def test_a_second_coefficient_changes_nothing_by_itself() -> None:
     set_lens(camera, 2)
     assert camera.model == pycolmap.CameraModelId.RADIAL
     np.testing.assert_array_equal(camera.img_from_cam(points), before)
+
+
+def test_a_prior_focal_length_that_leaves_no_structure_is_dropped_before_the_images_are_blamed(
+    bent_walk: Walk, make_context: Callable[..., StageContext], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FolderSource, "exif_focal", lambda _: 9.2)
+    context = make_context(bent_walk.folder)
+    figures = run(context)
+    assert figures["calibration"] == "self-calibrated"
+    assert figures["focal_px"] == pytest.approx(bent_walk.focal, rel=0.03)
+    assert figures["keyframes_placed"] == figures["keyframes"]
+    assert any("EXIF states (9 px) leaves no structure" in w for w in context.warnings)
+    with pytest.raises(InputError, match=r"--intrinsics \(focal length 9 px\) leaves no structure.*correct or omit it"):
+        run(make_context(bent_walk.folder, "frames.intrinsics=9.2,9.2,160,120", name="held"))
