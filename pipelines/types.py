@@ -145,7 +145,8 @@ class Calibration:
     """The camera of the (undistorted) frames and how it came to be known.
 
     `origin` is "given", "exif" or "self-calibrated"; `focal_sd` its standard deviation in pixels (0 when given);
-    `distortion` the (k1, k2, p1, p2[, k3]) that was removed from the frames, of a `fisheye` (k1, k2, k3, k4).
+    `distortion` the (k1, k2, p1, p2[, k3[, k4, k5, k6]]) that was removed from the frames, of a `fisheye` (k1, k2, k3,
+    k4).
     `directions`: in how many the camera looks at once, see `pipelines.geometry.rig`. `readout`: seconds of its rolling
     shutter, see `pipelines.structure.rolling`.
     """

@@ -18,12 +18,13 @@ _SAME_SHAPE = 0.01
 
 def distortion_names(fisheye: bool) -> tuple[str, ...]:
     """Return the names of a camera's distortion coefficients."""
-    return ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    return ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics in pixels, first pixel's centre at (0.5, 0.5); distortion k1, k2, p1, p2[, k3] as OpenCV has it.
+    """Intrinsics in pixels, first pixel's centre at (0.5, 0.5); distortion k1, k2, p1, p2[, k3[, k4, k5, k6]] as in
+    OpenCV.
 
     `fisheye` says that the distortion is the equidistant k1..k4 instead; `is_nominal` that these are the numbers of the
     kind of camera, not a calibration of this one.

@@ -12,7 +12,7 @@ from msgs_slam.formats.datasets.matching import times_or_frame_numbers
 from msgs_slam.formats.datasets.sequence import Sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import natural_key
-from msgs_slam.formats.safe_path import inside
+from msgs_slam.formats.safe_path import inside, named_file
 
 _MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0")
 _IMAGE_FOLDERS = ("images", "frames", ".", "rgb")
@@ -39,10 +39,10 @@ def open_colmap(path: Path) -> Sequence:
     model = read_colmap_model(folder)
     if not model.names:
         raise InputError(f"the COLMAP model in {folder} has no registered image: choose another of its models")
-    root = _find_images(path, folder, model)
+    root, files = _find_images(path, folder, model)
     order = sorted(range(len(model.names)), key=lambda i: natural_key(model.names[i]))
-    found = [i for i in order if inside(root, model.names[i], folder).is_file()]
-    images = [root / model.names[i] for i in found]
+    found = [i for i in order if files[i] is not None]
+    images = [file for i in found if (file := files[i]) is not None]
     camera, notes = _shared_camera(model)
     times, timed = times_or_frame_numbers(images)
     if len(found) < len(order):
@@ -69,17 +69,23 @@ def _find_model(path: Path) -> Path | None:
     return next((p for p in (*usual, *others) if model_suffix(p)), None)
 
 
-def _find_images(path: Path, model_folder: Path, model: ColmapModel) -> Path:
-    """The folder that holds most of the model's images."""
+def _find_images(path: Path, model_folder: Path, model: ColmapModel) -> tuple[Path, list[Path | None]]:
+    """The folder that holds most of the model's images, and the file of each image, None for one that is missing."""
     above = [path, *model_folder.resolve().parents[:_LEVELS_UP]]
     places = [base / name for base in above for name in _IMAGE_FOLDERS if (base / name).is_dir()]
-    counts = [sum(inside(place, name, model_folder).is_file() for name in model.names) for place in places]
-    if not counts or max(counts) == 0:
-        raise InputError(
-            f"none of the {len(model.names)} images of the COLMAP model in {model_folder} is found (first: "
-            f"{model.names[0]!r}): put them into {path / 'images'}"
-        )
-    return places[counts.index(max(counts))]
+    for shorten in (False, True):
+        found = [[named_file([place], name, model_folder, shorten) for name in model.names] for place in places]
+        missing = [files.count(None) for files in found]
+        if missing and min(missing) < len(model.names):
+            best = missing.index(min(missing))
+            for name, file in zip(model.names, found[best], strict=True):
+                if file is None:
+                    inside(places[best], name, model_folder)
+            return places[best], found[best]
+    raise InputError(
+        f"none of the {len(model.names)} images of the COLMAP model in {model_folder} is found (first: "
+        f"{model.names[0]!r}): put them into {path / 'images'}"
+    )
 
 
 def _shared_camera(model: ColmapModel) -> tuple[Camera | None, tuple[str, ...]]:
@@ -104,8 +110,8 @@ def camera_from_colmap(
         distortion = (*k, 0.0, 0.0, 0.0)[:4]
     elif name in ("OPENCV", "OPENCV_FISHEYE"):
         distortion = k
-    elif name == "FULL_OPENCV" and not any(k[5:]):
-        distortion = k[:5]
+    elif name == "FULL_OPENCV":
+        distortion = k if any(k[5:]) else k[:5]
     else:
         return None, (f"COLMAP's camera model {name} is not supported: the model's intrinsics are not used",)
     return Camera(width, height, *focal, rest[0], rest[1], distortion, fisheye), ()

@@ -9,19 +9,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.datasets.camera import Camera, distortion_names
 from msgs_slam.formats.datasets.matching import times_or_frame_numbers
 from msgs_slam.formats.datasets.sequence import Sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import image_size, natural_key
 from msgs_slam.formats.jsonfile import number, optional_number, read_json_object
-from msgs_slam.formats.safe_path import inside
+from msgs_slam.formats.safe_path import named_file
 from msgs_slam.formats.trajectory import clean_poses
 
 _FILE_NAMES = ("transforms.json", "transforms_train.json")
-_SUFFIXES_TRIED = ("", ".png", ".jpg", ".jpeg")
+_SUFFIXES_TRIED = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+_IMAGE_FOLDERS = ("images", "rgb", "frames", "color")
+_DEPTH_FOLDERS = ("depths", "depth")
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-_INTRINSIC_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "k1", "k2", "k3", "k4", "p1", "p2")
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_INTRINSIC_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", *_DISTORTION)
+_MODELS = ("OPENCV", "OPENCV_FISHEYE", "PERSPECTIVE", "PINHOLE", "RADIAL", "SIMPLE_PINHOLE", "SIMPLE_RADIAL")
+_HINTS = {"EQUIRECTANGULAR": "; for whole panoramas pass --camera equirectangular"}
+_SAME_CAMERA = 0.01
+_SAME_COEFFICIENT = 0.01
+"""By which a distortion coefficient may differ from the mean of all images: less than a pixel for most of the image."""
 
 
 def recognises(path: Path) -> bool:
@@ -45,9 +53,10 @@ def open_nerfstudio(path: Path) -> Sequence:
     images = {id(frame): _image(file, frame) for frame in frames}
     kept = [frame for frame in frames if images[id(frame)] is not None]
     if not kept:
-        raise InputError(f"{file}: none of its {len(frames)} frames has an image on disk: unpack it completely")
+        raise InputError(_why_no_image(file, frames))
     kept.sort(key=lambda frame: natural_key(str(images[id(frame)])))
     paths = [p for p in (images[id(frame)] for frame in kept) if p is not None]
+    _require_different(file, kept, paths)
     poses = np.stack([_matrix(frame, file) for frame in kept]) @ _OPENCV_FROM_OPENGL
     depth_paths = tuple(_depth(file, frame) for frame in kept)
     camera, notes = _camera(table, kept, file, paths[0])
@@ -78,16 +87,46 @@ def _image(file: Path, frame: dict[str, Any]) -> Path | None:
     name = frame.get("file_path")
     if not isinstance(name, str) or not name:
         raise InputError(f"{file}: a frame has no file_path: expected the image's path relative to the file")
-    tried = (inside(file.parent, name + suffix, file) for suffix in _SUFFIXES_TRIED)
-    return next((p for p in tried if p.is_file()), None)
+    places = _places(file, name, _IMAGE_FOLDERS)
+    tried = (named_file(places, name + suffix, file) for suffix in _SUFFIXES_TRIED)
+    return next((p for p in tried if p is not None), None)
+
+
+def _places(file: Path, name: str, folders: tuple[str, ...]) -> list[Path]:
+    """Where a file that a frame names may lie: beside the transforms.json, in the usual folders there, and in those
+    beside its own folder for a name that leads there."""
+    above = [file.parent.resolve().parent] if name.replace("\\", "/").startswith("../") else []
+    return [file.parent, *(place / folder for place in (file.parent, *above) for folder in folders)]
+
+
+def _why_no_image(file: Path, frames: list[dict[str, Any]]) -> str:
+    if not frames:
+        return f"{file}: none of its 0 frames has an image on disk: export it again"
+    first = frames[0]["file_path"]
+    return (
+        f"{file}: none of its {len(frames)} frames has an image on disk. The first is {first[:300]!r}; no such file is "
+        f"in {file.parent}, nor one of its bare name in {', '.join(_IMAGE_FOLDERS)} there (what lies outside of that "
+        f"folder is not read): put the images into {file.parent / _IMAGE_FOLDERS[0]}"
+    )
+
+
+def _require_different(file: Path, frames: list[dict[str, Any]], images: list[Path]) -> None:
+    seen: dict[Path, str] = {}
+    for frame, image in zip(frames, images, strict=True):
+        other = seen.setdefault(image, frame["file_path"])
+        if other is not frame["file_path"]:
+            raise InputError(
+                f"{file}: the frames {other!r} and {frame['file_path']!r} both are the image {image}: remove one, or "
+                "put the images where their names say"
+            )
 
 
 def _depth(file: Path, frame: dict[str, Any]) -> Path | None:
     name = frame.get("depth_file_path")
     if not isinstance(name, str):
         return None
-    path = inside(file.parent, name, file)
-    return path if path.is_file() and path.suffix.lower() == ".png" else None
+    path = named_file(_places(file, name, _DEPTH_FOLDERS), name, file)
+    return path if path is not None and path.suffix.lower() == ".png" else None
 
 
 def _names(file: Path, paths: list[Path]) -> tuple[str, ...]:
@@ -95,7 +134,8 @@ def _names(file: Path, paths: list[Path]) -> tuple[str, ...]:
     names = [p.name for p in paths]
     if len(set(names)) == len(names):
         return tuple(names)
-    return tuple("_".join(p.relative_to(file.parent).parts) for p in paths)
+    inner = (p.relative_to(file.parent) if p.is_relative_to(file.parent) else Path(*p.parts[-2:]) for p in paths)
+    return tuple("_".join(p.parts) for p in inner)
 
 
 def _matrix(frame: dict[str, Any], file: Path) -> NDArray[np.float64]:
@@ -113,20 +153,70 @@ def _matrix(frame: dict[str, Any], file: Path) -> NDArray[np.float64]:
 def _camera(
     table: dict[str, Any], frames: list[dict[str, Any]], file: Path, image: Path
 ) -> tuple[Camera | None, tuple[str, ...]]:
-    own = [{k: frame[k] for k in _INTRINSIC_KEYS if k in frame} for frame in frames]
-    if any(values != own[0] for values in own):
-        return None, ("the images have different cameras: the intrinsics in the file are not used",)
-    values = {**table, **own[0]}
+    """The camera of all frames, None where the file states none that is of use, and notes of what is not used."""
+    values, notes = _shared_intrinsics(table, frames, file)
+    model = str(values.get("camera_model") or "OPENCV").upper()
+    if model not in _MODELS:
+        return None, (
+            *notes,
+            f"the camera model {model} is not supported: its intrinsics are not used{_HINTS.get(model, '')}",
+        )
     actual = image_size(image)
     width, height = (int(optional_number(values, file, key) or size) for key, size in zip("wh", actual, strict=True))
-    angle = optional_number(values, file, "camera_angle_x")
-    if angle and not 0 < angle < math.pi:
-        raise InputError(f"{file}: camera_angle_x is {angle:g}, expected radians between 0 and pi")
-    fx = width / 2 / math.tan(angle / 2) if angle and "fl_x" not in values else number(values, file, "fl_x")
-    fy = optional_number(values, file, "fl_y") or fx
+    fx, fy = (
+        _focal(values, file, "fl_x", "camera_angle_x", width),
+        _focal(values, file, "fl_y", "camera_angle_y", height),
+    )
+    if fx is None and fy is None:
+        if not notes:
+            notes = (f"{file.name} states no focal length (fl_x or camera_angle_x): it is found from the images",)
+        return None, notes
     cx, cy = (optional_number(values, file, key) for key in ("cx", "cy"))
     center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
-    fisheye = values.get("camera_model") == "OPENCV_FISHEYE"
-    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
+    fisheye = model == "OPENCV_FISHEYE" or values.get("is_fisheye") is True
+    names = distortion_names(fisheye)[:5]  # its k4 is not that of the rational model
     distortion = tuple(optional_number(values, file, name) or 0.0 for name in names)
-    return Camera(width, height, fx, fy, *center, distortion, fisheye).resized(*actual), ()
+    unused = [n for n in _DISTORTION if n not in names and optional_number(values, file, n)]
+    if unused:
+        start = "" if fisheye else ": the lens is found from the images, beginning with the stated focal length"
+        notes = (*notes, f"the coefficients {', '.join(unused)} of {file.name} are not supported here{start}")
+    distortion = distortion if any(distortion[4:]) else distortion[:4]
+    camera = Camera(
+        width, height, fx or fy or 0.0, fy or fx or 0.0, *center, distortion, fisheye,
+        is_nominal=bool(unused) and not fisheye,
+    )  # fmt: skip
+    return camera.resized(*actual), notes
+
+
+def _focal(values: dict[str, Any], file: Path, length: str, angle: str, side: int) -> float | None:
+    """The focal length in pixels that is stated as such, or as the angle of view over a side of the image."""
+    radians = optional_number(values, file, angle)
+    if radians and not 0 < radians < math.pi:
+        raise InputError(f"{file}: {angle} is {radians:g}, expected radians between 0 and pi")
+    stated = optional_number(values, file, length)
+    return side / 2 / math.tan(radians / 2) if stated is None and radians else stated
+
+
+def _shared_intrinsics(
+    table: dict[str, Any], frames: list[dict[str, Any]], file: Path
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """The intrinsics of all frames: the mean of those that are stated for each, where they hardly differ; without any
+    where they do. Phones state them anew for each image, by how far the lens has moved to focus."""
+    own = [{key: frame[key] for key in _INTRINSIC_KEYS if key in frame} for frame in frames]
+    values = {**table, **own[0]}
+    if all(each == own[0] for each in own):
+        return values, ()
+    refused = (
+        {k: v for k, v in table.items() if k not in _INTRINSIC_KEYS},
+        ("the images have different cameras: the intrinsics in the file are not used",),
+    )
+    if any(each.keys() != own[0].keys() for each in own):
+        return refused
+    for key in own[0]:
+        stated = np.array([number(each, file, key) for each in own])
+        mean = float(stated.mean())
+        allowed = 0.0 if key in "wh" else _SAME_COEFFICIENT if key in _DISTORTION else _SAME_CAMERA * abs(mean)
+        if np.abs(stated - mean).max() > allowed:
+            return refused
+        values[key] = mean
+    return values, ("the intrinsics of the images differ by less than 1 %: their mean is used",)

@@ -20,8 +20,8 @@ FOCAL_GUESS = 1.2
 
 
 def to_pycolmap(camera: Camera) -> pycolmap.Camera:
-    """A fixed camera with known intrinsics: OPENCV with distortion, FULL_OPENCV with a third radial one, PINHOLE, or
-    OPENCV_FISHEYE."""
+    """A fixed camera with known intrinsics: OPENCV with distortion, FULL_OPENCV with more than two radial ones,
+    PINHOLE, or OPENCV_FISHEYE."""
     params = [camera.fx, camera.fy, camera.cx, camera.cy]
     model = "PINHOLE"
     if camera.fisheye:
@@ -29,7 +29,7 @@ def to_pycolmap(camera: Camera) -> pycolmap.Camera:
         params += (*camera.distortion, 0.0, 0.0, 0.0, 0.0)[:4]
     elif any(camera.distortion[4:]):
         model = "FULL_OPENCV"
-        params += [*camera.distortion, 0.0, 0.0, 0.0]
+        params += [*camera.distortion, 0.0, 0.0, 0.0][:8]
     elif any(camera.distortion):
         model = "OPENCV"
         params += camera.distortion[:4]
@@ -65,7 +65,7 @@ def set_lens(camera: pycolmap.Camera, coefficients: int) -> None:
 
 
 def distortion_of(camera: pycolmap.Camera) -> tuple[float, ...]:
-    """(k1, k2, p1, p2), and k3 where the camera has one; zeros for a pinhole."""
+    """(k1, k2, p1, p2), with k3 and k4 to k6 where the camera has them; zeros for a pinhole."""
     params = [float(p) for p in camera.params]
     if camera.model == pycolmap.CameraModelId.SIMPLE_RADIAL:
         return params[3], 0.0, 0.0, 0.0
@@ -74,7 +74,7 @@ def distortion_of(camera: pycolmap.Camera) -> tuple[float, ...]:
     if camera.model == pycolmap.CameraModelId.OPENCV:
         return params[4], params[5], params[6], params[7]
     if camera.model == pycolmap.CameraModelId.FULL_OPENCV:
-        return tuple(params[4:9])
+        return tuple(params[4:12] if any(params[9:12]) else params[4:9])
     return 0.0, 0.0, 0.0, 0.0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 import zlib
 from dataclasses import dataclass
@@ -330,7 +331,11 @@ def test_colmap_images_that_lead_out_are_refused(tmp_path: Path, known: Known) -
         ("OPENCV_FISHEYE", (50, 51, 32, 24, 1, 2, 3, 4), Camera(64, 48, 50, 51, 32, 24, (1, 2, 3, 4), True)),
         ("RADIAL_FISHEYE", (50, 32, 24, 1, 2), Camera(64, 48, 50, 50, 32, 24, (1, 2, 0, 0), True)),
         ("FULL_OPENCV", (50, 51, 32, 24, 1, 2, 3, 4, 5, 0, 0, 0), Camera(64, 48, 50, 51, 32, 24, (1, 2, 3, 4, 5))),
-        ("FULL_OPENCV", (50, 51, 32, 24, 1, 2, 3, 4, 5, 1, 0, 0), None),
+        (
+            "FULL_OPENCV",
+            (50, 51, 32, 24, 1, 2, 3, 4, 5, 1, 0, 0),
+            Camera(64, 48, 50, 51, 32, 24, (1, 2, 3, 4, 5, 1, 0, 0)),
+        ),
         ("FOV", (50, 51, 32, 24, 0.9), None),
     ],
 )
@@ -392,7 +397,6 @@ def test_blender_style_transforms(tmp_path: Path, known: Known) -> None:
         ({"frames": [{"transform_matrix": []}]}, "no file_path"),
         ({"frames": [{"file_path": "../../etc/hostname", "transform_matrix": []}]}, "outside"),
         ({"frames": [{"file_path": "images/frame_0.png"}]}, "no 4x4 transform_matrix"),
-        ({"fl_x": None}, "lacks 'fl_x'"),
         ({"fl_x": "50"}, "expected a number"),
     ],
 )
@@ -400,6 +404,108 @@ def test_bad_transforms_are_explained(tmp_path: Path, known: Known, changes: dic
     _transforms(tmp_path, known, **changes)
     with pytest.raises(InputError, match=message):
         open_sequence(tmp_path)
+
+
+def test_images_that_are_links_are_read(tmp_path: Path, known: Known) -> None:
+    """As in the caches of Hugging Face, DVC and git-annex, and on shared disks."""
+    names = [f"{i}.png" for i in range(N)]
+    for make, path in ((_colmap_folder, tmp_path / "colmap"), (_transforms, tmp_path / "nerfstudio")):
+        make(path, known, names) if make is _colmap_folder else make(path, known)
+        for number, image in enumerate(sorted((path / "images").iterdir())):
+            blob = tmp_path / "blobs" / path.name / f"{number}f0e1d2c"
+            blob.parent.mkdir(parents=True, exist_ok=True)
+            image.rename(blob)
+            image.symlink_to(blob)
+        assert (open_sequence(path).rgb(3) == known.rgb[3]).all()
+        (path / "images").rename(tmp_path / f"store_{path.name}")
+        (path / "images").symlink_to(tmp_path / f"store_{path.name}")
+        assert (open_sequence(path).rgb(3) == known.rgb[3]).all()
+
+
+def test_a_name_does_not_lead_out_behind_a_link(tmp_path: Path, known: Known) -> None:
+    _tum_folder(tmp_path / "set", known)
+    write_rgb(tmp_path / "store" / "0.png", known.rgb[0])
+    write_rgb(tmp_path / "secret.png", known.rgb[0])
+    (tmp_path / "set" / "link").symlink_to(tmp_path / "store")
+    (tmp_path / "set" / "rgb.txt").write_text("1.0 rgb/../link/0.png\n")
+    assert (open_sequence(tmp_path / "set").rgb(0) == known.rgb[0]).all()
+    (tmp_path / "set" / "rgb.txt").write_text("1.0 link/../secret.png\n")
+    with pytest.raises(InputError, match="no such file"):
+        open_sequence(tmp_path / "set")
+
+
+@pytest.mark.parametrize(
+    "named",
+    ["images\\frame_{}.png", "../images/frame_{}.png", "/home/other/scan/images/frame_{}.png",
+     "C:\\Users\\Me\\scan\\images\\frame_{}", ".\\frame_{}.png"],
+)  # fmt: skip
+def test_names_of_another_machine_are_found(tmp_path: Path, known: Known, named: str) -> None:
+    table = _transforms(tmp_path, known)
+    for i, frame in enumerate(table["frames"][::-1]):
+        frame["file_path"] = named.format(i)
+    (tmp_path / "transforms.json").write_text(json.dumps(table))
+    sequence = open_sequence(tmp_path)
+    assert [(sequence.rgb(i) == known.rgb[i]).all() for i in range(N)] == [True] * N
+    np.testing.assert_allclose(sequence.world_from_cam, known.poses, atol=1e-12)
+    if named.startswith(".."):  # as instant-ngp's scripts write it: the table in a folder beside the images
+        (tmp_path / "ngp").mkdir()
+        (tmp_path / "transforms.json").rename(tmp_path / "ngp" / "transforms.json")
+        assert (open_sequence(tmp_path / "ngp").rgb(3) == known.rgb[3]).all()
+
+
+def test_a_name_that_is_nowhere_is_told_with_the_places(tmp_path: Path, known: Known) -> None:
+    frame = {"file_path": "D:\\scan\\0.png", "transform_matrix": np.eye(4).tolist()}
+    _transforms(tmp_path, known, frames=[frame])
+    with pytest.raises(
+        InputError, match=r"none of its 1 frames.*'D:\\\\scan\\\\0.png'.*images, rgb.*put the images into"
+    ):
+        open_sequence(tmp_path)
+    write_rgb(tmp_path / "images" / "0.png", known.rgb[0])
+    _transforms(tmp_path, known, frames=[frame, frame | {"file_path": "E:\\scan\\0.png"}])
+    with pytest.raises(InputError, match="both are the image"):
+        open_sequence(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "distortion", "is_nominal", "note"),
+    [
+        ({"k2": 0.02, "k3": -0.3}, (0.1, 0.02, 0, 0.01, -0.3), False, ""),
+        ({"k4": 0.2}, (0.1, 0, 0, 0.01), True, "k4 of transforms.json are not supported here: the lens is found"),
+        ({"camera_model": "OPENCV_FISHEYE", "k4": 0.2, "p2": 0}, (0.1, 0, 0, 0.2), False, ""),
+        ({"camera_model": "OPENCV_FISHEYE", "k4": 0.2}, (0.1, 0, 0, 0.2), False, "p2 of transforms.json"),
+        ({"camera_model": "PINHOLE", "k1": 0, "p2": 0}, (0, 0, 0, 0), False, ""),
+        ({"camera_model": "EQUIRECTANGULAR"}, None, False, "EQUIRECTANGULAR is not supported.*--camera equirect"),
+        ({"camera_model": "FISHEYE624"}, None, False, "FISHEYE624 is not supported"),
+        ({"fl_x": None, "fl_y": None}, None, False, "states no focal length"),
+    ],
+)
+def test_what_transforms_state_of_the_lens_is_used_or_told(
+    tmp_path: Path, known: Known, changes: dict, distortion: tuple | None, is_nominal: bool, note: str
+) -> None:
+    _transforms(tmp_path, known, **changes)
+    sequence = open_sequence(tmp_path)
+    assert bool(sequence.notes) == bool(note)
+    assert re.search(note, " ".join(sequence.notes))
+    camera = sequence.camera
+    assert (camera is None) == (distortion is None)
+    if camera is not None:
+        assert (camera.distortion, camera.is_nominal) == (distortion, is_nominal)
+        assert (camera.fx, camera.fisheye) == (50, "FISHEYE" in changes.get("camera_model", ""))
+
+
+@pytest.mark.parametrize(("spread", "mean"), [(0.004, 50.1), (0.3, None)])
+def test_intrinsics_of_each_image_are_averaged_where_they_hardly_differ(
+    tmp_path: Path, known: Known, spread: float, mean: float | None
+) -> None:
+    table = _transforms(tmp_path, known)
+    keys = ("w", "h", "fl_x", "fl_y", "cx", "cy")
+    own = {key: table.pop(key) for key in keys}
+    for i, frame in enumerate(table["frames"]):
+        frame |= own | {"fl_x": 50.0 * (1 + spread * (i % 2)) + (0.02 if mean else 0)}
+    (tmp_path / "transforms.json").write_text(json.dumps(table))
+    sequence = open_sequence(tmp_path)
+    assert ("their mean is used" if mean else "different cameras") in sequence.notes[0]
+    assert (sequence.camera.fx if sequence.camera else None) == (mean and pytest.approx(mean, abs=1e-9))
 
 
 def test_each_set_is_told_from_the_others(tmp_path: Path, known: Known, shared_data: Path) -> None:
