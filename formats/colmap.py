@@ -109,7 +109,9 @@ def _plain_model(reconstruction: Any, folder: Path) -> ColmapModel:
 
 
 def _require_sense(model: ColmapModel, folder: Path) -> None:
-    finite = all(np.isfinite(a).all() for a in (model.obs_xy, *(np.array(c[3]) for c in model.cameras)))
+    finite = all(
+        np.isfinite(a).all() for a in (model.cam_from_world, model.obs_xy, *(np.array(c[3]) for c in model.cameras))
+    )
     problems = {
         "an image name occurs twice": len(set(model.names)) == len(model.names),
         "a camera has no size": all(width > 0 and height > 0 for _, width, height, _ in model.cameras),

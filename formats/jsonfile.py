@@ -26,23 +26,27 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
-def read_json(path: Path, most: int | None = MAX_JSON_BYTES) -> Any:
+def read_json(path: Path, most: int | None = MAX_JSON_BYTES, *, allow_nan: bool = False) -> Any:
     """Read a JSON file: numbers must be finite and of at most 40 digits, texts valid Unicode.
+
+    With `allow_nan` NaN and Infinity pass, which many programs write into poses they have lost.
 
     Raises InputError when it is missing, larger than `most` bytes (None, for what a run holds: of any size), damaged,
     or nested too deep.
     """
     text = read_text(path, most)
     with parsing(path, "valid JSON", "was it cut short or edited by hand?"):
-        value = json.loads(text, parse_constant=_refuse, parse_float=_finite, parse_int=_integer)
+        value = json.loads(
+            text, parse_constant=float if allow_nan else _refuse, parse_float=_finite, parse_int=_integer
+        )
         if _HALF_CHARACTER.search(text):  # half of a pair cannot be written anywhere: neither in a path nor in a file
             json.dumps(value, ensure_ascii=False).encode("utf-8")
     return value
 
 
-def read_json_object(path: Path, most: int | None = MAX_JSON_BYTES) -> dict[str, Any]:
+def read_json_object(path: Path, most: int | None = MAX_JSON_BYTES, *, allow_nan: bool = False) -> dict[str, Any]:
     """The object in a JSON file. Raises InputError as `read_json`, and when it holds something else."""
-    value = read_json(path, most)
+    value = read_json(path, most, allow_nan=allow_nan)
     if not isinstance(value, dict):
         raise InputError(f"{path} holds a {type(value).__name__}, expected an object in braces")
     return value
@@ -88,6 +92,6 @@ def optional_number(table: dict[str, Any], path: Path, *names: str) -> float | N
     if name is None:
         return None
     value = table[name]
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{path}: {name!r} is {str(value)[:80]!r}, expected a number")
     return float(value)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import number, read_json, read_json_object
+from msgs_slam.formats.jsonfile import read_json, read_json_object
 from msgs_slam.formats.textfile import read_text
 from msgs_slam.formats.trajectory import clean_poses, poses_from_quaternions
 
@@ -38,7 +38,7 @@ def phone_poses(path: Path) -> Found | None:
     if path.is_file():
         return _stray(path) if path.suffix.lower() == ".csv" else _record3d(path)
     for name in _POLYCAM:
-        if files := sorted((path / name).glob("*.json")):
+        if files := sorted((path / name).glob("[!.]*.json")):
             return "Polycam's poses", [f.stem for f in files], np.stack([_polycam(f) for f in files])
     if files := sorted(path.glob("frame_*.json")):
         return "3D Scanner App's poses", [f.stem for f in files], _scanner_app(files)
@@ -49,16 +49,19 @@ def phone_poses(path: Path) -> Found | None:
 
 
 def _polycam(path: Path) -> Array:
-    table = read_json_object(path)
+    table = read_json_object(path, allow_nan=True)
     matrix = np.eye(4)
-    matrix[:3] = [[number(table, path, key) for key in row] for row in _ROWS]
+    try:
+        matrix[:3] = [[float(table[key]) for key in row] for row in _ROWS]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} has no pose of twelve numbers, t_00 to t_23 ({error}): export it again") from error
     return np.asarray(clean_poses(matrix[None], str(path))[0] @ OPENCV_FROM_OPENGL)
 
 
 def _scanner_app(files: list[Path]) -> Array:
     matrices = []
     for path in files:
-        flat = read_json_object(path).get("cameraPoseARFrame")
+        flat = read_json_object(path, allow_nan=True).get("cameraPoseARFrame")
         if not isinstance(flat, list) or len(flat) != 16 or not all(isinstance(v, int | float) for v in flat):
             raise InputError(f"{path} has no cameraPoseARFrame of sixteen numbers: export all data again")
         matrices.append(np.array(flat, np.float64).reshape(4, 4))
@@ -66,7 +69,7 @@ def _scanner_app(files: list[Path]) -> Array:
 
 
 def _record3d(path: Path) -> Found | None:
-    table = read_json(path)
+    table = read_json(path, allow_nan=True)
     rows = table.get("poses") if isinstance(table, dict) else None
     if not isinstance(rows, list) or not rows:
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -36,13 +36,15 @@ _HOW = (
 class PoseFile:
     """N poses: world_from_cam (N, 4, 4), camera axes x right, y down, z forward; names (N) of their images without
     folder and suffix, () where it has none; times (N,) in seconds, None where it has none; `is_metric`: whether
-    files of its kind always are in metres."""
+    files of its kind always are in metres; `lost`: how many poses of the file are not finite, and here NaN or left
+    out."""
 
     what: str
     world_from_cam: NDArray[np.float64]
     names: tuple[str, ...] = ()
     times: NDArray[np.float64] | None = None
     is_metric: bool = False
+    lost: int = 0
 
     def __len__(self) -> int:
         return len(self.world_from_cam)
@@ -65,7 +67,10 @@ def read_poses(path: Path) -> PoseFile:
     known = np.isfinite(found.world_from_cam).all(axis=(1, 2))
     if not known.any():
         raise InputError(f"--poses {path} holds no pose: {_HOW}")
-    return found
+    lost = found.lost + int((~known).sum())
+    if lost > known.sum():
+        raise InputError(f"--poses {path}: {lost} of its {known.sum() + lost} poses are not finite: export it again")
+    return replace(found, lost=lost)
 
 
 def stem(name: str) -> str:
@@ -90,7 +95,7 @@ def _from_colmap(folder: Path) -> PoseFile:
 
 
 def _from_json(path: Path) -> PoseFile:
-    table = read_json(path)
+    table = read_json(path, allow_nan=True)
     listed = table.get("frames") if isinstance(table, dict) else table
     frames = [f for f in listed if isinstance(f, dict)] if isinstance(listed, list) else []
     keys = {key for frame in frames for key in frame}
@@ -101,10 +106,13 @@ def _from_json(path: Path) -> PoseFile:
         raise InputError(f"--poses {path} lists no frames with a pose and a name or time: {_HOW}")
     matrices = np.stack([_matrix(frame[matrix], path, k) for k, frame in enumerate(frames)])
     # ARKit's matrices are written column by column; then what should be 0 0 0 1 is the last column.
-    if np.abs(matrices[:, 3, :3]).max() > 0 and not np.abs(matrices[:, :3, 3]).max() > 0:
+    finite = matrices[np.isfinite(matrices).all(axis=(1, 2))]
+    if finite[:, 3, :3].any() and not finite[:, :3, 3].any():
         matrices = matrices.transpose(0, 2, 1)
     poses = clean_poses(matrices, str(path)) @ OPENCV_FROM_OPENGL
     times = np.array([_number(f.get(time), path) for f in frames]) if time and not name else None
+    if times is not None:
+        poses[~np.isfinite(times)] = np.nan
     names = _unique((stem(str(f.get(name, ""))) for f in frames), path) if name else ()
     is_arkit = matrix != "transform_matrix" or any("depth_file_path" in f for f in frames)
     return PoseFile("ARKit's poses" if matrix != "transform_matrix" else path.name, poses, names, times, is_arkit)
@@ -114,11 +122,13 @@ def _from_text(path: Path) -> PoseFile:
     rows = read_rows(path)
     if rows and len(rows[0]) == 8:
         times, poses = read_tum(path)
-        return PoseFile("a TUM trajectory", poses, times=times)
+        return PoseFile("a TUM trajectory", poses, times=times, lost=len(rows) - len(poses))
     return PoseFile("a file of matrices", read_matrices(path))
 
 
 def _matrix(value: Any, path: Path, number: int) -> NDArray[np.float64]:
+    if value is None:
+        return np.full((4, 4), np.nan)
     try:
         flat = np.array(value, np.float64).ravel()
     except (TypeError, ValueError):

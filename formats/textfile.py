@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,19 +15,39 @@ from msgs_slam.formats.reading import read_bytes
 MAX_TEXT_BYTES = 48 * 1024 * 1024
 """150,000 poses of 16 numbers with all their digits. Taken apart into words, text needs twenty times its size."""
 
+_COMMENT = re.compile(r"^\s*//|(?:^|\s)#")
+
 
 def read_text(path: Path, most: int | None = MAX_TEXT_BYTES) -> str:
-    """The text of a UTF-8 file. Raises InputError when it is missing, binary, or larger than `most` bytes."""
-    text = read_bytes(path, most).removeprefix(codecs.BOM_UTF8).decode("utf-8", errors="replace")
+    """The text of a UTF-8 file, or one of UTF-16 that begins with its mark, as PowerShell writes.
+
+    Raises InputError when it is missing, binary, or larger than `most` bytes.
+    """
+    data = read_bytes(path, most)
+    is_wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    text = data.removeprefix(codecs.BOM_UTF8).decode("utf-16" if is_wide else "utf-8", errors="replace")
     if "\0" in text[:4096]:
         raise InputError(f"{path} is not a text file: check that it is the right one")
     return text
 
 
 def read_rows(path: Path) -> list[list[str]]:
-    """The fields of each line, split at blanks and commas; empty lines and those that start with # are left out."""
-    lines = (line.strip() for line in read_text(path).splitlines())
-    return [line.replace(",", " ").split() for line in lines if line and not line.startswith("#")]
+    """The fields of each line, split at blanks and commas; empty lines, comments and a line of headings are left out.
+
+    A comment begins with # or // at the start of a line, or with # after a blank; headings are a first line without
+    a number.
+    """
+    lines = (_COMMENT.split(line, 1)[0].replace(",", " ").split() for line in read_text(path).splitlines())
+    rows = [line for line in lines if line]
+    return rows[1:] if len(rows) > 1 and not any(map(_is_number, rows[0])) else rows
+
+
+def _is_number(field: str) -> bool:
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
 
 
 def read_table(path: Path, columns: int | None = None) -> NDArray[np.float64]:

@@ -60,21 +60,27 @@ def poses_from_quaternions(
 ) -> NDArray[np.float64]:
     """(N, 4, 4) rigid transforms of quaternions (N, 4) and translations (N, 3) as the file `name` has them.
 
-    Raises InputError where a value is not finite, or a quaternion so far from length 1 that it is none.
+    A pose that is not finite, or whose quaternion is all zeros, as lost tracking is written, becomes all NaN. Raises
+    InputError where a quaternion is so far from length 1 that it is none.
     """
+    known = np.isfinite(quat_xyzw).all(axis=1) & np.isfinite(translations).all(axis=1) & quat_xyzw.any(axis=1)
     length = np.linalg.norm(quat_xyzw, axis=1)
-    bad = ~((np.abs(length - 1) <= _ROTATION_TOLERANCE) & _is_within_reach(translations))
+    bad = known & ~((np.abs(length - 1) <= _ROTATION_TOLERANCE) & _is_within_reach(translations))
     if bad.any():
-        row = int(np.argmax(bad))
-        raise InputError(
-            f"{name}: pose {row + 1} is no rigid transform (quaternion of length {length[row]:.3g}, position "
-            f"{np.array2string(translations[row], precision=3)}): remove it, or correct the order of the columns"
-        )
-    poses = np.tile(np.eye(4), (len(quat_xyzw), 1, 1))
-    if len(quat_xyzw):
-        poses[:, :3, :3] = Rotation.from_quat(quat_xyzw).as_matrix()
-        poses[:, :3, 3] = translations
+        raise _no_pose(quat_xyzw, translations, int(np.argmax(bad)), name)
+    poses = np.full((len(quat_xyzw), 4, 4), np.nan)
+    if known.any():
+        poses[known] = np.eye(4)
+        poses[known, :3, :3] = Rotation.from_quat(quat_xyzw[known]).as_matrix()
+        poses[known, :3, 3] = translations[known]
     return poses
+
+
+def _no_pose(quat_xyzw: NDArray[np.float64], translations: NDArray[np.float64], row: int, name: str) -> InputError:
+    return InputError(
+        f"{name}: pose {row + 1} is no rigid transform (quaternion of length {np.linalg.norm(quat_xyzw[row]):.3g}, "
+        f"position {np.array2string(translations[row], precision=3)}): remove it, or correct the order of the columns"
+    )
 
 
 def _is_within_reach(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -83,18 +89,20 @@ def _is_within_reach(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(N,) timestamps in file order and (N, 4, 4) world_from_cam of a TUM file.
+    """(N,) timestamps in file order and (N, 4, 4) world_from_cam of a TUM file, without rows that are not finite.
 
-    Raises InputError for a row of other than 8 numbers, a time that is not finite, or a pose that is none.
+    Raises InputError for a row of other than 8 numbers, a pose that is none, or where most rows are not finite.
     """
     rows = read_rows(path)
     for i, row in enumerate(rows):
         if len(row) != 8:
             raise InputError(f"{path}: row {i + 1} has {len(row)} numbers, a TUM trajectory has 8 (t, xyz, quat xyzw)")
     table = read_table(path, 8)
-    if not np.isfinite(table[:, 0]).all():
-        raise InputError(f"{path}: a row's time is not finite: remove it")
-    return table[:, 0], poses_from_quaternions(table[:, 4:], table[:, 1:4], str(path))
+    poses = poses_from_quaternions(table[:, 4:], table[:, 1:4], str(path))
+    known = np.isfinite(table[:, 0]) & np.isfinite(poses).all(axis=(1, 2))
+    if 2 * known.sum() < len(known):
+        raise _no_pose(table[:, 4:], table[:, 1:4], int(np.argmin(known)), str(path))
+    return table[known, 0], poses[known]
 
 
 def read_matrices(path: Path) -> NDArray[np.float64]:

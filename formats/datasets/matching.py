@@ -86,7 +86,11 @@ def poses_at(
     world_from_cam: NDArray[np.float64],
     tolerance: float = SAME_INSTANT_SECONDS,
 ) -> NDArray[np.float64]:
-    """(N, 4, 4) for each of `times` the pose nearest in time, NaN where none is within `tolerance` seconds."""
+    """(N, 4, 4) for each of `times` the known pose nearest in time, NaN where none is within `tolerance` seconds."""
+    known = np.isfinite(pose_times) & np.isfinite(world_from_cam).all(axis=(1, 2))
+    if not known.any():
+        return np.full((len(times), 4, 4), np.nan)
+    pose_times, world_from_cam = pose_times[known], world_from_cam[known]
     order = np.argsort(pose_times, kind="stable")
     index = order[nearest_index(pose_times[order], times)]
     result = world_from_cam[index].copy()

@@ -47,7 +47,7 @@ def open_nerfstudio(path: Path) -> Sequence:
     file = _file(path)
     if file is None:
         raise InputError(f"no transforms.json in {path}: give the folder that holds it")
-    table = read_json_object(file)
+    table = read_json_object(file, allow_nan=True)
     listed = table.get("frames")
     frames = [frame for frame in listed if isinstance(frame, dict)] if isinstance(listed, list) else []
     images = {id(frame): _image(file, frame) for frame in frames}

@@ -81,7 +81,7 @@ def run(context: StageContext) -> dict[str, Any]:
     camera, origin = known_camera(context, source, faces)
     _require_several(source)
     frames = pick_frames(context, source, faces)
-    given = given_poses(context.config.frames, source, frames)
+    given = given_poses(context.config.frames, source, frames, context.warn)
     rig = rig_of(1 if faces is None else len(faces), len(frames))
     masks = masks_of(context, source, faces, rig)
     keyframes = _keyframes(context, frames, masks, rig)

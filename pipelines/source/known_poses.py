@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from msgs_slam.formats.datasets.matching import SAME_INSTANT_SECONDS, poses_at
 from msgs_slam.formats.digest import files_sha256
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.image_times import frame_number
 from msgs_slam.formats.poses import PoseFile, read_poses, stem
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.source.opening import FolderSource, VideoSource
+from msgs_slam.pipelines.source.opening import FolderSource, VideoSource, Warn
 from msgs_slam.pipelines.source.recording import RecordingSource
 from msgs_slam.pipelines.types import Frame, GivenPoses
 
@@ -23,12 +24,14 @@ LEAST = 3
 """Poses that belong to an image, below which a file is taken for one of another recording."""
 
 
-def given_poses(config: FramesConfig, source: AnySource, frames: Sequence[Frame]) -> GivenPoses | None:
+def given_poses(
+    config: FramesConfig, source: AnySource, frames: Sequence[Frame], warn: Warn | None = None
+) -> GivenPoses | None:
     """The poses of `frames.poses` frame by frame; None where none are given.
 
     An image's pose is known by its name; of a file of times by the nearest within 20 ms; of one that states
-    neither, or times of images without, by the order, where there are as many as images. Raises InputError where
-    fewer than three belong to a frame.
+    neither, or times of images without, by the order, where there are as many as images. Poses of the file that are not
+    finite are reported to `warn`. Raises InputError where fewer than three belong to a frame.
     """
     if not config.poses:
         return None
@@ -45,6 +48,8 @@ def given_poses(config: FramesConfig, source: AnySource, frames: Sequence[Frame]
             f"--poses {config.poses}: of its {len(file)} poses {known.sum()} belong to frames of {source.path}"
             f"{_examples(file, frames)}. Give the poses of these images"
         )
+    if file.lost and warn is not None:
+        warn(f"--poses {config.poses}: {file.lost} of its poses are not finite, as lost tracking is written: left out")
     cam_from_world = np.full_like(found, np.nan)
     cam_from_world[known] = se3.inverse(found[known])
     return GivenPoses(cam_from_world, file.is_metric, file.what)
@@ -72,7 +77,7 @@ def pose_inputs(config: FramesConfig) -> dict[str, str]:
 def _by_name(file: PoseFile, source: AnySource, frames: Sequence[Frame]) -> NDArray[np.float64]:
     """A video's frames are called by their numbers."""
     if isinstance(source, VideoSource):
-        rows = {int(d): k for k, n in enumerate(file.names) if (d := "".join(c for c in n if c.isdigit()))}
+        rows = {frame_number(Path(n.replace(".", "_"))): k for k, n in enumerate(file.names)}
         return _rows(file, [rows.get(f.source_index) for f in frames])
     named = {n: k for k, n in enumerate(file.names)}
     return _rows(file, [named.get(stem(source.name(f.id, f.source_index))) for f in frames])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -169,6 +170,44 @@ def test_what_is_none_is_refused(name: str, text: str, what: str, tmp_path: Path
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=what):
         read_poses(tmp_path / name)
+
+
+def _spoil(path: Path, format: str) -> None:
+    """Make the second of the five poses one that was lost, as the program that writes the format does."""
+    if format in ("tum", "matrices"):
+        lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+        time, *rest = lines[1].split()
+        lines[1] = " ".join([time if format == "tum" else "nan", *["nan"] * len(rest)])
+        path.write_text("\n".join(lines))
+        return
+    if format == "polycam":
+        path = path / "keyframes" / "cameras" / "frame_001.json"
+        path.write_text(re.sub(r"(\"t_03\": )[^,}]*", r"\1NaN", path.read_text()))
+        (path.parent / "._frame_001.json").write_bytes(b"\0\5\x16\7")  # macOS leaves such beside each file
+        return
+    path = next((p for p in (path / "transforms.json", path / "metadata.json") if p.exists()), path)
+    table = json.loads(path.read_text())
+    rows = table if isinstance(table, list) else table.get("poses") or table["frames"]
+    key = next((k for k in ("transform_matrix", "cameraPoseARFrame", "transform") if k in rows[1]), None)
+    lost = (np.array(rows[1][key] if key else rows[1]) * np.nan).tolist()
+    rows[1] = rows[1] | {key: lost} if key else [0.0] * 7
+    path.write_text(json.dumps(table))
+
+
+@pytest.mark.parametrize("write", [transforms, arkit_rows, arkit_columns, tum, matrices, polycam, record3d])
+def test_a_lost_pose_does_not_cost_the_others(write: Callable[[Path, Poses], Path], tmp_path: Path) -> None:
+    path = write(tmp_path, made())
+    _spoil(path, write.__name__)
+    found = read_poses(path)
+    known = np.isfinite(found.world_from_cam).all(axis=(1, 2))
+    np.testing.assert_allclose(found.world_from_cam[known], made()[[0, 2, 3, 4]], atol=1e-6)
+    assert found.lost == 1
+
+
+def test_poses_that_are_mostly_lost_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" + ("nan " * 12 + "\n") * 4)
+    with pytest.raises(InputError, match="4 of its 5 poses are not finite"):
+        read_poses(tmp_path / "a.txt")
 
 
 def test_a_folder_without_poses_and_a_name_twice_are_refused(tmp_path: Path) -> None:

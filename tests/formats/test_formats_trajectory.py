@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from msgs_slam.formats.datasets.matching import poses_at
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.trajectory import nearest_rotation, read_matrices, read_tum, write_tum
 from tests.matrices import write_matrices
@@ -71,6 +72,17 @@ def test_bad_tum_files_are_explained(tmp_path: Path, text: str, message: str) ->
     (tmp_path / "t.txt").write_text(text)
     with pytest.raises(InputError, match=message):
         read_tum(tmp_path / "t.txt")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_text_of_other_systems_and_lost_rows_are_no_damage(tmp_path: Path, encoding: str) -> None:
+    rows = ["timestamp,tx,ty,tz,qx,qy,qz,qw"] + [f"{i},{i},0,0,0,0,0,1" for i in range(6)]
+    rows[2:2] = ["// a remark", "1,nan,nan,nan,nan,nan,nan,nan", "nan,1,2,3,0,0,0,1", "1,0,0,0,0,0,0,0  # lost", ""]
+    (tmp_path / "a.txt").write_bytes("\r\n".join(rows).encode(encoding))
+    times, poses = read_tum(tmp_path / "a.txt")
+    assert times.tolist() == [0, 1, 2, 3, 4, 5]
+    np.testing.assert_array_equal(poses[:, 0, 3], times)
+    np.testing.assert_array_equal(poses_at(np.array([1.0]), times, poses)[0], poses[1])
 
 
 def test_matrix_layouts_agree(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +11,17 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.video_writer import write_video
+from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.run.files import GIVEN_POSES
+from msgs_slam.pipelines.source.known_poses import given_poses
+from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.structure.candidates import GIVEN, _worth
 from msgs_slam.pipelines.structure.consistency import ModelReport
 from msgs_slam.pipelines.structure.given import agreement, posed_model
 from msgs_slam.pipelines.structure.lens import to_pycolmap, unknown_camera
-from msgs_slam.pipelines.types import GivenPoses
+from msgs_slam.pipelines.types import Frame, GivenPoses
 from tests.pipelines.frames.made_views import structure_of, walk_round
 
 CAMERA = to_pycolmap(Camera(640, 480, 520.0, 520.0, 320.0, 240.0))
@@ -107,3 +112,19 @@ def test_they_are_kept_for_the_stages_behind(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.cam_from_world, given.cam_from_world)
     assert (again.is_metric, again.what) == (True, "made up")
     assert given.known.sum() == 18
+
+
+def test_poses_named_by_frame_numbers_belong_to_a_videos_frames(tmp_path: Path) -> None:
+    """The last number in a name counts: those before it are the clip's, the camera's, the date's."""
+    video = write_video(tmp_path / "clip1.avi", (np.full((48, 64, 3), 9 * i, np.uint8) for i in range(8)), 10, "MJPG")
+    frames = [{"file_path": f"clip1_4k/clip1.{i:05d}.jpg", "transform_matrix": np.eye(4).tolist()} for i in range(8)]
+    for i, frame in enumerate(frames):
+        frame["transform_matrix"][0][3] = float("nan") if i == 6 else float(i)
+    frames.append({"file_path": "cm².jpg", "transform_matrix": np.eye(4).tolist()})
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    config, warnings = FramesConfig(poses=str(tmp_path)), []
+    picked = [Frame(k, f"{k:06d}.jpg", i / 10, i, 0.0) for k, i in enumerate((1, 3, 6, 7))]
+    given = given_poses(config, open_source(video), picked, warnings.append)
+    assert given is not None
+    np.testing.assert_allclose(-given.cam_from_world[:, 0, 3], [1, 3, np.nan, 7])
+    assert "1 of its poses are not finite" in "".join(warnings)
