@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import math
-import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from xml.etree.ElementTree import Element, ParseError, iterparse
+from xml.parsers.expat import errors
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +21,13 @@ from msgs_slam.formats.reading import parsing, read_bytes
 
 Array = NDArray[np.float64]
 
+_Texts = tuple[str | None, str | None, str | None, str | None]
+
 _MAX_TRACK_BYTES = 200_000_000
+_DEEPEST = 64
+_BEFORE_XML = b"\xef\xbb\xbf\xff\xfe\0 \t\r\n"
+_CUT_SHORT = tuple(errors.codes[e] for e in (errors.XML_ERROR_NO_ELEMENTS, errors.XML_ERROR_UNCLOSED_TOKEN))
+"""Of a logger that was switched off: what it wrote before is read."""
 _EQUATOR = 6_378_137.0
 _FLATTENING = 1 / 298.257223563
 """The ellipsoid of WGS 84."""
@@ -27,11 +35,13 @@ _FLATTENING = 1 / 298.257223563
 
 @dataclass(frozen=True)
 class Track:
-    """times (T,) seconds, rising; degrees (T, 2) latitude, longitude; altitude (T,) metres, NaN where untold."""
+    """times (T,) seconds, rising; degrees (T, 2) latitude, longitude; altitude (T,) metres, NaN where untold; how many
+    rows of the file were no fix and are `lost`."""
 
     times: Array
     degrees: Array
     altitude: Array
+    lost: int = 0
 
     def at(self, times: Array, farthest: float) -> Array:
         """(N, 3) latitude, longitude, altitude at other times, between fixes; NaN more than `farthest` s from one."""
@@ -59,44 +69,70 @@ def photo_places(photos: list[Path | None]) -> Array:
 def read_track(path: Path) -> Track:
     """A GPX track, or a CSV with a header that names time, lat, lon and perhaps alt (seconds, or ISO 8601).
 
-    Raises InputError when it is missing, damaged, of another kind, or has fewer than two fixes.
+    Rows that are no fix are left out and counted, and of fixes of one time all but one. Raises InputError when the file
+    is missing, damaged, of another kind, has fewer than two fixes, or more rows that are none.
     """
-    text = read_bytes(path, _MAX_TRACK_BYTES).decode("utf-8-sig", errors="replace")
+    data = read_bytes(path, _MAX_TRACK_BYTES)
     with parsing(path, "GPS track (GPX, or CSV with the columns time, lat, lon)"):
-        rows = _gpx_rows(text) if "<gpx" in text[:2000] else _csv_rows(text)
+        is_xml = data[:100].lstrip(_BEFORE_XML).startswith(b"<")
+        texts = list(_gpx_rows(data)) if is_xml else _csv_rows(data.decode("utf-8-sig", errors="replace"))
+        rows = [row for row in map(_fix, texts) if row is not None]
+        lost = len(texts) - len(rows)
         if len(rows) < 2:
             raise ValueError(f"it has {len(rows)} fixes with a time, two are needed")
-        values = np.array(sorted(rows), np.float64)
-        if not (np.isfinite(values[:, :3]).all() and (np.abs(values[:, 1:3]) <= (90, 180)).all()):
-            raise ValueError("a latitude or longitude is out of range")
-        return Track(values[:, 0], values[:, 1:3], values[:, 3])
+        if lost > len(rows):
+            raise ValueError(f"{lost} of its {len(texts)} rows are no time with a latitude and longitude")
+        values = np.array(rows, np.float64)
+        values = values[np.unique(values[:, 0], return_index=True)[1]]
+        return Track(values[:, 0], values[:, 1:3], values[:, 3], lost)
 
 
-def _gpx_rows(text: str) -> list[tuple[float, float, float, float]]:
-    """By patterns, so that no entity of the XML is ever expanded."""
-    rows = []
-    for found in re.finditer(r"<trkpt\b([^>]*)>(.*?)</trkpt>", text, re.DOTALL):
-        place = dict(re.findall(r"(lat|lon)\s*=\s*[\"']([^\"']+)[\"']", found[1]))
-        time = re.search(r"<time>\s*([^<]+?)\s*</time>", found[2])
-        height = re.search(r"<ele>\s*([^<]+?)\s*</ele>", found[2])
-        if time:
-            altitude = float(height[1]) if height else math.nan
-            rows.append((_seconds(time[1]), float(place["lat"]), float(place["lon"]), altitude))
-    return rows
+def _fix(row: _Texts) -> tuple[float, float, float, float] | None:
+    """Time, latitude, longitude, altitude; None where the texts are none."""
+    try:
+        time, lat, lon = _seconds(row[0] or ""), float(row[1] or ""), float(row[2] or "")
+        altitude = float(row[3]) if row[3] and row[3].strip() else math.nan
+    except ValueError:
+        return None
+    return (time, lat, lon, altitude) if math.isfinite(time) and abs(lat) <= 90 and abs(lon) <= 180 else None
 
 
-def _csv_rows(text: str) -> list[tuple[float, float, float, float]]:
-    table = csv.DictReader(io.StringIO(text))
+def _gpx_rows(data: bytes) -> Iterator[_Texts]:
+    """The points of a track that have a time. Entities are bounded by expat, external ones it does not fetch."""
+    above: list[Element] = []
+    try:
+        for event, element in iterparse(io.BytesIO(data), ("start", "end")):
+            if event == "start":
+                above.append(element)
+                if len(above) > _DEEPEST:
+                    raise ValueError(f"it is nested more than {_DEEPEST} deep")
+                continue
+            above.pop()
+            if _bare(element) == "trkpt":
+                told = {_bare(child): (child.text or "").strip() for child in element}
+                if "time" in told:
+                    yield told["time"], element.get("lat"), element.get("lon"), told.get("ele")
+            if above and not any(_bare(outer) == "trkpt" for outer in above):
+                above[-1].clear()  # what has been read is not kept in memory
+    except ParseError as error:
+        if error.code not in _CUT_SHORT:
+            raise
+
+
+def _bare(element: Element) -> str:
+    return element.tag.rpartition("}")[2]
+
+
+def _csv_rows(text: str) -> list[_Texts]:
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    separator = max(",;\t", key=lines[0].count) if lines else ","
+    table = csv.DictReader(lines, delimiter=separator)
     names = {(n or "").strip().lower(): n for n in table.fieldnames or ()}
     columns = [next((names[n] for n in options if n in names), None) for options in _COLUMNS]
     if None in columns[:3]:
         raise ValueError(f"its header is {', '.join(names) or 'empty'}; time, lat and lon are needed")
-    rows = []
-    for row in table:
-        time, lat, lon = (row[c] for c in columns[:3] if c is not None)
-        height = row[columns[3]] if columns[3] is not None else ""
-        rows.append((_seconds(time), float(lat), float(lon), float(height) if height else math.nan))
-    return rows
+    time, lat, lon, height = (c or "" for c in columns)
+    return [(row[time], row[lat], row[lon], row.get(height)) for row in table]
 
 
 _COLUMNS = (

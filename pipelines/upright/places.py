@@ -31,12 +31,19 @@ def world_on_earth(outcome: Outcome, world: World, gps: str) -> tuple[World, str
     """
     if gps == OFF:
         return world, ""
-    places = _exif_places(outcome) if gps == AUTO else _track_places(outcome, read_track(Path(gps)))
+    places = _exif_places(outcome) if gps == AUTO else _track_places(outcome, _track(gps))
     found = _laid_out(outcome, world, places)
     if isinstance(found, World):
         return found, ""
     log.info("not georeferenced: %s", found)
     return world, "" if gps == AUTO else f"{gps}: not georeferenced: {found}"
+
+
+def _track(gps: str) -> Track:
+    track = read_track(Path(gps))
+    if track.lost:
+        log.warning("%s: %d of its rows are no time with a latitude and longitude, and are left out", gps, track.lost)
+    return track
 
 
 def _laid_out(outcome: Outcome, world: World, places: Array) -> World | str:

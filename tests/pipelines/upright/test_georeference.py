@@ -103,6 +103,50 @@ def test_tracks_are_read_and_damage_is_refused(tmp_path: Path) -> None:
             read_track(tmp_path / "bad.csv")
 
 
+def _gpx(points: str, head: str = "") -> bytes:
+    return f"{head}<gpx xmlns='http://www.topografix.com/GPX/1/1'><trk><trkseg>{points}</trkseg></trk></gpx>".encode()
+
+
+def _point(i: int) -> str:
+    return f'<trkpt lon="1{i}" lat="5{i}"><time>2026-11-22T10:00:0{i}Z</time></trkpt>'
+
+
+@pytest.mark.parametrize(
+    ("content", "latitudes", "lost"),
+    [
+        (_gpx('<trkpt lat="9" lon="9"/>' + _point(1) + _point(2)), [51, 52], 0),
+        (_gpx('<trkpt lat="9" lon="9"></trkpt>' + _point(2) + _point(1)), [51, 52], 0),
+        (
+            _gpx(_point(1) + _point(2) + '<trkpt lat="99" lon="9"><time>2026-11-22T10:00:09Z</time></trkpt>'),
+            [51, 52],
+            1,
+        ),
+        (_gpx(_point(1) + _point(2) + _point(3))[:-60], [51, 52], 0),
+        (_gpx(_point(1) + _point(2), "<?xml version='1.0' encoding='UTF-16'?>").decode().encode("utf-16"), [51, 52], 0),
+        (b"\xef\xbb\xbftime;lat;lon\r\n1;51;1\r\n2;nan;1\r\n2;;\r\n3;52;1\r\n3;52;1\r\n4;53;1\r\n", [51, 52, 53], 2),
+    ],
+    ids=["point without time", "empty point", "out of range", "cut short", "UTF-16", "CSV"],
+)
+def test_rows_that_are_no_fix_cost_only_themselves(
+    content: bytes, latitudes: list[int], lost: int, tmp_path: Path
+) -> None:
+    (tmp_path / "a.gpx").write_bytes(content)
+    track = read_track(tmp_path / "a.gpx")
+    assert (track.degrees[:, 0].tolist(), track.lost) == (latitudes, lost)
+    assert (np.diff(track.times) > 0).all()
+
+
+def test_a_track_does_not_grow_when_it_is_read(tmp_path: Path) -> None:
+    """Neither by entities, nor in time with the square of its points, nor in depth."""
+    entities = "".join(f"<!ENTITY a{i} '{f'&a{i - 1};' * 10}'>" for i in range(1, 11))
+    bomb = _gpx("<trkpt lat='1' lon='1'><time>&a10;</time></trkpt>", f"<!DOCTYPE gpx [<!ENTITY a0 'ha'>{entities}]>")
+    secret = _gpx(_point(1) + "&s;" + _point(2), f"<!DOCTYPE gpx [<!ENTITY s SYSTEM 'file://{tmp_path}/s'>]>")
+    for content in (bomb, secret, b"<gpx>" + b"<trkpt >" * 100_000, _gpx("<trkpt lat='1' lon='1'></trkpt>" * 100_000)):
+        (tmp_path / "a.gpx").write_bytes(content)
+        with pytest.raises(InputError, match="GPS track"):
+            read_track(tmp_path / "a.gpx")
+
+
 def test_photos_tell_their_places(shared_data: Path) -> None:
     photos = list_images(shared_data / "gps_photos" / "images")
     places = photo_places([*photos, None])
