@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import io
-import math
 import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import IO, Any
@@ -19,6 +19,7 @@ from pillow_heif import register_heif_opener
 
 from msgs_slam.formats.atomic import write_bytes
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.exif import ExifLens, lens_of, place_of
 from msgs_slam.formats.reading import opened, parsing, reaching
 
 register_heif_opener()
@@ -43,9 +44,6 @@ _TURNS = {
 """What makes an image upright, by EXIF's orientation."""
 RAW_SUFFIXES = frozenset({".dng", ".cr2", ".nef", ".arw", ".raw"})
 """Of photos that are not read: raw sensor data."""
-_FULL_FRAME_WIDTH_MM = 36.0
-_FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
-_MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
@@ -82,9 +80,7 @@ def _why_no_images(folder: Path, files: list[Path]) -> str:
 
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) from the header, after the rotation stated in EXIF. Raises InputError as `read_rgb` does."""
-    with _opened(Path(path)) as image:
-        width, height = image.size
-        return (height, width) if _orientation(image) >= 5 else (width, height)
+    return read_header(path).size
 
 
 def is_depth_map(path: Path) -> bool:
@@ -187,34 +183,40 @@ def decode_rgb(data: bytes, name: str) -> NDArray[np.uint8]:
         return np.array(image.convert("RGB"), dtype=np.uint8)
 
 
+@dataclass(frozen=True)
+class Header:
+    """An image's size (width, height) as stored, the orientation that EXIF states (1 to 8), and the lens."""
+
+    stored: tuple[int, int]
+    orientation: int
+    lens: ExifLens
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) after the rotation stated in EXIF."""
+        return self.stored[::-1] if self.orientation >= 5 else self.stored
+
+
+def read_header(path: Path) -> Header:
+    """Header of an image. Raises InputError as `read_rgb` does."""
+    with _opened(Path(path)) as image:
+        lens = lens_of(_tags(image), _tags(image, ExifTags.IFD.Exif), image.size)
+        return Header(image.size, _orientation(image), lens)
+
+
 def exif_focal_px(path: Path, width: int, height: int) -> float | None:
     """Focal length in pixels of an image of width x height, from EXIF; None when EXIF states none.
 
     From the 35 mm equivalent (over the diagonal, as the makers define it for other aspect ratios than 3:2), else
     from the focal length and the sensor's pixel pitch. The image may have been resized since, but not cropped.
     """
-    with _opened(Path(path)) as image:
-        tags = dict(image.getexif().get_ifd(ExifTags.IFD.Exif))
-        stored = image.size
-    equivalent = _positive(tags.get(ExifTags.Base.FocalLengthIn35mmFilm))
-    if equivalent is not None:
-        return equivalent / _FULL_FRAME_DIAGONAL_MM * math.hypot(width, height)
-    focal_mm = _positive(tags.get(ExifTags.Base.FocalLength))
-    pitch = _positive(tags.get(ExifTags.Base.FocalPlaneXResolution))
-    unit = _MM_PER_RESOLUTION_UNIT.get(tags.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
-    if focal_mm is None or pitch is None or unit is None:
-        return None
-    sensor_width = _positive(tags.get(ExifTags.Base.ExifImageWidth)) or max(stored)
-    sensor_mm = sensor_width * unit / pitch
-    if not 1.0 < sensor_mm < 2 * _FULL_FRAME_WIDTH_MM:
-        return None  # some cameras fill the pitch with the image's print resolution
-    return focal_mm / sensor_mm * max(width, height)
+    return read_header(path).lens.focal_px(width, height)
 
 
 def exif_time(path: Path) -> float | None:
     """Seconds (of the camera's own clock, since 1970) when the image was taken, from EXIF; None when missing."""
     with _opened(Path(path)) as image:
-        tags = dict(image.getexif().get_ifd(ExifTags.IFD.Exif))
+        tags = _tags(image, ExifTags.IFD.Exif)
     text = tags.get(ExifTags.Base.DateTimeOriginal)
     fraction = str(tags.get(ExifTags.Base.SubsecTimeOriginal, "")).strip("\0 ")
     try:
@@ -228,37 +230,24 @@ def exif_time(path: Path) -> float | None:
 def exif_gps(path: Path) -> tuple[float, float, float] | None:
     """(latitude, longitude, altitude) in degrees and metres that EXIF states; altitude NaN, all None where missing."""
     with _opened(Path(path)) as image:
-        tags = dict(image.getexif().get_ifd(ExifTags.IFD.GPSInfo))
-    angles = []
-    for key, negative in ((ExifTags.GPS.GPSLatitude, "S"), (ExifTags.GPS.GPSLongitude, "W")):
-        try:
-            degrees, minutes, seconds = (float(v) for v in tags[key])
-        except (KeyError, TypeError, ValueError, ZeroDivisionError):
-            return None
-        sign = -1 if str(tags.get(key - 1, "")).strip("\0 ").upper() == negative else 1
-        angles.append(sign * (degrees + minutes / 60 + seconds / 3600))
-    latitude, longitude = angles
-    # Phones without a fix write zeros.
-    if not (abs(latitude) <= 90 and abs(longitude) <= 180) or (latitude == 0 and longitude == 0):
-        return None
-    height = _positive(tags.get(ExifTags.GPS.GPSAltitude))
-    below = tags.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01")
-    return latitude, longitude, math.nan if height is None else -height if below else height
+        tags = _tags(image, ExifTags.IFD.GPSInfo)
+    return place_of(tags)
 
 
 def _orientation(image: Image.Image) -> int:
     """1 to 8 as EXIF defines them; 1 for every other value: text, lists, other numbers."""
-    value = image.getexif().get(ExifTags.Base.Orientation, 1)
-    return int(value) if value in _TURNS else 1
+    value = _tags(image).get(ExifTags.Base.Orientation, 1)
+    return int(value) if isinstance(value, int | float) and value in _TURNS else 1
 
 
-def _positive(value: object) -> float | None:
-    """An EXIF number (int or rational) when it is a usable one."""
+def _tags(image: Image.Image, ifd: int | None = None) -> dict[int, Any]:
+    """EXIF's tags, of one of its directories or the base ones; none where they are damaged, for the image may be whole
+    beside them."""
     try:
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if math.isfinite(number) and number > 0 else None
+        exif = image.getexif()
+        return dict(exif if ifd is None else exif.get_ifd(ifd))
+    except Exception:  # Pillow raises whatever its parser meets
+        return {}
 
 
 def _read_one_channel(path: Path, what: str) -> NDArray:

@@ -142,7 +142,7 @@ def _check_panoramas(config: Config) -> None:
 
 
 def _require_several(source: AnySource) -> None:
-    if isinstance(source, FolderSource) and source.expected_frames - len(source.unreadable) < 2:
+    if isinstance(source, FolderSource) and len(source.headers.of) < 2:
         raise InputError(f"{source.path} holds one image only; a reconstruction needs several views of a scene")
 
 

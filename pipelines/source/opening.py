@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from msgs_slam.formats.digest import file_sha256, files_sha256
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.image_times import read_image_times, times_file
-from msgs_slam.formats.images import exif_focal_px, image_size, is_depth_map, list_images, read_rgb
+from msgs_slam.formats.images import is_depth_map, list_images, read_rgb
 from msgs_slam.formats.reading import reaching, require_file
 from msgs_slam.formats.textfile import read_text
 from msgs_slam.formats.video import VideoFrame, VideoReader, probe_video
+from msgs_slam.pipelines.source.one_camera import Headers, read_headers, require_one_lens
 from msgs_slam.pipelines.source.originals import reusable, written_names
 from msgs_slam.pipelines.source.recording import RecordingSource, open_recording
 
@@ -120,37 +121,27 @@ class FolderSource:
     height: int = field(init=False)
     expected_frames: int = field(init=False)
     has_times: bool = field(init=False)
-    unreadable: list[str] = field(init=False, default_factory=list)
+    headers: Headers = field(init=False)
     _images: list[Path] = field(init=False)
     _names: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         self._images = _without_depth_maps(list_images(self.path))
         self._names = written_names([path.name for path in self._images], self.path)
-        sizes = self._sizes()
-        if not sizes:
-            raise InputError(
-                f"none of the {len(self._images)} images in {self.path} can be read: copy them again, or convert them "
-                "to JPEG or PNG"
-            )
+        self.headers = read_headers(self.path, {path.name: path for path in self._images})
+        sizes = {name: header.size for name, header in self.headers.of.items()}
         _require_one_size(self.path, sizes, "images")
+        require_one_lens(self.path, self.headers)
         self.width, self.height = next(iter(sizes.values()))
         times = read_image_times(self._images)
         self.has_times = times is not None
         self._times = np.arange(len(self._images), dtype=np.float64) if times is None else times
         self.expected_frames = len(self._images)
 
-    def _sizes(self) -> dict[str, tuple[int, int]]:
-        sizes = {}
-        for path in self._images:
-            try:
-                sizes[path.name] = image_size(path)
-            except InputError:
-                self.unreadable.append(path.name)
-        return sizes
-
     def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
         """See `Source.read`; images that cannot be read are left out and reported to `warn`."""
+        if warn is not None:
+            self.headers.warn_of_cameras(warn)
         for index, path in enumerate(self._images):
             if wanted is not None and index not in wanted:
                 continue
@@ -177,11 +168,8 @@ class FolderSource:
         return self._images[index]
 
     def exif_focal(self) -> float | None:
-        """Return the focal length in pixels that the first readable image states, if any."""
-        for path in self._images:
-            if path.name not in self.unreadable:
-                return exif_focal_px(path, self.width, self.height)
-        return None
+        """Return the focal length in pixels that the images state, if any do."""
+        return self.headers.focal_px(self.width, self.height)
 
 
 def _without_depth_maps(images: list[Path]) -> list[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from datetime import datetime
@@ -11,9 +12,11 @@ import cv2
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
 from pillow_heif import from_bytes
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.exif import ExifLens, lens_of, place_of
 from msgs_slam.formats.image_times import frame_number, read_image_times
 from msgs_slam.formats.images import (
     decode_rgb,
@@ -251,6 +254,33 @@ def test_exif_that_tells_nothing(tmp_path: Path) -> None:
     assert exif_focal_px(_with_exif(tmp_path / "a.jpg", (40, 30)), 40, 30) is None
     assert exif_focal_px(_with_exif(tmp_path / "b.jpg", (40, 30), equivalent=0), 40, 30) is None
     assert exif_time(_with_exif(tmp_path / "c.jpg", (40, 30), taken="    :  :     :  :  ")) is None
+
+
+@pytest.mark.parametrize("equivalent", [1, 6, 1300, 65535])
+def test_an_impossible_35_mm_equivalent_is_ignored(tmp_path: Path, equivalent: int) -> None:
+    assert exif_focal_px(_with_exif(tmp_path / "a.jpg", (400, 300), equivalent=equivalent), 400, 300) is None
+    path = _with_exif(tmp_path / "b.jpg", (400, 300), equivalent=equivalent, focal=10.0, pitch=5080.0, width=4000)
+    assert exif_focal_px(path, 2000, 1500) == pytest.approx(1000)
+
+
+def test_malformed_exif_costs_what_it_says_and_not_the_image(tmp_path: Path, picture: np.ndarray) -> None:
+    half = IFDRational(1, 2)
+    zero, nothing = IFDRational(5, 0), IFDRational(0, 0)
+    assert place_of({1: b"S\0", 2: (10, 30, 0), 3: b"w", 4: (20, 15, half * 0)}) == pytest.approx(
+        (-10.5, -20.25, math.nan), nan_ok=True
+    )
+    assert place_of({1: "S", 2: (10, zero, 0), 3: "E", 4: (20, 15, 36)}) is None
+    assert place_of({1: "S", 2: (10, nothing, 0), 3: "E", 4: (20, 15, 36)}) is None
+    assert place_of({1: "S", 2: 10.0, 3: "E", 4: ("a", "b", "c")}) is None
+    bad = {0xA405: (26,), 0x920A: zero, 0xA20E: nothing, 0xA210: [2], 0xA404: zero}
+    assert lens_of({271: b"Maker\0", 272: 5}, bad, (40, 30)) == ExifLens(camera="Maker 5")
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(picture).save(tmp_path / "a.jpg", exif=exif.tobytes()[:-8] + b"\xff" * 8)
+    Image.fromarray(picture).save(tmp_path / "b.jpg", exif=b"Exif\0\0no TIFF header at all")
+    for name in ("a.jpg", "b.jpg"):
+        assert read_rgb(tmp_path / name).size == picture.size
+        assert (exif_focal_px(tmp_path / name, 40, 30), exif_gps(tmp_path / name)) == (None, None)
 
 
 def test_exif_time_with_fractions(tmp_path: Path) -> None:

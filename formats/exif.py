@@ -1,0 +1,103 @@
+"""The tags of EXIF as numbers that can be used: the lens, the place, the orientation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from PIL import ExifTags
+
+_FULL_FRAME_WIDTH_MM = 36.0
+_FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
+_MM_PER_RESOLUTION_UNIT = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0}
+_EQUIVALENTS = 7.0, 1200.0
+"""Focal lengths in mm at 35 mm film, from the widest lens without a fisheye's distortion to the longest that is sold:
+what lies outside is a slip of the writing program."""
+_Tags = Mapping[int, object]
+
+
+@dataclass(frozen=True)
+class ExifLens:
+    """Statements of EXIF on camera and lens; None or "" where it makes none.
+
+    `equivalent`: focal length in mm at 35 mm film, over the image's diagonal; `by_pitch`: the same from the focal
+    length and the sensor's pixel pitch; `focal_mm`: the focal length itself; `zoom`: digital zoom, 1 where none is
+    stated; `camera`: its make and model.
+    """
+
+    equivalent: float | None = None
+    by_pitch: float | None = None
+    focal_mm: float | None = None
+    zoom: float = 1.0
+    camera: str = ""
+
+    def focal_px(self, width: int, height: int) -> float | None:
+        """Focal length in pixels of an image of width x height that was resized, but not cropped."""
+        stated = self.equivalent or self.by_pitch
+        return None if stated is None else stated / _FULL_FRAME_DIAGONAL_MM * math.hypot(width, height)
+
+
+def lens_of(base: _Tags, tags: _Tags, size: tuple[int, int]) -> ExifLens:
+    """Read the lens from EXIF's base tags and its own, of an image stored as size = (width, height)."""
+    names = (_text(base.get(tag)) for tag in (ExifTags.Base.Make, ExifTags.Base.Model))
+    return ExifLens(
+        _plausible(positive(tags.get(ExifTags.Base.FocalLengthIn35mmFilm))),
+        _plausible(_by_pitch(tags, size)),
+        positive(tags.get(ExifTags.Base.FocalLength)),
+        positive(tags.get(ExifTags.Base.DigitalZoomRatio)) or 1.0,
+        " ".join(name for name in names if name),
+    )
+
+
+def _by_pitch(tags: _Tags, size: tuple[int, int]) -> float | None:
+    focal_mm = positive(tags.get(ExifTags.Base.FocalLength))
+    pitch = positive(tags.get(ExifTags.Base.FocalPlaneXResolution))
+    unit = _MM_PER_RESOLUTION_UNIT.get(positive(tags.get(ExifTags.Base.FocalPlaneResolutionUnit, 2)) or 0)
+    if focal_mm is None or pitch is None or unit is None:
+        return None
+    sensor_width = positive(tags.get(ExifTags.Base.ExifImageWidth)) or max(size)
+    sensor_mm = sensor_width * unit / pitch
+    if not 1.0 < sensor_mm < 2 * _FULL_FRAME_WIDTH_MM:
+        return None  # some cameras fill the pitch with the image's print resolution
+    return focal_mm / sensor_mm * max(size) / math.hypot(*size) * _FULL_FRAME_DIAGONAL_MM
+
+
+def place_of(tags: _Tags) -> tuple[float, float, float] | None:
+    """Return (latitude, longitude, altitude) in degrees and metres of EXIF's GPS tags; altitude NaN, all None where
+    missing."""
+    angles = []
+    for key, negative in ((ExifTags.GPS.GPSLatitude, "S"), (ExifTags.GPS.GPSLongitude, "W")):
+        try:
+            degrees, minutes, seconds = (float(v) for v in tags[key])  # type: ignore[attr-defined]
+        except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):
+            return None
+        sign = -1 if _text(tags.get(key - 1)).upper().startswith(negative) else 1
+        angles.append(sign * (degrees + minutes / 60 + seconds / 3600))
+    latitude, longitude = angles
+    # Phones without a fix write zeros.
+    if not (abs(latitude) <= 90 and abs(longitude) <= 180) or (latitude == 0 and longitude == 0):
+        return None
+    height = positive(tags.get(ExifTags.GPS.GPSAltitude))
+    below = tags.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01")
+    return latitude, longitude, math.nan if height is None else -height if below else height
+
+
+def positive(value: object) -> float | None:
+    """An EXIF number (int or rational) when it is a usable one."""
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def _plausible(equivalent: float | None) -> float | None:
+    low, high = _EQUIVALENTS
+    return equivalent if equivalent is not None and low <= equivalent <= high else None
+
+
+def _text(value: object) -> str:
+    """Text of a tag, which some programs write as bytes."""
+    text = value.decode("ascii", "replace") if isinstance(value, bytes) else "" if value is None else str(value)
+    return text.strip("\0 ")
