@@ -47,6 +47,11 @@ class ModelReport:
     parts: tuple[tuple[int, ...], ...]
 
     @property
+    def largest(self) -> tuple[int, ...]:
+        """The part with most keyframes; empty where nothing is placed."""
+        return self.parts[0] if self.parts else ()
+
+    @property
     def contradicted(self) -> list[Seam]:
         """Seams where the path may be folded."""
         return worst_contradictions(self.seams)
@@ -55,18 +60,18 @@ class ModelReport:
     def score(self) -> float:
         """To choose between models of the same matches: larger is better."""
         cuts = [s.after for s in self.contradicted]
-        runs = [sum(1 for k in self.parts[0] if a <= k < b) for a, b in pairwise([0, *cuts, self.total])]
+        runs = [sum(1 for k in self.largest if a <= k < b) for a, b in pairwise([0, *cuts, self.total])]
         return max(runs) / self.total * self.agreement * self.pairs_agreeing
 
     @property
     def is_whole(self) -> bool:
         """Whether hardly any keyframe is missing."""
-        return len(self.parts[0]) >= 0.95 * self.total
+        return len(self.largest) >= 0.95 * self.total
 
     @property
     def is_sound(self) -> bool:
         """Whether the other mapper need not be asked: what another one finds of the rest is a piece beside this."""
-        return len(self.parts[0]) >= 0.5 * self.total and self.is_consistent
+        return len(self.largest) >= 0.5 * self.total and self.is_consistent
 
     @property
     def is_consistent(self) -> bool:

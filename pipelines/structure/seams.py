@@ -155,8 +155,8 @@ def find_parts(
     than `reach` places later, holds them together."""
     place = {k: n for n, k in enumerate(placed)}
     loose = {s.after for s in seams if s.is_weak_link}
-    run = np.cumsum([k in loose for k in placed]).tolist()
-    number = run[-1]
+    run = np.cumsum([k in loose for k in placed], dtype=np.int64).tolist()
+    number = max(run, default=0)
     shared = np.zeros((number + 1, number + 1), np.int64)
     for track in tracks:
         for first, second in combinations([{run[n] for n in near} for near in _near(track, place, reach)], 2):

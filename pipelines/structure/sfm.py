@@ -247,7 +247,7 @@ class StructureFromMotion(Candidates):
         return pieces
 
     def _is_piece(self, report: ModelReport) -> bool:
-        return len(report.parts[0]) >= self.config.least_piece and report.is_consistent
+        return len(report.largest) >= self.config.least_piece and report.is_consistent
 
     def _largest_first(
         self, found: Adjusted, pieces: list[pycolmap.Reconstruction], views: Views

@@ -203,13 +203,16 @@ def with_depths(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics, setting
 
 
 def consistent(bundle: Bundle, intrinsics: Intrinsics, judged: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(O,) observations to keep: no outliers among those `judged`, nothing followed from one, and of points that at
-    least two cameras still see."""
+    """(O,) observations to keep: no outliers among those `judged`, nothing followed from one, over however many frames,
+    and of points that at least two cameras still see."""
     errors, source = bundle.errors(intrinsics), bundle.source_rows()
     # 1.1774: the median of a Rayleigh variable of sigma 1.
     sigma = max(float(np.median(errors[judged])) / 1.1774, 0.5) if judged.any() else 0.5
     keep = (errors < OUTLIER_SD * sigma) | ~judged
-    keep &= (bundle.obs_source < 0) | (keep[source] & (source >= 0))
+    before = np.zeros_like(keep)
+    while (before != keep).any():
+        before = keep
+        keep = keep & ((bundle.obs_source < 0) | (keep[source] & (source >= 0)))
     keep &= np.bincount(bundle.obs_point[keep], minlength=len(bundle.points))[bundle.obs_point] >= 2
     return keep
 

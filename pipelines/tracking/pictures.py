@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -16,9 +17,11 @@ from msgs_slam.pipelines.frames.learned import open_learned, picture_features
 from msgs_slam.pipelines.run.files import CALIBRATION, FEATURES, FRAMES, VOCABULARY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.structure.rolling import Shutter
+from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.types import Features, ProxyMaps
 
 T = TypeVar("T")
+_DESCRIPTORS_SHARE = 0.05
 
 
 class _Recent(Generic[T]):
@@ -43,9 +46,10 @@ def load_shutter(run: RunFolder) -> Shutter:
 
 
 class Pictures:
-    """Everything tracking looks up by frame id, and the camera; memory does not grow with the number of frames."""
+    """Everything tracking looks up by frame id, and the camera. Memory does not grow with the number of frames: of
+    `memory` bytes descriptors take no more than a small share."""
 
-    def __init__(self, run: RunFolder, settings: FramesConfig, kept: int = 12) -> None:
+    def __init__(self, run: RunFolder, settings: FramesConfig, memory: float = math.inf, kept: int = 12) -> None:
         self.run, self.settings = run, settings
         self.vocabulary = run.load(VOCABULARY)
         self.frames = {f.id: f for f in run.load(FRAMES)}
@@ -55,7 +59,12 @@ class Pictures:
         self._left_out = _Recent(lambda i: run.left_out(self.frames[i]), kept)
         self._features = _Recent(self._load_features, 4 * kept)
         # 64 x 128 numbers a frame: 32 MB for a thousand.
-        self._descriptor = _Recent(lambda i: describe(self.features(i), self.vocabulary), 5000)
+        self._descriptor = LruSequence(
+            max(self.frames, default=-1) + 1,
+            lambda i: describe(self.features(i), self.vocabulary),
+            lambda d: d.nbytes,
+            _DESCRIPTORS_SHARE * memory,
+        )
 
     def color(self, frame_id: int) -> NDArray[np.uint8]:
         """(H, W, 3) RGB."""
@@ -90,7 +99,7 @@ class Pictures:
 
     def descriptor(self, frame_id: int) -> NDArray[np.float32]:
         """Return the global descriptor of a frame, for retrieval."""
-        return self._descriptor(frame_id)
+        return self._descriptor[frame_id]
 
     def proxy(self, frame_id: int) -> ProxyMaps | None:
         """Proxy maps where the frame has any."""

@@ -43,18 +43,15 @@ def run(context: StageContext) -> dict[str, Any]:
     proxy = context.run.load(FIGURES["proxy"])
     settings = without_dependent_depth(context.config.tracking, proxy)
     metric = bool(proxy.get("metric", False))
-    pictures = Pictures(context.run, context.config.frames)
+    pictures = Pictures(context.run, context.config.frames, context.memory_room)
     intrinsics = pictures.intrinsics
 
     state = track_frames(context, frames, pictures)
-    if len(state.poses) < 2 and context.run.find(GIVEN_POSES) is None:
-        raise InputError(
-            f"{context.source}: no camera motion could be recovered from {len(frames)} frames. A still camera, pure "
-            "rotation or images without texture give no parallax; film while walking, or choose another part"
-        )
+    require_poses(context, state, frames, 2 if context.run.find(GIVEN_POSES) is None else 1)
     report = adjust_state(state, intrinsics, pictures.proxy, metric, settings)
     release_free_memory()
     carried = carry_given(context, state)
+    require_poses(context, state, frames, 2)
     set_rotation_only_poses(state, pictures, context.config.run.seed)
     if state.turned:
         context.warn(
@@ -78,6 +75,15 @@ def run(context: StageContext) -> dict[str, Any]:
     if lost:
         context.warn(f"{len(lost)} frames have no pose: {stretches(lost)}")
     return figures
+
+
+def require_poses(context: StageContext, state: TrackState, frames: list[Frame], least: int) -> None:
+    """Raise InputError where fewer than `least` frames have a pose."""
+    if len(state.poses) < least:
+        raise InputError(
+            f"{context.source}: no camera motion could be recovered from {len(frames)} frames. A still camera, pure "
+            "rotation or images without texture give no parallax; film while walking, or choose another part"
+        )
 
 
 def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures) -> TrackState:

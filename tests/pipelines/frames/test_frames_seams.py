@@ -13,7 +13,7 @@ import pytest
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.findings import warn_of_structure
 from msgs_slam.pipelines.structure.adjust import adjust
-from msgs_slam.pipelines.structure.consistency import ModelReport
+from msgs_slam.pipelines.structure.consistency import ModelReport, judge
 from msgs_slam.pipelines.structure.seams import (
     PairCheck,
     Seam,
@@ -98,6 +98,14 @@ def test_what_is_taken_out_leaves_no_observation(made_model: pycolmap.Reconstruc
     focal = made_model.cameras[1].focal_length
     assert 0 <= adjust(made_model, refine_camera=True) < 0.01 * focal
     assert made_model.cameras[1].focal_length == pytest.approx(focal, rel=0.001)
+
+
+def test_a_model_of_nothing_has_no_part() -> None:
+    assert find_parts([], find_seams([], [], [], REACH), [], REACH) == []
+    model = pycolmap.Reconstruction()
+    model.add_camera(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 300.0, 320, 240))
+    report = judge(model, [], [], 4, REACH)
+    assert (report.registered, report.score, report.is_sound) == (0, 0.0, False)
 
 
 def test_keyframes_that_were_not_placed_leave_a_gap() -> None:

@@ -11,7 +11,7 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.structure.bundle import Bundle, Problem, adjust_bundle, adjust_pose
-from msgs_slam.pipelines.tracking.adjust import adjust_state
+from msgs_slam.pipelines.tracking.adjust import adjust_state, consistent
 from msgs_slam.pipelines.tracking.pnp import colmap_camera
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics
@@ -97,6 +97,16 @@ def test_error_of_a_feature_that_was_followed_counts_once(known_bundle: KnownBun
         errors.append([aligned_error(poses, truth.cam_from_world, scale=True) for poses in found])
     once, each_time = np.mean(errors, axis=0)
     assert 0 < once < 0.8 * each_time
+
+
+def test_what_was_followed_from_an_outlier_goes_with_it_over_all_frames(known_bundle: KnownBundle) -> None:
+    bundle = without_depth(followed(known_bundle.bundle))
+    off = bundle.obs_xy.copy()
+    chain = (bundle.obs_point == 3) & (bundle.obs_cam < 4)
+    off[chain] += 60.0  # the feature in camera 0 is wrong; 2 was followed from it, 1 and 3 from there
+    keep = consistent(replace(bundle, obs_xy=off), known_bundle.intrinsics, np.ones(len(off), np.bool_))
+    assert not keep[chain].any()
+    assert keep[~chain].mean() > 0.99
 
 
 @pytest.mark.parametrize(("together", "share"), [(True, 0.3), (False, 0.7)])

@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,13 +12,16 @@ import pytest
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.correspondence.retrieval import describe
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, DEPTH_FIELDS, FRAMES, SPARSE, TRAJECTORY
-from msgs_slam.pipelines.tracking import adjust, stage
+from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, DEPTH_FIELDS, FRAMES, GIVEN_POSES, SPARSE, TRAJECTORY
+from msgs_slam.pipelines.tracking import adjust, pictures, stage
 from msgs_slam.pipelines.tracking.stage import STAGE, stretches
+from msgs_slam.pipelines.tracking.state import TrackState
+from msgs_slam.pipelines.types import GivenPoses
 from tests.pipelines.tracking.conftest import MadeRun
 
 
@@ -49,6 +53,37 @@ def test_poses_every_frame_in_metres(
     trajectory = made.run.load(TRAJECTORY, "tracking")
     assert np.allclose(trajectory.cam_from_world[0], np.eye(4), atol=1e-9)
     assert trajectory.is_keyframe.sum() == 9
+
+
+def test_given_poses_of_which_no_frame_could_be_posed_are_no_motion(
+    tmp_path: Path,
+    make_run: Callable[..., MadeRun],
+    open_stage: Callable[..., StageContext],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = make_run(tmp_path / "run")
+    GIVEN_POSES.save(made.run.stage("frames"), GivenPoses(np.full((24, 4, 4), np.nan), True, "made up"))
+    monkeypatch.setattr(stage, "track_frames", lambda *_: TrackState())
+    with pytest.raises(InputError, match="no camera motion could be recovered from 24 frames"):
+        STAGE.run(open_stage(made.run, "tracking"))
+
+
+@pytest.mark.parametrize(("memory", "described"), [(1e9, 2), (0.0, 4)])
+def test_global_descriptors_are_kept_only_while_there_is_memory_for_them(
+    tmp_path: Path, make_run: Callable[..., MadeRun], monkeypatch: pytest.MonkeyPatch, memory: float, described: int
+) -> None:
+    made, count = make_run(tmp_path / "run"), 0
+
+    def counted(*given: Any) -> np.ndarray:
+        nonlocal count
+        count += 1
+        return describe(*given)
+
+    monkeypatch.setattr(pictures, "describe", counted)
+    looked_up = pictures.Pictures(made.run, Config().frames, memory)
+    first, *_ = (looked_up.descriptor(i) for i in (0, 3, 0, 3))
+    assert count == described
+    assert np.array_equal(first, looked_up.descriptor(0))
 
 
 def test_sparse_model_reprojects_and_scales_are_right(
