@@ -16,9 +16,16 @@ from typing import Any, TypeVar
 from msgs_slam.formats.atomic import is_disk_full, watched_by, write_text
 from msgs_slam.formats.errors import DiskFullError, InputError, RecoverableError
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.standing import kept_inputs, next_upstream, stage_fingerprint, why_again
+from msgs_slam.pipelines.engine.standing import (
+    divided_otherwise,
+    kept_inputs,
+    next_upstream,
+    stage_fingerprint,
+    why_again,
+)
 from msgs_slam.pipelines.engine.time_left import TimeLeft
 from msgs_slam.pipelines.engine.workers import TaskWorkers
+from msgs_slam.pipelines.run.ending import FINGERPRINT, SNAPSHOT, find_sealed, move_in, results, seal, unseal
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.journal import Journal, empty
 from msgs_slam.pipelines.run.names import STAGES
@@ -26,7 +33,6 @@ from msgs_slam.pipelines.run.records import (
     Manifest,
     Source,
     StageRecord,
-    checksums,
     content_digest,
     load_records,
     plain,
@@ -42,8 +48,6 @@ from msgs_slam.pipelines.system.stopping import stop_if_asked
 T = TypeVar("T")
 R = TypeVar("R")
 _PROCESS = Path("/proc/self")
-FINGERPRINT = "fingerprint"
-"""File of an unfinished folder: the work it belongs to."""
 SameSource = Callable[[], None]
 
 
@@ -75,7 +79,7 @@ class StageContext:
     @property
     def snapshot(self) -> Path:
         """Folder for snapshots; made on first use."""
-        path = self.folder / "snapshot"
+        path = self.folder / SNAPSHOT
         path.mkdir(exist_ok=True)
         return path
 
@@ -180,13 +184,17 @@ def run_stages(
             settled = replace(config, run=replace(config.run, threads=config.run.threads or threads))
             context = StageContext(run, source, settled, folder, progress, [], stages, same_source, workers)
             with watch.running(stage.name) as ended:
-                record = _run_one(stage, context, fingerprint, inputs[stage.name])
-                ended(record := replace(record, settings=settings_of(config, stage.name)))
+                sealed = _find_ended(stage, run, config, fingerprint) if record is None else None
+                record = sealed or _run_one(stage, context, fingerprint, inputs[stage.name], config)
+                move_in(run, stage.name)
+                ended(record)
             records[stage.name] = record
             write_manifest(run.manifest_file, Manifest(origin, records))
+            unseal(run, stage.name)
             for later in STAGES[STAGES.index(stage.name) + 1 :]:  # made from what is no longer there
                 shutil.rmtree(run.stage(later), ignore_errors=True)
         else:
+            unseal(run, stage.name)
             watch.tell(stage.name, UP_TO_DATE)
         upstream = next_upstream(upstream, record)
     return records
@@ -258,7 +266,17 @@ def _check_inputs(
     return inputs
 
 
-def _run_one(stage: Stage, context: StageContext, fingerprint: str, inputs: Any) -> StageRecord:
+def _find_ended(stage: Stage, run: RunFolder, config: Config, fingerprint: str) -> StageRecord | None:
+    """The record of this very work, if it had ended when its process was killed."""
+    record = find_sealed(run, stage.name, fingerprint)
+    if record is None or divided_otherwise(stage, run, record, config):
+        return None
+    log.warning("%s had ended before it was interrupted: its results are taken over", stage.name)
+    return record
+
+
+def _run_one(stage: Stage, context: StageContext, fingerprint: str, inputs: Any, config: Config) -> StageRecord:
+    """Run the stage and seal its folder; `config` is what was asked for."""
     stop_if_asked()
     run, folder = context.run, context.folder
     journal = _open_partial(folder, fingerprint)
@@ -280,23 +298,14 @@ def _run_one(stage: Stage, context: StageContext, fingerprint: str, inputs: Any)
                 f"{run.root}: the disk is full. Free some space and run `msgs-slam resume {run.root}`"
             ) from error
         raise
-    shutil.rmtree(folder / "snapshot", ignore_errors=True)
-    (folder / FINGERPRINT).unlink()
-    files = checksums(folder, but=tuple(path.name for path in journal.files()))
-    journal.close(files)
-    shutil.rmtree(run.stage(stage.name), ignore_errors=True)
-    os.replace(folder, run.stage(stage.name))
-    _flush_folder(run.root)
-    return StageRecord(
-        fingerprint,
-        files,
-        time.monotonic() - started,
-        peak_memory_mb(),
-        plain(figures),
-        context.warnings,
-        content_digest(files),
-        inputs,
-    )
+    journal.check(files := results(folder))
+    seconds, memory = time.monotonic() - started, peak_memory_mb()
+    content, settings = content_digest(files), settings_of(config, stage.name)
+    record = StageRecord(
+        fingerprint, files, seconds, memory, plain(figures), context.warnings, content, inputs, settings
+    )  # fmt: skip
+    seal(folder, record)
+    return record
 
 
 def _open_partial(folder: Path, fingerprint: str) -> Journal:
@@ -311,14 +320,6 @@ def _open_partial(folder: Path, fingerprint: str) -> Journal:
         )  # fmt: skip
     write_text(stamp, fingerprint)
     return journal
-
-
-def _flush_folder(folder: Path) -> None:
-    """Make a rename survive a power cut."""
-    if hasattr(os, "O_DIRECTORY"):
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-        os.fsync(descriptor)
-        os.close(descriptor)
 
 
 def forget_peak() -> None:

@@ -58,6 +58,11 @@ def why_again(
     kept = kept_inputs(stage, config, record, inputs)
     if record.fingerprint != stage_fingerprint(stage, config, upstream, kept):
         return _what_differs(stage, record, config, upstream)
+    return divided_otherwise(stage, run, record, config)
+
+
+def divided_otherwise(stage: Stage, run: RunFolder, record: StageRecord, config: Config) -> str:
+    """Say that a stage was made in other parts than the memory that is given now would divide it into, "" if not."""
     if stage.division is not None:
         was = recorded_config({stage.name: record}, config)
         if stage.division(run, config) != stage.division(run, was):

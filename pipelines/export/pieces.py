@@ -6,7 +6,6 @@ are those of any run, and so is all that reads it.
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from hashlib import sha256
 from typing import Any
@@ -30,6 +29,7 @@ from msgs_slam.pipelines.run.files import (
     save_frames,
 )
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.journal import discard
 from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.system.progress import WithinStage
 
@@ -40,7 +40,7 @@ def make_pieces(context: StageContext) -> list[RunFolder]:
     run, names = context.run, context.run.pieces("tracking")
     for old in run.root.glob("piece_*"):
         if old.name not in names:
-            shutil.rmtree(old)
+            discard(old)
     records, made = load_records(run), []
     for name in names:
         piece = RunFolder(run.root / name)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import glob
 import shutil
 import threading
+import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -63,8 +66,8 @@ class Journal:
                 folder.rmdir()
         return damaged
 
-    def close(self, files: dict[str, tuple[int, str]]) -> None:
-        """End the journal of a stage that has left these files.
+    def check(self, files: dict[str, tuple[int, str]]) -> None:
+        """Compare the files that a stage has left with what was written.
 
         Raises RecoverableError where one is not what was written: a full or failing disk may keep less than it said.
         """
@@ -75,8 +78,6 @@ class Journal:
                 f"{self.folder / torn[0]} is not what was written there ({len(torn)} such files): the disk may be full "
                 f"or failing. Run `msgs-slam resume {self.folder.parent}`"
             )
-        for path in self.files():
-            path.unlink(missing_ok=True)
 
     def _known(self) -> dict[str, set[str]]:
         known: dict[str, set[str]] = {}
@@ -94,7 +95,16 @@ def _digest(path: Path) -> str:
         return ""
 
 
+def discard(folder: Path) -> None:
+    """Remove a folder whose name is needed. It is renamed first: what other processes have open in it may stay on a
+    network disk for as long as they do, in a folder beside it that the next call removes."""
+    with suppress(FileNotFoundError):
+        folder.rename(folder.with_name(f".{folder.name}.old-{time.time_ns()}"))
+    for old in folder.parent.glob(f".{glob.escape(folder.name)}.old-*"):
+        shutil.rmtree(old, ignore_errors=True)
+
+
 def empty(folder: Path) -> None:
     """Make the folder, with nothing in it."""
-    shutil.rmtree(folder, ignore_errors=True)
+    discard(folder)
     folder.mkdir(parents=True)

@@ -135,9 +135,9 @@ def differing_settings(record: StageRecord, config: Config) -> list[str]:
 
 
 def checksums(folder: Path, but: tuple[str, ...] = ()) -> dict[str, tuple[int, str]]:
-    """Relative path, with slashes, → (bytes, sha256) of every file below, but for those of these names."""
-    paths = sorted(p for p in folder.rglob("*") if p.is_file() and not p.is_symlink() and p.name not in but)
-    return {p.relative_to(folder).as_posix(): (p.stat().st_size, file_sha256(p)) for p in paths}
+    """Relative path, with slashes, → (bytes, sha256) of every file below, but for the entries `but` of the folder."""
+    files = {p.relative_to(folder): p for p in sorted(folder.rglob("*")) if p.is_file() and not p.is_symlink()}
+    return {n.as_posix(): (p.stat().st_size, file_sha256(p)) for n, p in files.items() if n.parts[0] not in but}
 
 
 def content_digest(files: Mapping[str, tuple[int, str]]) -> str:

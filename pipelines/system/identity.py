@@ -35,6 +35,7 @@ PLUMBING = frozenset(
         "msgs_slam.pipelines.run.settings_file",
         "msgs_slam.pipelines.run.finished_files",
         "msgs_slam.pipelines.run.journal",
+        "msgs_slam.pipelines.run.ending",
         "msgs_slam.pipelines.system.identity",
         "msgs_slam.pipelines.run.names",
         "msgs_slam.formats.errors",

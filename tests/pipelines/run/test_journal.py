@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from msgs_slam.formats.atomic import watched_by, write_text
+from msgs_slam.pipelines.run.ending import results
 from msgs_slam.pipelines.run.journal import JOURNAL, Journal
-from msgs_slam.pipelines.run.records import checksums
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -41,8 +41,7 @@ def test_lines_of_two_machines_do_not_overwrite_each_other(tmp_path: Path, monke
     journal = Journal(tmp_path)
     assert journal.discard_damaged() == []
     assert sorted(p.name for p in tmp_path.glob("*.txt")) == ["first.txt", "fourth.txt", "second.txt", "third.txt"]
-    journal.close(checksums(tmp_path, but=tuple(p.name for p in journal.files())))
-    assert not list(tmp_path.glob(f"{JOURNAL}*"))
+    journal.check(results(tmp_path))
 
 
 def test_the_journal_of_an_earlier_version_still_counts(tmp_path: Path) -> None:

@@ -10,9 +10,8 @@ import pytest
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines import reconstruct
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine import stages
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
-from msgs_slam.pipelines.run import running
+from msgs_slam.pipelines.run import ending, running
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import is_led, locked
 from msgs_slam.pipelines.run.names import STAGES
@@ -44,14 +43,14 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> States:
                 look(context.run.root)
         return {}
 
-    right = stages._flush_folder
+    right = ending._flush_folder
 
     def flush(folder: Path) -> None:
         if (folder / "tracking").exists() and len(found) == 1:
             look(folder)
         right(folder)
 
-    monkeypatch.setattr(stages, "_flush_folder", flush)
+    monkeypatch.setattr(ending, "_flush_folder", flush)
     monkeypatch.setattr(running, "_BETWEEN_WRITES", 0.0)
     monkeypatch.setattr(reconstruct, "all_stages", lambda: [Stage(name, run) for name in STAGES])
     return found

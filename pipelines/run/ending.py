@@ -1,0 +1,81 @@
+"""The end of a stage, in steps of which each may be the last one before a kill:
+
+    1. its record, with the checksums of all results, is written into the unfinished folder: from here on it is finished
+    2. snapshot, stamp and journals are removed
+    3. the folder of an earlier result is renamed aside and removed
+    4. the unfinished folder takes the name of the stage
+    5. the manifest names the stage
+    6. the record in the folder is removed
+
+A later process that finds such a record takes the stage over if every file is as the record says.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.jsonfile import read_json_object, write_json
+from msgs_slam.formats.reading import parsing
+from msgs_slam.pipelines.run.finished_files import FinishedFiles
+from msgs_slam.pipelines.run.journal import Journal, discard
+from msgs_slam.pipelines.run.layouts import dataclass_from_json
+from msgs_slam.pipelines.run.records import StageRecord, checksums, content_digest
+
+FINGERPRINT, SNAPSHOT, RECORD = "fingerprint", "snapshot", ".record.json"
+"""In an unfinished folder: the work that it belongs to, the folder of snapshots, the record of a stage that ended."""
+
+
+def results(folder: Path) -> dict[str, tuple[int, str]]:
+    """Relative path → (bytes, sha256) of every result in a stage's folder, finished or not."""
+    return checksums(folder, but=(FINGERPRINT, SNAPSHOT, RECORD, *(path.name for path in Journal(folder).files())))
+
+
+def seal(folder: Path, record: StageRecord) -> None:
+    """Declare an unfinished folder finished. Raises InputError when the disk refuses."""
+    write_json(folder / RECORD, asdict(record))
+
+
+def find_sealed(run: FinishedFiles, name: str, fingerprint: str) -> StageRecord | None:
+    """Find the record of a stage that ended without entering the manifest; None where there is none of this very work,
+    or a file is not as it says."""
+    for folder in (run.partial(name), run.stage(name)):
+        with suppress(InputError), parsing(folder / RECORD, "record of a stage"):
+            record = dataclass_from_json(StageRecord, read_json_object(folder / RECORD, most=None))
+            if record.fingerprint != fingerprint or content_digest(record.files) != record.content:
+                continue
+            found = results(folder)
+            if all(found.get(file) == expected for file, expected in record.files.items()):
+                return record
+    return None
+
+
+def move_in(run: FinishedFiles, name: str) -> None:
+    """Give a sealed folder the name of its stage, in the place of an earlier result, unless that is done."""
+    folder, target = run.partial(name), run.stage(name)
+    if not (folder / RECORD).exists():
+        return
+    shutil.rmtree(folder / SNAPSHOT, ignore_errors=True)
+    for path in (folder / FINGERPRINT, *Journal(folder).files()):
+        path.unlink(missing_ok=True)
+    discard(target)
+    os.replace(folder, target)
+    _flush_folder(run.root)
+
+
+def unseal(run: FinishedFiles, name: str) -> None:
+    """Remove the record from the folder of a stage that the manifest names."""
+    with suppress(OSError):
+        (run.stage(name) / RECORD).unlink(missing_ok=True)
+
+
+def _flush_folder(folder: Path) -> None:
+    """Make a rename survive a power cut."""
+    if hasattr(os, "O_DIRECTORY"):
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        os.fsync(descriptor)
+        os.close(descriptor)
