@@ -17,17 +17,18 @@ Array = NDArray[np.float64]
 SURE = 0.3
 """Confidence from which a depth is evidence and stays as it is."""
 _COMPANY_REACH, _COMPANY_SD = 3 / 80, 30.0
-"""As a part of the width; colours."""
+"""As a part of the longer side; colours."""
 _COMPANY_POWER = 0.9
 """Brings the calibration: from confidence 0.42 (reliability 0.5) on, at most 3 % are off by more than 5 %."""
 _EVIDENCE_POWER = 2.5
 _REACHES = ((1 / 16, 30.0, 1.0), (1 / 4, 60.0, 0.1))
-"""How far a depth speaks along like colours (as a part of the width), the colour step that stops it, and how much it
-then counts."""
+"""How far a depth speaks along like colours (as a part of the longer side), the colour step that stops it, and how much
+it then counts."""
 _ANYWHERE, _ANYWHERE_REACH = 1e-5, 1 / 4
-"""Weight and reach, as a part of the width, of what speaks across all colours: only where nothing else does."""
+"""Weight and reach, as a part of the longer side, of what speaks across all colours: only where nothing else does. From
+a fourth of it on, the blur (OpenCV cuts it off at four standard deviations) reaches from any pixel to any other."""
 _RIDGE = 3e-4
-"""Variance of place, in widths squared, below which the evidence does not fix a slope: then it is kept small."""
+"""Variance of place, in longer sides squared, below which the evidence does not fix a slope: then it is kept small."""
 _LEAST_SLOPE, _MOST_SLOPE = 0.5, 1.6
 _LEAST_PIXELS = 40
 _FLAT_CONFIDENCE, _GUESS_CONFIDENCE = 0.2, 0.03
@@ -37,7 +38,7 @@ _KNOWN_MASS = 1e-3
 def judge_by_company(confidence: NDArray[np.float32], image: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(h, w) confidence that also counts how sure the pixels around are that have a like colour; image (h, w, 3)."""
     both = np.stack([confidence, np.ones_like(confidence)], axis=-1)
-    total, mass = np.moveaxis(spread_votes(both, image, _COMPANY_REACH * image.shape[1], _COMPANY_SD), -1, 0)
+    total, mass = np.moveaxis(spread_votes(both, image, _COMPANY_REACH * max(confidence.shape), _COMPANY_SD), -1, 0)
     return np.power(confidence * np.clip(total / mass, 0, 1), _COMPANY_POWER).astype(np.float32)
 
 
@@ -60,14 +61,15 @@ def _local_planes(inverse: Array, weight: Array, image: NDArray[np.uint8]) -> tu
     """(h, w) inverse depth of the plane through the evidence around each pixel (in a picture, the inverse depth of a
     plane is linear), and the evidence's mass: weighted least squares whose weights fade along like colours."""
     height, width = inverse.shape
-    y, x = np.mgrid[:height, :width] / width
+    side = max(height, width)
+    y, x = np.mgrid[:height, :width] / side
     one = np.ones_like(x)
     factors = ((one, one), (x, one), (y, one), (x, x), (x, y), (y, y), (inverse, one), (inverse, x), (inverse, y))
     votes, sums = np.empty((height, width, len(factors)), np.float32), np.zeros((height, width, len(factors)))
     for k, (a, b) in enumerate(factors):
         votes[..., k] = weight * (a * b)
     for reach, color_sd, share in _REACHES:
-        spread = spread_votes(votes, image, reach * width, color_sd)
+        spread = spread_votes(votes, image, reach * side, color_sd)
         for k in range(len(factors)):  # one by one: all as float64 were the most memory that the stage needed
             sums[..., k] += share * spread[..., k].astype(np.float64)
     mass = sums[..., 0].copy()
@@ -87,7 +89,7 @@ def _local_planes(inverse: Array, weight: Array, image: NDArray[np.uint8]) -> tu
 def _spread_anywhere(votes: NDArray[np.float32]) -> NDArray[np.float32]:
     """(h, w) votes blurred widely; at an eighth of the size, for it is smooth."""
     height, width = votes.shape
-    size, sd = (max(1, width // 8), max(1, height // 8)), max(width * _ANYWHERE_REACH / 8, 1.0)
+    size, sd = (max(1, width // 8), max(1, height // 8)), max(max(height, width) * _ANYWHERE_REACH / 8, 1.0)
     small = cv2.resize(votes, size, interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(small, (0, 0), sd, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)

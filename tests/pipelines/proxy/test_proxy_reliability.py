@@ -57,7 +57,8 @@ def test_compact_maps_lose_only_what_they_may() -> None:
     error = np.abs(small.depth / np.where(maps.depth > 0, maps.depth, 1) - 1) * (maps.depth > 0)
     assert 0 < error[CONFIDENCE > 0.36].max() < 5.1e-4
     assert error.max() < 4.1e-3
-    assert 0 < np.abs(small.confidence - CONFIDENCE).max() < 0.0162
+    assert 0 < np.abs(small.confidence - CONFIDENCE)[maps.depth > 0].max() < 0.0162
+    assert not small.confidence[maps.depth == 0].any()
     np.testing.assert_array_equal(compact(small).depth, small.depth)
 
 
@@ -69,3 +70,14 @@ def test_mean_iou_of_known_pictures() -> None:
     assert mean_iou(first, others) == pytest.approx([0.5, 1, 0])
     assert mean_iou(np.full_like(first, VOID), others).tolist() == [0, 0, 0]
     assert mean_iou(first, others[:0]).shape == (0,)
+
+
+def test_no_number_that_is_none_reaches_a_file() -> None:
+    depth = np.array([[np.nan, np.inf, -1, 0, 3.4e38, 1e-42, 2, 2]], np.float32)
+    u = np.array([[0.5, 0.5, 0.5, 0.5, 0.5, 0.5, np.nan, 0.5]], np.float32)
+    small = compact(ProxyMaps(depth, u, np.zeros((1, 8), np.uint8), np.full((1, 8), np.nan, np.float32)))
+    for values in (small.depth, small.confidence, small.label_confidence):
+        assert np.isfinite(values).all()
+        assert values.min() >= 0
+    np.testing.assert_array_equal(small.depth[0, -2:], 2)
+    np.testing.assert_array_equal(small.confidence > 0, [[False] * 4 + [small.depth[0, 4] > 0] + [False] * 2 + [True]])

@@ -318,6 +318,50 @@ def test_each_of_two_blank_surfaces_takes_its_own_plane() -> None:
     assert np.abs(filled / truth - 1).max() < 0.03
 
 
+SURE_PLACES = {
+    "top rows": np.s_[:9],
+    "a corner": np.s_[:8, :8],
+    "the other corner": np.s_[-8:, -8:],
+    "left columns": np.s_[:, :6],
+    "one pixel": np.s_[3:4, 5:6],
+    "none": np.s_[:0],
+}
+
+
+@pytest.mark.parametrize("shape", [(96, 54), (54, 96), (72, 72), (320, 20), (20, 320)])
+@pytest.mark.parametrize("place", SURE_PLACES)
+def test_filled_depths_stay_near_the_sure_ones_in_pictures_of_any_shape(shape: tuple[int, int], place: str) -> None:
+    rng = np.random.default_rng(5)
+    image = rng.integers(0, 255, (*shape, 3)).astype(np.uint8)  # no two colours are alike: votes hardly spread
+    depth, confidence = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    depth[SURE_PLACES[place]] = rng.uniform(2, 3, depth[SURE_PLACES[place]].shape)
+    confidence[SURE_PLACES[place]] = 0.9
+    filled, trust = fill_unsure(depth, confidence, image)
+    assert np.isfinite(filled).all()
+    assert trust.min() >= 0
+    assert trust.max() <= 1
+    sure = confidence > 0
+    np.testing.assert_array_equal(filled[sure], depth[sure])
+    if sure.sum() >= 40:
+        assert 0.5 * 2 < filled.min() <= filled.max() < 2 * 3
+    else:
+        assert filled[~sure].max(initial=0) == 0
+    judged = judge_by_company(confidence, image)
+    assert 0 <= judged.min() <= judged.max() <= 1
+
+
+def test_a_picture_held_upright_is_filled_like_one_held_across() -> None:
+    """A plane of which the first third is sure."""
+    rows, columns = np.mgrid[:54, :96]
+    truth = (1 / (0.6 - 0.003 * columns + 0.001 * rows)).astype(np.float32)
+    confidence = np.where(columns < 32, 0.9, 0).astype(np.float32)
+    image = np.full((54, 96, 3), 120, np.uint8)
+    across, trust = fill_unsure(truth, confidence, image)
+    upright, trust_upright = fill_unsure(truth.T.copy(), confidence.T.copy(), image.swapaxes(0, 1).copy())
+    np.testing.assert_allclose(upright.T, across, rtol=0.02)
+    np.testing.assert_allclose(trust_upright.T, trust, atol=0.01)
+
+
 def test_a_chance_match_in_a_blank_wall_is_not_sure_for_it_stands_alone() -> None:
     image = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
     image[:, 30:] = np.random.default_rng(3).integers(0, 40, (HEIGHT, 30, 3))
