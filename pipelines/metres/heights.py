@@ -98,6 +98,8 @@ def ceiling_height(scene: Scene) -> list[Evidence]:
     if floor is None or ceiling is None or wrong is None:
         return []
     height = float((ceiling.point - floor.point) @ floor.normal)
+    if height <= 0:
+        return []
     return [measured("ceiling height", "ceiling", height, CEILING_OVER_FLOOR, wrong=max(wrong, 0.1), length_sd=0.02)]
 
 

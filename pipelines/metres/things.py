@@ -68,7 +68,7 @@ def _doors(scene: Scene, heights: Array, upward: Array) -> list[Evidence]:
     found = []
     for members in _instances(scene, upright, _LEAST_DOOR)[:_MOST_OF_A_KIND]:
         low, high = np.quantile(heights[members], [0.03, 0.97])
-        if low < 0.15 * high:
+        if high > 0 and low < 0.15 * high:  # a mirror shows doors under the floor too
             found.append(measured("door", "door", float(high), DOOR, wrong=_WRONG_NAME, length_sd=0.06))
     return found
 

@@ -30,11 +30,12 @@ class Gravity:
 
 def find_gravity(voxels: Voxels, cam_up: NDArray[np.float64]) -> Gravity:
     """Up is the normal direction of the most surface within 40° of the cameras' mean up `cam_up` (people hold
-    cameras upright). Opposite normals (floor and ceiling) count as the same direction."""
-    cam_up = cam_up / np.linalg.norm(cam_up)
+    cameras upright). Opposite normals (floor and ceiling) count as the same direction. Without any surface there, the
+    cameras' up, unsure."""
+    cam_up = cam_up / max(float(np.linalg.norm(cam_up)), 1e-12)
     along = voxels.normal @ cam_up
     near = np.abs(along) > np.cos(np.radians(40))
-    if voxels.weight[near].sum() < 0.03 * voxels.weight.sum():
+    if voxels.weight[near].sum() <= 0.03 * voxels.weight.sum():
         return Gravity(cam_up, False)
     normals = voxels.normal[near] * np.sign(along[near])[:, None]
     weight = voxels.weight[near]

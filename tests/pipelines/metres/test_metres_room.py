@@ -20,16 +20,17 @@ from msgs_slam.pipelines.metres.find import (
     find_metres,
     known_evidence,
     load_seen,
+    scene_evidence,
     usual_evidence,
 )
-from msgs_slam.pipelines.metres.heights import camera_height, floor_trust
-from msgs_slam.pipelines.metres.scene import Scene
+from msgs_slam.pipelines.metres.heights import camera_height, ceiling_height, floor_trust
+from msgs_slam.pipelines.metres.scene import Scene, SeenFrame, build_scene
 from msgs_slam.pipelines.metres.things import sizes_of_things
 from msgs_slam.pipelines.run.files import DEPTH_FIELDS, FIGURES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
-from msgs_slam.pipelines.types import Metres
-from msgs_slam.pipelines.voxels.layout import FLOOR, OTHER, Gravity
+from msgs_slam.pipelines.types import VOID, Intrinsics, Metres, ProxyMaps
+from msgs_slam.pipelines.voxels.layout import CEILING, FLOOR, OTHER, Gravity
 from msgs_slam.pipelines.voxels.voxels import Voxels
 
 STAGES_DONE = ("frames", "proxy", "tracking", "mapping")
@@ -193,6 +194,43 @@ def test_a_table_top_that_is_lowest_is_no_floor() -> None:
     trusts = [floor_trust(unnamed), floor_trust(named)]
     assert None not in trusts
     assert trusts[0] > trusts[1]  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(("low", "high"), [(-2.0, -0.2), (-0.5, 0.0), (-2.0, 2.0), (0.0, 2.0)])
+def test_a_door_mirrored_below_the_floor_tells_nothing(low: float, high: float) -> None:
+    heights = np.arange(low, high + 0.01, 0.05)
+    x, y = np.meshgrid(np.arange(0, 0.9, 0.05), heights)
+    door = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
+    room = scene([FLOOR_PART, (door, OTHER, "door")], CENTRES)
+    room.voxels.normal[len(FLOOR_PART[0]) :] = [0.0, 0, 1]
+    with np.errstate(all="raise"):
+        pieces = sizes_of_things(room)
+    assert [p.source for p in pieces] == (["door"] if high > 0 else [])
+    assert all(np.isfinite(p.log_scale) and np.isfinite(p.sd) for p in pieces)
+
+
+def test_a_ceiling_that_is_not_over_the_floor_tells_nothing() -> None:
+    below = scene([FLOOR_PART, (plane((0, 5), (0, 4), -1.0), CEILING, "ceiling")], CENTRES)
+    assert ceiling_height(below) == []
+    above = scene([FLOOR_PART, (plane((0, 5), (0, 4), 2.4), CEILING, "ceiling")], CENTRES)
+    assert len(ceiling_height(above)) == 1
+
+
+@pytest.mark.parametrize("sure", [0, 1, 9])
+def test_a_few_sure_pixels_make_a_scene_of_which_nothing_is_known(sure: int) -> None:
+    """Too few and too scattered for a single voxel."""
+    depth, confidence = np.zeros((40, 30), np.float32), np.zeros((40, 30), np.float32)
+    depth.ravel()[: 130 * sure : 130], confidence.ravel()[: 130 * sure : 130] = 2.0, 0.9
+    maps = ProxyMaps(depth, confidence, np.full(depth.shape, VOID, np.uint8), confidence)
+    frame = SeenFrame(np.zeros((40, 30, 3), np.uint8), maps, np.eye(4))
+    found = build_scene([frame], Intrinsics(30, 40, 30.0, 30.0, 15.0, 20.0), (), True)
+    if not sure:
+        assert found is None
+        return
+    assert found is not None
+    assert len(found.voxels) == 0
+    assert not found.gravity.is_sure
+    assert [p.source for p in scene_evidence(found)] == ["usual distances"]
 
 
 def test_on_stairs_the_camera_is_measured_over_its_own_step() -> None:

@@ -93,6 +93,31 @@ def test_a_frame_without_pose_keeps_what_it_said(room: Room) -> None:
     assert found.confidence.max() < 0.5
 
 
+def test_a_room_of_which_nothing_is_sure_has_the_names_of_each_frame_alone(room: Room) -> None:
+    """One sure pixel a frame, and none of them a voxel's worth."""
+
+    def scattered(frame: Frame) -> DepthEstimate:
+        depth = depth_of(room, frame)
+        confidence = np.zeros_like(depth.confidence)
+        confidence[::41, ::37] = 0.9
+        return replace(depth, depth=np.where(confidence > 0, depth.depth, 0).astype(np.float32), confidence=confidence)
+
+    said = {f.id: coarse(room.views[f.id].labels, np.random.default_rng(1)) for f in room.frames}
+    segments = SegmentLabels(room.sequence(), 16, SilentProgress())
+    scene = NamedScene.gather(segments, room.frames, scattered, lambda f: said[f.id], Vocabulary(NAMES, (0,), 16))
+    assert len(scene.keys) == 0
+    assert "wall" in scene.names
+    found = scene.estimate(room.sequence(), room.frames[0], scattered(room.frames[0]), said[0])
+    names = np.array([*scene.names, "void"])[np.minimum(found.labels, len(scene.names))]
+    assert (names == np.array(NAMES)[room.views[0].labels]).mean() > 0.5
+    segments.prepare(room.frames, scattered)
+    alone = segments.estimate(room.frames[0], scattered(room.frames[0]))
+    assert len(segments.classes()) == 0
+    assert (alone.labels == VOID).all()
+    assert not alone.confidence.any()
+    assert len(segments.heights(room.frames, scattered)) == 0
+
+
 def voxels_of(positions: list[tuple[float, float, float]], normals: list[tuple[float, float, float]]) -> Voxels:
     points = np.array(positions, float)
     keys = voxel_keys(points, 1.0)

@@ -1,9 +1,10 @@
-"""Voxels looked up in blocks, against all of them at once."""
+"""Voxels looked up in blocks, against all of them at once; rooms of which nothing or next to nothing was seen."""
 
 import numpy as np
 import pytest
 
 from msgs_slam.pipelines.voxels import voxels
+from msgs_slam.pipelines.voxels.layout import CEILING, OTHER, Gravity, find_gravity, floor_plane, name_structure
 
 
 @pytest.mark.parametrize("missing", [0, 1, 5_000])
@@ -26,3 +27,28 @@ def test_a_missing_voxel_is_answered_by_one_that_touches_it(missing: int) -> Non
         assert outside.any()
         assert (found.ravel()[8:][outside] == -1).all()
         assert (found.ravel()[8:] >= 0).sum() > voxels._BLOCK // 27
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+@pytest.mark.parametrize("slant", [(0.0, 1.0, 0.0), (1.0, 0.0, 0.0)])
+@pytest.mark.parametrize("cam_up", [(0.0, 2.0, 0.0), (0.0, 0.0, 0.0)])
+def test_a_room_of_next_to_no_surface_has_an_up_and_no_floor(
+    count: int, slant: tuple[float, ...], cam_up: tuple[float, ...]
+) -> None:
+    """Level or upright surface, and cameras whose upward axes cancel out."""
+    points = np.arange(3.0 * count).reshape(count, 3)
+    frames = [
+        (voxels.voxel_keys(points, 1.0), np.hstack([np.ones((count, 1)), points, np.tile(slant, (count, 1)), points]))
+    ]
+    few, centres = voxels.merge(1.0, frames), np.zeros((2, 3))
+    assert len(few) == count
+    found = find_gravity(few, np.array(cam_up))
+    assert np.isfinite(found.up).all()
+    if not count:
+        assert not found.is_sure
+        np.testing.assert_array_equal(found.up, np.array(cam_up) / max(np.linalg.norm(cam_up), 1))
+    for gravity in (found, Gravity(np.array([0.0, 1, 0]), True)):
+        kind = name_structure(few, gravity, centres)
+        assert len(kind) == count
+        assert gravity.is_sure or (kind == OTHER).all()
+        assert floor_plane(few, kind, gravity.up) is floor_plane(few, kind, gravity.up, CEILING) is None
