@@ -40,6 +40,10 @@ def grow_submap(task: SubmapTask, progress: Progress) -> None:
     exposures, settings = task.before.exposures(), task.config.mapping
     ids, poses, visited, kept = _start(task, task.before, exposures)
     gains, offsets = _exposures(ids, exposures)
+    no_depths = np.zeros((0, 1, 1), np.float32)
+    if len(visited) == 0:  # no added image has become a keyframe: the map stays as it was
+        task.save(GROWN, SubmapResult(kept, ids, poses, gains, offsets, no_depths, np.array([0])))
+        return
     views = task.views(rows_of(task.trajectory, ids[visited])).views
     shown = pixels_filled(kept, views) > 0
     made = optimise_map(
@@ -50,8 +54,7 @@ def grow_submap(task: SubmapTask, progress: Progress) -> None:
     )  # fmt: skip
     poses[visited], gains[visited], offsets[visited] = made.cam_from_world, made.log_gains, made.offsets
     grown = together([kept.only(~shown), made.gaussian_map])
-    no_depths, steps = np.zeros((0, 1, 1), np.float32), np.array([made.iterations])
-    task.save(GROWN, SubmapResult(grown, ids, poses, gains, offsets, no_depths, steps))
+    task.save(GROWN, SubmapResult(grown, ids, poses, gains, offsets, no_depths, np.array([made.iterations])))
 
 
 def _start(
@@ -67,7 +70,9 @@ def _start(
 
 
 def _to_visit(views: Sequence[View], was_there: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Rows of the views that were added, and of those that see something of what these show."""
+    """Rows of the views that were added, and of those that see something of what these show; none without any added."""
+    if was_there.all():
+        return np.zeros(0, np.int64)
     seen = overlaps(v.posed_depth() for v in views)[~was_there].max(axis=0).toarray().ravel()
     return np.flatnonzero(~was_there | (seen > _SEES_THE_SAME))
 
