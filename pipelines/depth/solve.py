@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -15,6 +16,9 @@ from msgs_slam.pipelines.depth.fields import Basis, Grid
 
 Array = NDArray[np.float64]
 _ROWS_AT_ONCE = 200_000
+_MOST_ITERATIONS = 500
+"""Of conjugate gradients; 600 keyframes that hang together by pairs alone took 129."""
+log = logging.getLogger("msgs_slam")
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,7 @@ class Equations:
 
 def solve_fields(parts: Iterable[Equations], fields: Array, expected: Array, prior: Prior) -> Array:
     """(N, nodes) the fields after one step: Cauchy-weighted equations, and `expected` (N, nodes) as far as the prior
-    holds them to it."""
+    holds them to it. Where the step does not converge, a warning is logged and the fields stay as they were."""
     normals = [sparse.kron(sparse.identity(len(fields)), prior.normal(), format="csr")]
     right = -(normals[0] @ (fields - expected).reshape(-1))
     for design, residual in _designs(parts, fields.size):
@@ -78,7 +82,15 @@ def solve_fields(parts: Iterable[Equations], fields: Array, expected: Array, pri
         while len(normals) > 1 and normals[-2].nnz <= 2 * normals[-1].nnz:
             normals[-2:] = [normals[-2] + normals[-1]]
     normal = sum(normals[:-1], normals[-1])
-    change, _ = cg(normal, right, rtol=1e-6, maxiter=500, M=sparse.diags(1 / normal.diagonal()))
+    change, unsolved = cg(normal, right, rtol=1e-6, maxiter=_MOST_ITERATIONS, M=sparse.diags(1 / normal.diagonal()))
+    if unsolved:
+        log.warning(
+            "the scales of depth of %d keyframes did not converge in %d iterations and stay as they were: depth may "
+            "disagree between these keyframes. Check the depth files or the depth network",
+            len(fields),
+            _MOST_ITERATIONS,
+        )
+        return fields
     return fields + change.reshape(fields.shape)
 
 

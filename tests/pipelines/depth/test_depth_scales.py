@@ -5,6 +5,7 @@ import pytest
 
 from msgs_slam.pipelines.depth import scales
 from msgs_slam.pipelines.depth.scales import COARSE
+from msgs_slam.pipelines.depth.solve import Equations, solve_fields
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 
 CAMERA = Intrinsics(640, 480, 500, 500, 320, 240)
@@ -50,6 +51,22 @@ def test_field_without_points_is_flat() -> None:
     nothing = COARSE.at(np.zeros((0, 2)), 640, 480)
     fields = scales.fit_to_points(np.zeros(0, int), nothing, np.zeros(0), np.zeros(0), np.array([0.0, 0.3]))
     assert np.allclose(fields, [[0.0] * 12, [0.3] * 12])
+
+
+@pytest.mark.parametrize("broken", [True, False])
+def test_a_field_that_does_not_converge_stays_as_it_was_and_that_is_said(
+    broken: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    rng = np.random.default_rng(0)
+    basis = COARSE.at(rng.uniform(0, 1, (40, 2)), 1, 1)
+    residual = rng.normal(0, 0.1, 40)
+    residual[0] = np.nan if broken else 0.0
+    parts = [Equations.of_places(0, basis, COARSE.size, residual, np.full(40, 0.05), 1.0)]
+    before = np.full((1, COARSE.size), 0.2)
+    after = solve_fields(parts, before, before, scales.PRIOR)
+    assert np.array_equal(after, before) == broken
+    assert np.isfinite(after).all()
+    assert ("did not converge" in caplog.text) == broken
 
 
 def test_sampling_reads_the_pixel_under_the_point() -> None:
