@@ -1,8 +1,11 @@
-"""HDR video (HLG, PQ) brought to the colours of ordinary images: OpenCV's decoder cuts it to 8 flat bits."""
+"""Video by PyAV: HDR (HLG, PQ) in the colours of ordinary images, where OpenCV's decoder cuts it to 8 flat bits, and
+other video that OpenCV cannot decode."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs_slam.formats.containers import OPEN_OPTIONS
 from msgs_slam.formats.spherical import read_moov
 
 _TRANSFERS = {16: "PQ", 18: "HLG"}  # ITU-T H.273, table 3
@@ -27,67 +31,125 @@ def hdr_transfer(path: Path) -> str:
     return _TRANSFERS.get(int.from_bytes(moov[place + 10 : place + 12], "big"), "") if place >= 0 else ""
 
 
-def can_tone_map() -> bool:
-    """Whether PyAV is there (the extra "hdr")."""
-    try:
-        import av  # noqa: F401
-    except ImportError:
-        return False
-    return True
+class AvCapture:
+    """Reader by PyAV with the part of OpenCV's VideoCapture that is used here: for HDR (`transfer` as `hdr_transfer`
+    says), whose frames are tone-mapped; for interlaced video, which is deinterlaced to as many frames as it has; and
+    for codecs that OpenCV cannot decode. What cannot be opened has no frame."""
 
-
-class HdrCapture:
-    """Reader of HDR videos with the part of OpenCV's VideoCapture that is used here; frames are tone-mapped."""
-
-    def __init__(self, path: Path, transfer: str) -> None:
+    def __init__(self, path: Path, transfer: str = "", interlaced: bool = False) -> None:
         import av
 
-        self._failure = av.FFmpegError
-        self._transfer = transfer
-        self._container = av.open(str(path), format="mov", options={"protocol_whitelist": "file"})
-        self._stream = self._container.streams.video[0]
-        self._stream.thread_type = "AUTO"
-        self._frames = self._container.decode(self._stream)
-        self._waiting = self._decoded()
-        self._frame: Any = self._waiting
-
-    def _decoded(self) -> Any:
+        self._transfer, self._turns = transfer, True
+        self.codec = ""
+        self._frame: Any = None
+        self._stream: Any = None
+        self._frames: Iterator[Any] = iter(())
         try:
-            return next(self._frames, None)
-        except self._failure:  # a truncated file: what came before it is good
-            return None
+            self._container = av.open(str(path), options=OPEN_OPTIONS)
+            self._stream = self._container.streams.video[0]
+            self._stream.thread_type = "AUTO"
+            self.codec = self._stream.codec_context.name
+        except (av.FFmpegError, OSError, ValueError, IndexError):
+            return
+        self._frames = _decoded(self._container, self._stream, interlaced)
 
     def isOpened(self) -> bool:
-        """Whether there is a frame at all."""
-        return self._frame is not None
+        """Whether there is a video stream."""
+        return self._stream is not None
 
     def get(self, what: int) -> float:
-        """The properties that are asked for; 0 for others."""
-        frame = self._frame
-        size = (frame.width, frame.height) if frame.rotation % 180 == 0 else (frame.height, frame.width)
+        """The properties that are asked for, of the frame grabbed last; 0 for others."""
+        frame, stream = self._frame, self._stream
+        turn = frame.rotation % 360
+        size = (frame.height, frame.width) if self._turns and turn % 180 else (frame.width, frame.height)
+        shape = stream.sample_aspect_ratio or 0
         values = {
             cv2.CAP_PROP_FRAME_WIDTH: size[0],
             cv2.CAP_PROP_FRAME_HEIGHT: size[1],
-            cv2.CAP_PROP_FRAME_COUNT: self._stream.frames,
-            cv2.CAP_PROP_FPS: self._stream.average_rate or 0,
+            cv2.CAP_PROP_FRAME_COUNT: stream.frames,
+            cv2.CAP_PROP_FPS: stream.guessed_rate or 0,
             cv2.CAP_PROP_POS_MSEC: float("nan") if frame.time is None else 1000 * frame.time,
+            cv2.CAP_PROP_ORIENTATION_META: turn,
+            cv2.CAP_PROP_SAR_NUM: shape and shape.numerator,
+            cv2.CAP_PROP_SAR_DEN: shape and shape.denominator,
         }
         return float(values.get(what, 0))
 
+    def set(self, what: int, value: float) -> bool:
+        """Leave the frames lying as they are stored, by CAP_PROP_ORIENTATION_AUTO; False for other properties."""
+        if what == cv2.CAP_PROP_ORIENTATION_AUTO:
+            self._turns = bool(value)
+        return what == cv2.CAP_PROP_ORIENTATION_AUTO
+
     def grab(self) -> bool:
         """Go to the next frame; False at the end."""
-        following, self._waiting = self._waiting or self._decoded(), None
+        following = next(self._frames, None)
         self._frame = following or self._frame
         return following is not None
 
     def retrieve(self) -> tuple[bool, NDArray[np.uint8]]:
         """The frame as OpenCV would give it: (H, W, 3) uint8 BGR, upright."""
-        rgb = tone_mapped(self._frame.to_ndarray(format="rgb48le"), self._transfer)
-        return True, np.ascontiguousarray(np.rot90(rgb, self._frame.rotation // 90)[..., ::-1])
+        frame = self._frame
+        if self._transfer:
+            bgr = tone_mapped(frame.to_ndarray(format="rgb48le"), self._transfer)[..., ::-1]
+        else:
+            bgr = frame.to_ndarray(format="bgr24")
+        return True, np.ascontiguousarray(np.rot90(bgr, frame.rotation // 90 if self._turns else 0))
 
     def release(self) -> None:
         """Close the video file."""
-        self._container.close()
+        if self._stream is not None:
+            self._frames = iter(())
+            self._container.close()
+
+
+def _decoded(container: Any, stream: Any, interlaced: bool) -> Iterator[Any]:
+    """Frames in the order of time; packets that do not decode are passed over, as OpenCV does."""
+    import av
+
+    graph = _deinterlacer(stream) if interlaced else None
+    packets, is_open = container.demux(stream), True
+    while is_open:
+        try:
+            packet = next(packets, None)
+            is_open = packet is not None
+            frames = packet.decode() if packet is not None else _rest(stream)
+        except av.FFmpegError:  # raised by `next` it is the last one: the file is truncated, what came before is good
+            continue
+        yield from frames if graph is None else _through(graph, frames if is_open else [*frames, None])
+
+
+def _rest(stream: Any) -> list[Any]:
+    """What the decoder still holds, where no end of the file has told it to hand that out."""
+    import av
+
+    try:
+        return list(stream.codec_context.decode(None))
+    except av.FFmpegError:
+        return []
+
+
+def _deinterlacer(stream: Any) -> Any:
+    """A graph that makes one frame of each; frames that are not marked as interlaced stay as they are."""
+    import av
+
+    graph = av.filter.Graph()
+    nodes = (
+        graph.add_buffer(template=stream, time_base=stream.time_base),
+        graph.add("bwdif", "mode=send_frame:parity=auto:deint=interlaced"),
+    )
+    graph.link_nodes(*nodes, graph.add("buffersink")).configure()
+    return graph
+
+
+def _through(graph: Any, frames: list[Any]) -> Iterator[Any]:
+    import av
+
+    for frame in frames:
+        graph.push(frame)
+        with contextlib.suppress(av.BlockingIOError, av.EOFError):
+            while True:
+                yield graph.pull()
 
 
 def tone_mapped(rgb: NDArray[np.uint16], transfer: str) -> NDArray[np.uint8]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import shlex
 import statistics
 from collections.abc import Callable, Container, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
@@ -21,26 +22,38 @@ os.environ.setdefault("OPENCV_VIDEOIO_DEBUG", "0")
 
 import cv2
 
+from msgs_slam.formats.containers import as_opencv_writes_them
+from msgs_slam.formats.display import Display, pixel_aspect, read_mirror
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.hdr_video import HdrCapture, can_tone_map, hdr_transfer
+from msgs_slam.formats.hdr_video import AvCapture, hdr_transfer
 from msgs_slam.formats.images import IMAGE_SUFFIXES
+from msgs_slam.formats.interlaced import has_pyav, is_interlaced, unreadable
 from msgs_slam.formats.reading import opened
 
 MAX_FRAME_PIXELS = 64_000_000
 """A larger frame is taken for a damaged or hostile header (8K video has 33 million)."""
 
-# The containers of one video each. Left out is what names other files (playlists, scripts, numbered images) or is made
-# into images by FFmpeg (text): such a file would show files from elsewhere on this disk, whatever it is called.
-_CONTAINERS = (
-    "mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "mpegts", "mpeg", "mpegvideo", "m4v", "flv", "live_flv", "asf",
-    "asf_o", "ogg", "gif", "apng", "h264", "hevc", "av1", "obu", "ivf", "vvc", "vc1", "dv", "mxf", "nut", "wtv", "rm",
-    "h263", "mjpeg", "mjpeg_2000", "yuv4mpegpipe", "gxf", "swf", "nsv", "dirac", "cavsvideo", "avs2", "avs3", "r3d",
-)  # fmt: skip
 _OPTIONS_VARIABLE = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
-_OPEN_OPTIONS = f"format_whitelist;{','.join(_CONTAINERS)}|protocol_whitelist;file"
 _SNIFFED_BYTES = 4096
 _UNKNOWN_RATE = 30.0
+_MOST_RATE = 10_000.0
+"""A larger one is a clock's unit and no number of frames a second."""
 _SHORTEST_STEP = 1e-6
+_FIRST_FRAMES = 8
+"""Decoded before to see whether a video is interlaced."""
+_DOUBTED_FRAMES = 1000
+"""Among so many, frames without a picture of their own are looked into."""
+_ARCHIVES = {
+    b"PK\3\4": "ZIP",
+    b"Rar!": "RAR",
+    b"7z\xbc\xaf": "7z",
+    b"\x1f\x8b": "gzip",
+    b"\xfd7zX": "xz",
+    b"BZh": "bzip2",
+}
+_CODECS = {"av01": "AV1", "vvc1": "H.266 (VVC)", "vvi1": "H.266 (VVC)", "apv1": "APV", "evc1": "EVC"}
+_DECODED = ("h264", "avc1", "hevc", "hev1", "hvc1", "mp4v", "mjpg", "vp80", "vp90", "vp09")
+"""By every OpenCV: a file of these is damaged where it has no frame."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +84,9 @@ def probe_video(path: Path) -> VideoInfo:
     Raises InputError for a missing, empty or text file, and for one in which no image can be decoded.
     """
     with VideoReader(path) as reader:
-        if next(reader, None) is None:
-            raise _undecodable(Path(path))
+        # Two frames: OpenCV makes the same picture of all frames that it cannot convert.
+        if not list(itertools.islice(reader, 2)):
+            raise _blank(Path(path), reader.blank_frames) if reader.blank_frames else _undecodable(Path(path))
         return reader.info
 
 
@@ -80,14 +94,18 @@ class VideoReader(Iterator[VideoFrame]):
     """Iterates over the wanted frames of a video, each a `VideoFrame`.
 
     `wanted` says by index (a set, a range or a function) which frames to hand out, None for all; the others are
-    decoded but not converted to RGB. Rotation stated in the file is applied. Timestamps are those of the container,
-    so a variable rate is kept; where they are missing or go back they are repaired to increase strictly.
+    decoded but not converted to RGB. A turn or mirroring stated in the file is applied, and pixels that are no squares
+    are stretched to such. Timestamps are those of the container, so a variable rate is kept; where they are missing or
+    go back they are repaired to increase strictly.
 
     After the end `timestamps` holds the time of every decoded frame and `missing_frames` how many frames the header
-    promised beyond those: more than a few mean a truncated or damaged file. `repaired_timestamps` counts the repairs.
-    `hdr` is "HLG" or "PQ" where the file says so, `tone_mapped` whether its frames are then brought to sRGB.
+    promised beyond those: more than a few mean a truncated or damaged file. `repaired_timestamps` counts the repairs,
+    `blank_frames` those wanted that show one flat colour and were left out (a fade, or a picture never decoded).
+    `hdr` is "HLG" or "PQ" where the file says so, `tone_mapped` whether its frames are then brought to sRGB;
+    `interlaced` whether frames are deinterlaced.
 
-    Raises InputError at construction as `probe_video` does.
+    Raises InputError at construction as `probe_video` does, and for interlaced video where it cannot be read, which
+    may show later.
     """
 
     def __init__(self, path: Path, wanted: Callable[[int], bool] | Container[int] | None = None) -> None:
@@ -95,12 +113,34 @@ class VideoReader(Iterator[VideoFrame]):
         _require_video_bytes(self._path)
         self._wanted = _as_predicate(wanted)
         self.hdr = hdr_transfer(self._path)
-        self.tone_mapped = bool(self.hdr) and can_tone_map()
-        self._capture = HdrCapture(self._path, self.hdr) if self.tone_mapped else _open(self._path)
-        self.info = _read_info(self._capture, self._path)
+        self.tone_mapped = bool(self.hdr) and has_pyav()
+        self.interlaced = has_pyav() and is_interlaced(self._path, _FIRST_FRAMES)
+        self._capture = self._first_grabbed()
+        self._is_grabbed = True
+        self.display = _read_display(self._capture, self._path)
+        self.info = _read_info(self._capture, self._path, self.display)
         self._clock = _Clock(self.info.fps)
+        self._last: NDArray | None = None
+        self._is_trusted = False
         self.ended = False
-        self.unreadable_frames = 0
+        self.unreadable_frames = self.blank_frames = 0
+
+    def _first_grabbed(self) -> cv2.VideoCapture | AvCapture:
+        """The decoder after its first frame: PyAV where OpenCV would fail and it is there."""
+        if self.tone_mapped or self.interlaced:
+            by_pyav = AvCapture(self._path, self.hdr, self.interlaced)
+            if self.interlaced and by_pyav.codec == "hevc":
+                raise unreadable(self._path, by_pyav.codec)
+            if by_pyav.isOpened() and by_pyav.grab():
+                return by_pyav
+            raise _undecodable(self._path)
+        capture = _open(self._path)
+        if capture.isOpened() and capture.grab():
+            return capture
+        instead = AvCapture(self._path) if has_pyav() else None
+        if instead is not None and instead.isOpened() and instead.grab():
+            return instead
+        raise _undecodable(self._path, _codec(capture))
 
     @property
     def timestamps(self) -> NDArray[np.float64]:
@@ -118,18 +158,35 @@ class VideoReader(Iterator[VideoFrame]):
         return max(0, self.info.frame_count_claimed - len(self._clock.times)) if self.ended else 0
 
     def __next__(self) -> VideoFrame:
-        while self._capture.grab():
+        while self._is_grabbed or self._capture.grab():
+            self._is_grabbed = False
             index = len(self._clock.times)
             timestamp = self._clock.next(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0)
             if not self._wanted(index):
                 continue
             decoded, bgr = self._capture.retrieve()
-            if decoded and bgr is not None and bgr.size:
-                return VideoFrame(index, timestamp, _as_rgb8(bgr))
-            self.unreadable_frames += 1
+            if not decoded or bgr is None or not bgr.size:
+                self.unreadable_frames += 1
+                continue
+            is_blank = _is_blank(bgr)
+            if is_blank or (self._last is not None and np.array_equal(bgr, self._last)):
+                self._require_converted(index)
+            self._last = bgr
+            if not is_blank:
+                return VideoFrame(index, timestamp, self.display.shown(_as_rgb8(bgr)))
+            self.blank_frames += 1
         self.ended = True
         self.close()
         raise StopIteration
+
+    def _require_converted(self, index: int) -> None:
+        """Ask FFmpeg, once, whether a frame without a picture, or with that of the last one, is what OpenCV makes of
+        interlaced ones."""
+        if self._is_trusted or index > _DOUBTED_FRAMES or isinstance(self._capture, AvCapture):
+            return
+        self._is_trusted = True
+        if is_interlaced(self._path, index + 1):
+            raise unreadable(self._path, _codec(self._capture), index)
 
     def close(self) -> None:
         """Release the decoder; iterating further ends at once."""
@@ -192,6 +249,9 @@ def _require_video_bytes(path: Path) -> None:
         raise InputError(f"{path} is a single image, not a video: give the folder that contains the images")
     with opened(path) as file:
         head = file.read(_SNIFFED_BYTES)
+    archive = next((name for start, name in _ARCHIVES.items() if head.startswith(start)), None)
+    if archive is not None:
+        raise InputError(f"{path} is a {archive} archive, not a video: unpack it first, then give what was in it")
     if b"\0" not in head and _is_text(head):
         raise InputError(f"{path} is a text file, not a video: give a video file or a folder that holds images")
 
@@ -208,7 +268,7 @@ def _is_text(head: bytes) -> bool:
 def _open(path: Path) -> cv2.VideoCapture:
     level, options = cv2.utils.logging.getLogLevel(), os.environ.get(_OPTIONS_VARIABLE)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    os.environ[_OPTIONS_VARIABLE] = _OPEN_OPTIONS  # OpenCV has no other way to hand them to FFmpeg
+    os.environ[_OPTIONS_VARIABLE] = as_opencv_writes_them()  # OpenCV has no other way to hand them to FFmpeg
     try:
         # Without naming the backend, "img_01.jpg" would open as the start of a numbered image series.
         capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
@@ -217,34 +277,69 @@ def _open(path: Path) -> cv2.VideoCapture:
         del os.environ[_OPTIONS_VARIABLE]
         if options is not None:
             os.environ[_OPTIONS_VARIABLE] = options
-    if not capture.isOpened():
-        raise _undecodable(path)
     return capture
 
 
-def _undecodable(path: Path) -> InputError:
+def _codec(capture: cv2.VideoCapture | AvCapture) -> str:
+    """The four letters of a capture's codec, "" where there is no stream."""
+    if isinstance(capture, AvCapture):
+        return capture.codec
+    letters = int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
+    return letters.to_bytes(4, "little").decode("latin-1").strip("\0 ") if capture.isOpened() else ""
+
+
+def _undecodable(path: Path, codec: str = "") -> InputError:
+    file = shlex.quote(str(path))
+    if codec and codec.lower() not in _DECODED:
+        name = _CODECS.get(codec.lower(), codec)
+        more = "" if has_pyav() else "; `pip install 'msgs-slam[hdr]'` brings more decoders"
+        return InputError(
+            f"no image can be decoded from {path}: there is no decoder for its codec, {name}, "
+            f"or it is damaged: convert it with `ffmpeg -i {file} -c:v libx264 OUT.mp4`{more}"
+        )
     return InputError(
         f"no image can be decoded from {path}: it contains no video stream (audio only?), is damaged, or was not "
-        "copied completely: play it in a video player, and if it plays convert it with `ffmpeg -i IN -c:v libx264 "
-        "OUT.mp4`"
+        "copied completely: play it in a video player, and if it plays convert it with "
+        f"`ffmpeg -i {file} -c:v libx264 OUT.mp4`"
     )
 
 
-def _read_info(capture: cv2.VideoCapture | HdrCapture, path: Path) -> VideoInfo:
-    width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
-    height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-    if width < 1 or height < 1:
+def _blank(path: Path, count: int) -> InputError:
+    return InputError(
+        f"all {count} frames of {path} are of one flat colour (a covered lens, or not decoded properly): play it in a "
+        f"video player, and if it plays convert it with `ffmpeg -i {shlex.quote(str(path))} -c:v libx264 OUT.mp4`"
+    )
+
+
+def _is_blank(image: NDArray) -> bool:
+    """Whether all pixels of an image (H, W) or (H, W, C) are the same."""
+    some = image[::16, ::16]
+    return bool((some == image[0, 0]).all() and (image == image[0, 0]).all())
+
+
+def _read_display(capture: cv2.VideoCapture | AvCapture, path: Path) -> Display:
+    mirror = read_mirror(path)
+    if mirror.is_mirrored:
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # a decoder knows turns only, and turns such a picture by 180°
+    aspect = pixel_aspect(capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN))
+    is_turned = mirror.swaps if mirror.is_mirrored else capture.get(cv2.CAP_PROP_ORIENTATION_META) % 180 != 0
+    return replace(mirror, aspect=1 / aspect if is_turned else aspect)
+
+
+def _read_info(capture: cv2.VideoCapture | AvCapture, path: Path, display: Display) -> VideoInfo:
+    stored = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    if min(stored) < 1:
         raise _undecodable(path)
+    width, height = display.size(*stored)
     if width * height > MAX_FRAME_PIXELS:
         raise InputError(
             f"{path} claims frames of {width}x{height}, over the limit of {MAX_FRAME_PIXELS / 1e6:.0f} million pixels: "
             "the file is damaged, or scale it down with `ffmpeg -i IN -vf scale=1920:-2 OUT.mp4`"
         )
-    count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
-    fps = capture.get(cv2.CAP_PROP_FPS)
-    claimed = int(count) if math.isfinite(count) and count > 0 else 0
-    rate = fps if math.isfinite(fps) and fps > 0 else _UNKNOWN_RATE
-    return VideoInfo(width, height, claimed, rate)
+    count, fps = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
+    if not 0 < fps < _MOST_RATE:
+        return VideoInfo(width, height, 0, _UNKNOWN_RATE)
+    return VideoInfo(width, height, int(count) if math.isfinite(count) and count > 0 else 0, fps)
 
 
 def _as_rgb8(decoded: NDArray) -> NDArray[np.uint8]:

@@ -104,7 +104,7 @@ def _video() -> Finding:
     from msgs_slam.formats.video import VideoReader
     from msgs_slam.formats.video_writer import write_video
 
-    frames = [np.full((48, 64, 3), 40 * i, np.uint8) for i in range(5)]
+    frames = [np.full((48, 64, 3), 40 * i + np.arange(64)[:, None], np.uint8) for i in range(5)]
     with tempfile.TemporaryDirectory() as folder:
         path = write_video(Path(folder) / "check.mp4", frames, 10.0)
         read = sum(1 for _ in VideoReader(path))

@@ -255,7 +255,22 @@ def _warn_of_the_file(path: Path, reader: VideoReader, warn: Warn) -> None:
             f"{path.name} is truncated: its header declares {reader.info.frame_count_claimed} frames, {decoded} "
             "decode; going on with those"
         )
+    _warn_of_shape(path, reader, warn)
+    if reader.blank_frames:
+        warn(f"{path.name}: {reader.blank_frames} frames of one flat colour (a fade, or damage) were left out")
     if reader.unreadable_frames:
         warn(f"{path.name}: {reader.unreadable_frames} damaged frames were left out")
-    if reader.repaired_timestamps:
+    if reader.repaired_timestamps == decoded - 1 > 1:
+        warn(f"{path.name} has no timestamps (a raw stream?): {reader.info.fps:g} frames a second are assumed")
+    elif reader.repaired_timestamps:
         warn(f"{path.name}: {reader.repaired_timestamps} of {decoded} timestamps were missing or went back; repaired")
+
+
+def _warn_of_shape(path: Path, reader: VideoReader, warn: Warn) -> None:
+    if reader.interlaced:
+        warn(f"{path.name} is interlaced: deinterlaced, at the cost of some detail; film progressive where you can")
+    if reader.display.aspect != 1:
+        warn(
+            f"{path.name} has pixels that are not square ({reader.display.aspect:.3f} times as wide as high): frames "
+            f"are stretched to {reader.info.width}x{reader.info.height}, the size in which all pixels given count"
+        )

@@ -206,7 +206,7 @@ def test_what_does_not_fit_is_refused_and_nothing_is_changed(
         clip = replace(CLIP, focal=1.3 * CLIP.intrinsics.fx)
         write_video(other, [f.rgb for f in list(iter_clip(make_world(texel=0.02), clip))[SECOND]], CLIP.fps)
     elif what == "another size":
-        write_video(other, [np.zeros((96, 128, 3), np.uint8)] * 5, CLIP.fps)
+        write_video(other, [np.tile(np.arange(128, dtype=np.uint8)[:, None], (96, 1, 3))] * 5, CLIP.fps)
     elif what == "no video":
         other.write_text("no video")
     else:

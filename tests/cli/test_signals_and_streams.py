@@ -100,7 +100,7 @@ def test_devices_and_odd_numbers_are_refused(finished_run: FinishedRun, tmp_path
 def test_video_that_the_disk_has_cut_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import numpy as np
 
-    frames = [np.full((48, 64, 3), 40 * i, np.uint8) for i in range(5)]
+    frames = [np.full((48, 64, 3), 40 * i + np.arange(64)[:, None], np.uint8) for i in range(5)]
     whole = write_video(tmp_path / "whole.avi", frames, 10.0).read_bytes()
 
     class Cut:

@@ -23,6 +23,50 @@ from msgs_slam.formats.video_writer import write_video
 REPO = Path(__file__).resolve().parents[2]
 
 
+def textured(count: int, width: int, height: int, step: int = 3) -> np.ndarray:
+    """(count, height, width, 3) uint8: blurred noise that moves to the left by `step` pixels a frame."""
+    noise = np.random.default_rng(0).uniform(0, 255, (height, width + count * step, 3))
+    smooth = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 3), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    return np.stack([smooth[:, i * step : i * step + width] for i in range(count)])
+
+
+def woven(count: int, width: int, height: int) -> np.ndarray:
+    """Interlaced frames of `textured`: their even rows are its frames 0, 2, 4..., their odd rows 1, 3, 5..."""
+    fields = textured(2 * count, width, height)
+    frames = fields[::2].copy()
+    frames[:, 1::2] = fields[1::2, 1::2]
+    return frames
+
+
+def encode(
+    path: Path, frames: np.ndarray, codec: str = "libx264", options: dict[str, str] | None = None,
+    interlaced: bool = False, aspect: Fraction | None = None, container: str | None = None,
+) -> Path:  # fmt: skip
+    """25 frames a second by PyAV; `aspect` is that of a pixel, `interlaced` sets the codec's flags for it."""
+    with av.open(str(path), "w", format=container) as file:
+        stream = file.add_stream(codec, rate=25, options=options or {})
+        stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], "yuv420p"
+        if aspect is not None:
+            stream.codec_context.sample_aspect_ratio = aspect
+        if interlaced:
+            stream.codec_context.flags |= 1 << 18 | 1 << 29
+        for time, rgb in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24").reformat(format="yuv420p")
+            frame.pts, frame.time_base = time, Fraction(1, 25)
+            file.mux(stream.encode(frame))
+        file.mux(stream.encode())
+    return path
+
+
+def with_matrix(path: Path, a: int, b: int, c: int, d: int) -> Path:
+    """Write a display matrix into the track header of an MP4."""
+    data = bytearray(path.read_bytes())
+    place = data.index(b"tkhd") + 4 + 40
+    data[place : place + 36] = struct.pack(">9i", a << 16, b << 16, 0, c << 16, d << 16, 0, 0, 0, 1 << 30)
+    path.write_bytes(data)
+    return path
+
+
 @pytest.fixture(scope="module")
 def counted_video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """40 frames of 96x64 at 25/s; frame i is (red 6 i, green 0, blue 240 - 6 i) with a white top-left corner."""
@@ -169,7 +213,7 @@ def test_playlists_pointers_and_long_texts_are_refused(tmp_path: Path) -> None:
     ],
 )
 def test_playlists_that_are_no_text_show_no_other_file(tmp_path: Path, name: str, text: bytes) -> None:
-    write_video(tmp_path / "secret.mkv", [np.full((32, 32, 3), 80, np.uint8)] * 3, 10)
+    write_video(tmp_path / "secret.mkv", list(textured(3, 32, 32)), 10)
     assert probe_video(tmp_path / "secret.mkv").width == 32
     (tmp_path / name).write_bytes(text.replace(b"%s", bytes(tmp_path / "secret.mkv")))
     with pytest.raises(InputError, match="no image can be decoded"):
@@ -247,13 +291,22 @@ def hdr_signal(srgb: np.ndarray, transfer: str) -> np.ndarray:
     return np.round(signal.clip(0, 1) * 65535).astype(np.uint16)
 
 
-def write_hdr(path: Path, pictures: list[np.ndarray], transfer: str) -> None:
+X265 = "log-level=none:pools=1:frame-threads=1:bframes=0:keyint=8:open-gop=0"
+
+
+def write_hdr(path: Path, pictures: list[np.ndarray], transfer: str, aspect: Fraction | None = None) -> None:
     """10 bit HEVC that says its transfer function, pictures as uint16 RGB."""
-    options = {"crf": "4", "preset": "ultrafast", "x265-params": "log-level=none:pools=1:frame-threads=1:bframes=0"}
+    options = {
+        "crf": "4",
+        "preset": "ultrafast",
+        "x265-params": X265,
+    }
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx265", rate=10, options=options)
         stream.width, stream.height, stream.pix_fmt = pictures[0].shape[1], pictures[0].shape[0], "yuv420p10le"
         context = stream.codec_context
+        if aspect is not None:
+            context.sample_aspect_ratio = aspect
         context.color_trc, context.color_primaries = {"PQ": 16, "HLG": 18}[transfer], 9
         context.colorspace, context.color_range = 9, 1
         for time, picture in enumerate(pictures):
@@ -294,10 +347,8 @@ def test_hdr_upright(tmp_path: Path) -> None:
     picture = np.zeros((64, 96, 3))
     picture[:32, :48] = 0.7, 0.2, 0.2
     write_hdr(tmp_path / "a.mp4", [hdr_signal(picture, "HLG")] * 2, "HLG")
-    data = bytearray((tmp_path / "a.mp4").read_bytes())
-    place = data.index(b"tkhd") + 4 + 40
-    data[place : place + 36] = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30)
-    (tmp_path / "b.mp4").write_bytes(data)
+    (tmp_path / "b.mp4").write_bytes((tmp_path / "a.mp4").read_bytes())
+    with_matrix(tmp_path / "b.mp4", 0, 1, -1, 0)
     info = probe_video(tmp_path / "b.mp4")
     assert (info.width, info.height) == (64, 96)
     turned = next(VideoReader(tmp_path / "b.mp4")).rgb

@@ -21,6 +21,13 @@ from msgs_slam.pipelines.run.records import Manifest, Source, load_source, write
 from msgs_slam.pipelines.source.opening import FolderSource, VideoSource, open_source
 
 
+def _shade(value: int, width: int = 64, height: int = 48) -> np.ndarray:
+    """(height, width, 3) of about that grey; a frame of exactly one colour is no picture."""
+    image = np.full((height, width, 3), value, np.uint8)
+    image[::2, : width // 2] += 6
+    return image
+
+
 def _noise(seed: int, size: tuple[int, int] = (48, 64)) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 255, (*size, 3), dtype=np.uint8)
 
@@ -31,7 +38,7 @@ def video(tmp_path: Path) -> Path:
     path = tmp_path / "short.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 48))
     for i in range(20):
-        writer.write(np.full((48, 64, 3), 10 * i, np.uint8))
+        writer.write(_shade(10 * i))
     writer.release()
     return path
 
@@ -217,8 +224,7 @@ def test_a_truncated_video_is_read_to_its_end_with_a_warning(shared_data: Path) 
 def test_videos_of_one_place_are_one_source(tmp_path: Path) -> None:
     shades = {"a": (10, 40, 70), "b": (130, 160)}
     paths = [
-        write_video(tmp_path / f"{name}.avi", [np.full((48, 64, 3), v, np.uint8) for v in values], 10.0)
-        for name, values in shades.items()
+        write_video(tmp_path / f"{name}.avi", [_shade(v) for v in values], 10.0) for name, values in shades.items()
     ]
     run = RunFolder(tmp_path / "both.msgs")
     assert one_source(paths[:1], run) == paths[0]
@@ -237,7 +243,7 @@ def test_videos_of_one_place_are_one_source(tmp_path: Path) -> None:
     assert load_source(moved).path == str(moved.root / "source.videos")
     (tmp_path / "both.videos").write_text("b.avi\na.avi\n")
     assert source_digest(tmp_path / "both.videos", "auto") != digest
-    write_video(tmp_path / "b.avi", [np.zeros((48, 80, 3), np.uint8)] * 2, 10.0)
+    write_video(tmp_path / "b.avi", [_shade(9, 80)] * 2, 10.0)
     with pytest.raises(InputError, match=r"videos of .*both.videos differ in size: .*b\.avi is 80x48, .*a\.avi"):
         open_source(tmp_path / "both.videos")
     (tmp_path / "both.videos").write_text("both.videos\n")
@@ -246,7 +252,7 @@ def test_videos_of_one_place_are_one_source(tmp_path: Path) -> None:
 
 
 def test_a_list_of_videos_never_enters_what_is_not_their_run(tmp_path: Path) -> None:
-    pictures = [np.zeros((48, 64, 3), np.uint8)] * 2
+    pictures = [_shade(9)] * 2
     paths = [write_video(tmp_path / f"{name}.avi", pictures, 10.0) for name in "ab"]
     run = RunFolder(tmp_path / "both.msgs")
     with pytest.raises(InputError):

@@ -1,0 +1,247 @@
+"""Videos whose frames are not simply shown as stored: interlaced, stretched, mirrored, raw, blank, damaged."""
+
+from __future__ import annotations
+
+import sys
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from msgs_slam.formats.display import pixel_aspect
+from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.hdr_video import AvCapture
+from msgs_slam.formats.spherical import read_moov, video_sphere
+from msgs_slam.formats.video import VideoReader, probe_video
+from msgs_slam.pipelines.source.opening import VideoSource
+from tests.formats.test_formats_video import encode, hdr_signal, textured, with_matrix, woven, write_hdr
+
+INTERLACED = [
+    ("a.mp4", "libx264", {"x264-params": "tff=1"}, (320, 240)),
+    ("a.mkv", "libx264", {"x264-params": "bff=1"}, (320, 240)),
+    ("a.ts", "mpeg2video", {}, (320, 240)),
+    ("a.mpg", "mpeg2video", {}, (320, 240)),
+    ("a.dv", "dvvideo", {}, (720, 576)),
+]
+
+
+@pytest.fixture
+def without_pyav(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in an installation without the extra."""
+    monkeypatch.setitem(sys.modules, "av", None)
+
+
+@pytest.mark.parametrize(("name", "codec", "options", "size"), INTERLACED)
+def test_interlaced_is_deinterlaced(
+    tmp_path: Path, name: str, codec: str, options: dict[str, str], size: tuple[int, int]
+) -> None:
+    path = encode(tmp_path / name, woven(6, *size), codec, options, interlaced=True)
+    reader = VideoReader(path)
+    frames = list(reader)
+    assert reader.interlaced
+    assert [f.source_index for f in frames] == list(range(6))
+    np.testing.assert_allclose(np.diff([f.timestamp for f in frames]), 0.04, atol=1e-6)
+    seen = frames[3].rgb.astype(float)
+    # Combed frames differ from row to row; what is there is as smooth as the pictures were.
+    comb = np.abs(seen[1:-1] - (seen[:-2] + seen[2:]) / 2).mean()
+    assert 0 < comb < 0.5 * np.abs(np.diff(woven(6, *size)[3].astype(float), axis=0)).mean()
+    shown = textured(12, *size)[6:8].astype(float)[:, :, : seen.shape[1]]
+    if seen.shape[1] == size[0]:  # pixels of DV are not square
+        assert 0 < min(np.abs(seen - field).mean() for field in shown) < 12
+
+
+@pytest.mark.usefixtures("without_pyav")
+@pytest.mark.parametrize(("name", "codec", "options", "size"), INTERLACED)
+def test_interlaced_is_named_where_it_cannot_be_read(
+    tmp_path: Path, name: str, codec: str, options: dict[str, str], size: tuple[int, int],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    with monkeypatch.context() as patch:
+        patch.delitem(sys.modules, "av")
+        path = encode(tmp_path / f"my {name}", woven(6, *size), codec, options, interlaced=True)
+    with pytest.raises(InputError, match=r"is interlaced video .*ffmpeg -i '.*my a\..*' -vf yadif OUT.mp4"):
+        probe_video(path)
+
+
+def test_interlaced_after_progressive_is_named(tmp_path: Path) -> None:
+    """In a stream that changes, OpenCV repeats its last good frame."""
+    parts = [
+        encode(tmp_path / "a.ts", textured(12, 320, 240), "mpeg2video").read_bytes(),
+        encode(tmp_path / "b.ts", woven(12, 320, 240), "mpeg2video", interlaced=True).read_bytes(),
+    ]
+    (tmp_path / "c.ts").write_bytes(b"".join(parts))
+    with pytest.raises(InputError, match=r"is interlaced from about frame \d+ on"):
+        list(VideoReader(tmp_path / "c.ts"))
+
+
+def test_separate_fields_are_named(tmp_path: Path) -> None:
+    options = {"x265-params": "log-level=none:pools=1:interlace=tff"}
+    path = encode(tmp_path / "a.mp4", textured(8, 320, 240)[:, ::2], "libx265", options)
+    with pytest.raises(InputError, match=r"fields are stored as separate images.*-vf weave,bwdif"):
+        probe_video(path)
+
+
+@pytest.mark.parametrize(("codec", "container"), [("libx264", "h264"), ("libx265", "hevc")])
+def test_raw_streams_are_read_at_their_rate(tmp_path: Path, codec: str, container: str) -> None:
+    options = {"x265-params": "log-level=none:pools=1"} if codec == "libx265" else {}
+    path = encode(tmp_path / f"a.{container}", textured(10, 320, 240), codec, options, container=container)
+    assert read_moov(path) == b""
+    assert video_sphere(path) == ""
+    said: list[str] = []
+    frames = list(VideoSource(path).read(warn=said.append))
+    np.testing.assert_allclose([f.timestamp for f in frames], np.arange(10) / 25, atol=1e-9)
+    assert said == [f"a.{container} has no timestamps (a raw stream?): 25 frames a second are assumed"]
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        b"\0\0\0\1\x67\x64\0\x1f\xff\xff\xff\xff\xff\xff\xff\xff",
+        b"\0\0\0\x10ftypmp42\0\0\0\0\0\0\0\1mdat\xff\xff\xff\xff\xff\xff\xff\xff",
+        b"\0\0\0\x10ftypmp42\0\0\0\0\0\0\0\1mdat\0\0\0\0\0\0\0\0",
+        b"\0\0\0\x10ftypmp42\0\0\0\0\0\0\0\2moov",
+        b"\0\0\0\x10ftypmp42\0\0\0\0\xff\xff\xff\xffmdat" + bytes(100),
+        b"\0\0\0\1moov",
+    ],
+)
+def test_damaged_boxes_hold_nothing(tmp_path: Path, head: bytes) -> None:
+    (tmp_path / "a.mp4").write_bytes(head)
+    assert read_moov(tmp_path / "a.mp4").strip(b"\0") == b""
+    with pytest.raises(InputError, match="no image can be decoded"):
+        probe_video(tmp_path / "a.mp4")
+
+
+def test_long_boxes_are_read(tmp_path: Path) -> None:
+    long = b"\0\0\0\1" + b"mdat" + (20).to_bytes(8, "big") + b"1234"
+    (tmp_path / "a.mp4").write_bytes(
+        b"\0\0\0\x10ftypmp42\0\0\0\0" + long + b"\0\0\0\1moov" + (19).to_bytes(8, "big") + b"abc"
+    )
+    assert read_moov(tmp_path / "a.mp4") == b"abc"
+
+
+@pytest.mark.parametrize(("turn", "size"), [(None, (320, 240)), ((0, 1, -1, 0), (240, 320))])
+def test_pixels_become_square(tmp_path: Path, turn: tuple[int, ...] | None, size: tuple[int, int]) -> None:
+    """Also where the phone was held upright: what is too narrow are then the rows."""
+    frames = textured(6, 320, 240)
+    plain = encode(tmp_path / "plain.mp4", frames)
+    narrow = encode(tmp_path / "a.mp4", frames[:, :, ::4][:, :, : 320 // 4].repeat(3, axis=2), aspect=Fraction(4, 3))
+    for path in (plain, narrow) if turn else ():
+        with_matrix(path, *turn)  # type: ignore[misc]
+    info = probe_video(narrow)
+    assert (info.width, info.height) == size
+    source = VideoSource(narrow)
+    assert (source.width, source.height) == size
+    said: list[str] = []
+    seen, true = list(source.read(warn=said.append))[4].rgb, list(VideoReader(plain))[4].rgb
+    assert seen.shape == true.shape == (size[1], size[0], 3)
+    assert 0 < np.abs(seen.astype(float) - true).mean() < 12
+    assert any("pixels that are not square" in s for s in said)
+
+
+@pytest.mark.parametrize(
+    ("wide", "high", "aspect"), [(0, 1, 1), (1, 0, 1), (1280, 1281, 1), (65535, 1, 1), (10, 11, 10 / 11)]
+)
+def test_only_plausible_pixels_are_believed(wide: float, high: float, aspect: float) -> None:
+    assert pixel_aspect(wide, high) == aspect
+
+
+def test_hdr_pixels_become_square(tmp_path: Path) -> None:
+    write_hdr(tmp_path / "a.mp4", [hdr_signal(textured(1, 96, 96)[0] / 255, "HLG")] * 2, "HLG", Fraction(3, 2))
+    reader = VideoReader(tmp_path / "a.mp4")
+    assert (reader.tone_mapped, reader.info.width, reader.info.height) == (True, 144, 96)
+    assert next(reader).rgb.shape == (96, 144, 3)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "way"),
+    [
+        ((-1, 0, 0, 1), lambda f: f[:, ::-1]),
+        ((1, 0, 0, -1), lambda f: f[::-1]),
+        ((0, 1, 1, 0), lambda f: f.swapaxes(0, 1)),
+        ((0, -1, -1, 0), lambda f: f[::-1, ::-1].swapaxes(0, 1)),
+        ((-1, 0, 0, -1), lambda f: f[::-1, ::-1]),
+    ],
+)
+@pytest.mark.parametrize("hdr", [False, True])
+def test_mirrored_is_not_turned(tmp_path: Path, matrix: tuple[int, ...], way: object, hdr: bool) -> None:
+    frames = textured(2, 96, 64)
+
+    def write(path: Path) -> Path:
+        if not hdr:
+            return encode(path, frames)
+        write_hdr(path, [hdr_signal(f / 255, "HLG") for f in frames], "HLG")
+        return path
+
+    stored = next(VideoReader(write(tmp_path / "a.mp4"))).rgb
+    shown = next(VideoReader(with_matrix(write(tmp_path / "b.mp4"), *matrix))).rgb
+    assert (shown == way(stored)).all()  # type: ignore[operator]
+
+
+def test_frames_of_one_colour_are_left_out(tmp_path: Path) -> None:
+    frames = np.concatenate([np.zeros((5, 240, 320, 3), np.uint8), textured(8, 320, 240)])
+    source = VideoSource(encode(tmp_path / "a.mp4", frames))
+    said: list[str] = []
+    assert [f.source_index for f in source.read(warn=said.append)] == list(range(5, 13))
+    assert said == ["a.mp4: 5 frames of one flat colour (a fade, or damage) were left out"]
+
+
+@pytest.mark.parametrize("pyav", [True, False])
+def test_all_of_one_colour_is_refused(tmp_path: Path, pyav: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = encode(tmp_path / "a.mp4", np.full((4, 240, 320, 3), (0, 135, 0), np.uint8))
+    if not pyav:
+        monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(InputError, match=r"all 4 frames of .* are of one flat colour"):
+        VideoSource(path)
+
+
+def test_a_codec_that_opencv_lacks_is_read_or_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = encode(tmp_path / "a.mp4", textured(4, 320, 240), "libsvtav1", {"svtav1-params": "lp=1"})
+    assert len(list(VideoReader(path))) == 4
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(InputError, match="no decoder for its codec, AV1"):
+        probe_video(path)
+
+
+@pytest.mark.parametrize(
+    ("start", "kind"), [(b"PK\3\4", "ZIP"), (b"7z\xbc\xaf\x27\x1c", "7z"), (b"\x1f\x8b\x08", "gzip")]
+)
+def test_archives_are_named(tmp_path: Path, start: bytes, kind: str) -> None:
+    (tmp_path / "a.mp4").write_bytes(start + bytes(range(256)))
+    with pytest.raises(InputError, match=f"is a {kind} archive, not a video: unpack it first"):
+        probe_video(tmp_path / "a.mp4")
+
+
+def damaged(path: Path, frames: list[int]) -> Path:
+    """Overwrite what an MP4 of one chunk holds for these frames."""
+    data = bytearray(path.read_bytes())
+    place = data.index(b"stsz") + 16
+    sizes = [int.from_bytes(data[place + 4 * i : place + 4 * i + 4], "big") for i in range(20)]
+    start = data.index(b"mdat") + 4
+    for frame in frames:
+        first = start + sum(sizes[:frame])
+        data[first : first + sizes[frame]] = b"\xff" * sizes[frame]
+    path.write_bytes(data)
+    return path
+
+
+def test_hdr_goes_on_after_damage(tmp_path: Path) -> None:
+    write_hdr(tmp_path / "a.mp4", [hdr_signal(f / 255, "HLG") for f in textured(20, 96, 64)], "HLG")
+    reader = VideoReader(damaged(tmp_path / "a.mp4", [7]))
+    last = list(reader)[-1]
+    assert reader.tone_mapped
+    assert last.timestamp == pytest.approx(1.9)
+    assert reader.missing_frames == 1
+
+
+def test_hdr_without_a_frame_is_explained(tmp_path: Path) -> None:
+    write_hdr(tmp_path / "a.mp4", [hdr_signal(f / 255, "HLG") for f in textured(20, 96, 64)], "HLG")
+    with pytest.raises(InputError, match="no image can be decoded"):
+        VideoReader(damaged(tmp_path / "a.mp4", list(range(20))))
+
+
+def test_what_pyav_cannot_open_has_no_frame(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_bytes(b"\0\0\0\x10ftypmp42\0\0\0\0" + bytes(50))
+    capture = AvCapture(tmp_path / "a.mp4", "HLG")
+    assert (capture.isOpened(), capture.grab()) == (False, False)
+    capture.release()
