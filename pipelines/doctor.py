@@ -16,6 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
+from msgs_slam.pipelines.system.limits import available_cpus
+
 GOOD, NOTE, BAD = "ok", "note", "BAD"
 DISTRIBUTION = "msgs-slam"
 _MODULES = (
@@ -121,7 +123,7 @@ def _viewer() -> Finding:
 
 
 def _threads() -> Finding:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = available_cpus()
     limit = os.environ.get("OMP_NUM_THREADS", "")
     if limit.isdecimal() and 0 < int(limit) < cores:
         return Finding(

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from msgs_slam.formats.atomic import temporary_of, write_text
+from msgs_slam.formats.atomic import own_temporaries, temporary_of, write_text
 from msgs_slam.formats.errors import InputError, RecoverableError
 from msgs_slam.formats.video import probe_video
 from msgs_slam.pipelines.config import Config
@@ -21,6 +20,7 @@ from msgs_slam.pipelines.run.running import NotedProgress
 from msgs_slam.pipelines.run.settings_file import load_settings
 from msgs_slam.pipelines.source.opening import source_digest
 from msgs_slam.pipelines.system.device import resolve_device
+from msgs_slam.pipelines.system.limits import available_cpus
 from msgs_slam.pipelines.system.progress import Progress
 
 
@@ -63,7 +63,8 @@ def one_source(sources: Sequence[Path], run: RunFolder) -> Path:
         probe_video(source)
     if not same:
         make_folder(run.root)
-        write_text(path, text)
+        with own_temporaries():  # no lock is held yet
+            write_text(path, text)
     return path
 
 
@@ -184,7 +185,7 @@ def _run(
                 "folder: --out NEW"
             )
 
-    threads = config.run.threads or (workers.threads if workers else threads) or os.cpu_count() or 1
+    threads = config.run.threads or (workers.threads if workers else threads) or available_cpus()
     set_threads(threads)
     with NotedProgress(progress, run) as noted:
         return run_stages(all_stages(), run, source, digest, config, noted, until, same_source, workers, threads)
@@ -196,7 +197,9 @@ def _require_run_or_empty(run: RunFolder) -> None:
         return
     # All that there is when the first file is being written.
     begun = {LOCK, LEADER, SOURCE_LIST, temporary_of(run.manifest_file).name}
-    if any(p.name not in begun for p in run.root.iterdir()):
+    # Other processes have names of their own for the list, and for a look at a leader.
+    others = (temporary_of(run.root / SOURCE_LIST).stem, f"{LEADER}-")
+    if any(p.name not in begun and not p.name.startswith(others) for p in run.root.iterdir()):
         raise InputError(f"{run.root} exists and is not a run folder. Choose another with --out FOLDER")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,6 +12,7 @@ from msgs_slam.pipelines.reconstruct import resume
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import RunBusyError
 from msgs_slam.pipelines.run.records import StageRecord
+from msgs_slam.pipelines.system.limits import available_cpus
 from msgs_slam.pipelines.system.progress import Progress, log
 from msgs_slam.pipelines.system.stopping import stop_if_asked
 
@@ -22,7 +22,7 @@ def work_on_run(
 ) -> dict[str, StageRecord]:
     """Lead or help until the run is done up to a stage; its records. Raises InputError as `resume` does, and for a node
     that cannot do a task (another version of the program, a full disk): the others go on."""
-    workers = SharedWorkers(shard, prepare, config.run.threads or os.cpu_count() or 1)
+    workers = SharedWorkers(shard, prepare, config.run.threads or available_cpus())
     log.info("shard %d of %d", shard.index, shard.count)
     while True:
         with suppress(RunBusyError):

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from msgs_slam.formats.atomic import own_temporaries
 from msgs_slam.formats.errors import InputError, RecoverableError
 from msgs_slam.formats.jsonfile import read_json, write_json
 from msgs_slam.pipelines.engine.workers import code_identity, work_here
@@ -152,7 +153,8 @@ class Posted:
         refused, value = work_here(work, task, name, prepare, folder, about["threads"], about["code"])
         if refused:
             raise RecoverableError(f"{name}: {refused}")
-        save_value(self.done(number), value)
+        with own_temporaries():  # on a disk without locks another process may do the same task
+            save_value(self.done(number), value)
 
     def withdraw(self) -> None:
         """Nobody takes one up any more; waits for those who are at one."""

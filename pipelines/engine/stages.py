@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import os
 import shutil
 import sys
 import time
@@ -41,6 +40,7 @@ from msgs_slam.pipelines.run.records import (
 )
 from msgs_slam.pipelines.run.settings_file import save_settings
 from msgs_slam.pipelines.system.device import resolve_device
+from msgs_slam.pipelines.system.limits import available_cpus
 from msgs_slam.pipelines.system.memory import memory_room, release_free_memory
 from msgs_slam.pipelines.system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log
 from msgs_slam.pipelines.system.stopping import stop_if_asked
@@ -86,7 +86,7 @@ class StageContext:
     @property
     def threads(self) -> int:
         """Number of CPU threads to use."""
-        return self.config.run.threads or os.cpu_count() or 1
+        return self.config.run.threads or available_cpus()
 
     @property
     def memory_room(self) -> float:
@@ -162,6 +162,7 @@ def run_stages(
     settings are written, and a stage that has to run again is taken out of the manifest, with those after it, before
     it starts. Raises InputError as the stages do.
     """
+    run = RunFolder(run.root.absolute())  # tasks take it to processes with another working folder
     records = load_records(run)
     origin = Source(str(source), source_digest)
     upstream = source_digest

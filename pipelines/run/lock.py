@@ -92,11 +92,19 @@ def _alone(stream: IO[bytes], root: Path) -> Iterator[bool]:
 def is_led(run: RunFolder) -> bool:
     """Whether a process works on the run now, by its lock; where there are none, by the sign of life."""
     try:
-        with (run.root / LOCK).open("rb") as stream:
+        with _open_existing(run.root / LOCK) as stream:
             taken = _take(stream)
     except OSError:  # nobody ever did, or it may not be read
         return False
     return shows_life(run.root / LEADER) if taken is None else not taken
+
+
+def _open_existing(path: Path) -> IO[bytes]:
+    """Open for writing, without which NFS gives no lock of this kind; where that is not allowed, for reading."""
+    try:
+        return path.open("r+b")
+    except OSError:
+        return path.open("rb")
 
 
 def take_lock(stream: IO[bytes]) -> bool:

@@ -31,6 +31,7 @@ PLUMBING = frozenset(
         "msgs_slam.pipelines.engine.standing",
         "msgs_slam.pipelines.system.progress",
         "msgs_slam.pipelines.system.stopping",
+        "msgs_slam.pipelines.system.limits",
         "msgs_slam.pipelines.run.records",
         "msgs_slam.pipelines.run.settings_file",
         "msgs_slam.pipelines.run.finished_files",

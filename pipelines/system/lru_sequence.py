@@ -45,6 +45,8 @@ class LruSequence(Sequence[T], Generic[T]):
     def keep(self, index: int, value: T) -> None:
         """Take a value that is at hand, the one that `make` would make."""
         with self._lock:
+            if index in self._kept:
+                self._used -= self._size_of(self._kept.pop(index))
             self._kept[index] = value
             self._used += self._size_of(value)
             while self._used > self._room and len(self._kept) > 1:

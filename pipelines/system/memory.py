@@ -5,9 +5,9 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from pathlib import Path
 
 from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.system.limits import memory_limits
 from msgs_slam.pipelines.types import Intrinsics
 
 NEEDS = {
@@ -26,7 +26,6 @@ LEAST_SUBMAP = 60
 ALIGNED_TOGETHER = 200
 """Fields of depths that are solved for at once: their equations take 0.4 MB each."""
 _UNKNOWN_MACHINE = 8_000_000_000
-_CONTAINER = Path("/sys/fs/cgroup")
 
 
 def submap_size(config: Config, camera: Intrinsics) -> int:
@@ -65,21 +64,10 @@ def room_on(device: object, host: float) -> float:
 
 def machine_memory() -> float:
     """Bytes of memory of the machine, or of the container where that has less; 8 GB where neither is known."""
-    return min([_physical_memory(), *_container_limits()])
+    return min([_physical_memory(), *memory_limits()])
 
 
 def _physical_memory() -> float:
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     return float(_UNKNOWN_MACHINE)
-
-
-def _container_limits() -> list[float]:
-    """Of cgroups, version 2 and 1."""
-    found = []
-    for name in ("memory.max", "memory/memory.limit_in_bytes"):
-        try:
-            found.append(float((_CONTAINER / name).read_text(encoding="ascii")))
-        except (OSError, ValueError):  # no such file; "max"
-            continue
-    return found

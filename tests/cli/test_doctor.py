@@ -31,7 +31,7 @@ def test_what_is_missing_is_said_with_its_fix(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setenv("MSGS_SLAM_CACHE", str(tmp_path / "none"))
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setattr(doctor, "_MODULES", ("math", "no_such_module_at_all"))
-    monkeypatch.setattr(doctor.os, "sched_getaffinity", lambda _: {0, 1, 2}, raising=False)
+    monkeypatch.setattr(doctor, "available_cpus", lambda: 3)
     usage = namedtuple("usage", "free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10**8))
     findings = {f.name: f for f in examine(tmp_path)}

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from msgs_slam.formats.atomic import write_bytes
 from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.engine.chunks import Chunk
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 
@@ -75,3 +76,8 @@ def read_missing(path: Path, progress: SilentProgress) -> str:
     with path.with_name("attempts").open("a") as attempts:
         attempts.write("x")
     return path.read_text()
+
+
+def known_in_chunk(chunk: Chunk, progress: SilentProgress) -> int:
+    """What is known of all things, for each of the chunk's."""
+    return chunk.known["number"] * len(chunk.numbers)

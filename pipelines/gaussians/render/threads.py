@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from torch import Tensor
 
 import msgs_slam.pipelines.gaussians.render.cards as cards
+from msgs_slam.pipelines.system.limits import available_cpus
 
 PART = 16384
 """Gaussians that a thread takes at a time."""
@@ -29,7 +30,7 @@ def get_threads() -> int:
     """The number of threads in use, at least 1."""
     if _state["threads"]:
         return _state["threads"]
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return available_cpus()
 
 
 def host_threads(example: Tensor) -> int:

@@ -7,17 +7,24 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import engine_calls
 import pytest
 
+from msgs_slam.formats import atomic
 from msgs_slam.formats.errors import InputError, RecoverableError
+from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine import shards, workers
+from msgs_slam.pipelines.engine.chunks import in_chunks
 from msgs_slam.pipelines.engine.shards import Posted, Shard, SharedWorkers, posted_in
+from msgs_slam.pipelines.engine.stages import Stage, StageContext, run_stages
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.system import values
+from msgs_slam.pipelines.system.progress import SilentProgress
 
 HOLDS = "import fcntl, sys; f = open(sys.argv[1], 'ab'); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()"
 
@@ -126,3 +133,54 @@ def test_a_missing_file_inside_a_task_is_told_at_once(folder: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"nowhere\.txt"):
         shared(0, 2).each(engine_calls.read_missing, [folder / "nowhere.txt"], folder)
     assert (folder / "attempts").read_text() == "xx"
+
+
+def test_two_that_end_the_same_task_without_locks_do_not_disturb_each_other(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other one ends it between the last byte of this one's result and its renaming."""
+    posted = Posted.post(engine_calls.halve_noted, [(folder / "0", 8)], folder, 1)
+    replace, others = atomic.os.replace, []
+
+    def interrupted(temporary: Path, path: Path) -> None:
+        if not others and path == posted.done(0):
+            others.append(temporary)
+            with monkeypatch.context() as other:
+                other.setattr(atomic, "process_mark", lambda: "of the other")
+                posted._do_locked(0, posted._about(), engine_calls.silent)
+        replace(temporary, path)
+
+    monkeypatch.setattr(atomic.os, "replace", interrupted)
+    assert posted.do_one(Shard(), engine_calls.silent)
+    assert values.load_value(posted.done(0)) == 4
+    assert others
+
+
+def test_tasks_of_a_run_given_by_a_relative_path_can_be_done_from_elsewhere(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Workers have another working folder, on this machine or another."""
+
+    class Elsewhere:
+        at_once, threads = 2, 1
+
+        def each(self, work: Callable[..., Any], tasks: Sequence[Any], folder: Path) -> list[Any]:
+            monkeypatch.chdir(away)
+            found = shared(0, 2).each(work, tasks, folder)
+            monkeypatch.chdir(root)
+            return found
+
+    def run(context: StageContext) -> dict[str, Any]:
+        return {"sum": sum(in_chunks(context, engine_calls.known_in_chunk, 6, number=7))}
+
+    monkeypatch.setattr(values, "_OURS", "")
+    (root := folder.parent / "here").mkdir()
+    (away := folder.parent / "elsewhere").mkdir()
+    monkeypatch.chdir(root)
+    Path("run.msgs").mkdir()
+    stages = [Stage(name, run) for name in STAGES[:1]]
+    records = run_stages(
+        stages, RunFolder(Path("run.msgs")), Path("v"), "d", Config(), SilentProgress(), STAGES[0], workers=Elsewhere()
+    )  # fmt: skip
+    assert records[STAGES[0]].figures == {"sum": 6 * 7}
+    assert not list(away.iterdir())

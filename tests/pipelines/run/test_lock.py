@@ -1,19 +1,21 @@
 """One process leads a run, on a disk without locks too; what a dead one leaves stops nobody."""
 
 import errno
+import fcntl
 import json
 import os
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import IO
 
 import pytest
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.run import lock_file
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock import LEADER, RunBusyError, locked
+from msgs_slam.pipelines.run.lock import LEADER, RunBusyError, is_led, locked
 from msgs_slam.pipelines.run.lock_file import SILENT, leading
 
 
@@ -95,3 +97,35 @@ def test_a_leader_gives_signs_of_life(tmp_path: Path, monkeypatch: pytest.Monkey
         os.utime(tmp_path / LEADER, (0, 0))
         while (tmp_path / LEADER).stat().st_mtime == 0:
             time.sleep(0.01)
+
+
+def test_a_network_disk_that_locks_only_what_may_be_written_knows_its_leader(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As NFS answers on Linux (flock(2))."""
+    flock = fcntl.flock
+
+    def of_nfs(stream: IO[bytes], operation: int) -> None:
+        if fcntl.fcntl(stream, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+            raise OSError(errno.EBADF, "Bad file descriptor")
+        flock(stream, operation)
+
+    monkeypatch.setattr("fcntl.flock", of_nfs)
+    run = RunFolder(tmp_path / "run.msgs")
+    assert not is_led(run)
+    with locked(run):
+        assert is_led(run)
+    assert not is_led(run)
+
+
+def test_a_run_that_may_only_be_read_knows_its_leader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, opened = RunFolder(tmp_path / "run.msgs"), Path.open
+
+    def refused(path: Path, mode: str = "r", **more: object) -> IO[bytes]:
+        if mode == "r+b":
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return opened(path, mode, **more)  # type: ignore[call-overload, no-any-return]
+
+    with locked(run):
+        monkeypatch.setattr(Path, "open", refused)
+        assert is_led(run)

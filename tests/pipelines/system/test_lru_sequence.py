@@ -1,15 +1,23 @@
 """What does not fit into memory is made again, and nobody sees the difference."""
 
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from msgs_slam.pipelines.system import memory
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.engine.stages import StageContext
+from msgs_slam.pipelines.gaussians.render.threads import get_threads
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system import limits
+from msgs_slam.pipelines.system.limits import available_cpus
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.memory import machine_memory, memory_room
+from msgs_slam.pipelines.system.progress import SilentProgress
 
 
 def test_what_was_used_last_stays_and_the_rest_is_made_again() -> None:
@@ -65,6 +73,15 @@ def test_what_is_at_hand_is_taken_and_threads_get_what_they_ask_for() -> None:
         assert list(pool.map(values.__getitem__, [i % 40 for i in range(400)])) == [str(i % 40) for i in range(400)]
 
 
+def test_a_value_that_is_kept_again_counts_once() -> None:
+    made: list[int] = []
+    values = LruSequence(3, lambda i: made.append(i) or "0123456789", len, room=30)
+    for _ in range(3):
+        values.keep(0, "0123456789")
+    assert [len(v) for v in (*values, *values)] == [10] * 6
+    assert made == [1, 2]
+
+
 PEAKS = """
 import numpy as np
 from msgs_slam.pipelines.engine.stages import forget_peak, peak_memory_mb
@@ -88,11 +105,56 @@ def test_the_peak_of_memory_is_that_of_a_stage() -> None:
     assert after < with_block - 200
 
 
-def test_room_is_half_of_the_machine_or_container(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def cgroups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Sets the cgroups of this process: the lines of /proc/self/cgroup, and files below /sys/fs/cgroup."""
+    monkeypatch.setattr(limits, "_CGROUPS", tmp_path / "sys")
+    monkeypatch.setattr(limits, "_OWN_CGROUPS", tmp_path / "own")
+
+    def place(own: str, **files: str) -> None:
+        shutil.rmtree(tmp_path / "sys", ignore_errors=True)
+        (tmp_path / "own").write_text(own)
+        for name, text in files.items():
+            (tmp_path / "sys" / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / "sys" / name).write_text(text)
+
+    return place
+
+
+def test_room_is_half_of_the_machine_or_container(cgroups: Callable[..., None]) -> None:
     assert memory_room(700) == 700e6
-    assert 2e8 < memory_room(0) == machine_memory() / 2
-    (tmp_path / "memory.max").write_text("max\n")
-    monkeypatch.setattr(memory, "_CONTAINER", tmp_path)
+    cgroups("0::/\n", **{"memory.max": "max\n"})
     whole = machine_memory()
-    (tmp_path / "memory.max").write_text("300000000\n")
-    assert machine_memory() == 300e6 < whole
+    assert 2e8 < memory_room(0) == whole / 2
+    job = "/system.slice/slurmstepd.scope/job_7/step_0"
+    for own, name in (
+        ("0::/\n", "memory.max"),
+        (f"0::{job}\n", "system.slice/slurmstepd.scope/job_7/memory.max"),  # the limit is the job's, not the step's
+        ("0::/kubepods/pod3/of-the-host\n", "memory.max"),  # seen from inside the container
+        ("4:cpu,cpuacct:/\n9:memory:/slurm/job_7/step_0\n", "memory/slurm/job_7/memory.limit_in_bytes"),
+        ("9:memory:/docker/of-the-host\n", "memory/memory.limit_in_bytes"),
+        ("", "memory.max"),
+    ):
+        cgroups(own, **{name: "300000000\n"})
+        assert machine_memory() == 300e6 < whole, own
+    cgroups("0::/a\n", **{"a/memory.max": "max\n", "b/memory.max": "300000000\n"})
+    assert machine_memory() == whole
+
+
+def test_cpus_are_those_of_the_process(cgroups: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its affinity (SLURM, docker --cpuset-cpus) and by quotas (docker --cpus, Kubernetes)."""
+    monkeypatch.setattr("os.cpu_count", lambda: 128)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(8)), raising=False)
+    run = RunFolder(Path("run.msgs"))
+    for own, files, wanted in (
+        ("", {}, 8),
+        ("0::/pod/c\n", {"pod/c/cpu.max": "max 100000\n"}, 8),
+        ("0::/pod/c\n", {"pod/c/cpu.max": "max 100000\n", "pod/cpu.max": "150000 100000\n"}, 2),
+        ("0::/\n", {"cpu.max": "20000 100000\n"}, 1),
+        ("0::/\n", {"cpu.max": "1600000 100000\n"}, 8),
+        ("3:cpu,cpuacct:/d\n", {"cpu/d/cpu.cfs_quota_us": "300000\n", "cpu/d/cpu.cfs_period_us": "100000\n"}, 3),
+        ("3:cpu,cpuacct:/d\n", {"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, 8),
+    ):
+        cgroups(own, **files)
+        assert available_cpus() == get_threads() == wanted, own
+        assert StageContext(run, Path(), Config(), Path(), SilentProgress()).threads == wanted
