@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from PIL import ExifTags
+from PIL import ExifTags, Image
 
 _FULL_FRAME_WIDTH_MM = 36.0
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
@@ -14,6 +14,20 @@ _MM_PER_RESOLUTION_UNIT = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0}
 _EQUIVALENTS = 7.0, 1200.0
 """Focal lengths in mm at 35 mm film, from the widest lens without a fisheye's distortion to the longest that is sold:
 what lies outside is a slip of the writing program."""
+TURNS = {
+    1: None,
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""Turns that make an image upright, by EXIF's orientation."""
+QUARTER_TURNS = {1: 0, 8: 1, 3: 2, 6: 3}
+"""Anticlockwise quarter turns of those of them that do not mirror."""
+ANTICLOCKWISE = (None, Image.Transpose.ROTATE_90, Image.Transpose.ROTATE_180, Image.Transpose.ROTATE_270)
 _Tags = Mapping[int, object]
 
 

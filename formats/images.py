@@ -19,8 +19,17 @@ from pillow_heif import register_heif_opener
 
 from msgs_slam.formats.atomic import write_bytes
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.exif import ExifLens, lens_of, place_of
-from msgs_slam.formats.reading import opened, parsing, reaching
+from msgs_slam.formats.exif import ANTICLOCKWISE, QUARTER_TURNS, TURNS, ExifLens, lens_of, place_of
+from msgs_slam.formats.pixels import (
+    decode_16_bits,
+    decode_deep_colour,
+    deep_values,
+    is_deep_colour,
+    is_one_deep_channel,
+    to_rgb8,
+    transparent_pixels,
+)
+from msgs_slam.formats.reading import opened, parsing, reaching, read_bytes
 
 register_heif_opener()
 
@@ -30,18 +39,8 @@ MAX_IMAGE_PIXELS = 120_000_000
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif"})
 _FORMATS = ("JPEG", "PNG", "BMP", "DIB", "TIFF", "WEBP", "GIF", "HEIF")
 _PLAIN_FORMATS = ("JPEG", "MPO", "PNG")
+_SEVERAL_IMAGES = ("TIFF", "WEBP", "PNG", "GIF")
 _ADVICE = "copy it again or remove it"
-_TURNS = {
-    1: None,
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
-}
-"""What makes an image upright, by EXIF's orientation."""
 RAW_SUFFIXES = frozenset({".dng", ".cr2", ".nef", ".arw", ".raw"})
 """Of photos that are not read: raw sensor data."""
 
@@ -84,10 +83,10 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def is_depth_map(path: Path) -> bool:
-    """Whether the header says one channel of 16 bits; False for a file that cannot be read."""
+    """Whether the header says one channel of more than 8 bits; False for a file that cannot be read."""
     try:
         with _opened(Path(path)) as image:
-            return image.mode.startswith("I")
+            return is_one_deep_channel(image)
     except InputError:
         return False
 
@@ -102,19 +101,52 @@ def is_plain(path: Path) -> bool:
         return image.format in _PLAIN_FORMATS and image.mode in ("RGB", "L") and _orientation(image) == 1
 
 
-def read_rgb(path: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB, turned upright as EXIF or HEIF says; 10 to 16 bits become 8, grey is tripled, alpha dropped.
+@dataclass(frozen=True)
+class Reading:
+    """Rule by which files become pixels, the same for all images of one camera.
+
+    orientation: that of EXIF (1 to 8) by which all are turned, None: each by its own. span: values of images of more
+    than 8 bits that become 0 and 255, None: the whole 16 bits.
+    """
+
+    orientation: int | None = None
+    span: tuple[float, float] | None = None
+
+
+AS_STATED = Reading()
+
+
+def read_rgb(path: Path, reading: Reading = AS_STATED) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 RGB, turned upright as EXIF or HEIF says; more bits become 8, grey is tripled, alpha dropped.
 
     Raises InputError for a missing, truncated, oversized or unreadable file.
     """
     with _opened(Path(path)) as image:
+        is_wide = reading.span is not None and is_deep_colour(image)  # first: asking a PNG for EXIF loads it
+        turn = _turn(image, reading)
+        if is_wide and reading.span is not None:
+            image = Image.fromarray(decode_deep_colour(read_bytes(Path(path)), reading.span))
         image.load()
-        turn = _TURNS[_orientation(image)]
-        upright = image if turn is None else image.transpose(turn)
-        if upright.mode.startswith("I"):  # one channel of 16 bit; Pillow's own conversion saturates it
-            grey = (np.clip(np.asarray(upright), 0, 65535) >> 8).astype(np.uint8)
-            return np.repeat(grey[:, :, None], 3, axis=2)
-        return np.array(upright if upright.mode == "RGB" else upright.convert("RGB"), dtype=np.uint8)
+        return to_rgb8(image if turn is None else image.transpose(turn), reading.span)
+
+
+def read_transparent(path: Path, reading: Reading = AS_STATED) -> NDArray[np.bool_] | None:
+    """(H, W) pixels of `read_rgb` that are less than half opaque; None where all are opaque. Raises the same."""
+    with _opened(Path(path)) as image:
+        if image.mode in ("RGB", "L") and "transparency" not in image.info:
+            return None
+        turn = _turn(image, reading)
+        image.load()
+        return transparent_pixels(image if turn is None else image.transpose(turn))
+
+
+def read_deep(path: Path) -> NDArray | None:
+    """(H, W) or (H, W, 3) values of more than 8 bits as stored; None for other images. Raises as `read_rgb` does."""
+    with _opened(Path(path)) as image:
+        if is_deep_colour(image):
+            return decode_16_bits(read_bytes(Path(path)))
+        image.load()
+        return deep_values(image)
 
 
 def read_depth_png(path: Path) -> NDArray[np.uint16]:
@@ -180,16 +212,19 @@ def decode_rgb(data: bytes, name: str) -> NDArray[np.uint8]:
     """`read_rgb` for an image held in memory; `name` is what errors call it."""
     with parsing(name, "image", _ADVICE), _quiet_open(io.BytesIO(data)) as image:
         _require_sane_size(image, name)
-        return np.array(image.convert("RGB"), dtype=np.uint8)
+        return to_rgb8(image)
 
 
 @dataclass(frozen=True)
 class Header:
-    """An image's size (width, height) as stored, the orientation that EXIF states (1 to 8), and the lens."""
+    """An image's size (width, height) as stored, the orientation that EXIF states (1 to 8), the lens; whether it has
+    more than 8 bits a channel, and how many images the file holds."""
 
     stored: tuple[int, int]
     orientation: int
     lens: ExifLens
+    is_deep: bool = False
+    images: int = 1
 
     @property
     def size(self) -> tuple[int, int]:
@@ -200,8 +235,12 @@ class Header:
 def read_header(path: Path) -> Header:
     """Header of an image. Raises InputError as `read_rgb` does."""
     with _opened(Path(path)) as image:
+        deep = is_one_deep_channel(image) or is_deep_colour(image)  # first: asking a PNG for EXIF loads it
         lens = lens_of(_tags(image), _tags(image, ExifTags.IFD.Exif), image.size)
-        return Header(image.size, _orientation(image), lens)
+        images = int(getattr(image, "n_frames", 1)) if image.format in _SEVERAL_IMAGES else 1
+        before = _turned_before(image)
+        stored = image.size[::-1] if before >= 5 else image.size
+        return Header(stored, _orientation(image) if before == 1 else before, lens, deep, images)
 
 
 def exif_focal_px(path: Path, width: int, height: int) -> float | None:
@@ -234,10 +273,24 @@ def exif_gps(path: Path) -> tuple[float, float, float] | None:
     return place_of(tags)
 
 
+def _turn(image: Image.Image, reading: Reading) -> Image.Transpose | None:
+    """The turn from the image as Pillow decodes it to that of the rule; HEIF comes turned already."""
+    if reading.orientation is None or reading.orientation not in QUARTER_TURNS:
+        return TURNS[_orientation(image)]
+    done = QUARTER_TURNS.get(_turned_before(image), 0)
+    return ANTICLOCKWISE[(QUARTER_TURNS[reading.orientation] - done) % 4]
+
+
+def _turned_before(image: Image.Image) -> int:
+    """The orientation that has been applied by the decoder."""
+    value = image.info.get("original_orientation")
+    return value if isinstance(value, int) and value in TURNS else 1
+
+
 def _orientation(image: Image.Image) -> int:
     """1 to 8 as EXIF defines them; 1 for every other value: text, lists, other numbers."""
     value = _tags(image).get(ExifTags.Base.Orientation, 1)
-    return int(value) if isinstance(value, int | float) and value in _TURNS else 1
+    return int(value) if isinstance(value, int | float) and value in TURNS else 1
 
 
 def _tags(image: Image.Image, ifd: int | None = None) -> dict[int, Any]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.geometry.rig import ONE_CAMERA, Rig
-from msgs_slam.pipelines.masks.files import MaskFiles, open_masks
+from msgs_slam.pipelines.masks.files import MaskFiles, open_masks, reduce_mask
 from msgs_slam.pipelines.masks.people import PeopleCards, PeopleFinder, people_cards
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.run.files import LEFT_OUT
@@ -52,6 +52,7 @@ class FrameMasks:
         self, config: Config, source: Source, folder: Path, picked: Path, threads: int,
         faces: Faces | None = None, rig: Rig = ONE_CAMERA,
     ) -> None:  # fmt: skip
+        self._source = source
         self._files = open_masks(Path(config.frames.masks), source) if config.frames.masks else MaskFiles({})
         self._cards = _cards(config)
         self._folder, self._picked, self._threads = folder, picked, threads
@@ -81,11 +82,16 @@ class FrameMasks:
     def left_out(self, frame: Frame, width: int, height: int) -> NDArray[np.bool_] | None:
         """(height, width) of a picked frame; None where all of it is scene."""
         size = (width, height) if self._faces is None else self._faces.size
-        given = self._files.left_out(frame.source_index, *size)
+        given = any_of((self._files.left_out(frame.source_index, *size), self._transparent(frame.source_index, size)))
         if given is not None and self._faces is not None:
             given = self._faces.cut_mask(given, frame.id // self._rig.stations)
         both = any_of((given, LEFT_OUT.find(self._folder, frame.name)))
         return both if both is not None and both.any() else None
+
+    def _transparent(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+        """(height, width) of the source's image `index`, its transparent background at a size (width, height)."""
+        clear = self._source.transparent(index)
+        return None if clear is None else reduce_mask(clear, *size)
 
     def write(self, folder: Path, frames: Sequence[Frame], lens: Lens) -> dict[str, Any]:
         """Write the masks of the undistorted frames that have any; how many these are, and how much they leave out."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -13,14 +13,16 @@ from msgs_slam.formats.digest import files_sha256
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.image_times import frame_number
 from msgs_slam.formats.images import image_size, natural_key, read_rgb
-from msgs_slam.pipelines.source.opening import Source, VideoSource
+from msgs_slam.pipelines.source.opening import FolderSource, Source, VideoSource
 
 
 @dataclass(frozen=True)
 class MaskFiles:
-    """paths: index of an image in the source → its mask."""
+    """paths: index of an image in the source → its mask; turns: the anticlockwise quarter turns that make it lie as the
+    image is read, of those that need any."""
 
     paths: dict[int, Path]
+    turns: dict[int, int] = field(default_factory=dict)
 
     def left_out(self, index: int, width: int, height: int) -> NDArray[np.bool_] | None:
         """(height, width) of the source's image `index`; None where it has no mask. What is black in half of a pixel
@@ -28,12 +30,17 @@ class MaskFiles:
         path = self.paths.get(index)
         if path is None:
             return None
-        scene = (read_rgb(path).max(-1) > 0).astype(np.float32)
-        return np.asarray(cv2.resize(scene, (width, height), interpolation=cv2.INTER_AREA) <= 0.5)
+        return reduce_mask(np.rot90(read_rgb(path).max(-1) == 0, self.turns.get(index, 0)), width, height)
 
     def digest(self) -> str:
         """Changes with the names and contents."""
         return files_sha256((p.name, p) for p in self.paths.values())
+
+
+def reduce_mask(left_out: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
+    """(height, width) of a mask of another size. What is left out in half of a pixel is left out."""
+    scene = (~left_out).astype(np.float32)
+    return np.asarray(cv2.resize(scene, (width, height), interpolation=cv2.INTER_AREA) <= 0.5)
 
 
 def open_masks(folder: Path, source: Source) -> MaskFiles:
@@ -58,13 +65,18 @@ def open_masks(folder: Path, source: Source) -> MaskFiles:
             f"--masks {folder}: {len(strangers)} of {len(files)} files belong to no image, the first is "
             f"{strangers[0].name}. The name of a mask is {rule}"
         )
-    for path in paths.values():
-        if (size := image_size(path)) != (source.width, source.height):
+    turns = {}
+    for index, path in paths.items():
+        turn = source.turns_from_upright(index) if isinstance(source, FolderSource) else 0
+        size = image_size(path)
+        if turn == 2 or (turn and size == (source.height, source.width)):
+            turns[index], size = turn, (source.width, source.height)
+        if size != (source.width, source.height):
             raise InputError(
                 f"{path} is {size[0]}x{size[1]}, the images are {source.width}x{source.height}: make masks of the "
                 "same size"
             )
-    return MaskFiles(paths)
+    return MaskFiles(paths, turns)
 
 
 def _by_number(files: list[Path], source: Source) -> tuple[dict[int, Path], list[Path]]:

@@ -10,13 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.exif import ExifLens
-from msgs_slam.formats.images import Header, read_header
+from msgs_slam.formats.exif import QUARTER_TURNS, ExifLens
+from msgs_slam.formats.images import Header, read_deep, read_header
 
 _ALIKE = 1.05
 """Focal lengths that differ by less are one: EXIF rounds to whole millimetres, which are 4 % of 25, and the focus moves
 the lens by 2 to 3 %."""
 _MOST_NAMED = 4
+_SAMPLED_IMAGES, _SAMPLED_STEP = 24, 3
+_SPAN_PERCENTILES = 0.5, 99.5
+_LARGEST_16_BIT = 65535
 _Key = Callable[[ExifLens], float | None]
 
 
@@ -34,8 +37,37 @@ class Headers:
         known = [focal for lens in some if (focal := lens.focal_px(width, height)) is not None]
         return float(np.median(known)) if known else None
 
-    def warn_of_cameras(self, warn: Callable[[str], None]) -> None:
-        """Report images of several makes or models, which are taken as one camera where their focal lengths agree."""
+    def common_orientation(self) -> int | None:
+        """Return the EXIF orientation by which all images are turned, the commonest, where turning each by its own
+        would make two sizes of one; None where each is turned by its own.
+
+        A phone that is turned between two photos is one camera only as its sensor lies.
+        """
+        found = Counter(h.orientation for h in self.of.values())
+        differ = len({h.size for h in self.of.values()}) > 1 and len({h.stored for h in self.of.values()}) == 1
+        if not differ or not set(found) <= set(QUARTER_TURNS):
+            return None
+        return min(found, key=lambda o: (-found[o], o))
+
+    def turns_from_upright(self, name: str, common: int | None) -> int:
+        """Return the anticlockwise quarter turns by which an image that is turned as all are differs from upright."""
+        if common is None or name not in self.of:
+            return 0
+        return (QUARTER_TURNS[common] - QUARTER_TURNS[self.of[name].orientation]) % 4
+
+    def warn(self, warn: Callable[[str], None]) -> None:
+        """Report images of several makes or models, which are treated as one camera, and files of several images."""
+        several = [f"{name} ({h.images})" for name, h in self.of.items() if h.images > 1]
+        if several:
+            warn(
+                f"{len(several)} files hold several images, of which the first is used: {several[0]}"
+                f"{', …' if len(several) > 1 else ''}"
+            )
+        if self.common_orientation() is not None:
+            warn(
+                "some images were taken upright and some sideways, by their EXIF: all are turned as most of them are, "
+                "so that they are of one camera"
+            )
         cameras = Counter(h.lens.camera for h in self.of.values() if h.lens.camera).most_common()
         if len(cameras) > 1:
             told = ", ".join(f"{count} by {name}" for name, count in cameras[:_MOST_NAMED])
@@ -59,6 +91,31 @@ def read_headers(folder: Path, images: Mapping[str, Path]) -> Headers:
             f"none of the {len(images)} images of {folder} can be read: {next(iter(unreadable.values()), '')}"
         )
     return Headers(found, unreadable)
+
+
+def common_span(headers: Headers, images: Mapping[str, Path]) -> tuple[float, float] | None:
+    """Values that become black and white in all images of more than 8 bits; None where they use most of 16 bits.
+
+    From a half to 99.5 % of the pixels of evenly chosen images: grey of 10 to 14 bits, or of a thermal camera, fills a
+    small part of the range, of which 8 bits would keep a few levels.
+    """
+    deep = [name for name, header in headers.of.items() if header.is_deep]
+    chosen = deep[:: -(-len(deep) // _SAMPLED_IMAGES)] if deep else []
+    found = []
+    for name in chosen:
+        try:
+            values = read_deep(images[name])
+        except InputError:
+            continue  # left out with its reason when it is read
+        if values is not None:
+            some = values[::_SAMPLED_STEP, ::_SAMPLED_STEP].ravel()
+            found.append(some[np.isfinite(some)].astype(np.float64))
+    sample = np.concatenate(found) if found else np.zeros(0)
+    if not sample.size:
+        return None
+    low, high = (float(v) for v in np.percentile(sample, _SPAN_PERCENTILES))
+    is_whole = sample.min() >= 0 and sample.max() <= _LARGEST_16_BIT and high - low >= _LARGEST_16_BIT / 2
+    return None if is_whole or high <= low else (low, high)
 
 
 def require_one_lens(folder: Path, headers: Headers) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Container, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
@@ -14,11 +15,11 @@ from numpy.typing import NDArray
 from msgs_slam.formats.digest import file_sha256, files_sha256
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.image_times import read_image_times, times_file
-from msgs_slam.formats.images import is_depth_map, list_images, read_rgb
+from msgs_slam.formats.images import Reading, is_depth_map, list_images, read_rgb, read_transparent
 from msgs_slam.formats.reading import reaching, require_file
 from msgs_slam.formats.textfile import read_text
 from msgs_slam.formats.video import VideoFrame, VideoReader, probe_video
-from msgs_slam.pipelines.source.one_camera import Headers, read_headers, require_one_lens
+from msgs_slam.pipelines.source.one_camera import Headers, common_span, read_headers, require_one_lens
 from msgs_slam.pipelines.source.originals import reusable, written_names
 from msgs_slam.pipelines.source.recording import RecordingSource, open_recording
 
@@ -54,6 +55,10 @@ class Source(Protocol):
 
     def exif_focal(self) -> float | None:
         """Focal length in pixels of the source that its metadata states, or None."""
+        ...
+
+    def transparent(self, index: int) -> NDArray[np.bool_] | None:
+        """(height, width) pixels of image `index` that its alpha channel makes transparent; None without any."""
         ...
 
 
@@ -99,6 +104,10 @@ class VideoSource:
         """Return None: videos state no focal length."""
         return None
 
+    def transparent(self, index: int) -> None:
+        """Return None: the alpha channel of videos is not read."""
+        return
+
 
 def video_files(path: Path) -> tuple[Path, ...]:
     """The videos that a text file of the suffix .videos names, one a line, seen from its folder; of any other file
@@ -122,6 +131,7 @@ class FolderSource:
     expected_frames: int = field(init=False)
     has_times: bool = field(init=False)
     headers: Headers = field(init=False)
+    _common: int | None = field(init=False)
     _images: list[Path] = field(init=False)
     _names: tuple[str, ...] = field(init=False)
 
@@ -129,7 +139,11 @@ class FolderSource:
         self._images = _without_depth_maps(list_images(self.path))
         self._names = written_names([path.name for path in self._images], self.path)
         self.headers = read_headers(self.path, {path.name: path for path in self._images})
-        sizes = {name: header.size for name, header in self.headers.of.items()}
+        self._common = self.headers.common_orientation()
+        sizes = {
+            name: header.size if self._common is None else replace(header, orientation=self._common).size
+            for name, header in self.headers.of.items()
+        }
         _require_one_size(self.path, sizes, "images")
         require_one_lens(self.path, self.headers)
         self.width, self.height = next(iter(sizes.values()))
@@ -141,12 +155,12 @@ class FolderSource:
     def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
         """See `Source.read`; images that cannot be read are left out and reported to `warn`."""
         if warn is not None:
-            self.headers.warn_of_cameras(warn)
+            self.headers.warn(warn)
         for index, path in enumerate(self._images):
             if wanted is not None and index not in wanted:
                 continue
             try:
-                rgb = read_rgb(path)
+                rgb = read_rgb(path, self.reading)
             except InputError as error:
                 if warn is not None:
                     warn(f"left out: {error}")
@@ -161,7 +175,20 @@ class FolderSource:
     def original(self, index: int) -> Path | None:
         """The image's file, unless other programs would see it turned, transparent or not at all."""
         path = self._images[index]
-        return path if reusable(path) else None
+        return path if reusable(path) and self.reading.orientation in (None, 1) else None
+
+    @cached_property
+    def reading(self) -> Reading:
+        """The rule by which all images become pixels."""
+        return Reading(self._common, common_span(self.headers, {path.name: path for path in self._images}))
+
+    def transparent(self, index: int) -> NDArray[np.bool_] | None:
+        """Return the transparent pixels of image `index`, see `Source.transparent`."""
+        return read_transparent(self._images[index], self.reading)
+
+    def turns_from_upright(self, index: int) -> int:
+        """Return the anticlockwise quarter turns by which image `index` differs from its upright view."""
+        return self.headers.turns_from_upright(self._images[index].name, self._common)
 
     def file(self, index: int) -> Path:
         """The image of that number, however it is turned."""

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import Camera, Sequence, open_sequence, recognise_source
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import exif_focal_px, image_size
+from msgs_slam.formats.images import Reading, read_rgb, read_transparent
 from msgs_slam.formats.video import VideoFrame
+from msgs_slam.pipelines.source.one_camera import Headers, common_span, read_headers, require_one_lens
 from msgs_slam.pipelines.source.originals import reusable, written_names
 
 Warn = Callable[[str], None]
@@ -36,26 +40,45 @@ class RecordingSource:
     expected_frames: int = field(init=False)
     has_times: bool = field(init=False)
     _names: tuple[str, ...] = field(init=False)
+    _headers: Headers | None = field(init=False)
+    _reading: Reading = field(init=False)
 
     def __post_init__(self) -> None:
         s = self.sequence
         self.path, self.expected_frames, self.has_times = s.root, len(s), s.timed
         self._names = written_names(s.names, s.root)
-        if s.image_paths:
-            self.width, self.height = image_size(s.image_paths[0])
-        else:
+        self._headers, self._reading = None, Reading()
+        if not s.image_paths:
             self.height, self.width = s.rgb(0).shape[:2]
+            return
+        images = dict(zip(s.names, s.image_paths, strict=True))
+        self._headers = read_headers(s.root, images)
+        if s.camera is None:
+            require_one_lens(s.root, self._headers)
+        first = next(iter(self._headers.of.values()))
+        common = self._headers.common_orientation()
+        if (
+            common is None
+            and s.camera is not None
+            and _is_shape_of(first.stored, s.camera)
+            and first.size != first.stored
+        ):
+            common = 1  # the program that made the data set has not turned its images
+        self._reading = Reading(common, common_span(self._headers, images))
+        self.width, self.height = first.size if common is None else replace(first, orientation=common).size
 
     def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
         """See `Source.read`; what the reader notes of the data set, and images that cannot be read, are reported."""
         if warn is not None:
+            if self._headers is not None:
+                self._headers.warn(warn)
             for note in self.sequence.notes:
                 warn(f"{self.sequence.format}: {note}")
         for index in range(len(self.sequence)):
             if wanted is not None and index not in wanted:
                 continue
             try:
-                rgb = self.sequence.rgb(index)
+                rgb = self._rgb(index)
             except InputError as error:
                 if warn is not None:
                     warn(f"left out: {error}")
@@ -74,14 +97,27 @@ class RecordingSource:
     def original(self, index: int) -> Path | None:
         """The image's file, unless other programs would see it turned, transparent or not at all."""
         path = self.sequence.image_paths[index] if self.sequence.image_paths else None
-        return path if path is not None and reusable(path) else None
+        return path if path is not None and reusable(path) and self._reading.orientation in (None, 1) else None
+
+    def transparent(self, index: int) -> NDArray[np.bool_] | None:
+        """Return the transparent pixels of image `index`, see `Source.transparent`."""
+        paths = self.sequence.image_paths
+        return read_transparent(paths[index], self._reading) if paths else None
 
     def exif_focal(self) -> float | None:
-        """Return the focal length in pixels that the first image states, if any."""
+        """Return the focal length in pixels that the images state, if any do."""
+        return None if self._headers is None else self._headers.focal_px(self.width, self.height)
+
+    def _rgb(self, index: int) -> NDArray[np.uint8]:
         paths = self.sequence.image_paths
-        return exif_focal_px(paths[0], self.width, self.height) if paths else None
+        return read_rgb(paths[index], self._reading) if paths else self.sequence.rgb(index)
 
     def known_camera(self) -> Camera | None:
         """The data set's camera at the size of its images."""
         camera = self.sequence.camera
         return None if camera is None else camera.resized(self.width, self.height)
+
+
+def _is_shape_of(size: tuple[int, int], camera: Camera) -> bool:
+    """Whether images of the size (width, height) are wide or high as the camera's are."""
+    return camera.width != camera.height and (size[0] > size[1]) == (camera.width > camera.height)

@@ -31,6 +31,7 @@ from msgs_slam.formats.images import (
     read_grey_png,
     read_label_png,
     read_rgb,
+    read_transparent,
     write_grey_png,
     write_rgb,
 )
@@ -96,6 +97,60 @@ def test_a_foreign_writer_is_read(tmp_path: Path, picture: np.ndarray) -> None:
     for name in ("grey.png", "deep_grey.png"):
         assert (read_rgb(tmp_path / name) == picture[:, :, :1]).all(), name
     assert (decode_rgb((tmp_path / "a.bmp").read_bytes(), "a") == picture).all()
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "PA", "RGBA", "CMYK", "YCbCr", "LAB", "HSV", "I;16B", "F"])
+def test_every_pixel_format_is_read_as_the_picture_it_is(tmp_path: Path, mode: str) -> None:
+    """A grey ramp, which every format can hold."""
+    ramp = np.repeat(np.linspace(0, 255, 64).round().astype(np.uint8)[None], 16, axis=0)
+    grey = Image.fromarray(ramp)
+    if mode == "I;16B":
+        Image.fromarray((ramp.astype(np.uint16) * 257).astype(">u2")).save(tmp_path / "a.tif")
+    elif mode == "LAB":
+        lab = cv2.cvtColor(np.repeat(ramp[..., None], 3, axis=2), cv2.COLOR_RGB2LAB)
+        shifted = np.dstack([lab[..., 0], (lab[..., 1:].astype(int) - 128).astype(np.int8).view(np.uint8)])
+        Image.frombytes("LAB", (64, 16), shifted.tobytes()).save(tmp_path / "a.tif")
+    elif mode == "F":
+        Image.fromarray(ramp.astype(np.float32)).save(tmp_path / "a.tif")
+    elif mode in ("P", "PA", "HSV", "YCbCr"):
+        made = grey.convert("RGB").convert(mode.replace("PA", "P") if mode != "HSV" else "RGB")
+        made.save(tmp_path / ("a.jpg" if mode == "YCbCr" else "a.png"), **({"transparency": 0} if mode == "PA" else {}))
+    else:
+        (grey.convert("RGB") if mode == "CMYK" else grey).convert(mode).save(
+            tmp_path / ("a.tif" if mode == "CMYK" else "a.png")
+        )
+    path = next(p for p in tmp_path.iterdir())
+    found = read_rgb(path).astype(int)
+    assert found.shape == (16, 64, 3)
+    assert np.abs(found.mean(axis=(0, 2)) - ramp[0]).max() < (256 if mode == "1" else 6 if mode[0] != "P" else 30)
+    assert found[:, -8:].mean() > found[:, :8].mean() + 200
+
+
+def test_transparency_of_every_kind_is_found(tmp_path: Path) -> None:
+    picture = np.full((8, 10), 200, np.uint8)
+    picture[:, :4] = 7
+    grey, clear = Image.fromarray(picture), picture == 7
+    alpha = Image.fromarray(np.where(clear, 0, 255).astype(np.uint8))
+    Image.merge("LA", (grey, alpha)).save(tmp_path / "la.png")
+    Image.merge("RGBA", (grey, grey, grey, alpha)).save(tmp_path / "rgba.webp", lossless=True, exact=True)
+    Image.merge("RGBA", (grey, grey, grey, alpha)).save(tmp_path / "rgba.tif")
+    grey.save(tmp_path / "key.png", transparency=7)
+    grey.convert("RGB").save(tmp_path / "rgb_key.png", transparency=(7, 7, 7))
+    palette = Image.fromarray(clear.astype(np.uint8), "P")
+    palette.putpalette([9, 9, 9, 5, 5, 5])
+    palette.save(tmp_path / "palette.png", transparency=1)
+    deep = np.dstack([np.repeat(picture[:, :, None], 3, 2), np.asarray(alpha)]).astype(np.uint16) * 257
+    cv2.imwrite(str(tmp_path / "deep.png"), deep)
+    files = sorted(tmp_path.iterdir())
+    assert len(files) == 7
+    for path in files:
+        found = read_transparent(path)
+        assert found is not None, path.name
+        assert (found == clear).all(), path.name
+        assert read_rgb(path).shape == (8, 10, 3)
+    grey.save(tmp_path / "opaque.png")
+    Image.merge("LA", (grey, Image.new("L", grey.size, 255))).save(tmp_path / "opaque_la.png")
+    assert read_transparent(tmp_path / "opaque.png") is read_transparent(tmp_path / "opaque_la.png") is None
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

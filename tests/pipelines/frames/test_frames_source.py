@@ -114,54 +114,6 @@ def test_a_folder_of_damaged_images_is_refused(tmp_path: Path) -> None:
         open_source(tmp_path)
 
 
-def _photos(folder: Path, *lenses: dict[int, object], model: str = "Phone") -> Path:
-    folder.mkdir()
-    for i, tags in enumerate(lenses):
-        exif = Image.Exif()
-        exif[0x0110] = model
-        exif.get_ifd(0x8769).update(tags)
-        Image.fromarray(_noise(i)).save(folder / f"{i}.jpg", exif=exif)
-    return folder
-
-
-EQUIVALENT, FOCAL, ZOOM, PITCH = 0xA405, 0x920A, 0xA404, 0xA20E
-
-
-@pytest.mark.parametrize(
-    ("first", "second", "told"),
-    [
-        ({EQUIVALENT: 28}, {EQUIVALENT: 56}, r"4 with .* 28 mm .*\(0\.jpg, 1\.jpg, …\); 2 with .* 56 mm"),
-        ({EQUIVALENT: 24, FOCAL: 4.2}, {EQUIVALENT: 28, FOCAL: 4.2}, r"24 mm .* 28 mm"),
-        ({FOCAL: 10.0, PITCH: 81.28}, {FOCAL: 20.0, PITCH: 81.28}, r"2 lenses or zooms: 4 with"),
-        ({FOCAL: 4.25}, {FOCAL: 6.0}, r"4 with a focal length of 4\.25 mm \("),
-        ({EQUIVALENT: 26, FOCAL: 4.2, ZOOM: 0.0}, {EQUIVALENT: 26, FOCAL: 4.2, ZOOM: 2.0}, r"digital zoom of 1 .* 2 "),
-    ],
-)
-def test_images_of_several_lenses_are_refused_by_their_groups(
-    first: dict[int, object], second: dict[int, object], told: str, tmp_path: Path
-) -> None:
-    with pytest.raises(InputError, match=told):
-        open_source(_photos(tmp_path / "photos", *4 * [first], *2 * [second]))
-
-
-@pytest.mark.parametrize(
-    ("lenses", "equivalent"),
-    [
-        (({EQUIVALENT: 28}, {EQUIVALENT: 29}, {EQUIVALENT: 29}), 29),
-        (({}, {EQUIVALENT: 28}, {EQUIVALENT: 1}, {EQUIVALENT: 0}), 28),
-        (({FOCAL: 4.0}, {EQUIVALENT: 26, FOCAL: 4.0}), 26),
-        (({EQUIVALENT: 26, FOCAL: 4.2}, {EQUIVALENT: 26, FOCAL: 1.6, ZOOM: 2.0}), 26),  # the macro mode of phones
-        (({}, {}), None),
-    ],
-)
-def test_focal_lengths_that_agree_are_one_camera(
-    lenses: tuple[dict[int, object], ...], equivalent: float | None, tmp_path: Path
-) -> None:
-    source = open_source(_photos(tmp_path / "photos", *lenses))
-    wanted = None if equivalent is None else pytest.approx(equivalent / 43.2666 * 80, rel=1e-4)
-    assert source.exif_focal() == wanted
-
-
 def test_one_image_is_refused(tmp_path: Path, make_context: Callable[..., StageContext]) -> None:
     write_rgb(tmp_path / "one" / "a.jpg", _noise(0))
     with pytest.raises(InputError, match="one image only"):
