@@ -24,7 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -34,9 +34,8 @@ import numpy as np
 import torch
 from render_scenes import room
 from torch import Tensor
-from torch.nn import functional
 
-from msgs_slam.pipelines.gaussians.render import composite, render, set_threads, track_gn
+from msgs_slam.pipelines.gaussians.render import Rendering, composite, render, set_threads, track_gn
 from msgs_slam.pipelines.gaussians.render.compositing import choose_backend
 from msgs_slam.pipelines.gaussians.render.rendering import project_map
 from msgs_slam.pipelines.geometry import se3
@@ -62,28 +61,34 @@ def timed(task: Callable[[], object], device: torch.device) -> float:
 
 
 class Case:
-    """One room on one device: projected Gaussians with gradients, and a gradient for every image."""
+    """One room on one device: projected Gaussians whose colours have gradients, and a gradient for every image.
+
+    Classes are drawn without gradients: no part of the program asks for those of more than colours.
+    """
 
     def __init__(self, width: int, height: int, count: int, classes: int, device: torch.device) -> None:
         self.size, self.device = (width, height), device
         scene = room(width, height, count, classes)
         projected = project_map(scene.means, scene.radii, POSE, scene.intrinsics)
-        tensors = (*projected, scene.opacities, torch.cat([scene.colors, scene.logits], 1))
+        tensors = (*projected, scene.opacities, scene.colors)
         self.inputs = [x.detach().to(device).contiguous().requires_grad_() for x in tensors]
-        shapes = [(height, width, 3 + classes), *[(height, width)] * 3]
+        self.features = torch.cat([scene.colors, scene.logits], 1).to(device)
+        shapes = [(height, width, 3), *[(height, width)] * 3]
         self.upstream = [torch.randn(shape, device=device) for shape in shapes]
 
-    def forward(self, backend: str) -> Sequence[Tensor]:
-        image = composite(*self.inputs, *self.size, backend=backend)
-        return image.features, image.depth_sum, image.depth_silhouette, image.silhouette
+    @torch.no_grad()
+    def forward(self, backend: str) -> None:
+        composite(*self.inputs[:-1], self.features, *self.size, backend=backend)
 
     def forward_backward(self, backend: str) -> None:
         for tensor in self.inputs:
             tensor.grad = None
-        torch.autograd.backward(self.forward(backend), self.upstream)
+        image = composite(*self.inputs, *self.size, backend=backend)
+        images = (image.features, image.depth_sum, image.depth_silhouette, image.silhouette)
+        torch.autograd.backward(images, self.upstream)
 
     def gsplat(self) -> Callable[[], None] | None:
-        """The same Gaussians through gsplat's rasteriser (C + 4 channels), where it is installed."""
+        """The same Gaussians through gsplat's rasteriser (colours and depth), where it is installed."""
         try:
             from gsplat import rasterization
         except ImportError:
@@ -161,32 +166,29 @@ def print_table(results: list[dict]) -> None:
 
 
 class Iteration:
-    """A mapping iteration: projection, rendering, colour + SSIM + depth + cross-entropy of classes, fused Adam."""
+    """A mapping iteration: projection, rendering, colour + SSIM + depth, fused Adam."""
 
     def __init__(self, row: tuple[int, int, int, int], device: torch.device) -> None:
         scene = room(*row)
         self.intrinsics, self.size = scene.intrinsics, row[:2]
-        raw = (scene.means, scene.radii.log(), torch.logit(scene.opacities), scene.colors, scene.logits)
+        raw = (scene.means, scene.radii.log(), torch.logit(scene.opacities), scene.colors)
         self.parameters = [x.to(device).clone().requires_grad_() for x in raw]
         self.optimizer = torch.optim.Adam(self.parameters, lr=1e-4, fused=True)
         with torch.no_grad():
             seen = self.draw(torch.eye(4, dtype=torch.float64))
-        self.image, self.depth = (255 * seen.features[..., :3]).to(torch.uint8), seen.depth
+        self.image, self.depth = (255 * seen.features).to(torch.uint8), seen.depth
         self.exposure = torch.zeros(2, 3, device=device)
-        self.labels = seen.features[..., 3:].argmax(-1)
         self.weight = torch.ones_like(self.depth)
 
-    def draw(self, pose: Tensor) -> object:
-        means, log_radii, opacity_logits, colors, logits = self.parameters
-        features = torch.cat([colors, logits], 1)
-        return render(means, log_radii.exp(), opacity_logits.sigmoid(), features, pose, self.intrinsics)
+    def draw(self, pose: Tensor) -> Rendering:
+        means, log_radii, opacity_logits, colors = self.parameters
+        return render(means, log_radii.exp(), opacity_logits.sigmoid(), colors, pose, self.intrinsics)
 
     def step(self) -> None:
         self.optimizer.zero_grad()
         seen = self.draw(POSE)
-        loss = photo_loss(seen.features[..., :3], self.exposure, self.image)
+        loss = photo_loss(seen.features, self.exposure, self.image)
         loss = loss + losses.depth_loss(seen.depth, self.depth, self.weight, 1.0)
-        loss = loss + functional.cross_entropy(seen.features[..., 3:].flatten(0, 1), self.labels.flatten())
         loss.backward()
         self.optimizer.step()
 
@@ -200,7 +202,7 @@ def measure_iteration(repeats: int, device: torch.device) -> None:
     ][2:]
     bare, whole = (statistics.median(x) for x in zip(*pairs, strict=True))
     print(
-        f"mapping iteration 320x240, 50 000, 8: {whole:.1f} ms = {whole / bare:.2f} x bare forward + backward "
+        f"mapping iteration 320x240, 50 000: {whole:.1f} ms = {whole / bare:.2f} x bare forward + backward "
         "(wanted <= 3)"
     )
 
@@ -239,7 +241,7 @@ def measure_memory() -> None:
     iteration.step()
     peak = _resident("VmHWM") - before
     own = 3 * tensors  # gradients and two moments come to life in the first step
-    print(f"640x480, 200 000, 40: peak {peak / 1e9:.2f} GB above the parameters in the first step, "
+    print(f"640x480, 200 000: peak {peak / 1e9:.2f} GB above the parameters in the first step, "
           f"{own / 1e9:.2f} GB of it gradients and Adam (wanted <= 1 GB)")  # fmt: skip
 
 
@@ -255,7 +257,7 @@ import sys, time; sys.path[:0] = {paths}
 import torch
 from render_scenes import random_gaussians
 from msgs_slam.pipelines.gaussians.render import composite
-scene = {{k: x.requires_grad_() for k, x in random_gaussians(100, 40, 30, 11, 0).items()}}
+scene = {{k: x.requires_grad_() for k, x in random_gaussians(100, 40, 30, 3, 0).items()}}
 start = time.perf_counter(), time.process_time()
 composite(**scene, width=40, height=30).features.sum().backward()
 print(time.perf_counter() - start[0], time.process_time() - start[1])
