@@ -33,6 +33,8 @@ NO_READOUT = (0.0, 0.0)
 
 LONGEST_STEP = 1.0
 """Seconds: frames farther apart say nothing about the camera's velocity at either."""
+LEAST_STEP = 1e-4
+"""Seconds: frames of nearly one time (duplicated or repaired timestamps) make a derivative of noise alone."""
 LEAST_GAIN = 0.01
 """Share of the robust cost that a readout must explain. Of three cameras that take all rows at once it was less than
 0.00002, of a phone that holds still 0.001; of a Kinect 0.03 at first and 0.054 in the end."""
@@ -73,13 +75,17 @@ def read_readout(text: str) -> Readout | None:
 def velocities(cam_from_world: Array, times: Array, worlds: NDArray[np.int64] | None = None) -> Array:
     """(N, 6) twists a second of cameras (N, 4, 4) in order, at times (N,): the derivative of the polynomial through the
     poses of up to two frames before and two after. Frames more than LONGEST_STEP away, or in another of the `worlds`
-    (N,), or of a clock that was set back, do not count; without any the velocity is zero."""
+    (N,), or of a clock that was set back, or within LEAST_STEP of the frame between or of this one, do not count;
+    without any the velocity is zero."""
     count = len(times)
     steps, twists = np.zeros((len(REACH), count)), np.zeros((len(REACH), count, 6))
     for row, offset in enumerate(REACH):
         here = np.arange(max(0, -offset), count - max(0, offset))
         apart = (times[here + offset] - times[here]) * np.sign(offset)
-        known = (apart > 0) & (apart <= LONGEST_STEP)
+        nearer = here + offset - np.sign(offset)
+        known = (
+            (apart >= LEAST_STEP) & (apart <= LONGEST_STEP) & (abs(times[here + offset] - times[nearer]) >= LEAST_STEP)
+        )
         if worlds is not None:
             known &= worlds[here + offset] == worlds[here]
         here = here[known]

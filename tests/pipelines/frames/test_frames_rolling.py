@@ -101,6 +101,14 @@ def test_velocity_is_the_derivative_of_the_poses_of_one_world() -> None:
     assert 0 < np.abs(found - wanted)[inner].max() < 0.01 * np.abs(wanted).max()
     assert np.abs(found - wanted).max() < 0.15 * np.abs(wanted).max()
     assert not velocities(poses, 2 * np.arange(COUNT)).any()
+    # A frame whose time is (nearly) that of its predecessor adds nothing, and above all no step of almost no length.
+    for gap in (0.0, 1e-6):
+        twice = np.insert(np.arange(COUNT), 12, 11)
+        times = TIMES[twice] + gap * (np.arange(COUNT + 1) == 12)
+        jitter = se3.exp(np.full(6, 1e-3) * (np.arange(COUNT + 1) == 12)[:, None])
+        doubled, plain = velocities(jitter @ poses[twice], times), velocities(poses, TIMES)
+        assert np.isfinite(doubled).all()
+        assert 0 < np.abs(doubled[13:18] - plain[12:17]).max() < 0.2 * np.abs(plain).max()
     assert np.array_equal(velocities(poses, TIMES % 1.5), velocities(poses, TIMES % 1.5, worlds))
 
 
