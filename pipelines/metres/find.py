@@ -14,7 +14,7 @@ from msgs_slam.pipelines.metres.heights import camera_height, ceiling_height, us
 from msgs_slam.pipelines.metres.known import MEASURED, known_scale
 from msgs_slam.pipelines.metres.network import network_scale
 from msgs_slam.pipelines.metres.scene import Scene, SeenFrame, build_scene
-from msgs_slam.pipelines.metres.sizes import THINGS
+from msgs_slam.pipelines.metres.sizes import OUTDOORS, THINGS
 from msgs_slam.pipelines.metres.things import sizes_of_things
 from msgs_slam.pipelines.networks.card import Card
 from msgs_slam.pipelines.run.files import CALIBRATION, CLASSES, DEPTH_FIELDS, FIGURES, FRAME_SCALES, FRAMES, PROXY_MAPS
@@ -24,6 +24,9 @@ from msgs_slam.pipelines.types import Intrinsics, Metres, MetresSource, Trajecto
 _MOST_FRAMES = 40
 _MOST_NETWORK_FRAMES = 24
 _CONTRADICTION = 3.0
+_OUTDOORS_SHARE = 0.2
+"""Share of an image, in the middle of all, that shows sky or open ground; through windows it is less. A judgement, not
+fitted to recordings."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +51,32 @@ def find_metres(
     threads of the device. Raises InputError for a network that is not what its card says.
     """
     given = known_evidence(run)
-    usual = usual_evidence(load_seen(run, trajectory), card, threads, device) if guess else []
+    seen = load_seen(run, trajectory) if guess else None
+    usual = [] if seen is None else usual_evidence(seen, card, threads, device)
     # What was measured needs no guesses beside it: they can only doubt it.
     pieces = given if any(p.kind == MEASURED for p in given) else [*given, *usual]
-    return describe(pieces) if pieces else None, contradiction(given, usual)
+    warning = contradiction(given, usual)
+    if seen is not None and not given and is_outdoors(seen):
+        warning = (
+            "the scene is outdoors by its labels (sky, grass, road), so its size in metres is not estimated: what the "
+            "estimate knows are rooms. Give --scale-ref, or a GPS track with --gps"
+        )
+    return describe(pieces) if pieces else None, warning
+
+
+def is_outdoors(seen: Seen) -> bool:
+    """Whether sky and open ground fill much of the images, where a network named what they show."""
+    wanted = [i for i, name in enumerate(seen.names) if name.lower() in OUTDOORS]
+    if not (seen.is_named and wanted and seen.frames):
+        return False
+    return float(np.median([np.isin(f.maps.labels, wanted).mean() for f in seen.frames])) > _OUTDOORS_SHARE
 
 
 def usual_evidence(seen: Seen, card: Card | None, threads: int = 1, device: str = "cpu") -> list[Evidence]:
-    """Collect evidence of a network, the room and the things in it; none where no frame has reliable depth."""
+    """Collect evidence of a network, the room and the things in it; none where no frame has reliable depth, nor
+    outdoors, where neither the network nor what is usual in a room holds."""
+    if is_outdoors(seen):
+        return []
     scene = build_scene(seen.frames, seen.camera, seen.names, seen.is_named) if seen.frames else None
     if scene is None:
         return []

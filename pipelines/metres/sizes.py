@@ -61,3 +61,8 @@ DOORS = ("door", "double door")
 FLOORS = ("floor", "rug", "carpet", "road", "earth", "ground")
 FURNITURE = (*TOPS, "cabinet", "shelf", "storage", "wardrobe")
 """What a plane that is taken for the floor must not mostly be called."""
+OUTDOORS = (
+    "outdoors", "sky", "grass", "road", "sidewalk", "mountain", "field", "sea", "hill", "river", "skyscraper",
+    "dirt track",
+)  # fmt: skip
+"""The group of the networks and the classes of ADE20K in it, which a room shows through its windows at most."""

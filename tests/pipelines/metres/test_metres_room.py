@@ -15,7 +15,9 @@ from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.export.stage import run as export
 from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.metres import find
 from msgs_slam.pipelines.metres.find import (
+    Seen,
     contradiction,
     find_metres,
     known_evidence,
@@ -25,7 +27,9 @@ from msgs_slam.pipelines.metres.find import (
 )
 from msgs_slam.pipelines.metres.heights import camera_height, ceiling_height, floor_trust
 from msgs_slam.pipelines.metres.scene import Scene, SeenFrame, build_scene
+from msgs_slam.pipelines.metres.sizes import OUTDOORS
 from msgs_slam.pipelines.metres.things import sizes_of_things
+from msgs_slam.pipelines.networks.registry import _room_classes
 from msgs_slam.pipelines.run.files import DEPTH_FIELDS, FIGURES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
@@ -100,6 +104,30 @@ def test_depth_in_a_wrong_unit_is_doubted(oracle_run: OracleRun) -> None:
     seen = load_seen(run, run.load(TRAJECTORY, "mapping"))
     assert contradiction(known_evidence(run), usual_evidence(seen, None)) == warning
     assert found_in(oracle_run(pixel_stride=6))[1] is None
+
+
+def test_outdoors_no_size_is_guessed(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A quarter of each image is called sky; a tenth may be a window."""
+    seen = load_seen(run, run.load(TRAJECTORY, "mapping"))
+    classes = _room_classes(150)
+    assert dict(zip(classes["classes"], classes["groups"], strict=True))["sky"] in OUTDOORS
+
+    def showing(share: float) -> Seen:
+        frames = []
+        for frame in seen.frames:
+            labels = frame.maps.labels.copy()
+            labels[: round(share * len(labels))] = len(seen.names)
+            frames.append(replace(frame, maps=replace(frame.maps, labels=labels)))
+        return replace(seen, frames=frames, names=(*seen.names, "outdoors"), is_named=True)
+
+    assert usual_evidence(showing(0.1), None)
+    assert usual_evidence(showing(0.25), None) == []
+    assert usual_evidence(replace(showing(0.25), is_named=False), None)
+    monkeypatch.setattr(find, "load_seen", lambda *_: showing(0.25))
+    metres, warning = found_in(run)
+    assert metres is None
+    assert warning is not None
+    assert "outdoors by its labels" in warning
 
 
 def test_a_reference_wins_over_what_is_usual(run: RunFolder) -> None:

@@ -239,7 +239,7 @@ def test_a_model_that_needs_another_is_here_when_both_are(server: tuple[str, Beh
     assert card.classes[0] == "wall"
     assert card.labels[0] == "wall"
     assert {"floor", "ceiling", "seating", "table", "other"} <= set(card.labels)
-    assert len(card.labels) == 17
+    assert len(card.labels) == 18
     head = Model("head", "head", (f"{server[0]}/head",), 0, "", "MIT", True)
     body = Model("net", "dinov2-ade20k", (f"{server[0]}/m",), len(DATA), SHA, "MIT", True, needs="head")
     pair = ModelStore(tmp_path, (body, head), models.families)
