@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Protocol
 
 from msgs_slam.formats.errors import DiskFullError, InputError, RecoverableError
+from msgs_slam.formats.reading import opened
 
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NOT_ALLOWED = {errno.EACCES, errno.EPERM, errno.EROFS}
 _NEARLY_FULL_BYTES = 1 << 20
 _LONGEST_NAME = 255
+_AT_ONCE = 1 << 20
 
 
 class Watcher(Protocol):
@@ -93,6 +95,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
         for watcher in _watchers:
             watcher.written(path)
     except OSError as error:
+        if _is_of_another(error, path, temporary):
+            raise RecoverableError(
+                f"{os.fsdecode(error.filename)}: {error.strerror}, while writing {path.name}: check its rights"
+            ) from error
         raise _explained(error, path) from error
     finally:
         with suppress(OSError):  # what the block raised says more
@@ -126,14 +132,22 @@ def write_lines(path: Path, lines: Iterable[str]) -> None:
 
 
 def copy_file(source: Path, target: Path) -> None:
-    """A copy, atomically: what is given away may be edited without changing what it came from."""
-    with atomic_path(target) as temporary:
-        shutil.copyfile(source, temporary)
+    """A copy, atomically: what is given away may be edited without changing what it came from. Raises InputError where
+    the source cannot be read, and as `atomic_path` does."""
+    with opened(source, any_content=True) as file, atomic_path(target) as temporary, temporary.open("wb") as copy:
+        shutil.copyfileobj(file, copy, _AT_ONCE)
 
 
 def _flush_to_disk(path: Path) -> None:
     with path.open("rb+") as file:
         os.fsync(file.fileno())
+
+
+def _is_of_another(error: OSError, path: Path, temporary: Path) -> bool:
+    """Whether the system names a file that is read or written beside `path`, and the disk is not full."""
+    if not isinstance(error.filename, str | bytes) or error.errno == errno.ENOENT or is_disk_full(error, path.parent):
+        return False
+    return Path(os.fsdecode(error.filename)) not in (path, temporary, *path.parents)
 
 
 def _explained(error: OSError, path: Path) -> Exception:

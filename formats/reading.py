@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from collections.abc import Iterator
@@ -13,19 +14,26 @@ from msgs_slam.formats.errors import InputError
 
 _LFS_POINTER = b"version https://git-lfs"
 _MOST_OF_A_REASON = 200
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
 def reaching(path: Path) -> Iterator[None]:
-    """Around looking at a path, or into a folder: what the system refuses there becomes an InputError."""
+    """Around looking at a path, or into a folder: what the system refuses there becomes an InputError, which names the
+    path that the system names."""
     try:
         yield
-    except FileNotFoundError as error:
-        raise InputError(f"no such file: {path}: check the spelling, and that the disk is mounted") from error
-    except PermissionError as error:
-        raise InputError(f"cannot read {path}: permission denied: change its rights or copy it") from error
     except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}: check the path and the disk") from error
+        raise _unreachable(error, path) from error
+
+
+def _unreachable(error: OSError, path: Path) -> InputError:
+    named = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else path
+    if isinstance(error, FileNotFoundError):
+        return InputError(f"no such file: {named}: check the spelling, and that the disk is mounted")
+    if isinstance(error, PermissionError):
+        return InputError(f"cannot read {named}: permission denied: change its rights or copy it")
+    return InputError(f"cannot read {named}: {error.strerror or error}: check the path and the disk")
 
 
 @contextmanager
@@ -62,11 +70,18 @@ def opened(path: Path, most: int | None = None, *, any_content: bool = False) ->
             raise InputError(f"{str(path)!r} is no path: check the spelling") from error
         except IsADirectoryError:
             raise InputError(f"{path} is a folder, not a file") from None
-        with file:
+    with file:
+        with reaching(path):
             _require_kind(path, file, most)
             if not any_content:
                 _require_content(path, file)
+        try:
             yield file
+        except OSError as error:
+            # Of a read nothing is named; what names another file, or finds no room, is no fault of this one.
+            if error.filename is None and error.errno not in _NO_ROOM:
+                raise _unreachable(error, path) from error
+            raise
 
 
 def _require_kind(path: Path, file: BufferedReader, most: int | None) -> None:

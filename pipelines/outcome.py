@@ -97,7 +97,7 @@ class Outcome:
     def source_is_folder(self) -> bool:
         """Whether frames kept the names of the source's images."""
         source = Path(load_source(self.run).path)
-        return source.is_dir() or source.suffix == ""
+        return source.is_dir() or (source.suffix == "" and not source.exists())
 
     def require_map(self) -> GaussianMap:
         """The map. Raises InputError before mapping is done."""

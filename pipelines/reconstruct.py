@@ -174,7 +174,10 @@ def _run(
     threads: int = 0,
 ) -> dict[str, StageRecord]:
     def same_source() -> None:
-        kept = f"What is done so far is kept: bring it back, then run `msgs-slam resume {run.root}`"
+        kept = (
+            f"What is done so far is kept: bring it back, then run `msgs-slam resume {run.root}`; or, if it lies "
+            f"elsewhere now: `msgs-slam reconstruct SOURCE --out {run.root}`"
+        )
         try:
             same = source_digest(source, config.run.format) == digest
         except InputError as error:

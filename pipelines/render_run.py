@@ -185,8 +185,17 @@ def _require_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
 
 
 def _write_pictures(folder: Path, pictures: Iterator[Picture]) -> Path:
-    for i, picture in enumerate(pictures):
-        write_rgb(folder / f"{i:06d}.png", picture)
+    count = 0
+    for picture in pictures:
+        write_rgb(folder / f"{count:06d}.png", picture)
+        count += 1
+    others = [p for p in folder.glob("*.png") if p.stem.isdecimal() and int(p.stem) >= count]
+    if others:
+        log.warning(
+            "%s holds %d numbered pictures from before besides the %d of this rendering, %s the first: remove them, or "
+            "name a new folder",
+            folder, len(others), count, min(p.name for p in others),
+        )  # fmt: skip
     return folder
 
 

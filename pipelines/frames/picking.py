@@ -28,7 +28,7 @@ def pick_frames(context: StageContext, source: AnySource, faces: Faces | None) -
             for message in stored["warnings"]:
                 context.warn(message)
             return frames
-    config = context.config.frames
+    config, earlier = context.config.frames, len(context.warnings)  # those before are given again by who gave them
     pictures = source.read(warn=context.warn)
     pictures = context.progress.track(pictures, "picking", source.expected_frames or None)
     rate = config.rate if source.has_times else 0.0
@@ -44,7 +44,7 @@ def pick_frames(context: StageContext, source: AnySource, faces: Faces | None) -
         raise InputError(f"{source.path} gives one frame only; a reconstruction needs several views of a scene")
     if faces is not None:
         frames = _of_all_directions(frames, faces)
-    write_json(table, {"frames": [asdict(f) for f in frames], "warnings": context.warnings})
+    write_json(table, {"frames": [asdict(f) for f in frames], "warnings": context.warnings[earlier:]})
     return frames
 
 

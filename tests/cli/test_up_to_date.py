@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,8 @@ from cli_runs import files_below, invoke
 
 from msgs_slam.pipelines.engine import standing
 from msgs_slam.pipelines.networks.registry import ModelStore
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.records import Manifest, load_records, load_source, write_manifest
 from tests.cli.test_models_commands import write_network
 
 
@@ -68,3 +71,13 @@ def test_status_says_what_another_version_would_make_again(
     resumed = invoke("resume", run, "--until", "global_ba", "-v")
     assert "global_ba and what follows are made again (another version of the program" in resumed.stderr
     assert resumed.stderr.count("] up to date") == 4
+
+
+def test_a_source_that_has_moved_is_asked_for(copied_run: Callable[[str], Path], tmp_path: Path) -> None:
+    run = RunFolder(copied_run("run.msgs"))
+    source = replace(load_source(run), path=str(tmp_path / "gone" / "room.avi"))
+    write_manifest(run.manifest_file, Manifest(source, load_records(run)))
+    assert invoke("resume", run.root, "--until", "frames").exit_code == 0
+    refused = invoke("resume", run.root, "--set", "frames.rate=1")
+    assert refused.exit_code == 1
+    assert f"msgs-slam reconstruct SOURCE --out {run.root}" in refused.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import resource
 import shutil
 import signal
@@ -12,8 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from msgs_slam.formats.atomic import atomic_path, write_bytes, write_text
+from msgs_slam.formats.atomic import atomic_path, copy_file, write_bytes, write_text
 from msgs_slam.formats.errors import DiskFullError, InputError, RecoverableError
+from msgs_slam.formats.reading import opened
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -115,3 +117,38 @@ def test_other_errors_stay_what_they_are(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="weird") as caught, atomic_path(tmp_path / "a.bin"):
         raise OSError(errno.EIO, "weird")
     assert not isinstance(caught.value, InputError)
+
+
+def test_the_file_that_the_system_refuses_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source, target = tmp_path / "source.jpg", tmp_path / "out" / "target.jpg"
+    with pytest.raises(InputError, match=r"no such file: .*source\.jpg"):
+        copy_file(source, target)
+    source.write_bytes(b"picture")
+    real = os.open
+
+    def refusing(path: Path, *words: int, **more: int) -> int:
+        if Path(path) == source:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return real(path, *words, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", refusing)
+        with pytest.raises(InputError, match=r"cannot read .*source\.jpg: permission denied"):
+            copy_file(source, target)
+    copy_file(source, target)
+    assert target.read_bytes() == b"picture"
+
+    def write(code: int, name: str | None) -> None:
+        with opened(source):
+            raise OSError(code, os.strerror(code), name)
+
+    with pytest.raises(OSError, match="target"):  # the caller's own fault, not of what it reads
+        write(errno.EACCES, str(target))
+    with pytest.raises(OSError, match="No space"):
+        write(errno.ENOSPC, None)
+    with pytest.raises(InputError, match=r"cannot read .*source\.jpg: Input/output error"):
+        write(errno.EIO, None)
+    with pytest.raises(DiskFullError), atomic_path(target):
+        raise OSError(errno.ENOSPC, "No space left on device", str(source))
+    with pytest.raises(RecoverableError, match=r"source\.jpg: Permission denied, while"), atomic_path(target):
+        raise PermissionError(errno.EACCES, "Permission denied", str(source))

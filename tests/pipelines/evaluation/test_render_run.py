@@ -15,8 +15,10 @@ from msgs_slam.formats.video import VideoReader
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.demo import TRUTH, VIDEO, demo_summary, run_demo, unpack_demo_clip
 from msgs_slam.pipelines.evaluation.image_quality import psnr
+from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.render_run import render_run
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.records import Manifest, Source, load_records, write_manifest
 from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.world import make_world, render_frame
 from tests.world.demo_clip import OPTIONS, pack_clip
@@ -31,6 +33,26 @@ def test_own_path_in_colour_shows_the_frames(oracle_run: OracleRun, truth: Seque
     # Frames 0 and 31 are the ends of the path; 0 is a keyframe.
     assert 18 < psnr(pictures[0], truth.rgb(0)) < 45
     assert psnr(pictures[0], truth.rgb(0)) > psnr(pictures[0], truth.rgb(20)) + 4
+
+
+def test_pictures_of_an_earlier_rendering_are_reported_and_stay(
+    oracle_run: OracleRun, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run, folder = oracle_run(), tmp_path / "pictures"
+    for fps in (1.6, 1.6):
+        assert len(list_images(render_run(run, folder, path="own", fps=fps))) == 5
+    assert "from before" not in caplog.text
+    render_run(run, folder, path="own", fps=1.0)
+    assert f"{folder} holds 2 numbered pictures from before besides the 3 of this rendering, 000003.png" in caplog.text
+    assert len(list_images(folder)) == 5
+
+
+def test_a_video_whose_name_has_no_suffix_is_no_folder(oracle_run: OracleRun, tmp_path: Path) -> None:
+    run, clip = oracle_run(), tmp_path / "clip"
+    for there, is_folder in ((lambda: None, True), (lambda: clip.write_bytes(b"video"), False)):
+        there()  # what is gone is judged by its name
+        write_manifest(run.manifest_file, Manifest(Source(str(clip), ""), load_records(run)))
+        assert load_outcome(RunFolder(run.root)).source_is_folder is is_folder
 
 
 def test_side_by_side_video_of_an_orbit(oracle_run: OracleRun, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
+from msgs_slam.pipelines.frames.picking import pick_frames
 from msgs_slam.pipelines.frames.tasks import known_camera
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.proxy.files.recording import RecordingDepth, RecordingLabels
@@ -63,6 +64,15 @@ def test_each_layout_is_recognised_and_read(layout: str, short: Sequence, tmp_pa
     np.testing.assert_allclose(found, expected, atol=1e-3)
     assert len({source.name(i, i) for i in range(5)}) == 5
     assert open_source(path, format).expected_frames == 5
+
+
+def test_warnings_of_an_interrupted_attempt_are_given_once(short: Sequence, tmp_path: Path) -> None:
+    source = open_source(seven_scenes(short, tmp_path / "set"))
+    for _ in range(2):
+        context = StageContext(RunFolder(tmp_path), source.path, Config(), tmp_path, SilentProgress())
+        context.warn("looks like panoramas")  # by every attempt, before it picks
+        pick_frames(context, source, None)
+        assert context.warnings.count("looks like panoramas") == 1
 
 
 def test_a_camera_of_a_file_is_fixed_and_one_of_the_kind_is_a_start(short: Sequence, tmp_path: Path) -> None:
