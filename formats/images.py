@@ -5,8 +5,8 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -80,6 +80,15 @@ def _why_no_images(folder: Path, files: list[Path]) -> str:
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) from the header, after the rotation stated in EXIF. Raises InputError as `read_rgb` does."""
     return read_header(path).size
+
+
+def first_readable(paths: Sequence[Path]) -> Path:
+    """Return the first of some images whose header can be read; where none can, the first."""
+    for path in paths:
+        with suppress(InputError):
+            image_size(path)
+            return path
+    return paths[0]
 
 
 def is_depth_map(path: Path) -> bool:

@@ -13,7 +13,7 @@ from msgs_slam.formats.datasets.camera import Camera, distortion_names
 from msgs_slam.formats.datasets.matching import times_or_frame_numbers
 from msgs_slam.formats.datasets.sequence import Sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import image_size, natural_key
+from msgs_slam.formats.images import first_readable, image_size, natural_key
 from msgs_slam.formats.jsonfile import number, optional_number, read_json_object
 from msgs_slam.formats.safe_path import named_file
 from msgs_slam.formats.trajectory import clean_poses
@@ -59,7 +59,7 @@ def open_nerfstudio(path: Path) -> Sequence:
     _require_different(file, kept, paths)
     poses = np.stack([_matrix(frame, file) for frame in kept]) @ _OPENCV_FROM_OPENGL
     depth_paths = tuple(_depth(file, frame) for frame in kept)
-    camera, notes = _camera(table, kept, file, paths[0])
+    camera, notes = _camera(table, kept, file, first_readable(paths))
     missing = len(frames) - len(kept)
     times, timed = times_or_frame_numbers(paths)
     return Sequence(

@@ -18,7 +18,7 @@ from msgs_slam.formats.datasets.matching import (
 )
 from msgs_slam.formats.datasets.sequence import LabelClass, Sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import image_size, list_images
+from msgs_slam.formats.images import first_readable, image_size, list_images
 from msgs_slam.formats.trajectory import read_matrices
 
 _CLASS_FOLDERS = ("semantic_class", "semantic_classes")
@@ -58,7 +58,7 @@ def _is_rendered(path: Path) -> bool:
 def _open_nice_slam(path: Path) -> Sequence:
     images = [p for p in list_images(path / "results") if p.name.startswith("frame")]
     parameters = next((p / "cam_params.json" for p in (path, path.parent) if (p / "cam_params.json").is_file()), None)
-    camera, scale = _wide_camera(images[0]), 6553.5
+    camera, scale = _wide_camera(first_readable(images)), 6553.5
     times, timed = times_or_frame_numbers(images)
     if parameters is not None:
         camera, given = read_intrinsics_json(parameters, integer_centres=True)
@@ -80,7 +80,7 @@ def _open_nice_slam(path: Path) -> Sequence:
 
 def _open_rendered(path: Path) -> Sequence:
     images = list_images(path / "rgb")
-    camera, scale = _wide_camera(images[0]), None
+    camera, scale = _wide_camera(first_readable(images)), None
     times, timed = times_or_frame_numbers(images)
     if (path / "cam_params.json").is_file():
         camera, scale = read_intrinsics_json(path / "cam_params.json", integer_centres=True)

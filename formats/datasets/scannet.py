@@ -12,7 +12,7 @@ from msgs_slam.formats.datasets.matching import classes_found, files_for_images,
 from msgs_slam.formats.datasets.scannet_labels import find_label_table, read_nyu40_classes
 from msgs_slam.formats.datasets.sequence import LabelClass, Sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import image_size, list_images
+from msgs_slam.formats.images import first_readable, image_size, list_images
 from msgs_slam.formats.textfile import read_table
 from msgs_slam.formats.trajectory import read_matrices
 
@@ -42,7 +42,7 @@ def open_scannet(path: Path) -> Sequence:
         names=tuple(p.name for p in images),
         timestamps=times_or_frame_numbers(images)[0],  # the frame numbers count at the sensor's 30 a second
         image_paths=tuple(images),
-        camera=_camera(path / "intrinsic" / "intrinsic_color.txt", images[0], _COLOR_SIZE),
+        camera=_camera(path / "intrinsic" / "intrinsic_color.txt", first_readable(images), _COLOR_SIZE),
         world_from_cam=np.stack([_pose(path / "pose" / f"{p.stem}.txt") for p in images]),
         depth_paths=depth_paths,
         depth_camera=_camera(path / "intrinsic" / "intrinsic_depth.txt", first_depth, _DEPTH_SIZE),

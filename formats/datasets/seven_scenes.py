@@ -12,7 +12,7 @@ from msgs_slam.formats.datasets.matching import ASSUMED_RATE, files_for_images
 from msgs_slam.formats.datasets.sequence import Sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.image_times import frame_number
-from msgs_slam.formats.images import image_size, list_images
+from msgs_slam.formats.images import first_readable, image_size, list_images
 from msgs_slam.formats.textfile import read_table
 from msgs_slam.formats.trajectory import read_matrices
 
@@ -39,7 +39,7 @@ def open_seven_scenes(path: Path) -> Sequence:
     numbers = [frame_number(p) for p in images]
     if not images or None in numbers:
         raise InputError(f"{path} has no frame-XXXXXX.color images: give one of the scene's seq-XX folders")
-    size = image_size(images[0])
+    size = image_size(first_readable(images))
     return Sequence(
         format="7scenes",
         root=path,

@@ -13,7 +13,7 @@ from msgs_slam.formats.datasets.camera import Camera
 from msgs_slam.formats.datasets.intrinsics_json import read_intrinsics_json
 from msgs_slam.formats.datasets.matching import SAME_INSTANT_SECONDS, nearest_index, poses_at, read_timed_files
 from msgs_slam.formats.datasets.sequence import Sequence
-from msgs_slam.formats.images import image_size
+from msgs_slam.formats.images import first_readable, image_size
 from msgs_slam.formats.trajectory import read_tum
 
 _DEPTH_PER_METRE = 5000.0
@@ -41,7 +41,7 @@ def open_tum_rgbd(path: Path) -> Sequence:
     cannot be read or name files outside the folder.
     """
     times, images = read_timed_files(path / "rgb.txt", path, float, _LINE)
-    camera, notes = _camera(path, images[0])
+    camera, notes = _camera(path, first_readable(images))
     truth = path / "groundtruth.txt"
     return Sequence(
         format="tum",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -191,3 +192,16 @@ def test_a_data_set_is_reconstructed_with_what_it_knows(truth: Sequence, tmp_pat
     # The same pictures under another name are another source.
     with pytest.raises(InputError, match="another source"):
         reconstruct(path / "rgb", run, replace(config, run=replace(config.run, format="images")), SilentProgress())
+
+
+@pytest.mark.parametrize("write", [tum, seven_scenes])
+def test_a_data_set_may_begin_with_a_damaged_image(
+    write: Callable[[Sequence, Path], Path], short: Sequence, tmp_path: Path
+) -> None:
+    source = open_source(write(short, tmp_path / "set"))
+    assert isinstance(source, RecordingSource)
+    source.sequence.image_paths[0].write_bytes(b"\x89PNG\r\n not really")
+    again, notes = open_source(tmp_path / "set"), []
+    assert (again.width, again.height) == (source.width, source.height)
+    assert len(list(again.read(warn=notes.append))) == 4
+    assert any(source.sequence.image_paths[0].name in note for note in notes)
