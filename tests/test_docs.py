@@ -1,6 +1,8 @@
 """What the README, the benchmarks' README and the site say exists: commands, options, settings, files, messages."""
 
 import ast
+import json
+import os
 import re
 import shlex
 import subprocess
@@ -103,6 +105,47 @@ def test_options_of_benchmarks_exist() -> None:
         made = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
         for option in re.findall(r"(?<=\s)--[a-z-]+", rest):
             assert option in made or option[2:] in made, f"{name} {option}"
+
+
+def test_commands_of_benchmarks_are_understood(tmp_path: Path) -> None:
+    """Every script starts and its own parser takes what the pages give it; nothing is measured."""
+    commands = re.findall(r"python (tests/benchmarks/\w+\.py)((?:\\\n|[^\n`#>|])*)", texts())
+    words = [[name, *shlex.split(re.sub(r"\\\n|\[[^\]]*\]", " ", rest))] for name, rest in commands]
+    scripts = [p for p in sorted(BENCHMARKS.glob("*.py")) if '"__main__"' in p.read_text(encoding="utf-8")]
+    helps = [[str(p.relative_to(ROOT)), "--help"] for p in scripts]
+    given = json.dumps([[str(ROOT / w[0]), *w[1:]] for w in words + helps])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(BENCHMARKS)])}
+    done = subprocess.run(
+        [sys.executable, "-c", _PARSES, given], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert json.loads(done.stdout.splitlines()[-1]) == []
+
+
+_PARSES = """
+import argparse, contextlib, io, json, runpy, sys
+right = argparse.ArgumentParser.parse_args
+def parse(self, *arguments, **named):
+    right(self, *arguments, **named)
+    raise SystemExit(0)
+argparse.ArgumentParser.parse_args = parse
+wrong = []
+for command in json.loads(sys.argv[1]):
+    sys.argv, path, said, code = list(command), list(sys.path), io.StringIO(), "it went on without parsing"
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            runpy.run_path(command[0], run_name="__main__")
+    except SystemExit as end:
+        code = end.code
+    except ImportError as error:  # of an extra that is not installed, of ours not: an architecture test says which
+        code = 0 if error.name in {"pytest", "ray", "evo", "av", "sklearn"} else repr(error)
+    except Exception as error:
+        code = repr(error)
+    sys.path[:] = path
+    if code:
+        wrong.append([command, code, said.getvalue()[-300:]])
+print(json.dumps(wrong))
+"""
 
 
 def test_pictures_are_there_and_small() -> None:

@@ -103,8 +103,6 @@ def by_cluster(
 
 def main() -> None:
     """Print what was done and which files differ."""
-    from ray.cluster_utils import Cluster
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--nodes", type=int, default=2)
@@ -113,6 +111,8 @@ def main() -> None:
     parser.add_argument("--bad", default="", choices=("", *BAD))
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
+    from ray.cluster_utils import Cluster
+
     video, _ = unpack_demo_clip(arguments.work)
     whole, shared = (arguments.work / f"{name}.msgs" for name in ("whole", "cluster"))
     begin(video, whole, STAGES[-1], *SETTINGS)

@@ -8,6 +8,7 @@ same line from the true one. Lengths are compared after one scale for the whole 
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -49,14 +50,19 @@ def place(outcome: Outcome, cloud: GaussianCloud, truth: MatchedTruth, rng: np.r
             return found, (truth.world_from_cam[row] @ np.append(depth[y, x] * ray, 1.0))[:3]
 
 
-def main(run: str, truth_path: str, pairs: str = "150") -> None:
+def main() -> None:
     """One line of figures."""
-    outcome, sequence = load_outcome(RunFolder(Path(run)), "cpu"), open_sequence(Path(truth_path))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("truth", type=Path)
+    parser.add_argument("pairs", type=int, nargs="?", default=150)
+    arguments = parser.parse_args()
+    outcome, sequence = load_outcome(RunFolder(arguments.run), "cpu"), open_sequence(arguments.truth)
     truth = match_truth(outcome.frames, outcome.source_is_folder, sequence)
     both = outcome.trajectory.is_posed & truth.has_pose
     scale = align_points(outcome.trajectory.centers[both], truth.world_from_cam[both][:, :3, 3]).scale
     cloud, rng, rows = map_cloud(outcome), np.random.default_rng(0), []
-    for _ in range(int(pairs)):
+    for _ in range(arguments.pairs):
         (a, true_a), (b, true_b) = (place(outcome, cloud, truth, rng) for _ in range(2))
         length, sd = tape(a, b)
         rows.append((scale * length, scale * sd, np.linalg.norm(true_a - true_b)))
@@ -64,10 +70,11 @@ def main(run: str, truth_path: str, pairs: str = "150") -> None:
     error = np.abs(length - true)
     within = ", ".join(f"{np.mean(error < n * sd):.0%} within {n} sd" for n in (1, 2, 3))
     print(
-        f"{run}: {len(rows)} distances, median {np.median(true):.2f} m; error median {100 * np.median(error):.2f} cm, "
-        f"90 % {100 * np.quantile(error, 0.9):.2f} cm; stated sd median {100 * np.median(sd):.2f} cm; {within}"
+        f"{arguments.run}: {len(rows)} distances, median {np.median(true):.2f} m; error median "
+        f"{100 * np.median(error):.2f} cm, 90 % {100 * np.quantile(error, 0.9):.2f} cm; "
+        f"stated sd median {100 * np.median(sd):.2f} cm; {within}"
     )
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

@@ -1,8 +1,8 @@
-"""Lengths of walls in a run's mesh beside those in surfaces made of true depth. Usage: walls.py RUN DATASET"""
+"""Lengths of walls in a run's mesh beside those in surfaces made of true depth."""
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +50,11 @@ def grid_faces(depth: NDArray) -> NDArray[np.int64]:
 
 def main() -> None:
     """Both lists of walls, in metres of the data set."""
-    run, truth = RunFolder(Path(sys.argv[1])), open_sequence(Path(sys.argv[2]))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("dataset", type=Path)
+    arguments = parser.parse_args()
+    run, truth = RunFolder(arguments.run), open_sequence(arguments.dataset)
     outcome, world = load_outcome(run, "cpu"), run.find(WORLD)
     assert world is not None
     t, matched = outcome.moved(world.exported_from_run).trajectory, match_truth(outcome.frames, False, truth)

@@ -17,16 +17,16 @@ from msgs_slam.pipelines.proxy.stereo import card
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
 from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
 from on_card.rows import Rows, first_seconds, milliseconds, wait
-from on_card.scenes import CARD, CPU, SIZES, Place, mapper, step, stereo_scene, world_of
+from on_card.scenes import CARD, CPU, REHEARSAL, SIZES, Place, mapper, step, stereo_scene, world_of
 
-BACK_TO_BACK = 30
+BACK_TO_BACK = 2 if REHEARSAL else 30
 """Visits without a wait in between."""
 
 
 def time_renderer(rows: Rows) -> None:
     """Compositing forward with all classes and with gradients of colours, and the whole rendering, of every room."""
     for row in SIZES.rows:
-        size = f"{row[0]}x{row[1]}, {row[2]:,}, {row[3]}".replace(",", " ").replace("  ", ", ")
+        size = f"{row[0]}x{row[1]}, {row[2]}, {row[3]}"
         for place, backend in ((CARD, "cuda"), (CPU, "cpu")):
             with rows.attempt(f"time of {size} on {place.name}"), place.used():
                 case = Case(*row, torch.device(place.device))
@@ -55,7 +55,7 @@ def _add(rows: Rows, case: str, of: str, place: Place, task: Callable[[], object
 def time_mapping(rows: Rows) -> None:
     """A visit and what is done once a pass, beside the counts of `launches.py`."""
     counted = _expected(rows)
-    case = f"{SIZES.size[0]}x{SIZES.size[1]}, {SIZES.gaussians:,} Gaussians".replace(",", " ", 1)
+    case = f"{SIZES.size[0]}x{SIZES.size[1]}, {SIZES.gaussians} Gaussians"
     for place in (CARD, CPU):
         with rows.attempt(f"mapping on {place.name}"), place.used():
             optimiser = mapper(place)
