@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.run.running import load_running
+from msgs_slam.pipelines.system.progress import log
 from msgs_slam.pipelines.viewer.scene import ViewerScene, load_scenes
 
 _BETWEEN_LOOKS = 2.0
@@ -59,6 +61,10 @@ class Watch:
                     return
             except InputError as error:  # a stage that is made again just now: the next look finds it whole
                 self._tell(str(error))
+            except Exception as error:  # nobody waits for this thread: it says what went wrong, and looks again
+                log.exception("%s cannot be shown as it is now", self._run.root)
+                with suppress(Exception):
+                    self._tell(f"Not shown as it is now, {type(error).__name__}: {error}. Looking again")
 
     def _look(self) -> None:
         stages = self._shown_stages()

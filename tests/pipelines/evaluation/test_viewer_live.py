@@ -1,5 +1,6 @@
 """The viewer of a run that is still being made: what it shows after each stage, and what it says is to come."""
 
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,8 +17,9 @@ from msgs_slam.pipelines.run.lock import locked
 from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.run.running import NotedProgress
 from msgs_slam.pipelines.system.progress import BEGUN, SilentProgress, StageEvent
+from msgs_slam.pipelines.viewer import live
 from msgs_slam.pipelines.viewer.live import standing
-from msgs_slam.pipelines.viewer.scene import load_scenes
+from msgs_slam.pipelines.viewer.scene import ViewerScene, load_scenes
 from tests.browser import BROWSER, browser
 
 OracleRun = Callable[..., RunFolder]
@@ -76,6 +78,26 @@ def test_a_line_says_what_is_shown_and_what_is_to_come(run: RunFolder) -> None:
     assert "Shown: the map after mapping (4 of 6 stages done). Still to come: global_ba, export." in standing(run)
     note_finished(run, STAGES)
     assert standing(run) == ""
+
+
+def test_an_error_of_the_page_does_not_end_the_watch(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(live, "_BETWEEN_LOOKS", 0.02)
+    said, shown, followed = [], [], threading.Event()
+
+    def show(scenes: list[ViewerScene]) -> None:
+        shown.append(len(scenes))
+        if len(shown) == 1:
+            raise IndexError("swapped meanwhile")
+        followed.set()
+
+    watch = live.Watch(run, said.append, show)
+    note_finished(run, STAGES[:2])
+    assert followed.wait(60)
+    watch.stop()
+    assert any("IndexError: swapped meanwhile" in text for text in said)
+    assert "cannot be shown as it is now" in caplog.text
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
