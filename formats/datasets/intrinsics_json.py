@@ -43,9 +43,25 @@ def read_intrinsics_json(path: Path, *, integer_centres: bool) -> tuple[Camera, 
 def _distortion(table: dict, path: Path, names: tuple[str, ...]) -> tuple[float, ...]:
     values = table.get("distortion")
     if values is None:
-        named = tuple(optional_number(table, path, name) or 0.0 for name in names)
-        return named if any(named[4:]) else named[:4]
-    count = len(values) if isinstance(values, list) else 0
-    if not 0 < count <= len(names) or not all(isinstance(v, int | float) for v in values):
-        raise InputError(f"{path}: distortion is {str(values)[:80]}, expected up to {len(names)}: {', '.join(names)}")
-    return tuple(float(v) for v in values) + (0.0,) * (4 - count)
+        return _trimmed([optional_number(table, path, name) or 0.0 for name in names])
+    is_numbers = isinstance(values, list) and all(isinstance(v, int | float) for v in values)
+    found = coefficients(values, names) if is_numbers else None
+    if found is None:
+        usual = f"up to {min(len(names), 5)}: {', '.join(names[:5])}" + (", or 8 with k4, k5, k6" if names[5:] else "")
+        raise InputError(f"{path}: distortion is {str(values)[:80]}, expected {usual}")
+    return found
+
+
+def coefficients(values: list[float], names: tuple[str, ...]) -> tuple[float, ...] | None:
+    """Distortion coefficients of a list in OpenCV's order, as `Camera` has them; None for a list of another length, or
+    with thin prism or tilt coefficients (the 9th to 14th) that are not zero."""
+    if any(values[len(names) :]) or len(values) not in (*range(1, min(len(names), 5) + 1), 8, 12, 14):
+        return None
+    found = tuple(float(v) for v in values[: len(names)])
+    return (*found, 0.0, 0.0, 0.0)[: max(4, len(found))] if len(found) <= 5 else _trimmed(list(found))
+
+
+def _trimmed(values: list[float]) -> tuple[float, ...]:
+    """Without trailing zeros that another lens model would have: 4, 5 or 8 coefficients."""
+    padded = (*values, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)[:8]
+    return padded if any(padded[5:]) else padded[:5] if padded[4] else padded[:4]
