@@ -121,8 +121,9 @@ def write_bytes(path: Path, data: bytes | bytearray | memoryview) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a UTF-8 text file atomically, line ends as they are. Raises InputError as `atomic_path` does."""
-    write_bytes(path, text.encode("utf-8"))
+    """Write a UTF-8 text file atomically, line ends as they are; names that are no UTF-8 are escaped. Raises InputError
+    as `atomic_path` does."""
+    write_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 def write_lines(path: Path, lines: Iterable[str]) -> None:

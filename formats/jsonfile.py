@@ -18,6 +18,8 @@ MAX_JSON_BYTES = 32 * 1024 * 1024
 MAX_TOML_BYTES = 1024 * 1024
 _MOST_DIGITS = 40
 _DEEPEST_KEY, _KEY_ENDS = 64, re.compile(r"[=\n,\[{]")
+_NO_KEY = re.compile(r"""#[^\n]*|\"{3}(?:[^\\]|\\.)*?\"{3}|'{3}.*?'{3}|"(?:[^"\\\n]|\\.)*"|'[^'\n]*'""", re.DOTALL)
+"""A comment or a string of TOML: dots in it divide no key."""
 _HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
 
 
@@ -56,7 +58,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     """The table in a TOML file. Raises InputError when it is missing, too large, damaged or nested too deep."""
     text = read_text(path, MAX_TOML_BYTES)
     with parsing(path, "valid TOML", "correct it"):
-        if any(part.count(".") > _DEEPEST_KEY for part in _KEY_ENDS.split(text)):
+        if any(part.count(".") > _DEEPEST_KEY for part in _KEY_ENDS.split(_NO_KEY.sub("", text))):
             raise ValueError("a key of too many parts")  # tomllib takes the square of their number in time
         return tomllib.loads(text)
 

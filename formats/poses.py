@@ -14,7 +14,7 @@ from msgs_slam.formats.colmap import model_suffix, read_colmap_model
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.jsonfile import read_json
 from msgs_slam.formats.phone_poses import OPENCV_FROM_OPENGL, phone_poses
-from msgs_slam.formats.reading import reaching
+from msgs_slam.formats.reading import home_expanded, reaching
 from msgs_slam.formats.textfile import read_rows
 from msgs_slam.formats.trajectory import clean_poses, read_matrices, read_tum
 
@@ -53,7 +53,7 @@ class PoseFile:
 def read_poses(path: Path) -> PoseFile:
     """The poses of a file or folder, whatever it is of those named above. Raises InputError for anything else."""
     with reaching(path):
-        path = path.expanduser()
+        path = home_expanded(path)
         if not path.exists():
             raise InputError(f"--poses {path}: there is no such file or folder: check the spelling")
         phone = phone_poses(path) if path.is_dir() or path.suffix.lower() in (".csv", ".json") else None

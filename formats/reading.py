@@ -36,6 +36,11 @@ def _unreachable(error: OSError, path: Path) -> InputError:
     return InputError(f"cannot read {named}: {error.strerror or error}: check the path and the disk")
 
 
+def home_expanded(text: str | Path) -> Path:
+    """The path with `~` or `~user` at its beginning replaced; as it is where there is no such user."""
+    return Path(os.path.expanduser(text))
+
+
 @contextmanager
 def parsing(path: Path | str, what: str, advice: str = "copy or export it again") -> Iterator[None]:
     """Around code that takes a file's bytes apart, a library's above all: what it raises is the file's fault.

@@ -1,16 +1,39 @@
-"""Paths that a file names, kept inside the folder the file belongs to."""
+"""Paths that can be written into files, and paths that a file names, kept inside the folder it belongs to."""
 
 from __future__ import annotations
 
 import os
 import posixpath
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from msgs_slam.formats.errors import InputError
 
 _LONGEST_NAME, _LONGEST_PATH = 255, 4000
 """Bytes that Linux takes for a part of a path, and a little less than it takes for the whole."""
+
+
+def is_unicode(text: str) -> bool:
+    """Whether a text can be written as UTF-8: names on disk that are no UTF-8 come as lone surrogates."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def require_unicode(path: Path) -> None:
+    """Raise InputError for a path that no JSON or text file can hold."""
+    if not is_unicode(str(path)):
+        raise InputError(f"{path}: a name in this path is no valid UTF-8, as of an old disk or ZIP file. Rename it")
+
+
+def require_listable(paths: Iterable[Path]) -> None:
+    """Raise InputError for paths that a text file of one path a line cannot hold."""
+    for path in paths:
+        require_unicode(path.resolve())
+        if "\n" in str(path.resolve()):
+            raise InputError(f"{path}: a name in this path holds a line break: rename it")
 
 
 def inside(root: Path, relative: str, named_by: Path) -> Path:

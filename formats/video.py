@@ -29,6 +29,7 @@ from msgs_slam.formats.hdr_video import AvCapture, hdr_transfer
 from msgs_slam.formats.images import IMAGE_SUFFIXES
 from msgs_slam.formats.interlaced import has_pyav, is_interlaced, unreadable
 from msgs_slam.formats.reading import opened
+from msgs_slam.formats.safe_path import require_unicode
 
 MAX_FRAME_PIXELS = 64_000_000
 """A larger frame is taken for a damaged or hostile header (8K video has 33 million)."""
@@ -266,6 +267,7 @@ def _is_text(head: bytes) -> bool:
 
 
 def _open(path: Path) -> cv2.VideoCapture:
+    require_unicode(path.resolve())  # OpenCV ends the whole process
     level, options = cv2.utils.logging.getLogLevel(), os.environ.get(_OPTIONS_VARIABLE)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     os.environ[_OPTIONS_VARIABLE] = as_opencv_writes_them()  # OpenCV has no other way to hand them to FFmpeg

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.atomic import atomic_path, free_bytes, is_disk_full
 from msgs_slam.formats.errors import DiskFullError, InputError
+from msgs_slam.formats.safe_path import require_unicode
 
 CODECS = {".mp4": "mp4v", ".avi": "FFV1", ".mkv": "FFV1"}
 """By the file's ending: MPEG-4 plays everywhere, FFV1 loses nothing."""
@@ -28,6 +29,7 @@ def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, cod
     codec = codec or CODECS.get(path.suffix.lower())
     if codec is None:
         raise InputError(f"{path}: cannot tell the video format; give a file name that ends in {' or '.join(CODECS)}")
+    require_unicode(path)  # OpenCV ends the whole process
     with atomic_path(path) as temporary:
         writer: cv2.VideoWriter | None = None
         size, written = (0, 0), 0

@@ -9,6 +9,7 @@ import click
 from msgs_slam.msgs_cli.options import RUN_ARGUMENT
 from msgs_slam.msgs_cli.output import Output, verbosity_options
 from msgs_slam.msgs_cli.summary import tell_run
+from msgs_slam.pipelines.system.wording import quoted
 
 
 @click.command()
@@ -27,6 +28,6 @@ def extend(run_path: Path, videos: tuple[Path, ...], output: Output) -> None:
     from msgs_slam.pipelines.run.folder import RunFolder
 
     run = RunFolder(run_path)
-    with output.stopping_softly(f"Resume with: msgs-slam resume {run.root}"):
+    with output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"):
         records = extend_run(run, videos, output.progress())
     tell_run(output, run.root, records)

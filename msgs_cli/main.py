@@ -38,7 +38,8 @@ from msgs_slam.msgs_cli.output import Output, on_sigterm, verbosity_options
 from msgs_slam.msgs_cli.summary import print_summary, tell_run
 from msgs_slam.msgs_cli.text import flush_output, prepare_streams, printable, say
 from msgs_slam.msgs_cli.work import work
-from msgs_slam.pipelines.run.names import EXPORTS
+from msgs_slam.pipelines.run.names import EXPORTS, STAGES
+from msgs_slam.pipelines.system.wording import quoted
 
 
 class FriendlyGroup(click.Group):
@@ -157,12 +158,11 @@ def reconstruct(
     from msgs_slam.pipelines.run.folder import RunFolder
 
     run = RunFolder(out) if out else default_run_folder(sources[0])
-    texts = source_settings(about_source)
-    texts += [f"mapping.hold_out={hold_out}"] if hold_out is not None else []
+    texts = source_settings(about_source | {"mapping__hold_out": hold_out})
     config = load_config(config_file, [*overrides, *texts], base=existing_config(run))
     with (
         cluster_workers(engine_name, address, config, output) as workers,
-        output.stopping_softly(f"Resume with: msgs-slam resume {run.root}"),
+        output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"),
     ):
         records = run_reconstruct(one_source(sources, run), run, config, output.progress(), until, workers)
     tell_run(output, run.root, records)
@@ -170,6 +170,10 @@ def reconstruct(
 
 @main.command()
 @RUN_ARGUMENT
+@click.option(
+    "--redo", type=click.Choice(STAGES),
+    help="Make this stage and those after it again, with the networks that are installed now; run.toml stays.",
+)  # fmt: skip
 @settings_options
 @device_option
 @UNTIL
@@ -177,6 +181,7 @@ def reconstruct(
 @verbosity_options
 def resume(
     run_path: Path,
+    redo: str | None,
     config_file: Path | None,
     overrides: tuple[str, ...],
     until: str,
@@ -185,7 +190,10 @@ def resume(
     output: Output,
     **about_source: str | None,
 ) -> None:
-    """Resume RUN where it stopped. Finished stages are kept unless one of their settings is changed."""
+    """Resume RUN where it stopped. Finished stages are kept unless one of their settings is changed, or --redo names
+    them. A stage that is made again replaces what it had left only when it ends well."""
+    if redo and STAGES.index(redo) > STAGES.index(until):
+        raise click.UsageError(f"--redo {redo} comes after --until {until}: nothing would be made again")
     from msgs_slam.pipelines.read_config import load_config
     from msgs_slam.pipelines.reconstruct import require_run
     from msgs_slam.pipelines.reconstruct import resume as run_resume
@@ -197,9 +205,9 @@ def resume(
     config = load_config(config_file, [*overrides, *source_settings(about_source)], base=load_settings(run))
     with (
         cluster_workers(engine_name, address, config, output) as workers,
-        output.stopping_softly(f"Resume with: msgs-slam resume {run.root}"),
+        output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"),
     ):
-        records = run_resume(run, output.progress(), config, until, workers)
+        records = run_resume(run, output.progress(), config, until, workers, redo=redo or "")
     tell_run(output, run.root, records)
 
 
@@ -274,7 +282,7 @@ def demo(
     config = load_config(config_file, [*overrides, *source_settings(about_source)])
 
     def reconstruct_clip(video: Path, run: RunFolder) -> None:
-        with output.stopping_softly(f"Resume with: msgs-slam resume {run.root}"):
+        with output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"):
             records = run_reconstruct(video, run, config, output.progress())
         if not output.quiet:
             print_summary(run.root, records)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -148,30 +148,25 @@ def device_option(command: Callable[..., None]) -> Callable[..., None]:
     return click.option("--device", setting.replace(".", "__"), metavar=metavar, help=help)(command)
 
 
-def source_settings(given: dict[str, str | None]) -> list[str]:
-    """The options of `source_options` as `section.key="value"` texts.
+def source_settings(given: Mapping[str, str | int | None]) -> list[str]:
+    """The options of `source_options`, and --hold-out, as `section.key="value"` texts.
 
     Raises SettingError, in the words that were typed, for a value that one cannot have.
     """
     from msgs_slam.formats.errors import SettingError
-    from msgs_slam.pipelines.read_config import load_config
+    from msgs_slam.pipelines.read_config import load_config, toml_value
 
     texts = []
-    for option, (key, *_) in _SOURCE_OPTIONS.items():
+    for option, key in [*((name, row[0]) for name, row in _SOURCE_OPTIONS.items()), ("hold-out", "mapping.hold_out")]:
         if (value := given.get(key.replace(".", "__"))) is None:
             continue
-        text = f"{key}={_toml_string(value)}"
+        text = f"{key}={toml_value(value)}"
         try:
             load_config(None, [text])
         except SettingError as error:
             raise SettingError(str(error).replace(f"--set {text}: {key}", f"--{option}")) from error
         texts.append(text)
     return texts
-
-
-def _toml_string(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
 
 
 def open_run(path: Path) -> RunFolder:

@@ -19,12 +19,16 @@ def tell_run(output: Output, root: Path, records: dict[str, Any]) -> None:
 def print_summary(root: Path, records: dict[str, Any]) -> None:
     """Print the table, what is not said yet, and where the results are."""
     from msgs_slam.msgs_cli.tables import scale_lines, status_table, warning_lines
-    from msgs_slam.pipelines.status import DONE, StageStatus
+    from msgs_slam.pipelines.reconstruct import all_stages
+    from msgs_slam.pipelines.run.folder import RunFolder
+    from msgs_slam.pipelines.status import DONE, StageStatus, about_new_networks
 
     say(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
     for line in warning_lines(records, is_said):
         say(line, err=True)
     for line in scale_lines(root, records):
         say(line)
+    if line := about_new_networks(RunFolder(root), all_stages()):
+        say(f"\n{line}")
     if "export" in records:
         say(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")

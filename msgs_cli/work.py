@@ -8,6 +8,7 @@ import click
 
 from msgs_slam.msgs_cli.options import RUN_ARGUMENT, UNTIL, open_run
 from msgs_slam.msgs_cli.output import Output, verbosity_options
+from msgs_slam.pipelines.system.wording import quoted
 
 
 @click.command()
@@ -28,6 +29,6 @@ def work(run_path: Path, shard: str, until: str, output: Output) -> None:
     from msgs_slam.pipelines.work import work_on_run
 
     chosen, run = Shard.parse(shard), open_run(run_path)
-    with output.stopping_softly(f"The same command goes on, or without others: msgs-slam resume {run.root}"):
+    with output.stopping_softly(f"The same command goes on, or without others: msgs-slam resume {quoted(run.root)}"):
         work_on_run(run, chosen, load_settings(run), output.worker_setup(remote=True), until)
     output.tell_result(run=run.root)

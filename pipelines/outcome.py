@@ -34,6 +34,7 @@ from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import StageRecord, load_records, load_source, recorded_config
 from msgs_slam.pipelines.run.settings_file import load_settings
 from msgs_slam.pipelines.system.device import resolve_device
+from msgs_slam.pipelines.system.wording import quoted
 from msgs_slam.pipelines.types import VOID, Calibration, ClassTable, Frame, Metres, Trajectory
 
 T = TypeVar("T")
@@ -102,7 +103,9 @@ class Outcome:
     def require_map(self) -> GaussianMap:
         """The map. Raises InputError before mapping is done."""
         if self.gaussian_map is None:
-            raise InputError(f"{self.run.root}: there is no map yet. Run `msgs-slam resume {self.run.root}` first")
+            raise InputError(
+                f"{self.run.root}: there is no map yet. Run `msgs-slam resume {quoted(self.run.root)}` first"
+            )
         return self.gaussian_map
 
     def load_sparse(self) -> SparseModel | None:
@@ -143,7 +146,7 @@ def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:
     pose_stage = next((s for s in _POSE_STAGES if s in records), "")
     if not pose_stage:
         raise InputError(
-            f"{run.root}: no camera poses yet (tracking is not done). Run `msgs-slam resume {run.root}` first"
+            f"{run.root}: no camera poses yet (tracking is not done). Run `msgs-slam resume {quoted(run.root)}` first"
         )
     trajectory = run.load(TRAJECTORY, pose_stage)
     map_stage = next((s for s in _MAP_STAGES if s in records), "")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 import json
 import math
+import os
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import Field, fields, replace
@@ -16,6 +17,8 @@ from typing import Any, get_type_hints
 
 from msgs_slam.formats.errors import InputError, SettingError
 from msgs_slam.formats.jsonfile import read_toml
+from msgs_slam.formats.reading import home_expanded
+from msgs_slam.formats.safe_path import is_unicode
 from msgs_slam.pipelines.config import Config, allowed_values, range_text
 
 
@@ -89,6 +92,8 @@ def _checked(value: Any, wanted: Any, choices: tuple[str, ...], where: str) -> A
         value = str(value)  # strings need no quotes, and a file's name may be a number
     if not isinstance(value, wanted) or (wanted is int and isinstance(value, bool)):
         raise SettingError(f"{where} expects {wanted.__name__}, got {value!r:.80}")
+    if isinstance(value, str) and not is_unicode(value):
+        raise SettingError(f"{where} is no valid UTF-8, got {value!r:.80}: rename the file or folder")
     if choices and value not in choices:
         raise SettingError(f"{where} is one of {', '.join(choices)}; got {value!r}{nearest(value, choices)}")
     return value
@@ -112,16 +117,39 @@ def config_to_toml(config: Config) -> str:
         for f in fields(values):
             allowed = allowed_values(f)
             lines.append(f"# {f.metadata['help']}" + (f" ({allowed})" if allowed else ""))
-            lines.append(f"{f.name} = {_toml_value(getattr(values, f.name))}")
+            lines.append(f"{f.name} = {toml_value(getattr(values, f.name))}")
         lines.append("")
     return "\n".join(lines)
 
 
-def _toml_value(value: Any) -> str:
+_PATHS = {
+    "frames.intrinsics": "", "frames.poses": "", "frames.masks": "", "export.gps": "",
+    "proxy.depth": "files: onnx:", "proxy.semantics": "files: onnx:",
+}  # fmt: skip
+"""Settings that may name a file or folder → what stands before its path there."""
+
+
+def with_absolute_paths(config: Config) -> Config:
+    """Make the paths of files and folders that are there absolute: a run goes on from any working folder."""
+    changes: dict[str, dict[str, str]] = {}
+    for key, beginnings in _PATHS.items():
+        section, _, name = key.partition(".")
+        text = getattr(getattr(config, section), name)
+        before = next((b for b in beginnings.split() if text.startswith(b)), None if beginnings else "")
+        if before is None or text in ("", before, "auto", "off"):
+            continue
+        path = os.path.abspath(home_expanded(text.removeprefix(before)))
+        if os.path.exists(path):
+            changes.setdefault(section, {})[name] = before + path
+    return merge_settings(config, changes, "paths")
+
+
+def toml_value(value: bool | int | float | str) -> str:
+    """The value as TOML."""
     if isinstance(value, bool):
         return str(value).lower()
-    # JSON strings are valid TOML basic strings.
-    return json.dumps(value) if isinstance(value, str) else repr(value)
+    # A JSON string is a TOML basic string, but for pairs of surrogates, which TOML refuses, and a bare DEL.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f") if isinstance(value, str) else repr(value)
 
 
 _FIXED = {

@@ -7,11 +7,13 @@ from pathlib import Path
 
 from msgs_slam.formats.atomic import own_temporaries, temporary_of, write_text
 from msgs_slam.formats.errors import InputError, RecoverableError
+from msgs_slam.formats.safe_path import require_listable, require_unicode
 from msgs_slam.formats.video import probe_video
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import Stage, run_stages
 from msgs_slam.pipelines.engine.threads import set_threads
 from msgs_slam.pipelines.engine.workers import TaskWorkers
+from msgs_slam.pipelines.read_config import with_absolute_paths
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import LEADER, LOCK, locked, make_folder
 from msgs_slam.pipelines.run.names import SOURCE_LIST, STAGES
@@ -22,6 +24,7 @@ from msgs_slam.pipelines.source.opening import source_digest
 from msgs_slam.pipelines.system.device import resolve_device
 from msgs_slam.pipelines.system.limits import available_cpus
 from msgs_slam.pipelines.system.progress import Progress
+from msgs_slam.pipelines.system.wording import quoted
 
 
 def all_stages() -> list[Stage]:
@@ -49,8 +52,7 @@ def one_source(sources: Sequence[Path], run: RunFolder) -> Path:
     """
     if len(sources) == 1:
         return sources[0]
-    if any("\n" in str(source) for source in sources):
-        raise InputError("a video's name holds a line break: rename it")
+    require_listable([*sources, run.root])
     _require_run_or_empty(run)
     path, text = run.root / SOURCE_LIST, "".join(f"{source.resolve()}\n" for source in sources)
     same = path.is_file() and path.read_bytes() == text.encode()
@@ -97,6 +99,9 @@ def reconstruct(
     Raises InputError for a source that cannot be used and for a folder that holds something else; a folder made by
     this call is removed again when the source turns out to be unusable.
     """
+    require_unicode(source.resolve())  # the manifest names it
+    require_unicode(run.root.absolute())
+    config = with_absolute_paths(config)
     digest = source_digest(source, config.run.format)
     _require_run_or_empty(run)
     resolve_device(config.run.device)  # refused before anything is written
@@ -112,18 +117,21 @@ def resume(
     until: str = STAGES[-1],
     workers: TaskWorkers | None = None,
     once_locked: Callable[[], None] = lambda: None,
+    redo: str = "",
 ) -> dict[str, StageRecord]:
-    """Go on with a run from its own settings, or from `config`."""
+    """Go on with a run from its own settings, or from `config`; the stage `redo` and those after it are made again."""
     require_run(run)
     if run.is_piece:
-        raise InputError(f"{run.root} is a piece of {run.root.parent}: run `msgs-slam resume {run.root.parent}`")
+        raise InputError(
+            f"{run.root} is a piece of {run.root.parent}: run `msgs-slam resume {quoted(run.root.parent)}`"
+        )
     origin = load_source(run)
     source = Path(origin.path)
-    config = config or load_settings(run)
+    config = with_absolute_paths(config or load_settings(run))
     resolve_device(config.run.device)
     with locked(run):
         once_locked()
-        return _run(run, source, origin.digest, config, progress, until, workers)
+        return _run(run, source, origin.digest, config, progress, until, workers, redo=redo)
 
 
 def extend(run: RunFolder, videos: Sequence[Path], progress: Progress) -> dict[str, StageRecord]:
@@ -158,7 +166,8 @@ def require_run(run: RunFolder) -> None:
 def runs_near(path: Path, most: int = 3) -> list[Path]:
     """Run folders that may be meant where `path` is none: in it, around it, of the video that it is, of a like name."""
     inside = sorted(path.iterdir()) if path.is_dir() else []
-    beside = [path.with_suffix(".msgs"), Path(f"{path.stem}.msgs"), *path.parents[:2]]
+    named = [path.with_suffix(".msgs"), Path(f"{path.stem}.msgs")] if path.name else []  # "." and "/" have no name
+    beside = [*named, *path.parents[:2]]
     found = dict.fromkeys(p for p in [*inside, *beside] if RunFolder(p).manifest_file.is_file())
     return list(found)[:most]
 
@@ -172,11 +181,12 @@ def _run(
     until: str,
     workers: TaskWorkers | None,
     threads: int = 0,
+    redo: str = "",
 ) -> dict[str, StageRecord]:
     def same_source() -> None:
         kept = (
-            f"What is done so far is kept: bring it back, then run `msgs-slam resume {run.root}`; or, if it lies "
-            f"elsewhere now: `msgs-slam reconstruct SOURCE --out {run.root}`"
+            f"What is done so far is kept: bring it back, then run `msgs-slam resume {quoted(run.root)}`; or, if it lies "
+            f"elsewhere now: `msgs-slam reconstruct SOURCE --out {quoted(run.root)}`"
         )
         try:
             same = source_digest(source, config.run.format) == digest
@@ -191,7 +201,7 @@ def _run(
     threads = config.run.threads or (workers.threads if workers else threads) or available_cpus()
     set_threads(threads)
     with NotedProgress(progress, run) as noted:
-        return run_stages(all_stages(), run, source, digest, config, noted, until, same_source, workers, threads)
+        return run_stages(all_stages(), run, source, digest, config, noted, until, same_source, workers, threads, redo)
 
 
 def _require_run_or_empty(run: RunFolder) -> None:

@@ -21,6 +21,7 @@ from msgs_slam.pipelines.evaluation.splat_views import SplatScene, draw_splats
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress, log
+from msgs_slam.pipelines.system.wording import quoted
 from msgs_slam.pipelines.types import Intrinsics
 from msgs_slam.pipelines.upright.world import WORLD, up_in_run
 from msgs_slam.pipelines.viewer.camera_path import EXPORTED, CameraPath, read_camera_path
@@ -131,7 +132,7 @@ def _in_world_of_run(path: CameraPath, run: RunFolder) -> tuple[NDArray[np.float
         if (world := run.find(WORLD)) is None:
             raise InputError(
                 f"the camera path is in the coordinates of exported files, and {run.root} has none: "
-                f"run `msgs-slam resume {run.root}` first"
+                f"run `msgs-slam resume {quoted(run.root)}` first"
             )
         cam_from_run = world.exported_from_run.inverse().apply_to_poses(np.linalg.inv(poses))
         return np.asarray(np.linalg.inv(cam_from_run), np.float64), fovs

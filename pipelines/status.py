@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.config import Config, ProxyConfig
 from msgs_slam.pipelines.engine.stages import Stage
 from msgs_slam.pipelines.engine.standing import newly_chosen, next_upstream, why_again
+from msgs_slam.pipelines.masks.people import people_cards
+from msgs_slam.pipelines.networks.card import Card
+from msgs_slam.pipelines.networks.registry import ModelStore
+from msgs_slam.pipelines.proxy.selection import choose_depth, choose_semantics, metric_card
 from msgs_slam.pipelines.run.files import CALIBRATION
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import STAGES
@@ -19,6 +24,7 @@ from msgs_slam.pipelines.run.running import Running, load_running
 from msgs_slam.pipelines.run.settings_file import load_settings
 from msgs_slam.pipelines.structure.window_size import window_size, windows_of
 from msgs_slam.pipelines.system.memory import ALIGNED_TOGETHER, GAUSSIANS, NEEDS, memory_room, submap_size
+from msgs_slam.pipelines.system.wording import quoted
 
 _BEYOND = 0.3
 """MB for each keyframe that `frames` or tracking has not in work."""
@@ -34,7 +40,8 @@ class StageStatus:
     run.toml, as `section.key=value`, with which `resume` would make it again; damaged: names of those files;
     expected_mb: the peak of memory that other recordings of that size have had, None before the keyframes are known;
     again: why `resume` would make it again, where nothing above says so; newer: what `auto` would choose otherwise by
-    now, and `resume` leaves as it is; running: how far the process is that makes it now."""
+    now, and `resume` leaves as it is; networks: the names of those that it would choose, where there are any; running:
+    how far the process is that makes it now."""
 
     name: str
     state: str
@@ -44,6 +51,7 @@ class StageStatus:
     expected_mb: float | None = None
     again: str = ""
     newer: tuple[str, ...] = ()
+    networks: tuple[str, ...] = ()
     running: Running | None = None
 
     @property
@@ -73,15 +81,17 @@ class RunStatus:
     @property
     def warnings(self) -> list[str]:
         """Faults of the run itself, each with the command that repairs it."""
-        again = f"`msgs-slam resume {self.run.root}` makes it and what follows again"
+        again = f"`msgs-slam resume {quoted(self.run.root)}` makes it and what follows again"
         changed = [
             f"{s.name} was made with other settings than run.toml asks for by now ({', '.join(s.changed)}): {again}"
             for s in self.stages
             if s.changed
         ]
         damaged = [
-            f"{s.name}: {len(s.damaged)} of its {len(s.record.files)} files are damaged or gone ({_few(s.damaged)}): "
-            f"{again}"
+            f"{s.name}: its folder is gone: {again}"
+            if not self.run.stage(s.name).exists()
+            else f"{s.name}: {len(s.damaged)} of its {len(s.record.files)} files are missing or damaged "
+            f"({_few(s.damaged)}): {again}"
             for s in self.stages
             if s.damaged and s.record
         ]
@@ -94,8 +104,13 @@ class RunStatus:
     def notes(self) -> list[str]:
         """Remarks on the run that are no fault."""
         return [
-            f"{s.name} keeps what auto chose when it was made ({', '.join(s.newer)}); other networks are there by now: "
-            f"to have it chosen anew, delete {self.run.stage(s.name)} and run `msgs-slam resume {self.run.root}`"
+            f"{s.name} keeps what auto chose when it was made ({', '.join(s.newer)}); "
+            + (
+                f"networks installed since then: {', '.join(s.networks)}. To use them: "
+                f"`msgs-slam resume {quoted(self.run.root)} --redo {s.name}`"
+                if s.networks
+                else "the networks that it used are not installed any more"
+            )
             for s in self.stages
             if s.newer
         ]
@@ -108,7 +123,7 @@ class RunStatus:
             stages.append(
                 {"name": s.name, "state": s.state, "changed": s.changed, "damaged": s.damaged, "record": record,
                  "expected_mb": s.expected_mb, "again": s.again, "newer": s.newer,
-                 "progress": asdict(s.running) if s.running else None}
+                 "networks": s.networks, "progress": asdict(s.running) if s.running else None}
             )  # fmt: skip
         return {
             "run": str(self.run.root),
@@ -138,7 +153,9 @@ def run_status(run: RunFolder, program: Sequence[Stage] = ()) -> RunStatus:
         state, why = _state(run, name, record, damaged), "" if changed or damaged else again.get(name, "")
         now = running if running and running.stage == name and record is None else None
         state = RUNNING if now else state
-        stages.append(StageStatus(name, state, record, changed, damaged, expected, why, newer.get(name, ()), now))
+        chosen = newer.get(name, ())
+        networks = networks_chosen(chosen)
+        stages.append(StageStatus(name, state, record, changed, damaged, expected, why, chosen, networks, now))
     return RunStatus(run, load_source(run).path, tuple(stages), memory_room(config.run.memory_mb) / 1e6)
 
 
@@ -161,6 +178,39 @@ def _compared(
         newer[stage.name] = tuple(newly_chosen(stage, config, record, inputs))
         upstream = next_upstream(upstream, record)
     return again, newer
+
+
+def networks_chosen(inputs: Iterable[str]) -> tuple[str, ...]:
+    """Names of the networks in the cache that `auto` chooses for these inputs of stages."""
+    proxy, people = ProxyConfig(), people_cards(ModelStore.open())
+    cards: dict[str, list[Card | None]] = {
+        "people": [people.person, people.classes] if people else [],
+        "depth": [choose_depth(proxy).card],
+        "labels": [choose_semantics(proxy).card],
+        "metres": [metric_card()],
+    }
+    return tuple(dict.fromkeys(card.model.stem for name in inputs for card in cards[name] if card is not None))
+
+
+def about_new_networks(run: RunFolder, program: Sequence[Stage]) -> str:
+    """Say which networks have been installed since the run's stages were made, and how to use them; "" without any."""
+    records, config, source = load_records(run), load_settings(run), Path(load_source(run).path)
+    added: dict[str, tuple[str, ...]] = {}
+    for stage in program:
+        if (record := records.get(stage.name)) is None or not stage.auto(config):
+            continue
+        with suppress(InputError):  # files are gone, of which the run itself tells
+            newer = newly_chosen(stage, config, record, stage.inputs(source, config) if stage.inputs else None)
+            if networks := networks_chosen(newer):
+                added[stage.name] = networks
+    if not added:
+        return ""
+    first = next(iter(added))
+    minutes = sum(r.seconds for name, r in records.items() if STAGES.index(name) >= STAGES.index(first)) / 60
+    return (
+        f"Networks installed since this run: {', '.join(dict.fromkeys(n for v in added.values() for n in v))}. To use "
+        f"them: msgs-slam resume {quoted(run.root)} --redo {first} (it took {minutes:.0f} min without them)"
+    )
 
 
 def expected_mb(stage: str, run: RunFolder, config: Config) -> float | None:

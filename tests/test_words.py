@@ -97,3 +97,36 @@ def test_words_that_may_not_come_back(banned: str) -> None:
         if not any(stay in text for stay in MAY_STAY)
     ]
     assert found == [], f"better: {BANNED[banned]}"
+
+
+NO_PATHS = {"model.name", "name", "text", "EXTRACTOR", "model.family", "source", "kind", "s.name", "first"}
+"""Names of networks and words of the program's own."""
+
+
+def unquoted_in_commands(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """(line, expression) of what stands in a command that a message suggests and is not quoted for the shell."""
+    for node in (n for n in ast.walk(tree) if isinstance(n, ast.JoinedStr)):
+        before = ""
+        for value in node.values:
+            if isinstance(value, ast.Constant):
+                before += str(value.value)
+                continue
+            assert isinstance(value, ast.FormattedValue)
+            is_in_command = re.search(r"msgs-slam [a-z]+ [^`\n]*$", before) and not re.search(r"\. [^`]*$", before)
+            shown = ast.unparse(value.value)
+            if is_in_command and shown not in NO_PATHS and "quoted(" not in shown:
+                yield node.lineno, shown
+            before += "…"
+
+
+def test_paths_in_suggested_commands_are_quoted() -> None:
+    """A command with the name "my room.msgs" in it can be pasted."""
+    wrong = ast.parse('f"{a} is bad. Run `msgs-slam resume {run.root}`, not {b}"')
+    assert list(unquoted_in_commands(wrong)) == [(1, "run.root")]
+    found = [
+        f"{path.relative_to(ROOT)}:{line} {shown}"
+        for room in ("msgs_cli", "pipelines", "formats")
+        for path in sorted((ROOT / room).rglob("*.py"))
+        for line, shown in unquoted_in_commands(ast.parse(path.read_text(encoding="utf-8")))
+    ]
+    assert found == []

@@ -44,6 +44,7 @@ from msgs_slam.pipelines.system.limits import available_cpus
 from msgs_slam.pipelines.system.memory import memory_room, release_free_memory
 from msgs_slam.pipelines.system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log
 from msgs_slam.pipelines.system.stopping import stop_if_asked
+from msgs_slam.pipelines.system.wording import quoted
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -152,10 +153,12 @@ def run_stages(
     same_source: SameSource = _trusted,
     workers: TaskWorkers | None = None,
     threads: int = 0,
+    redo: str = "",
 ) -> dict[str, StageRecord]:
     """Bring every stage up to `until` up to date; returns their records.
 
-    `config` is what was asked for, and is saved; the stages work with so many `threads` where it leaves that open.
+    `config` is what was asked for, and is saved; the stages work with so many `threads` where it leaves that open. The
+    stage `redo` and those after it are made again in any case, and `auto` chooses anew for them.
 
     A stage is up to date when its fingerprint (code, own settings, seed, own inputs, content of the stages before
     it) and its files are unchanged. Nothing of the run changes before everything that can be checked is; then the
@@ -167,7 +170,7 @@ def run_stages(
     origin = Source(str(source), source_digest)
     upstream = source_digest
     wanted = stages[: STAGES.index(until) + 1]
-    inputs = _check_inputs(wanted, run, source, config, source_digest, same_source)
+    inputs = _check_inputs(wanted, run, source, config, source_digest, same_source, redo)
     if run.manifest() is None:
         write_manifest(run.manifest_file, Manifest(origin, records))
     save_settings(run, config)
@@ -175,6 +178,7 @@ def run_stages(
     for stage in wanted:
         record = records.get(stage.name)
         why = "" if record is None else why_again(stage, run, record, config, upstream, inputs[stage.name])
+        why = why or ("as asked for" if stage.name == redo else "")
         if record is None or why:
             fingerprint = stage_fingerprint(stage, config, upstream, inputs[stage.name])
             if why:
@@ -239,7 +243,7 @@ def _drop(records: dict[str, StageRecord], name: str) -> bool:
 
 
 def _check_inputs(
-    stages: list[Stage], run: RunFolder, source: Path, config: Config, upstream: str, same_source: SameSource
+    stages: list[Stage], run: RunFolder, source: Path, config: Config, upstream: str, same_source: SameSource, redo: str
 ) -> dict[str, Any]:
     """What each stage reads beside the stages before it; raises InputError where one has work to do and cannot.
 
@@ -249,7 +253,9 @@ def _check_inputs(
     settled = True
     for stage in stages:
         record = records.get(stage.name)
-        settled = settled and record is not None and not why_again(stage, run, record, config, upstream, record.inputs)
+        settled = settled and record is not None and stage.name != redo
+        if settled and record is not None:
+            settled = not why_again(stage, run, record, config, upstream, record.inputs)
         try:
             inputs[stage.name] = stage.inputs(source, config) if stage.inputs else None
         except InputError as error:
@@ -296,7 +302,7 @@ def _run_one(stage: Stage, context: StageContext, fingerprint: str, inputs: Any,
     except OSError as error:
         if is_disk_full(error, run.root):
             raise DiskFullError(
-                f"{run.root}: the disk is full. Free some space and run `msgs-slam resume {run.root}`"
+                f"{run.root}: the disk is full. Free some space and run `msgs-slam resume {quoted(run.root)}`"
             ) from error
         raise
     journal.check(files := results(folder))

@@ -53,8 +53,10 @@ def why_again(
     stage: Stage, run: RunFolder, record: StageRecord, config: Config, upstream: str, inputs: Any
 ) -> str:  # fmt: skip
     """Why a finished stage has to be made again, "" where it has not; `inputs` are those of now."""
+    if not run.stage(stage.name).exists():
+        return "its folder is gone"
     if damaged := run.damaged(stage.name):
-        return f"{len(damaged)} of its files are damaged or gone"
+        return f"{len(damaged)} of its files are missing or damaged"
     kept = kept_inputs(stage, config, record, inputs)
     if record.fingerprint != stage_fingerprint(stage, config, upstream, kept):
         return _what_differs(stage, record, config, upstream)

@@ -19,6 +19,7 @@ from msgs_slam.pipelines.run.journal import Journal
 from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.system.identity import stage_file, stage_identity
 from msgs_slam.pipelines.system.progress import Progress
+from msgs_slam.pipelines.system.wording import quoted
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -70,7 +71,7 @@ class Workers:
             if ended.failure:
                 raise RecoverableError(
                     f"{ended.call.name}: {ended.failure.rstrip()}\nWhat the other tasks have done is kept: run "
-                    f"`msgs-slam resume {folder.parent}`"
+                    f"`msgs-slam resume {quoted(folder.parent)}`"
                 )
             refused, found[ended.call.name] = ended.value
             if refused:

@@ -30,7 +30,7 @@ from msgs_slam.pipelines.run.files import FIGURES, LOOPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_source
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress
-from msgs_slam.pipelines.system.wording import figure_text
+from msgs_slam.pipelines.system.wording import figure_text, quoted
 from msgs_slam.pipelines.types import LoopEdge
 from msgs_slam.pipelines.upright.world import FIRST, WORLD
 
@@ -158,7 +158,7 @@ def _piece_section(piece: Outcome, progress: Progress) -> str:
         f"Apart from the rest: {name.replace('_', ' ')}",
         chips([*_figures(piece, views), ("seconds of the source", seconds)]),
         "<p>It is not connected to the rest: it has a coordinate system and a unit of its own. "
-        f"<code>msgs-slam report {escape(str(piece.run.root))}</code> says more; view and render take it, too.</p>",
+        f"<code>msgs-slam report {escape(quoted(piece.run.root))}</code> says more; view and render take it, too.</p>",
         '<div class="two">', *trajectory_plots(piece, None), "</div>", "" if views is None else views.sheet,
     )  # fmt: skip
 
@@ -213,7 +213,7 @@ def files_of_export(run: RunFolder) -> list[tuple[str, str]]:
     """Name and size of the files of the stage, or that one is not as the stage left it, and of those that
     `msgs-slam export --only` has added since. Reads all of them."""
     root = run.stage("export")
-    wrong = {name: f"damaged or gone: msgs-slam resume {run.root}" for name in run.damaged("export")}
+    wrong = {name: f"damaged or gone: msgs-slam resume {quoted(run.root)}" for name in run.damaged("export")}
     sizes = {p.relative_to(root).as_posix(): f"{p.stat().st_size / 1e6:.2f} MB" for p in root.rglob("*") if p.is_file()}
     return sorted((sizes | wrong).items())
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.run.records import Manifest, read_manifest
+from msgs_slam.pipelines.system.wording import quoted
 
 Stamp = tuple[int, int, int]
 """Inode, bytes and time of change: another one means that the file may be another."""
@@ -79,12 +80,12 @@ class FinishedFiles:
         if manifest is None:
             return path
         if stage not in manifest.records:
-            raise InputError(f"{self.root}: {stage} is not done. Run `msgs-slam resume {self.root}` first")
+            raise InputError(f"{self.root}: {stage} is not done. Run `msgs-slam resume {quoted(self.root)}` first")
         expected = manifest.records[stage].files.get(name)
         if expected is None or not self._is_intact(path, *expected):
             what = "is gone" if not path.is_file() else "is not as the program left it: damaged or changed"
             raise InputError(
-                f"{path} {what}. Run `msgs-slam resume {self.root}`: {stage} and what follows are made again"
+                f"{path} {what}. Run `msgs-slam resume {quoted(self.root)}`: {stage} and what follows are made again"
             )
         return path
 

@@ -14,6 +14,7 @@ from msgs_slam.formats.atomic import process_mark
 from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.errors import RecoverableError
 from msgs_slam.pipelines.system.stopping import stop_if_asked
+from msgs_slam.pipelines.system.wording import quoted
 
 JOURNAL = ".written"
 
@@ -76,7 +77,7 @@ class Journal:
         if torn:
             raise RecoverableError(
                 f"{self.folder / torn[0]} is not what was written there ({len(torn)} such files): the disk may be full "
-                f"or failing. Run `msgs-slam resume {self.folder.parent}`"
+                f"or failing. Run `msgs-slam resume {quoted(self.folder.parent)}`"
             )
 
     def _known(self) -> dict[str, set[str]]:

@@ -18,6 +18,7 @@ from msgs_slam.pipelines.config import Config, config_to_dict
 from msgs_slam.pipelines.read_config import merge_known_settings
 from msgs_slam.pipelines.run.layouts import dataclass_from_json
 from msgs_slam.pipelines.run.names import EXTENSION, SOURCE_LIST, STAGES
+from msgs_slam.pipelines.system.wording import quoted
 
 if TYPE_CHECKING:
     from msgs_slam.pipelines.run.folder import RunFolder
@@ -67,7 +68,7 @@ def read_manifest(path: Path) -> Manifest:
     except InputError as error:
         raise InputError(
             f"{error}\nWithout it nothing in the run can be trusted. Its settings are kept beside it: "
-            f"msgs-slam reconstruct SOURCE --out NEW --config {path.with_name('run.toml')}"
+            f"msgs-slam reconstruct SOURCE --out NEW --config {quoted(path.with_name('run.toml'))}"
         ) from error
 
 

@@ -16,6 +16,7 @@ from msgs_slam.pipelines.read_config import config_to_toml, merge_known_settings
 from msgs_slam.pipelines.run.before import before_of
 from msgs_slam.pipelines.run.records import load_records, load_source, recorded_config
 from msgs_slam.pipelines.system.progress import log
+from msgs_slam.pipelines.system.wording import quoted
 
 if TYPE_CHECKING:
     from msgs_slam.pipelines.run.folder import RunFolder
@@ -44,8 +45,8 @@ def load_settings(run: RunFolder) -> Config:
         if not (records := load_records(run)):
             raise InputError(
                 f"{run.root} was stopped before its settings were written, or {run.settings_file.name} is gone, and "
-                f"nothing is finished: run `msgs-slam reconstruct {load_source(run).path} --out {run.root}` with the "
-                "options it had"
+                f"nothing is finished: run `msgs-slam reconstruct {quoted(load_source(run).path)} "
+                f"--out {quoted(run.root)}` with the options it had"
             )
         log.warning("%s is gone: stages that are not done get default settings", run.settings_file)
         return recorded_config(records, Config())
@@ -56,7 +57,7 @@ def load_settings(run: RunFolder) -> Config:
     if not as_written:
         raise InputError(
             f"{run.settings_file} is not as the program left it: damaged, or edited by hand. Delete it and run "
-            f"`msgs-slam resume {run.root}`: what the finished stages were made with is kept in manifest.json. "
+            f"`msgs-slam resume {quoted(run.root)}`: what the finished stages were made with is kept in manifest.json. "
             "(Settings are changed with --set SECTION.KEY=VALUE, or with --config FILE, which may be a copy of it)"
         )
     return _known(read_toml(run.settings_file), run)

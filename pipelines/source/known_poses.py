@@ -13,6 +13,7 @@ from msgs_slam.formats.digest import files_sha256
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.image_times import frame_number
 from msgs_slam.formats.poses import PoseFile, read_poses, stem
+from msgs_slam.formats.reading import home_expanded
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.source.opening import FolderSource, VideoSource, Warn
@@ -66,10 +67,12 @@ def check_poses(config: FramesConfig, source: AnySource) -> None:
 
 
 def pose_inputs(config: FramesConfig) -> dict[str, str]:
-    """Return the digest of the pose files; {} without any."""
-    path = Path(config.poses).expanduser()
-    if not config.poses or not path.exists():
+    """Return the digest of the pose files; {} where none are given. Raises InputError where they are gone."""
+    if not config.poses:
         return {}
+    path = home_expanded(config.poses)
+    if not path.exists():
+        raise InputError(f"--poses {path}: there is no such file or folder: check the spelling")
     files = sorted(p for p in path.rglob("*") if p.suffix in (".bin", ".txt", ".json")) if path.is_dir() else [path]
     return {"poses": files_sha256((p.name, p) for p in files)}
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from msgs_slam.formats.datasets.camera import Camera
 from msgs_slam.formats.datasets.intrinsics_json import read_intrinsics_json
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.reading import reaching
+from msgs_slam.formats.reading import home_expanded, reaching
 from msgs_slam.formats.textfile import read_rows
 
 _HOW = "give fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file that holds them"
@@ -35,7 +35,7 @@ def read_intrinsics(text: str, width: int, height: int) -> Camera:
         return _from_numbers(numbers, width, height, f"intrinsics {text}")
     path = Path(text)
     with reaching(path):
-        path = path.expanduser()
+        path = home_expanded(path)
         if not path.is_file():
             raise InputError(f"intrinsics {text!r} are neither numbers nor an existing file: {_HOW}")
     return _fit_to_source(_from_file(path, width, height), width, height, path)

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 MOST_STRETCHES = 8
+
+
+def quoted(path: Path | str) -> str:
+    """A path as a word of a command that can be pasted into a shell."""
+    return shlex.quote(str(path))
 
 
 def stretches(ids: Iterable[int], most: int = MOST_STRETCHES) -> str:

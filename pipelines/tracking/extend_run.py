@@ -8,6 +8,7 @@ from pathlib import Path
 
 from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.safe_path import require_listable
 from msgs_slam.formats.video import probe_video
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.run.before import FINAL, save_before
@@ -18,6 +19,7 @@ from msgs_slam.pipelines.run.records import Manifest, Source, load_records, load
 from msgs_slam.pipelines.source.opening import open_source, source_digest, video_files
 from msgs_slam.pipelines.source.recording import RecordingSource
 from msgs_slam.pipelines.system.progress import Progress
+from msgs_slam.pipelines.system.wording import quoted
 from msgs_slam.pipelines.tracking.localise import require_overlap
 
 
@@ -35,12 +37,13 @@ def require_extendable(run: RunFolder, videos: Sequence[Path], config: Config, p
     done, needed = load_records(run), STAGES[: STAGES.index(FINAL) + 1]
     unfinished = [s for s in needed if s not in done or run.damaged(s)]
     if unfinished:
-        raise InputError(f"{run.root}: {unfinished[0]} is not done. Run `msgs-slam resume {run.root}` first")
+        raise InputError(f"{run.root}: {unfinished[0]} is not done. Run `msgs-slam resume {quoted(run.root)}` first")
     if run.load(CALIBRATION).directions > 1:
         raise InputError(
             f"{run.root} was made from panoramas, and only a run of ordinary videos can be extended: reconstruct "
             "all the recordings together, in a new run"
         )
+    require_listable(videos)
     width, height = _size(video_files(source)[0])
     for video in videos:
         if video.resolve() in [file.resolve() for file in video_files(source)]:
@@ -77,7 +80,7 @@ def _require_plain_videos(run: RunFolder, source: Path, config: Config) -> None:
     why = "with --poses" if config.frames.poses else f"from {source}, no video"
     raise InputError(
         f"{run.root} was made {why}: only runs of videos without given poses are extended. Reconstruct all of it into "
-        f"another folder, with --poses {run.root / 'export' / 'sparse' / '0'}"
+        f"another folder, with --poses {quoted(run.root / 'export' / 'sparse' / '0')}"
     )
 
 

@@ -20,6 +20,7 @@ from msgs_slam.pipelines.source.sharpness import reduce_image
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
 from msgs_slam.pipelines.structure.lens import Lens, calibrated_camera, make_lens, to_pycolmap
 from msgs_slam.pipelines.system.progress import Progress
+from msgs_slam.pipelines.system.wording import quoted
 from msgs_slam.pipelines.tracking.pictures import Pictures, load_shutter
 from msgs_slam.pipelines.tracking.pnp import MIN_INLIERS, solve_pose
 from msgs_slam.pipelines.tracking.relocalise import relocalise
@@ -56,7 +57,7 @@ def require_overlap(
             raise InputError(
                 f"{video}: of {len(seen)} of its images {recognised} show what {run.root} has seen, so nothing tells "
                 "where it belongs. Film it from a place that the run has seen on, or make it a run of its own: "
-                f"msgs-slam reconstruct {video}. Nothing was changed"
+                f"`msgs-slam reconstruct {quoted(video)}`. Nothing was changed"
             )
 
 
@@ -117,6 +118,6 @@ def _require_same_focal(run: RunFolder, video: Path, seen: Sequence[Sightings], 
     if abs(factor - 1) > _SAME_FOCAL and most >= MIN_INLIERS and most > _BETTER * agreeing(1.0):
         raise InputError(
             f"{video}: it was taken by another camera, or zoomed: its focal length is about {factor * camera.fx:.0f} "
-            f"px, that of {run.root} {camera.fx:.0f} px. Make it a run of its own: msgs-slam reconstruct {video}. "
-            "Nothing was changed"
+            f"px, that of {run.root} {camera.fx:.0f} px. Make it a run of its own: "
+            f"`msgs-slam reconstruct {quoted(video)}`. Nothing was changed"
         )

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from msgs_slam.pipelines.system.wording import quoted
 from msgs_slam.pipelines.viewer.camera_path import CameraPath, Keyframe
 from msgs_slam.pipelines.viewer.scene import ViewerScene
 from msgs_slam.pipelines.viewer.views import client_view, move_client, shown_pose
@@ -90,7 +91,7 @@ class Flight:
         name = f"{Path(self._scene.title).stem}-path.json"
         client.send_file_download(name, self.path.to_json().encode(), save_immediately=True)
         source = "FILE" if self._scene.run is None else "RUN"
-        self.told.content = f"Render it with `msgs-slam render {source} out.mp4 --path {name}`."
+        self.told.content = f"Render it with `msgs-slam render {source} out.mp4 --path {quoted(name)}`."
 
     def rest(self) -> None:
         """End the flight that is on."""

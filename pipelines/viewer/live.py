@@ -12,6 +12,7 @@ from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.run.running import load_running
 from msgs_slam.pipelines.system.progress import log
+from msgs_slam.pipelines.system.wording import quoted
 from msgs_slam.pipelines.viewer.scene import ViewerScene, load_scenes
 
 _BETWEEN_LOOKS = 2.0
@@ -31,7 +32,7 @@ def standing(run: RunFolder) -> str:
     shown = next((text for name, text in reversed(_SHOWING.items()) if name in records), "nothing yet")
     running = load_running(run)
     if running is None:
-        what = f"{', '.join(left)}. No job is running: `msgs-slam resume {run.root.name}` goes on"
+        what = f"{', '.join(left)}. No job is running: `msgs-slam resume {quoted(run.root.name)}` goes on"
     else:
         what = ", ".join(f"{name} ({running.text})" if name == running.stage else name for name in left)
     return f"Shown: {shown} ({len(STAGES) - len(left)} of {len(STAGES)} stages done). Still to come: {what}."

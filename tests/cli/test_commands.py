@@ -1,13 +1,17 @@
 """The command line through click's runner: exit codes, messages, help."""
 
+import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import click
+import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
 from msgs_slam.formats.atomic import temporary_of
+from msgs_slam.formats.video_writer import write_video
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.reconstruct import existing_config
@@ -51,6 +55,19 @@ def test_a_folder_that_is_no_run_is_refused(command: str, tmp_path: Path) -> Non
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("command", ["resume", "status", "export", "view", "report"])
+@pytest.mark.parametrize("named", [".", "..", "/"])
+def test_the_working_folder_that_is_no_run_is_refused(
+    command: str, named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    result = invoke(command, named)
+    assert result.exit_code == 1
+    assert isinstance(result.exception, SystemExit)
+    assert "no run" in result.stderr or "not a run" in result.stderr
+
+
 def refused(source: Path, out: Path, *options: object) -> str:
     """The message with which `reconstruct` ends; nothing must be left behind."""
     existed = out.exists()
@@ -71,6 +88,33 @@ def test_empty_file_and_text_file(tmp_path: Path) -> None:
     assert "is empty" in refused(video, tmp_path / "run")
     video.write_text("this is not a video")
     assert "video.mp4" in refused(video, tmp_path / "run")
+
+
+def test_a_user_who_does_not_exist(tmp_path: Path) -> None:
+    source = tmp_path / "room.avi"
+    write_video(source, [np.full((48, 64, 3), 9 * i, np.uint8) for i in range(5)], 10.0)
+    for option, value in (
+        ("--poses", "~nosuch/p.txt"), ("--intrinsics", "~nosuch/c.json"), ("--masks", "~nosuch/m"),
+        ("--gps", "~nosuch/g.gpx"), ("--depth", "onnx:~nosuch/card.toml"),
+    ):  # fmt: skip
+        assert "~nosuch/" in refused(source, tmp_path / "run", option, value)
+
+
+def test_names_that_are_no_utf_8(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/K\xfcche 2019"))
+    folder.mkdir()
+    write_video(tmp_path / "good.avi", [np.full((48, 64, 3), 9 * i, np.uint8) for i in range(5)], 10.0)
+    video = Path(shutil.copy(tmp_path / "good.avi", folder / "room.avi"))
+    for source, out in ((video, tmp_path / "run"), (folder, tmp_path / "run"), (tmp_path / "good.avi", folder / "run")):
+        assert "K\\udcfcche 2019" in (said := refused(source, out))
+        assert "no valid UTF-8" in said
+    monkeypatch.chdir(folder)
+    assert "no valid UTF-8" in refused(Path("room.avi"), Path("room.msgs"))
+    monkeypatch.undo()
+    assert "no valid UTF-8" in invoke("reconstruct", tmp_path / "good.avi", video, "-o", tmp_path / "run").stderr
+    assert not (tmp_path / "run").exists()
+    assert invoke("batch", folder, "--out", tmp_path / "runs").exit_code == 1
+    assert "no valid UTF-8" in (tmp_path / "runs" / "batch.md").read_text()
 
 
 def test_empty_folder(tmp_path: Path) -> None:

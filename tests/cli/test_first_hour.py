@@ -34,6 +34,7 @@ def video(tmp_path: Path) -> Path:
         (["--camera", "fish-eye"], "--camera is one of auto, perspective, equirectangular, fisheye"),
         (["--set", "run.device=gpu"], "did you mean cuda?"),
         (["--set", "frames.rat=3"], "did you mean frames.rate?"),
+        (["--hold-out", "1"], "--hold-out is 2 to 1000000, or 0; got 1"),
         (["--devise", "cpu"], "--device"),
     ],
 )

@@ -1,12 +1,14 @@
 """A finished run stays finished, whatever has come to the machine since; what would run again is said before."""
 
 import json
+import shlex
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from cli_runs import files_below, invoke
+from cli_runs import QUICK, FinishedRun, files_below, invoke
 
 from msgs_slam.pipelines.engine import standing
 from msgs_slam.pipelines.networks.registry import ModelStore
@@ -41,11 +43,77 @@ def test_networks_that_are_pulled_later_make_nothing_again(
     assert "keeps what auto chose" not in invoke("status", run).stdout
     assert invoke("models", "pull", "--from", shared_data / "models").exit_code == 0
     require_unchanged_by_resume(run)
+    resumed = invoke("resume", run).stdout
+    assert "Networks installed since this run: person, ade20k-small, fast-depth. To use them: " in resumed
+    assert f"msgs-slam resume {run} --redo frames (" in resumed
     said = invoke("status", run).stdout
-    assert "proxy keeps what auto chose when it was made (labels)" in said
-    assert "frames keeps what auto chose when it was made (people)" in said
-    assert "export keeps what auto chose when it was made (metres)" in said
+    since = f"networks installed since then: {{}}. To use them: `msgs-slam resume {run} --redo {{}}`"
+    for stage, what, networks in (
+        ("proxy", "labels", "ade20k-small"),
+        ("frames", "people", "person, ade20k-small"),
+        ("export", "metres", "fast-depth"),
+    ):
+        assert f"{stage} keeps what auto chose when it was made ({what}); {since.format(networks, stage)}" in said
     assert "again" not in {row["again"] for row in json.loads(invoke("status", run, "--json").stdout)["stages"]}
+
+
+def test_a_stage_is_made_again_on_demand_with_the_networks_of_now(
+    copied_run: Callable[[str], Path], cache: Path, shared_data: Path
+) -> None:
+    run = copied_run("run.msgs")
+    before, times = contents(run), files_below(run / "frames", run / "tracking")
+    assert invoke("resume", run, "--redo", "export", "--until", "frames").exit_code == 2
+    same = invoke("resume", run, "--redo", "export")
+    assert "export and what follows are made again (as asked for)" in same.stderr
+    assert same.stderr.count("] up to date") == 5
+    assert {k for k, v in contents(run).items() if before.get(k) != v} == {str(run / "manifest.json")}
+    assert invoke("models", "pull", "--from", shared_data / "models").exit_code == 0
+    made = invoke("resume", run, "--redo", "proxy", "--until", "proxy")
+    assert made.exit_code == 0, made.output
+    assert "proxy and what follows are made again (as asked for)" in made.stderr
+    assert made.stderr.count("] up to date") == 1
+    assert load_records(RunFolder(run))["proxy"].figures["semantics"] != "segments"
+    assert files_below(run / "frames", run / "tracking") == {k: v for k, v in times.items() if "/frames/" in k}
+    assert "proxy keeps" not in invoke("status", run).stdout
+    for file in cache.iterdir():
+        file.unlink()
+    gone = "proxy keeps what auto chose when it was made (labels); the networks that it used are not installed any more"
+    assert gone in invoke("status", run).stdout
+    assert "Networks installed" not in invoke("resume", run, "--until", "proxy").stdout
+
+
+def test_a_folder_that_is_gone_is_called_so(copied_run: Callable[[str], Path]) -> None:
+    run = copied_run("my room's.msgs")
+    shutil.rmtree(run / "export")
+    said = " ".join(invoke("status", run).stdout.split())
+    again = said.split("export: its folder is gone: `")[1].split("`")[0]
+    assert shlex.split(again) == ["msgs-slam", "resume", str(run)], "can be pasted"
+    resumed = invoke(*shlex.split(again)[1:])
+    assert "export and what follows are made again (its folder is gone)" in resumed.stderr
+    assert "damaged" not in resumed.stderr
+
+
+def test_files_of_options_are_found_from_another_folder_and_may_be_gone_when_their_stage_is_done(
+    finished_run: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(finished_run.folder / "export" / "trajectory.txt", "poses.txt")
+    settings = [x for s in QUICK for x in ("--set", s)]
+    wanted = ("--poses", "poses.txt", "--until", "frames", *settings)
+    made = invoke("reconstruct", finished_run.video, "--out", "run.msgs", *wanted)
+    assert made.exit_code == 0, made.output
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    found = invoke("resume", "../run.msgs", "--until", "frames")
+    assert (found.exit_code, "up to date" in found.stderr, "keeps" in found.stderr) == (0, True, False)
+    (tmp_path / "poses.txt").unlink()
+    kept = invoke("resume", "../run.msgs", "--until", "frames")
+    assert kept.exit_code == 0, kept.stderr
+    assert "frames: keeps what it was made from (--poses" in kept.stderr
+    assert "up to date" in kept.stderr
+    other = invoke("resume", "../run.msgs", "--until", "frames", "--set", "frames.parallax=0.05")
+    assert other.exit_code == 1
+    assert "poses.txt: there is no such file" in other.stderr
 
 
 def test_a_network_that_is_added_later_makes_nothing_again(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import struct
 import subprocess
 import sys
@@ -363,3 +364,14 @@ def test_ordinary_videos_are_not_taken_for_hdr(counted_video: Path, tmp_path: Pa
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) * 2 // 3])
     with pytest.raises(InputError, match="no image can be decoded"):
         list(VideoReader(tmp_path / "cut.mp4"))
+
+
+def test_names_that_are_no_utf_8_are_refused(tmp_path: Path) -> None:
+    """OpenCV would end the process."""
+    frames = [np.full((48, 64, 3), 9 * i, np.uint8) for i in range(5)]
+    named = tmp_path / os.fsdecode(b"K\xfcche.avi")
+    with pytest.raises(InputError, match="no valid UTF-8"):
+        write_video(named, frames, 10.0)
+    write_video(tmp_path / "good.avi", frames, 10.0).rename(named)
+    with pytest.raises(InputError, match="no valid UTF-8"):
+        probe_video(named)

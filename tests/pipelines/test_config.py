@@ -2,13 +2,24 @@
 
 import dataclasses
 import itertools
+import tomllib
 from pathlib import Path
 
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.config import Config, config_to_dict
-from msgs_slam.pipelines.read_config import FIXED, GONE, config_to_toml, load_config
+from msgs_slam.msgs_cli.options import source_settings
+from msgs_slam.pipelines.config import Config, FramesConfig, ProxyConfig, config_to_dict
+from msgs_slam.pipelines.read_config import (
+    FIXED,
+    GONE,
+    config_to_toml,
+    load_config,
+    merge_settings,
+    with_absolute_paths,
+)
 
 
 def test_printed_settings_read_back_the_same(tmp_path: Path) -> None:
@@ -16,6 +27,51 @@ def test_printed_settings_read_back_the_same(tmp_path: Path) -> None:
     file = tmp_path / "settings.toml"
     file.write_text(config_to_toml(changed))
     assert load_config(file) == changed != Config()
+
+
+TEXTS = st.text(st.characters(exclude_categories=["Cs"]))
+
+
+@given(TEXTS, TEXTS, TEXTS)
+@example("/home/me/🏠/masks", "𠮷野 \x7f\x1b", 'a "b" \\ # c\r\n\u2028\x85')
+def test_every_text_is_read_back_as_it_was_written(masks: str, words: str, poses: str) -> None:
+    config = dataclasses.replace(
+        Config(), frames=FramesConfig(masks=masks, poses=poses), proxy=ProxyConfig(classes=words)
+    )
+    assert merge_settings(Config(), tomllib.loads(config_to_toml(config)), "") == config
+    assert load_config(None, source_settings({"frames__masks": masks, "frames__poses": poses})).frames == config.frames
+
+
+def test_text_that_no_file_can_hold_is_refused() -> None:
+    with pytest.raises(InputError, match=r"--masks is no valid UTF-8.*rename the file or folder"):
+        source_settings({"frames__masks": "K\udcfcche"})
+    with pytest.raises(InputError, match=r"frames\.masks is no valid UTF-8"):
+        load_config(overrides=["frames.masks=K\udcfcche"])
+
+
+def test_dots_in_comments_and_texts_divide_no_key(tmp_path: Path) -> None:
+    file = tmp_path / "settings.toml"
+    dots = "." * 70
+    file.write_text(f'# {dots}\n[frames] # {dots} "\nmasks = "{dots}\\" #"\nposes = \'{dots}\'\nmax_side = 320')
+    assert load_config(file).frames == FramesConfig(masks=f'{dots}" #', poses=dots, max_side=320)
+    file.write_text("a" + ".a" * 70 + ' = "#"')
+    with pytest.raises(InputError, match="a key of too many parts"):
+        load_config(file)
+
+
+def test_paths_of_files_that_are_there_become_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("masks", "auto", "multiview", "depth"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "camera.json").touch()
+    typed = ("frames.masks=masks", "frames.poses=gone", "proxy.depth=files:depth", "proxy.semantics=files")
+    config = load_config(overrides=[*typed, "export.gps=auto", "frames.intrinsics=./camera.json"])
+    whole = with_absolute_paths(config)
+    assert (whole.frames.masks, whole.frames.poses) == (str(tmp_path / "masks"), "gone")
+    assert whole.frames.intrinsics == str(tmp_path / "camera.json")
+    assert (whole.proxy.depth, whole.proxy.semantics) == (f"files:{tmp_path / 'depth'}", "files")
+    assert whole.export.gps == "auto"
+    assert with_absolute_paths(load_config(overrides=["proxy.depth=multiview"])).proxy.depth == "multiview"
 
 
 def test_override_beats_file_beats_default(tmp_path: Path) -> None:

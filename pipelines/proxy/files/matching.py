@@ -7,7 +7,7 @@ from pathlib import Path
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import natural_key
-from msgs_slam.formats.reading import reaching
+from msgs_slam.formats.reading import home_expanded, reaching
 from msgs_slam.pipelines.types import Frame
 
 _KINDS = r"(colou?r|rgb|image|img|depth|disp|labels?|semantic|segmentation|class|conf|confidence)"
@@ -26,9 +26,9 @@ def find_folder(given: str, source: Path, names: tuple[str, ...], suffixes: tupl
 
     Raises InputError when there is none that holds files with one of `suffixes`.
     """
-    roots = [Path(given).expanduser()] if given else [source.parent, source]
+    roots = [home_expanded(given)] if given else [source.parent, source]
     candidates = [root / name for root in roots for name in names]
-    candidates += [Path(given).expanduser()] if given else [source]
+    candidates += [home_expanded(given)] if given else [source]
     for folder in candidates:
         with reaching(folder):
             if folder.is_dir() and _list(folder, suffixes, names):
