@@ -78,8 +78,8 @@ def batch(
         _print(rows)
     if failed:
         say(f"{len(failed)} of {len(mine)} recordings failed; {out}/NAME.failed.txt says why", err=True)
-    paths = {"table": out / "batch.json", "runs": [r.run for r in mine], "failed": [r.run for r in failed]}
-    output.tell_result(int(bool(failed)), **paths)
+    runs = {"runs": [r.run for r in mine], "failed": [r.run for r in failed]}
+    output.tell_result(int(bool(failed)), table=out / "batch.json", **runs)
     if failed:
         sys.exit(1)
 

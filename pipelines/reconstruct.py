@@ -185,8 +185,8 @@ def _run(
 ) -> dict[str, StageRecord]:
     def same_source() -> None:
         kept = (
-            f"What is done so far is kept: bring it back, then run `msgs-slam resume {quoted(run.root)}`; or, if it lies "
-            f"elsewhere now: `msgs-slam reconstruct SOURCE --out {quoted(run.root)}`"
+            f"What is done so far is kept: bring it back, then run `msgs-slam resume {quoted(run.root)}`; or, if it "
+            f"lies elsewhere now: `msgs-slam reconstruct SOURCE --out {quoted(run.root)}`"
         )
         try:
             same = source_digest(source, config.run.format) == digest
