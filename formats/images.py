@@ -67,14 +67,29 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(images, key=lambda p: natural_key(p.name))
 
 
+def count_images(folder: Path) -> int:
+    """How many image files lie directly in a folder, hidden ones not counted; 0 where there is no such folder."""
+    try:
+        names = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
+        return sum(p.is_file() for p in names)
+    except OSError:  # none, no folder, or none that may be read
+        return 0
+
+
+def hint_at_inner_folder(folder: Path, least: int = 2) -> str:
+    """Name the folder directly in `folder` with the most images; "" where none has `least`."""
+    counts = {p.name: count_images(p) for p in sorted(folder.iterdir()) if not p.name.startswith(".")}
+    name = max(counts, key=counts.__getitem__, default="")
+    return f"the folder {name}/ in it holds {counts[name]} images: give that" if counts.get(name, 0) >= least else ""
+
+
 def _why_no_images(folder: Path, files: list[Path]) -> str:
     raw = sorted({p.suffix.lower() for p in files} & RAW_SUFFIXES)
     if raw:
         return f"no readable image in {folder}: {', '.join(raw)} files are not supported, export them as JPEG first"
-    return (
-        f"no images in {folder} ({len(files)} other files): give the folder that directly holds the "
-        f"{', '.join(sorted(IMAGE_SUFFIXES))} files"
-    )
+    hint = hint_at_inner_folder(folder)
+    kinds = f"give the folder that directly holds the {', '.join(sorted(IMAGE_SUFFIXES))} files"
+    return f"no images in {folder} ({len(files)} other files): {hint or kinds}"
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -34,6 +34,8 @@ _VIDEOS = {
     ".mts", ".mxf", ".nut", ".ogg", ".ogv", ".qt", ".sens", ".ts", ".videos", ".vob", ".webm", ".wmv", ".y4m",
 }  # fmt: skip
 _MOST_NAMED = 5
+_NOT_LISTED = (".", "__MACOSX")
+"""How names begin that nobody gave: hidden files, and what macOS adds to an archive."""
 DONE, FAILED, ELSEWHERE, UNFINISHED, NOT_YET = "done", "failed", "in another process", "unfinished", "not yet"
 _FIGURES = (("frames", "frames"), ("tracking", "posed"), ("tracking", "keyframes"), ("mapping", "keyframe_psnr"))
 
@@ -77,7 +79,7 @@ def find_recordings(folder: Path, runs: Path) -> list[Recording]:
     fails. Other folders are reported. Raises InputError where there is none."""
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder. `batch` takes a folder of videos, image folders or data sets")
-    visible = [p for p in sorted(folder.iterdir()) if not p.name.startswith(".") and not _is_run(p, runs)]
+    visible = [p for p in sorted(folder.iterdir()) if not p.name.startswith(_NOT_LISTED) and not _is_run(p, runs)]
     sources = [p for p in visible if _is_recording(p)]
     others = [p.name for p in visible if p not in sources and p.is_dir() and any(p.iterdir())]
     if others:

@@ -19,7 +19,7 @@ from msgs_slam.formats.datasets.matching import (
 )
 from msgs_slam.formats.datasets.sequence import LabelClass, Sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import IMAGE_SUFFIXES, list_images
+from msgs_slam.formats.images import count_images, list_images
 from msgs_slam.formats.textfile import read_rows
 from msgs_slam.formats.trajectory import read_matrices, read_tum
 
@@ -32,7 +32,7 @@ _INTRINSICS_FILES = ("intrinsics.json", "cam_params.json", "camera.json")
 
 def recognises(path: Path) -> bool:
     """A folder of images, or one with a folder rgb/, images/, color/ or frames/."""
-    return _image_folder(path) is not None
+    return image_folder(path) is not None
 
 
 def open_folder(path: Path) -> Sequence:
@@ -43,7 +43,7 @@ def open_folder(path: Path) -> Sequence:
     distortion, depth_scale, pixel_centre), timestamps.txt, and traj.txt: world-from-camera, a 4x4 matrix or a TUM line
     for each image or each frame number. Raises InputError where one of them contradicts the images.
     """
-    folder = _image_folder(path)
+    folder = image_folder(path)
     if folder is None:
         raise InputError(f"no images in {path}: give the folder that holds the images, or one above rgb/ or images/")
     images = list_images(folder)
@@ -65,14 +65,29 @@ def open_folder(path: Path) -> Sequence:
         depth_per_metre=depth_scale or 1000.0,
         label_paths=label_paths,
         classes=_classes(root, label_paths),
+        notes=_unused_images(path, folder),
     )
 
 
-def _image_folder(path: Path) -> Path | None:
-    for folder in (path, *(path / name for name in _IMAGE_FOLDERS)):
-        if folder.is_dir() and any(p.suffix.lower() in IMAGE_SUFFIXES for p in folder.iterdir() if p.is_file()):
-            return folder
-    return None
+def image_folder(path: Path) -> Path | None:
+    """The folder that holds most images: this one, or the rgb/, images/, color/ or frames/ in it. None without any.
+
+    A picture or two beside images/ are thumbnails or plots; the other way round images/ is something else's.
+    """
+    counts = _image_counts(path)
+    return max(counts, key=counts.__getitem__) if any(counts.values()) else None
+
+
+def _image_counts(path: Path) -> dict[Path, int]:
+    return {folder: count_images(folder) for folder in (path, *(path / name for name in _IMAGE_FOLDERS))}
+
+
+def _unused_images(path: Path, used: Path) -> tuple[str, ...]:
+    counts = _image_counts(path)
+    others = [f"{count} in {folder.name}/" for folder, count in counts.items() if count and folder != used]
+    if not others:
+        return ()
+    return (f"the {counts[used]} images in {used.name}/ are used, not the {' and '.join(others)}",)
 
 
 def _root_of(images: Path) -> Path:

@@ -67,12 +67,12 @@ def recognise_source(path: Path) -> str | None:
     """The format of a recording to reconstruct; None for a video, and for a folder that holds images directly.
 
     Other than `recognise`, it takes what a user points at literally: a folder of images is no data set because of what
-    is above it, nor because somebody has left a COLMAP model in it.
+    is above it, nor because somebody has left a COLMAP model in it; but a few pictures beside images/ are no source.
     """
     path = Path(path)
     with reaching(path):
         names = [name for name, reader in _READERS.items() if path.exists() and reader.recognises(path)]
-        holds_images = path.is_dir() and any(p.suffix.lower() in IMAGE_SUFFIXES for p in path.iterdir())
+        holds_images = path.is_dir() and folder.image_folder(path) == path
     return next((name for name in names if not (holds_images and name in _NOT_FROM_INSIDE)), None)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.atomic import copy_file
 from msgs_slam.formats.errors import InputError, RecoverableError
 from msgs_slam.formats.gps import photo_places
-from msgs_slam.formats.images import read_rgb, write_rgb
+from msgs_slam.formats.images import hint_at_inner_folder, read_rgb, write_rgb
 from msgs_slam.formats.jsonfile import read_json, write_json
 from msgs_slam.formats.video import VideoFrame
 from msgs_slam.pipelines.config import Config
@@ -53,7 +53,7 @@ from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
 from msgs_slam.pipelines.source.known_poses import check_poses, given_poses, pose_inputs
-from msgs_slam.pipelines.source.opening import FolderSource, Source, open_source
+from msgs_slam.pipelines.source.opening import FolderSource, Source, Warn, open_source
 from msgs_slam.pipelines.source.sharpness import reduce_image
 from msgs_slam.pipelines.structure.backbone import to_sparse_model
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
@@ -79,7 +79,7 @@ def run(context: StageContext) -> dict[str, Any]:
             "the images are twice as wide as high, like 360° panoramas: if they are, pass --camera equirectangular"
         )
     camera, origin = known_camera(context, source, faces)
-    _require_several(source)
+    _require_several(source, context.warn)
     frames = pick_frames(context, source, faces)
     given = given_poses(context.config.frames, source, frames, context.warn)
     rig = rig_of(1 if faces is None else len(faces), len(frames))
@@ -141,9 +141,15 @@ def _check_panoramas(config: Config) -> None:
         )
 
 
-def _require_several(source: AnySource) -> None:
-    if isinstance(source, FolderSource) and len(source.headers.of) < 2:
-        raise InputError(f"{source.path} holds one image only; a reconstruction needs several views of a scene")
+def _require_several(source: AnySource, warn: Warn | None = None) -> None:
+    if not isinstance(source, FolderSource):
+        return
+    hint = hint_at_inner_folder(source.path, source.expected_frames + 1)
+    if len(source.headers.of) < 2:
+        needed = f"holds one image only; a reconstruction needs several views of a scene{hint and ': '}{hint}"
+        raise InputError(f"{source.path} {needed}")
+    if hint and warn is not None:
+        warn(f"{source.path} holds {source.expected_frames} images; {hint} if those are meant")
 
 
 # keyframes and structure ----------------------------------------------------------------------------------------

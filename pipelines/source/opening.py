@@ -16,7 +16,7 @@ from msgs_slam.formats.digest import file_sha256, files_sha256
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.image_times import read_image_times, times_file
 from msgs_slam.formats.images import Reading, is_depth_map, list_images, read_rgb, read_transparent
-from msgs_slam.formats.reading import reaching, require_file
+from msgs_slam.formats.reading import opened, reaching, require_file
 from msgs_slam.formats.textfile import read_text
 from msgs_slam.formats.video import VideoFrame, VideoReader, probe_video
 from msgs_slam.pipelines.source.one_camera import Headers, common_span, read_headers, require_one_lens
@@ -219,6 +219,16 @@ def open_source(path: Path, format: str = "auto") -> VideoSource | FolderSource 
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 """Begins an address; a path has lost one of its slashes."""
+_ARCHIVE_HEADS = (
+    b"PK\3\4",
+    b"\x1f\x8b",
+    b"BZh",
+    b"7z\xbc\xaf\x27\x1c",
+    b"Rar!\x1a\x07",
+    b"\xfd7zXZ\0",
+    b"\x28\xb5\x2f\xfd",
+)
+_TAR_MARK_AT = 257
 
 
 def require_source(path: Path) -> None:
@@ -231,6 +241,10 @@ def require_source(path: Path) -> None:
             next(path.iterdir(), None)
             return
     require_file(path)
+    with opened(path) as file:
+        head = file.read(_TAR_MARK_AT + 5)
+    if head.startswith(_ARCHIVE_HEADS) or head[_TAR_MARK_AT:] == b"ustar":
+        raise InputError(f"{path} is an archive: unpack it first, then give the video or the folder that was in it")
 
 
 def source_digest(source: Path, format: str) -> str:

@@ -178,12 +178,13 @@ def test_heic_is_upright(tmp_path: Path, picture: np.ndarray, orientation: int) 
     assert 0 < np.abs(heic.astype(int) - jpeg).mean() < 3
 
 
-def test_heic_tells_focal_length_time_and_place(tmp_path: Path, picture: np.ndarray) -> None:
+@pytest.mark.parametrize("south", ["S", b"S\0"])
+def test_heic_tells_focal_length_time_and_place(tmp_path: Path, picture: np.ndarray, south: str | bytes) -> None:
     exif = Image.Exif()
     camera, gps = exif.get_ifd(ExifTags.IFD.Exif), exif.get_ifd(ExifTags.IFD.GPSInfo)
     camera[ExifTags.Base.FocalLengthIn35mmFilm] = 26
     camera[ExifTags.Base.DateTimeOriginal] = "2024:05:06 07:08:09"
-    gps |= {1: "S", 2: (10.0, 30.0, 0.0), 3: "E", 4: (20.0, 15.0, 36.0), 6: 120.5}
+    gps |= {1: south, 2: (10.0, 30.0, 0.0), 3: "E", 4: (20.0, 15.0, 36.0), 6: 120.5}
     Image.fromarray(picture).save(tmp_path / "IMG_1.HEIC", exif=exif)
     path = tmp_path / "IMG_1.HEIC"
     assert list_images(tmp_path) == [path]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from layouts import LAYOUTS, START, seven_scenes, tum
+from PIL import Image
 
 from msgs_slam.formats.datasets import Camera, Sequence, open_sequence
 from msgs_slam.formats.errors import InputError
@@ -169,6 +171,40 @@ def test_a_folder_of_images_is_no_data_set_by_what_lies_beside_it(short: Sequenc
     assert isinstance(open_source(tmp_path / "plain", "colmap"), RecordingSource)
     with pytest.raises(InputError, match="did you mean 'scannet'"):
         open_source(tmp_path / "plain", "scanet")
+
+
+@pytest.mark.parametrize(
+    "strays", [["thumbnail.jpg"], ["banana.png", "trimesh.PNG"], ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]]
+)
+@pytest.mark.parametrize("layout", ["colmap", "nerfstudio", "images", "frames"])
+def test_pictures_beside_the_images_do_not_hide_a_project(
+    layout: str, strays: list[str], short: Sequence, tmp_path: Path
+) -> None:
+    path = tmp_path / "project"
+    LAYOUTS["nerfstudio" if layout == "nerfstudio" else "colmap"][0](short, path)
+    if layout in ("images", "frames"):
+        shutil.rmtree(path / "sparse")
+        (path / "images").rename(path / layout)
+    for name in (*strays, "._0.jpg", ".DS_Store", "Thumbs.db"):
+        Image.new("RGB", (20, 30)).save(path / name, "PNG")
+    source = open_source(path)
+    assert isinstance(source, RecordingSource)
+    assert source.sequence.format == (layout if layout in ("colmap", "nerfstudio") else "folder")
+    assert source.expected_frames == 5
+    if source.sequence.format == "folder":
+        assert f"the 5 images in {layout}/ are used, not the {len(strays)} in project/" in source.sequence.notes
+    assert isinstance(open_source(path, "images"), FolderSource)
+
+
+def test_a_damaged_first_image_does_not_cost_the_set(short: Sequence, tmp_path: Path) -> None:
+    for layout in ("tum", "nerfstudio", "scannet", "colmap", "nice_slam"):
+        path = LAYOUTS[layout][0](short, tmp_path / layout)
+        first = open_sequence(path).image_paths[0]
+        first.write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
+        warnings: list[str] = []
+        source = open_source(path)
+        assert (source.width, len(list(source.read(warn=warnings.append)))) == (240, 4), layout
+        assert "git-LFS" in "".join(warnings)
 
 
 def test_times_stay_those_of_the_set(short: Sequence, tmp_path: Path) -> None:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from PIL import Image
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_grey_png, write_rgb
 from msgs_slam.formats.video_writer import write_video
+from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.reconstruct import one_source, source_digest
@@ -220,3 +223,25 @@ def test_a_list_of_videos_never_enters_what_is_not_their_run(tmp_path: Path) -> 
         (run.root / name).write_text("a half")  # left by a process that was killed
     source = one_source(paths, run)
     assert source.read_text() == "".join(f"{path.resolve()}\n" for path in paths)
+
+
+def test_archives_and_folders_of_folders_are_told_what_to_give(tmp_path: Path) -> None:
+    for i in range(3):
+        write_rgb(tmp_path / "scan" / "photos" / f"{i}.jpg", _noise(i))
+    for kind in ("zip", "tar", "gztar", "xztar"):
+        archive = shutil.make_archive(str(tmp_path / "scan"), kind, tmp_path / "scan")
+        with pytest.raises(InputError, match="is an archive: unpack it first"):
+            open_source(Path(archive))
+    with pytest.raises(InputError, match=r"no images in .*the folder photos/ in it holds 3 images: give that"):
+        open_source(tmp_path / "scan")
+    write_rgb(tmp_path / "scan" / "cover.jpg", _noise(9))
+    done = CliRunner().invoke(main, ["reconstruct", str(tmp_path / "scan"), "--out", str(tmp_path / "run"), "--quiet"])
+    assert done.exit_code
+    assert "holds one image only; a reconstruction needs several views of a scene: the folder photos/" in done.output
+
+
+def test_pointers_in_place_of_images_are_named(tmp_path: Path) -> None:
+    for i in range(3):
+        (tmp_path / f"{i}.JPG").write_text("version https://git-lfs.github.com/spec/v1\n")
+    with pytest.raises(InputError, match=r"none of the 3 images.*0\.JPG is a git-LFS pointer"):
+        open_source(tmp_path)
