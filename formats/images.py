@@ -68,7 +68,7 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def count_images(folder: Path) -> int:
-    """How many image files lie directly in a folder, hidden ones not counted; 0 where there is no such folder."""
+    """Count the image files directly in a folder, hidden ones left out; 0 where there is no such folder."""
     try:
         names = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
         return sum(p.is_file() for p in names)

@@ -57,7 +57,9 @@ def deep_values(image: Image.Image) -> NDArray | None:
 def is_deep_colour(image: Image.Image) -> bool:
     """Whether an unloaded PNG or TIFF stores three or four channels of 16 bits, of which Pillow keeps the high
     bytes."""
-    return image.format in ("PNG", "TIFF") and image.mode in ("RGB", "RGBA") and ";16" in str(getattr(image, "tile", ""))
+    return (
+        image.format in ("PNG", "TIFF") and image.mode in ("RGB", "RGBA") and ";16" in str(getattr(image, "tile", ""))
+    )
 
 
 def decode_deep_colour(data: bytes, span: tuple[float, float]) -> NDArray[np.uint8]:

@@ -193,7 +193,7 @@ def _write_pictures(folder: Path, pictures: Iterator[Picture]) -> Path:
     others = [p for p in folder.glob("*.png") if p.stem.isdecimal() and int(p.stem) >= count]
     if others:
         log.warning(
-            "%s holds %d numbered pictures from before besides the %d of this rendering, %s the first: remove them, or "
+            "%s holds %d numbered images from before besides the %d of this rendering, %s the first: remove them, or "
             "name a new folder",
             folder, len(others), count, min(p.name for p in others),
         )  # fmt: skip

@@ -43,7 +43,7 @@ def test_pictures_of_an_earlier_rendering_are_reported_and_stay(
         assert len(list_images(render_run(run, folder, path="own", fps=fps))) == 5
     assert "from before" not in caplog.text
     render_run(run, folder, path="own", fps=1.0)
-    assert f"{folder} holds 2 numbered pictures from before besides the 3 of this rendering, 000003.png" in caplog.text
+    assert f"{folder} holds 2 numbered images from before besides the 3 of this rendering, 000003.png" in caplog.text
     assert len(list_images(folder)) == 5
 
 
