@@ -12,8 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Protocol
 
-from msgs_slam.formats.errors import DiskFullError, InputError, RecoverableError
-from msgs_slam.formats.reading import opened
+from .errors import DiskFullError, InputError, RecoverableError
+from .reading import opened
 
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NOT_ALLOWED = {errno.EACCES, errno.EPERM, errno.EROFS}

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.atomic import atomic_path
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.video_writer import write_video
+from .atomic import atomic_path
+from .errors import InputError
+from .video_writer import write_video
 
 H264, VP9, MPEG4 = "H.264", "VP9", "MPEG-4 part 2"
 PLAYED = (H264, VP9)

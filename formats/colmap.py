@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.formats.atomic import write_bytes, write_lines, write_text
-from msgs_slam.formats.colmap_binary import require_whole_files
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.ply_table import slices
-from msgs_slam.formats.reading import parsing, require_file
-from msgs_slam.formats.trajectory import FARTHEST, nearest_rotation, poses_from_quaternions
+from .atomic import write_bytes, write_lines, write_text
+from .colmap_binary import require_whole_files
+from .errors import InputError
+from .ply_table import slices
+from .reading import parsing, require_file
+from .trajectory import FARTHEST, nearest_rotation, poses_from_quaternions
 
 _PINHOLE_MODEL_ID = 1
 _CAMERA_ID = 1
@@ -88,7 +88,7 @@ def read_colmap_model(folder: Path) -> ColmapModel:
 def _plain_model(reconstruction: Any, folder: Path) -> ColmapModel:
     images = sorted((reconstruction.images[i] for i in reconstruction.reg_image_ids()), key=lambda image: image.name)
     camera_ids = sorted({image.camera_id for image in images})
-    from msgs_slam.formats.reconstruction import ModelArrays  # pycolmap takes long to import
+    from .reconstruction import ModelArrays  # pycolmap takes long to import
 
     found = ModelArrays.of(reconstruction, [image.image_id for image in images])
     poses = [image.cam_from_world() for image in images]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-from msgs_slam.formats.reading import parsing, read_bytes
+from .reading import parsing, read_bytes
 
 # Parameters of each of COLMAP's camera models, in the order of the models' ids (SIMPLE_PINHOLE first).
 _PARAMETER_COUNTS = dict(enumerate((3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)))

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable
 from pathlib import Path
 
-from msgs_slam.formats.reading import opened
+from .reading import opened
 
 
 def file_sha256(path: Path) -> str:

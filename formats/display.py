@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.spherical import read_moov
+from .spherical import read_moov
 
 _SQUARE = 0.002
 """Sides that differ by less come from a size that was rounded to whole pixels."""

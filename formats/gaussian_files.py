@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussian_glb import read_gaussian_glb
-from msgs_slam.formats.gaussian_ply import read_gaussian_ply
-from msgs_slam.formats.gaussians import GaussianCloud, unit_quaternions
-from msgs_slam.formats.reading import parsing, read_bytes
-from msgs_slam.formats.spz import read_spz
+from .errors import InputError
+from .gaussian_glb import read_gaussian_glb
+from .gaussian_ply import read_gaussian_ply
+from .gaussians import GaussianCloud, unit_quaternions
+from .reading import parsing, read_bytes
+from .spz import read_spz
 
 _SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
 _SMALLEST_SCALE = 1e-9

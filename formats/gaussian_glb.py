@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussian_ply import SH_C0
-from msgs_slam.formats.gaussians import GaussianCloud, unit_quaternions
-from msgs_slam.formats.glb import FLOAT, WIDTHS, Part, glb_parts, write_glb, write_primitive
-from msgs_slam.formats.reading import parsing, read_bytes
-from msgs_slam.formats.spz import read_spz_stream, spz_bytes
+from .errors import InputError
+from .gaussian_ply import SH_C0
+from .gaussians import GaussianCloud, unit_quaternions
+from .glb import FLOAT, WIDTHS, Part, glb_parts, write_glb, write_primitive
+from .reading import parsing, read_bytes
+from .spz import read_spz_stream, spz_bytes
 
 EXTENSION = "KHR_gaussian_splatting"
 COMPRESSION = "KHR_gaussian_splatting_compression_spz_2"

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from plyfile import PlyData
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussians import GaussianCloud, parts_of, unit_quaternions
-from msgs_slam.formats.ply_table import Rows, columns, read_ply, slices, write_ply
-from msgs_slam.formats.reading import parsing
+from .errors import InputError
+from .gaussians import GaussianCloud, parts_of, unit_quaternions
+from .ply_table import Rows, columns, read_ply, slices, write_ply
+from .reading import parsing
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * f_dc."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.trajectory import FARTHEST
+from .trajectory import FARTHEST
 
 _LARGEST_LOG = 20.0
 """exp of it is half a `FARTHEST`: the squares that make a covariance still fit into float32."""

@@ -15,9 +15,9 @@ from xml.parsers.expat import errors
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import exif_gps
-from msgs_slam.formats.reading import parsing, read_bytes
+from .errors import InputError
+from .images import exif_gps
+from .reading import parsing, read_bytes
 
 Array = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.containers import OPEN_OPTIONS
-from msgs_slam.formats.spherical import read_moov
+from .containers import OPEN_OPTIONS
+from .spherical import read_moov
 
 _TRANSFERS = {16: "PQ", 18: "HLG"}  # ITU-T H.273, table 3
 _KNEE = 0.75

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import exif_time
-from msgs_slam.formats.reading import reaching
-from msgs_slam.formats.textfile import read_rows
+from .errors import InputError
+from .images import exif_time
+from .reading import reaching
+from .textfile import read_rows
 
 _LIST_NAMES = ("timestamps.txt", "times.txt", "rgb.txt")
 

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, UnidentifiedImageError
 from pillow_heif import register_heif_opener
 
-from msgs_slam.formats.atomic import write_bytes
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.exif import ANTICLOCKWISE, QUARTER_TURNS, TURNS, ExifLens, lens_of, place_of
-from msgs_slam.formats.pixels import (
+from .atomic import write_bytes
+from .errors import InputError
+from .exif import ANTICLOCKWISE, QUARTER_TURNS, TURNS, ExifLens, lens_of, place_of
+from .pixels import (
     decode_16_bits,
     decode_deep_colour,
     deep_values,
@@ -29,7 +29,7 @@ from msgs_slam.formats.pixels import (
     to_rgb8,
     transparent_pixels,
 )
-from msgs_slam.formats.reading import opened, parsing, reaching, read_bytes
+from .reading import opened, parsing, reaching, read_bytes
 
 register_heif_opener()
 

@@ -13,8 +13,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from msgs_slam.formats.containers import OPEN_OPTIONS, as_opencv_writes_them
-from msgs_slam.formats.errors import InputError
+from .containers import OPEN_OPTIONS, as_opencv_writes_them
+from .errors import InputError
 
 _PROGRESSIVE = 1
 """AV_FIELD_PROGRESSIVE; 0 is unknown, all above are interlaced."""

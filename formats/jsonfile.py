@@ -9,10 +9,10 @@ import tomllib
 from pathlib import Path
 from typing import Any, NoReturn
 
-from msgs_slam.formats.atomic import write_text
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.reading import parsing
-from msgs_slam.formats.textfile import read_text
+from .atomic import write_text
+from .errors import InputError
+from .reading import parsing
+from .textfile import read_text
 
 MAX_JSON_BYTES = 32 * 1024 * 1024
 MAX_TOML_BYTES = 1024 * 1024

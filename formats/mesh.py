@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.glb import Part, write_primitive
-from msgs_slam.formats.ply_table import Rows, columns, read_ply, read_rows, write_ply
-from msgs_slam.formats.reading import parsing
-from msgs_slam.formats.trajectory import FARTHEST
+from .errors import InputError
+from .glb import Part, write_primitive
+from .ply_table import Rows, columns, read_ply, read_rows, write_ply
+from .reading import parsing
+from .trajectory import FARTHEST
 
 _LABEL_ATTRIBUTE = "_LABEL"
 _PLACE, _COLOR = ("x", "y", "z"), ("red", "green", "blue")

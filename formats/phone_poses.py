@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import read_json, read_json_object
-from msgs_slam.formats.textfile import read_text
-from msgs_slam.formats.trajectory import clean_poses, poses_from_quaternions
+from .errors import InputError
+from .jsonfile import read_json, read_json_object
+from .textfile import read_text
+from .trajectory import clean_poses, poses_from_quaternions
 
 Array = NDArray[np.float64]
 _POLYCAM = ("keyframes/corrected_cameras", "keyframes/cameras", "corrected_cameras", "cameras")

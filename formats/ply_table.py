@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElementParseError
 
-from msgs_slam.formats.atomic import atomic_path
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.reading import opened, parsing
+from .atomic import atomic_path
+from .errors import InputError
+from .reading import opened, parsing
 
 _MAX_HEADER_BYTES = 1 << 20
 _ROWS = 1 << 18

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.ply_table import Rows, slices, write_ply
+from .ply_table import Rows, slices, write_ply
 
 _VERTEX = np.dtype([
     *((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")), *((name, "u1") for name in ("red", "green", "blue"))

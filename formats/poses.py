@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.colmap import model_suffix, read_colmap_model
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import read_json
-from msgs_slam.formats.phone_poses import OPENCV_FROM_OPENGL, phone_poses
-from msgs_slam.formats.reading import home_expanded, reaching
-from msgs_slam.formats.textfile import read_rows
-from msgs_slam.formats.trajectory import clean_poses, read_matrices, read_tum
+from .colmap import model_suffix, read_colmap_model
+from .errors import InputError
+from .jsonfile import read_json
+from .phone_poses import OPENCV_FROM_OPENGL, phone_poses
+from .reading import home_expanded, reaching
+from .textfile import read_rows
+from .trajectory import clean_poses, read_matrices, read_tum
 
 _MODEL_FOLDERS = (".", "sparse/0", "sparse", "0")
 _TABLES = ("transforms.json", "transforms_train.json")

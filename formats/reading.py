@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 
-from msgs_slam.formats.errors import InputError
+from .errors import InputError
 
 _LFS_POINTER = b"version https://git-lfs"
 _MOST_OF_A_REASON = 200

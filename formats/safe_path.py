@@ -7,7 +7,7 @@ import posixpath
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from msgs_slam.formats.errors import InputError
+from .errors import InputError
 
 _LONGEST_NAME, _LONGEST_PATH = 255, 4000
 """Bytes that Linux takes for a part of a path, and a little less than it takes for the whole."""

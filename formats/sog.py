@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from msgs_slam.formats.atomic import write_bytes
-from msgs_slam.formats.gaussian_ply import SH_C0
-from msgs_slam.formats.gaussians import GaussianCloud
+from .atomic import write_bytes
+from .gaussian_ply import SH_C0
+from .gaussians import GaussianCloud
 
 Array = NDArray[np.float64]
 

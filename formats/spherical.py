@@ -8,8 +8,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.reading import parsing
+from .errors import InputError
+from .reading import parsing
 
 WHOLE, PART = "equirectangular", "part of a sphere"
 _MOST_OF_MOOV = 64 << 20

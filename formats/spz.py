@@ -16,11 +16,11 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from msgs_slam.formats.atomic import write_bytes
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussian_ply import SH_C0
-from msgs_slam.formats.gaussians import GaussianCloud, unit_quaternions
-from msgs_slam.formats.reading import opened, parsing, require_file
+from .atomic import write_bytes
+from .errors import InputError
+from .gaussian_ply import SH_C0
+from .gaussians import GaussianCloud, unit_quaternions
+from .reading import opened, parsing, require_file
 
 _MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")

@@ -13,9 +13,9 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.atomic import atomic_path
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.reading import parsing, require_file
+from .atomic import atomic_path
+from .errors import InputError
+from .reading import parsing, require_file
 
 if TYPE_CHECKING:
     import torch

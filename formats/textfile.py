@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.reading import read_bytes
+from .errors import InputError
+from .reading import read_bytes
 
 MAX_TEXT_BYTES = 48 * 1024 * 1024
 """150,000 poses of 16 numbers with all their digits. Taken apart into words, text needs twenty times its size."""

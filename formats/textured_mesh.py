@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.atomic import write_text
-from msgs_slam.formats.glb import Part, write_primitive
-from msgs_slam.formats.images import jpeg_bytes, write_rgb
+from .atomic import write_text
+from .glb import Part, write_primitive
+from .images import jpeg_bytes, write_rgb
 
 _UNLIT = "KHR_materials_unlit"
 _LINEAR, _MIPMAPPED, _CLAMPED = 9729, 9987, 33071

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.formats.atomic import write_text
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.textfile import read_rows, read_table
+from .atomic import write_text
+from .errors import InputError
+from .textfile import read_rows, read_table
 
 _ROTATION_TOLERANCE = 0.05
 """Largest departure of R^T R from the identity that is taken for rounding or drift rather than for another format."""

@@ -22,14 +22,14 @@ os.environ.setdefault("OPENCV_VIDEOIO_DEBUG", "0")
 
 import cv2
 
-from msgs_slam.formats.containers import as_opencv_writes_them
-from msgs_slam.formats.display import Display, pixel_aspect, read_mirror
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.hdr_video import AvCapture, hdr_transfer
-from msgs_slam.formats.images import IMAGE_SUFFIXES
-from msgs_slam.formats.interlaced import has_pyav, is_interlaced, unreadable
-from msgs_slam.formats.reading import opened
-from msgs_slam.formats.safe_path import require_unicode
+from .containers import as_opencv_writes_them
+from .display import Display, pixel_aspect, read_mirror
+from .errors import InputError
+from .hdr_video import AvCapture, hdr_transfer
+from .images import IMAGE_SUFFIXES
+from .interlaced import has_pyav, is_interlaced, unreadable
+from .reading import opened
+from .safe_path import require_unicode
 
 MAX_FRAME_PIXELS = 64_000_000
 """A larger frame is taken for a damaged or hostile header (8K video has 33 million)."""

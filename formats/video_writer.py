@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.atomic import atomic_path, free_bytes, is_disk_full
-from msgs_slam.formats.errors import DiskFullError, InputError
-from msgs_slam.formats.safe_path import require_unicode
+from .atomic import atomic_path, free_bytes, is_disk_full
+from .errors import DiskFullError, InputError
+from .safe_path import require_unicode
 
 CODECS = {".mp4": "mp4v", ".avi": "FFV1", ".mkv": "FFV1"}
 """By the file's ending: MPEG-4 plays everywhere, FFV1 loses nothing."""

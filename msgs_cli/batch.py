@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from msgs_slam.msgs_cli.options import (
+from .options import (
     FOLDER,
     UNTIL,
     engine_options,
@@ -17,11 +17,11 @@ from msgs_slam.msgs_cli.options import (
     source_options,
     source_settings,
 )
-from msgs_slam.msgs_cli.output import Output, verbosity_options
-from msgs_slam.msgs_cli.text import say
+from .output import Output, verbosity_options
+from .text import say
 
 if TYPE_CHECKING:
-    from msgs_slam.pipelines.engine.engines import LocalEngine, RayEngine
+    from ..pipelines.engine.engines import LocalEngine, RayEngine
 
 
 @click.command()
@@ -52,10 +52,10 @@ def batch(
     indexed jobs, AWS Batch: docs/batch.md).
     """
     require_engine(engine_name, address)
-    from msgs_slam.formats.jsonfile import read_toml
-    from msgs_slam.pipelines.batch import find_recordings, run_batch, table_rows, write_table
-    from msgs_slam.pipelines.engine.shards import Shard
-    from msgs_slam.pipelines.read_config import load_config
+    from ..formats.jsonfile import read_toml
+    from ..pipelines.batch import find_recordings, run_batch, table_rows, write_table
+    from ..pipelines.engine.shards import Shard
+    from ..pipelines.read_config import load_config
 
     recordings = find_recordings(folder.resolve(), out.resolve())
     mine = Shard.parse(shard).of(recordings)
@@ -87,7 +87,7 @@ def batch(
 def _open_engine(name: str, address: str, threads: int) -> tuple[LocalEngine | RayEngine, int, int]:
     """The engine, the CPUs of a recording, and the threads that follow: as many on every node, or the results would
     differ; 0 for all of the machine's."""
-    from msgs_slam.pipelines.engine.engines import LocalEngine, RayEngine
+    from ..pipelines.engine.engines import LocalEngine, RayEngine
 
     if name == "local":
         return LocalEngine(), 1, threads
@@ -97,8 +97,8 @@ def _open_engine(name: str, address: str, threads: int) -> tuple[LocalEngine | R
 
 
 def _print(rows: list[dict[str, object]]) -> None:
-    from msgs_slam.msgs_cli.tables import format_table, terminal_width
-    from msgs_slam.pipelines.system.wording import figure_text
+    from ..pipelines.system.wording import figure_text
+    from .tables import format_table, terminal_width
 
     columns = list(dict.fromkeys(key for row in rows for key in row))
     cells = [[figure_text(row[c]) if c in row else "" for c in columns] for row in rows]

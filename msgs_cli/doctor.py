@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from msgs_slam.msgs_cli.text import say
+from .text import say
 
 
 @click.command()
@@ -16,7 +16,7 @@ def doctor() -> None:
 
     Exit code 1 where something would keep a reconstruction from running.
     """
-    from msgs_slam.pipelines.doctor import BAD, examine
+    from ..pipelines.doctor import BAD, examine
 
     findings = examine(Path("."))
     width = max(len(f.name) for f in findings)

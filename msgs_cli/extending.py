@@ -6,10 +6,10 @@ from pathlib import Path
 
 import click
 
-from msgs_slam.msgs_cli.options import RUN_ARGUMENT
-from msgs_slam.msgs_cli.output import Output, verbosity_options
-from msgs_slam.msgs_cli.summary import tell_run
-from msgs_slam.pipelines.system.wording import quoted
+from ..pipelines.system.wording import quoted
+from .options import RUN_ARGUMENT
+from .output import Output, verbosity_options
+from .summary import tell_run
 
 
 @click.command()
@@ -24,8 +24,8 @@ def extend(run_path: Path, videos: tuple[Path, ...], output: Output) -> None:
     together, and the map is grown where the added frames look. Coordinates stay what they were, as near as the
     adjustment allows. Stopped, the same command or `msgs-slam resume RUN` goes on.
     """
-    from msgs_slam.pipelines.reconstruct import extend as extend_run
-    from msgs_slam.pipelines.run.folder import RunFolder
+    from ..pipelines.reconstruct import extend as extend_run
+    from ..pipelines.run.folder import RunFolder
 
     run = RunFolder(run_path)
     with output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"):

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 import click
 
-from msgs_slam.pipelines.system.progress import BEGUN, StageEvent
+from ..pipelines.system.progress import BEGUN, StageEvent
 
 T = TypeVar("T")
 _SECONDS_BETWEEN = 0.2

@@ -10,9 +10,9 @@ from typing import Any
 
 import click
 
-from msgs_slam.msgs_cli.options import RUN_ARGUMENT, open_run
-from msgs_slam.msgs_cli.output import Output, on_sigterm, verbosity_options
-from msgs_slam.msgs_cli.text import say
+from .options import RUN_ARGUMENT, open_run
+from .output import Output, on_sigterm, verbosity_options
+from .text import say
 
 
 @click.command()
@@ -21,9 +21,9 @@ from msgs_slam.msgs_cli.text import say
 @click.option("--json", "as_json", is_flag=True, help="The same for programs, with every figure.")
 def status(run_path: Path, verbose: bool, as_json: bool) -> None:
     """Say which stages of RUN are done, what they found, what was degraded, and which files are damaged."""
-    from msgs_slam.msgs_cli.tables import scale_lines, status_table, warning_lines
-    from msgs_slam.pipelines.reconstruct import all_stages
-    from msgs_slam.pipelines.status import run_status
+    from ..pipelines.reconstruct import all_stages
+    from ..pipelines.status import run_status
+    from .tables import scale_lines, status_table, warning_lines
 
     run = open_run(run_path)
     found = run_status(run, all_stages())
@@ -55,10 +55,10 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
 @verbosity_options
 def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | None, output: Output) -> None:
     """Compare RUN with the truth: poses, images, depth, labels, mesh. Writes RUN/evaluation/."""
-    from msgs_slam.formats.datasets import open_sequence
-    from msgs_slam.pipelines.evaluation.class_map import open_class_map
-    from msgs_slam.pipelines.evaluation.table import evaluation_table
-    from msgs_slam.pipelines.evaluation.write import write_evaluation
+    from ..formats.datasets import open_sequence
+    from ..pipelines.evaluation.class_map import open_class_map
+    from ..pipelines.evaluation.table import evaluation_table
+    from ..pipelines.evaluation.write import write_evaluation
 
     joins = open_class_map(class_map) if class_map else None
     run = open_run(run_path)
@@ -78,8 +78,8 @@ def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | No
 @verbosity_options
 def report(run_path: Path, to: Path | None, pdf: bool, output: Output) -> None:
     """Write one HTML file that says what was found, how good it is, and what to film better."""
-    from msgs_slam.pipelines.evaluation.pdf import find_browser, print_pdf
-    from msgs_slam.pipelines.evaluation.report import write_report
+    from ..pipelines.evaluation.pdf import find_browser, print_pdf
+    from ..pipelines.evaluation.report import write_report
 
     browser = find_browser() if pdf else ""
     with on_sigterm(signal.SIG_DFL):
@@ -137,7 +137,7 @@ def render(
     An .mp4 is H.264 where PyAV is installed (pip install 'msgs-slam[hdr]'), else VP9: browsers play both. An .avi or
     .mkv loses nothing (FFV1).
     """
-    from msgs_slam.pipelines.render_run import render_file, render_run
+    from ..pipelines.render_run import render_file, render_run
 
     is_file = source.is_file() and source.suffix.lower() in SPLAT_FILES
     if is_file and (kind != "color" or camera_path == "own"):
@@ -162,7 +162,7 @@ def view(path: Path, port: int, host: str) -> None:
 
     Needs the extra: pip install 'msgs-slam[viewer]'.
     """
-    from msgs_slam.pipelines.viewer.server import open_viewer
+    from ..pipelines.viewer.server import open_viewer
 
     try:
         with on_sigterm(signal.default_int_handler):

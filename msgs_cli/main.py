@@ -15,14 +15,16 @@ import click
 # Spinning OpenMP threads of one library steal the cores of the next; must be set before torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-from msgs_slam.formats.errors import InputError, SettingError
-from msgs_slam.msgs_cli import looking
-from msgs_slam.msgs_cli.batch import batch
-from msgs_slam.msgs_cli.doctor import doctor
-from msgs_slam.msgs_cli.extending import extend
-from msgs_slam.msgs_cli.json_lines import Interrupted, is_asked_for, only_json
-from msgs_slam.msgs_cli.models import models
-from msgs_slam.msgs_cli.options import (
+from ..formats.errors import InputError, SettingError
+from ..pipelines.run.names import EXPORTS, STAGES
+from ..pipelines.system.wording import quoted
+from . import looking
+from .batch import batch
+from .doctor import doctor
+from .extending import extend
+from .json_lines import Interrupted, is_asked_for, only_json
+from .models import models
+from .options import (
     FOLDER,
     RUN_ARGUMENT,
     UNTIL,
@@ -34,12 +36,10 @@ from msgs_slam.msgs_cli.options import (
     source_options,
     source_settings,
 )
-from msgs_slam.msgs_cli.output import Output, on_sigterm, verbosity_options
-from msgs_slam.msgs_cli.summary import print_summary, tell_run
-from msgs_slam.msgs_cli.text import flush_output, prepare_streams, printable, say
-from msgs_slam.msgs_cli.work import work
-from msgs_slam.pipelines.run.names import EXPORTS, STAGES
-from msgs_slam.pipelines.system.wording import quoted
+from .output import Output, on_sigterm, verbosity_options
+from .summary import print_summary, tell_run
+from .text import flush_output, prepare_streams, printable, say
+from .work import work
 
 
 class FriendlyGroup(click.Group):
@@ -152,10 +152,10 @@ def reconstruct(
     No option is needed. Stopped at any moment, the same command, or `msgs-slam resume RUN`, goes on where it was; with
     a changed setting only the stages that depend on it run again.
     """
-    from msgs_slam.pipelines.read_config import load_config
-    from msgs_slam.pipelines.reconstruct import default_run_folder, existing_config, one_source
-    from msgs_slam.pipelines.reconstruct import reconstruct as run_reconstruct
-    from msgs_slam.pipelines.run.folder import RunFolder
+    from ..pipelines.read_config import load_config
+    from ..pipelines.reconstruct import default_run_folder, existing_config, one_source
+    from ..pipelines.reconstruct import reconstruct as run_reconstruct
+    from ..pipelines.run.folder import RunFolder
 
     run = RunFolder(out) if out else default_run_folder(sources[0])
     texts = source_settings(about_source | {"mapping__hold_out": hold_out})
@@ -194,11 +194,11 @@ def resume(
     them. A stage that is made again replaces what it had left only when it ends well."""
     if redo and STAGES.index(redo) > STAGES.index(until):
         raise click.UsageError(f"--redo {redo} comes after --until {until}: nothing would be made again")
-    from msgs_slam.pipelines.read_config import load_config
-    from msgs_slam.pipelines.reconstruct import require_run
-    from msgs_slam.pipelines.reconstruct import resume as run_resume
-    from msgs_slam.pipelines.run.folder import RunFolder
-    from msgs_slam.pipelines.run.settings_file import load_settings
+    from ..pipelines.read_config import load_config
+    from ..pipelines.reconstruct import require_run
+    from ..pipelines.reconstruct import resume as run_resume
+    from ..pipelines.run.folder import RunFolder
+    from ..pipelines.run.settings_file import load_settings
 
     run = RunFolder(run_path)
     require_run(run)
@@ -238,9 +238,9 @@ def export(
     """
     if (config_file or overrides) and to is None:
         raise click.UsageError("add --to DIR: files of other settings (--set, --config) do not go into the run")
-    from msgs_slam.pipelines.export.stage import export_run
-    from msgs_slam.pipelines.read_config import load_config
-    from msgs_slam.pipelines.reconstruct import made_with
+    from ..pipelines.export.stage import export_run
+    from ..pipelines.read_config import load_config
+    from ..pipelines.reconstruct import made_with
 
     run = open_run(run_path)
     settings = load_config(config_file, overrides, base=made_with(run)).export
@@ -274,10 +274,10 @@ def demo(
     **about_source: str | None,
 ) -> None:
     """Reconstruct a short video of a made-up room, compare with its known truth, print the errors and where to look."""
-    from msgs_slam.pipelines.demo import demo_summary, run_demo
-    from msgs_slam.pipelines.read_config import load_config
-    from msgs_slam.pipelines.reconstruct import reconstruct as run_reconstruct
-    from msgs_slam.pipelines.run.folder import RunFolder
+    from ..pipelines.demo import demo_summary, run_demo
+    from ..pipelines.read_config import load_config
+    from ..pipelines.reconstruct import reconstruct as run_reconstruct
+    from ..pipelines.run.folder import RunFolder
 
     config = load_config(config_file, [*overrides, *source_settings(about_source)])
 
@@ -310,7 +310,7 @@ def completion(shell: str) -> None:
 @settings_options
 def show_config(config_file: Path | None, overrides: tuple[str, ...]) -> None:
     """Print every setting as commented TOML: save it, change it, pass it with --config."""
-    from msgs_slam.pipelines.read_config import config_to_toml, load_config
+    from ..pipelines.read_config import config_to_toml, load_config
 
     click.echo(config_to_toml(load_config(config_file, overrides)), nl=False)
 

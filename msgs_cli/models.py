@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from msgs_slam.pipelines.networks.registry import Model, ModelStore
+    from ..pipelines.networks.registry import Model, ModelStore
 
 
 @click.group()
@@ -23,7 +23,7 @@ def _size(model: Model) -> str:
 @models.command("list")
 def list_models() -> None:
     """Every known model: whether it is here, its size and its licence."""
-    from msgs_slam.pipelines.networks.registry import ModelStore
+    from ..pipelines.networks.registry import ModelStore
 
     store = ModelStore.open()
     for model in store.models:
@@ -58,8 +58,8 @@ def pull(names: tuple[str, ...], best: bool, folder: Path | None, trust: bool, o
 
     A broken download goes on where it stopped.
     """
-    from msgs_slam.formats.errors import InputError
-    from msgs_slam.pipelines.networks.registry import ModelStore
+    from ..formats.errors import InputError
+    from ..pipelines.networks.registry import ModelStore
 
     store = ModelStore.open()
     if folder is not None:
@@ -100,7 +100,7 @@ def _pull_one(store: ModelStore, model: Model, trust: bool, offline: bool) -> Pa
 @click.option("--name", default="", help="Its name in the cache; by default the file's own.")
 def add(file: Path, family: str, name: str) -> None:
     """Copy your own ONNX or TFLite file into the cache as a model of a known family."""
-    from msgs_slam.pipelines.networks.registry import ModelStore
+    from ..pipelines.networks.registry import ModelStore
 
     model = ModelStore.open().add(file, family, name)
     click.echo(f"{model.name}: sha256 {model.sha256}")
@@ -109,7 +109,7 @@ def add(file: Path, family: str, name: str) -> None:
 @models.command()
 def verify() -> None:
     """Compare every file in the cache with its hash; exit code 1 when one is damaged."""
-    from msgs_slam.pipelines.networks.registry import ModelStore
+    from ..pipelines.networks.registry import ModelStore
 
     found = ModelStore.open().verify()
     for name, state in found.items():
@@ -122,8 +122,8 @@ def verify() -> None:
 @click.argument("name")
 def path(name: str) -> None:
     """Print the path of a model's file."""
-    from msgs_slam.formats.errors import InputError
-    from msgs_slam.pipelines.networks.registry import ModelStore
+    from ..formats.errors import InputError
+    from ..pipelines.networks.registry import ModelStore
 
     store = ModelStore.open()
     model = store.get(name)

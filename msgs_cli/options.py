@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from msgs_slam.pipelines.run.names import STAGES
+from ..pipelines.run.names import STAGES
 
 if TYPE_CHECKING:
-    from msgs_slam.msgs_cli.output import Output
-    from msgs_slam.pipelines.config import Config
-    from msgs_slam.pipelines.engine.workers import Workers
-    from msgs_slam.pipelines.run.folder import RunFolder
+    from ..pipelines.config import Config
+    from ..pipelines.engine.workers import Workers
+    from ..pipelines.run.folder import RunFolder
+    from .output import Output
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 RUN_ARGUMENT = click.argument("run_path", metavar="RUN", type=click.Path(path_type=Path))
@@ -63,8 +63,8 @@ def cluster_workers(name: str, address: str, config: Config, output: Output) -> 
     if name == "local":
         yield None
         return
-    from msgs_slam.pipelines.engine.engines import RayEngine
-    from msgs_slam.pipelines.engine.workers import Workers
+    from ..pipelines.engine.engines import RayEngine
+    from ..pipelines.engine.workers import Workers
 
     engine = RayEngine(address)
     try:
@@ -153,8 +153,8 @@ def source_settings(given: Mapping[str, str | int | None]) -> list[str]:
 
     Raises SettingError, in the words that were typed, for a value that one cannot have.
     """
-    from msgs_slam.formats.errors import SettingError
-    from msgs_slam.pipelines.read_config import load_config, toml_value
+    from ..formats.errors import SettingError
+    from ..pipelines.read_config import load_config, toml_value
 
     texts = []
     for option, key in [*((name, row[0]) for name, row in _SOURCE_OPTIONS.items()), ("hold-out", "mapping.hold_out")]:
@@ -171,8 +171,8 @@ def source_settings(given: Mapping[str, str | int | None]) -> list[str]:
 
 def open_run(path: Path) -> RunFolder:
     """Raises InputError for a folder that is no run."""
-    from msgs_slam.pipelines.reconstruct import require_run
-    from msgs_slam.pipelines.run.folder import RunFolder
+    from ..pipelines.reconstruct import require_run
+    from ..pipelines.run.folder import RunFolder
 
     run = RunFolder(path)
     require_run(run)

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from msgs_slam.msgs_cli.json_lines import JsonHandler, JsonProgress, write_line
-from msgs_slam.msgs_cli.text import TextHandler, say
+from .json_lines import JsonHandler, JsonProgress, write_line
+from .text import TextHandler, say
 
 if TYPE_CHECKING:
-    from msgs_slam.pipelines.system.progress import Progress
+    from ..pipelines.system.progress import Progress
 
 _STOPPING = (
     "Stopping at the next snapshot. Press Ctrl-C again to stop now (what was done since the last snapshot is lost)."
@@ -64,8 +64,8 @@ class Output:
 
     def progress(self, job: str = "") -> Progress:
         """Bars on a terminal, a line a stage in a file or pipe, JSON lines, or nothing; of a `job` among others."""
-        from msgs_slam.msgs_cli.progress import BarProgress
-        from msgs_slam.pipelines.system.progress import LineProgress, SilentProgress
+        from ..pipelines.system.progress import LineProgress, SilentProgress
+        from .progress import BarProgress
 
         if self.quiet:
             return SilentProgress()
@@ -88,7 +88,7 @@ class Output:
     def stopping_softly(self, how_to_go_on: str) -> Iterator[None]:
         """End the work in this block at its next snapshot on the first SIGINT, SIGTERM or SIGHUP, at once on the
         second; then the process ends with 128 plus the signal's number, as shells expect."""
-        from msgs_slam.pipelines.system.stopping import soft_stop
+        from ..pipelines.system.stopping import soft_stop
 
         try:
             with soft_stop(self._tell_stopping):
@@ -109,7 +109,7 @@ class Output:
 
 
 def _worker_progress(output: Output, remote: bool, name: str) -> Progress:
-    from msgs_slam.pipelines.system.progress import LineProgress
+    from ..pipelines.system.progress import LineProgress
 
     output.set_up_logging()
     if remote and not output.quiet and not output.as_json:
@@ -143,7 +143,7 @@ def is_said(warning: str) -> bool:
 def on_sigterm(handler: Any) -> Iterator[None]:
     """Handle SIGTERM (docker stop, systemd) otherwise inside this block. SIG_DFL ends the process at once, without a
     library's stack trace; `signal.default_int_handler` raises KeyboardInterrupt, as Ctrl-C does."""
-    from msgs_slam.pipelines.system.stopping import let_libraries_take_signals
+    from ..pipelines.system.stopping import let_libraries_take_signals
 
     let_libraries_take_signals()
     before = signal.signal(signal.SIGTERM, handler)

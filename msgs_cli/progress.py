@@ -8,8 +8,8 @@ from typing import TypeVar
 
 from tqdm import tqdm
 
-from msgs_slam.pipelines.system.progress import BEGUN, ENDED, UP_TO_DATE, StageEvent
-from msgs_slam.pipelines.system.stopping import is_asked
+from ..pipelines.system.progress import BEGUN, ENDED, UP_TO_DATE, StageEvent
+from ..pipelines.system.stopping import is_asked
 
 T = TypeVar("T")
 _FORMAT = "{desc} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from msgs_slam.msgs_cli.output import Output, is_said
-from msgs_slam.msgs_cli.text import say
+from .output import Output, is_said
+from .text import say
 
 
 def tell_run(output: Output, root: Path, records: dict[str, Any]) -> None:
@@ -18,10 +18,10 @@ def tell_run(output: Output, root: Path, records: dict[str, Any]) -> None:
 
 def print_summary(root: Path, records: dict[str, Any]) -> None:
     """Print the table, what is not said yet, and where the results are."""
-    from msgs_slam.msgs_cli.tables import scale_lines, status_table, warning_lines
-    from msgs_slam.pipelines.reconstruct import all_stages
-    from msgs_slam.pipelines.run.folder import RunFolder
-    from msgs_slam.pipelines.status import DONE, StageStatus, about_new_networks
+    from ..pipelines.reconstruct import all_stages
+    from ..pipelines.run.folder import RunFolder
+    from ..pipelines.status import DONE, StageStatus, about_new_networks
+    from .tables import scale_lines, status_table, warning_lines
 
     say(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
     for line in warning_lines(records, is_said):

@@ -9,11 +9,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from msgs_slam.pipelines.system.wording import figure_text
+from ..pipelines.system.wording import figure_text
 
 if TYPE_CHECKING:
-    from msgs_slam.pipelines.run.records import StageRecord
-    from msgs_slam.pipelines.status import StageStatus
+    from ..pipelines.run.records import StageRecord
+    from ..pipelines.status import StageStatus
 
 
 KEY_FIGURES = {
@@ -66,8 +66,8 @@ def status_table(stages: Sequence[StageStatus], everything: bool = False) -> str
 
 def scale_lines(root: Path, records: dict[str, StageRecord]) -> list[str]:
     """Return the line about the scale of the world; none before the export has estimated it."""
-    from msgs_slam.pipelines.run.files import METRES
-    from msgs_slam.pipelines.run.folder import RunFolder
+    from ..pipelines.run.files import METRES
+    from ..pipelines.run.folder import RunFolder
 
     metres = RunFolder(root).find(METRES) if "export" in records else None
     return [] if metres is None else [f"\nScale: {metres.text}"]

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from msgs_slam.msgs_cli.options import RUN_ARGUMENT, UNTIL, open_run
-from msgs_slam.msgs_cli.output import Output, verbosity_options
-from msgs_slam.pipelines.system.wording import quoted
+from ..pipelines.system.wording import quoted
+from .options import RUN_ARGUMENT, UNTIL, open_run
+from .output import Output, verbosity_options
 
 
 @click.command()
@@ -24,9 +24,9 @@ def work(run_path: Path, shard: str, until: str, output: Output) -> None:
     of the tasks first; one alone would do all. What a killed one was at is done by the others. For SLURM arrays,
     Kubernetes indexed jobs and AWS Batch: docs/batch.md.
     """
-    from msgs_slam.pipelines.engine.shards import Shard
-    from msgs_slam.pipelines.run.settings_file import load_settings
-    from msgs_slam.pipelines.work import work_on_run
+    from ..pipelines.engine.shards import Shard
+    from ..pipelines.run.settings_file import load_settings
+    from ..pipelines.work import work_on_run
 
     chosen, run = Shard.parse(shard), open_run(run_path)
     with output.stopping_softly(f"The same command goes on, or without others: msgs-slam resume {quoted(run.root)}"):

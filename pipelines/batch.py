@@ -12,21 +12,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from msgs_slam.formats.atomic import own_temporaries, write_text
-from msgs_slam.formats.datasets import looks_like_recording
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import write_json
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.engines import Call, Engine
-from msgs_slam.pipelines.engine.workers import code_identity, require_same_world
-from msgs_slam.pipelines.read_config import load_config, merge_settings
-from msgs_slam.pipelines.reconstruct import existing_config, reconstruct
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock import RunBusyError
-from msgs_slam.pipelines.run.names import STAGES
-from msgs_slam.pipelines.run.records import load_records
-from msgs_slam.pipelines.system.progress import Progress, log
-from msgs_slam.pipelines.system.wording import markdown_table
+from ..formats.atomic import own_temporaries, write_text
+from ..formats.datasets import looks_like_recording
+from ..formats.errors import InputError
+from ..formats.jsonfile import write_json
+from .config import Config
+from .engine.engines import Call, Engine
+from .engine.workers import code_identity, require_same_world
+from .read_config import load_config, merge_settings
+from .reconstruct import existing_config, reconstruct
+from .run.folder import RunFolder
+from .run.lock import RunBusyError
+from .run.names import STAGES
+from .run.records import load_records
+from .system.progress import Progress, log
+from .system.wording import markdown_table
 
 _VIDEOS = {
     ".264", ".265", ".360", ".3g2", ".3gp", ".asf", ".avi", ".divx", ".dv", ".flv", ".gif", ".h264", ".h265", ".hevc",

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from msgs_slam.formats.atomic import write_bytes
-from msgs_slam.formats.datasets import open_sequence
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.video import VideoReader
-from msgs_slam.pipelines.evaluation.table import evaluation_table
-from msgs_slam.pipelines.evaluation.write import write_evaluation
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.system.progress import Progress
+from ..formats.atomic import write_bytes
+from ..formats.datasets import open_sequence
+from ..formats.errors import InputError
+from ..formats.images import write_rgb
+from ..formats.video import VideoReader
+from .evaluation.table import evaluation_table
+from .evaluation.write import write_evaluation
+from .run.folder import RunFolder
+from .system.progress import Progress
 
 VIDEO, TRUTH, RUN = "room.mp4", "room_truth", "room.msgs"
 CLIP = Path(__file__).with_name("demo_clip")

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msgs_slam.pipelines.system.limits import available_cpus
+from .system.limits import available_cpus
 
 GOOD, NOTE, BAD = "ok", "note", "BAD"
 DISTRIBUTION = "msgs-slam"
@@ -103,8 +103,8 @@ def _libraries() -> Finding:
 
 def _video() -> Finding:
     """A few frames through the encoder and back."""
-    from msgs_slam.formats.video import VideoReader
-    from msgs_slam.formats.video_writer import write_video
+    from ..formats.video import VideoReader
+    from ..formats.video_writer import write_video
 
     frames = [np.full((48, 64, 3), 40 * i + np.arange(64)[:, None], np.uint8) for i in range(5)]
     with tempfile.TemporaryDirectory() as folder:
@@ -159,7 +159,7 @@ def _gpu() -> Finding:
 
 
 def _models() -> Finding:
-    from msgs_slam.pipelines.networks.registry import ModelStore
+    from .networks.registry import ModelStore
 
     store = ModelStore.open()
     here = [model.name for model in store.models if store.is_here(model)]
@@ -170,7 +170,7 @@ def _models() -> Finding:
 
 
 def _kernels() -> Finding:
-    from msgs_slam.pipelines.system.jit import cache_root
+    from .system.jit import cache_root
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.geometry.alignment import Similarity
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.run.files import (
+from ..formats.errors import InputError
+from .config import Config
+from .gaussian_map import GaussianMap
+from .geometry.alignment import Similarity
+from .geometry.sparse_model import SparseModel
+from .run.files import (
     CALIBRATION,
     CLASS_IDS,
     CLASSES,
@@ -30,12 +30,12 @@ from msgs_slam.pipelines.run.files import (
     SUBMAPS,
     TRAJECTORY,
 )
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import StageRecord, load_records, load_source, recorded_config
-from msgs_slam.pipelines.run.settings_file import load_settings
-from msgs_slam.pipelines.system.device import resolve_device
-from msgs_slam.pipelines.system.wording import quoted
-from msgs_slam.pipelines.types import VOID, Calibration, ClassTable, Frame, Metres, Trajectory
+from .run.folder import RunFolder
+from .run.records import StageRecord, load_records, load_source, recorded_config
+from .run.settings_file import load_settings
+from .system.device import resolve_device
+from .system.wording import quoted
+from .types import VOID, Calibration, ClassTable, Frame, Metres, Trajectory
 
 T = TypeVar("T")
 _MAP_STAGES = ("global_ba", "mapping")

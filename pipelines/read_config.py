@@ -15,11 +15,11 @@ from dataclasses import Field, fields, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from msgs_slam.formats.errors import InputError, SettingError
-from msgs_slam.formats.jsonfile import read_toml
-from msgs_slam.formats.reading import home_expanded
-from msgs_slam.formats.safe_path import is_unicode
-from msgs_slam.pipelines.config import Config, allowed_values, range_text
+from ..formats.errors import InputError, SettingError
+from ..formats.jsonfile import read_toml
+from ..formats.reading import home_expanded
+from ..formats.safe_path import is_unicode
+from .config import Config, allowed_values, range_text
 
 
 def load_config(file: Path | None = None, overrides: Iterable[str] = (), base: Config | None = None) -> Config:

@@ -5,36 +5,36 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from msgs_slam.formats.atomic import own_temporaries, temporary_of, write_text
-from msgs_slam.formats.errors import InputError, RecoverableError
-from msgs_slam.formats.safe_path import require_listable, require_unicode
-from msgs_slam.formats.video import probe_video
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.stages import Stage, run_stages
-from msgs_slam.pipelines.engine.threads import set_threads
-from msgs_slam.pipelines.engine.workers import TaskWorkers
-from msgs_slam.pipelines.read_config import with_absolute_paths
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock import LEADER, LOCK, locked, make_folder
-from msgs_slam.pipelines.run.names import SOURCE_LIST, STAGES
-from msgs_slam.pipelines.run.records import StageRecord, load_records, load_source, recorded_config
-from msgs_slam.pipelines.run.running import NotedProgress
-from msgs_slam.pipelines.run.settings_file import load_settings
-from msgs_slam.pipelines.source.opening import source_digest
-from msgs_slam.pipelines.system.device import resolve_device
-from msgs_slam.pipelines.system.limits import available_cpus
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.system.wording import quoted
+from ..formats.atomic import own_temporaries, temporary_of, write_text
+from ..formats.errors import InputError, RecoverableError
+from ..formats.safe_path import require_listable, require_unicode
+from ..formats.video import probe_video
+from .config import Config
+from .engine.stages import Stage, run_stages
+from .engine.threads import set_threads
+from .engine.workers import TaskWorkers
+from .read_config import with_absolute_paths
+from .run.folder import RunFolder
+from .run.lock import LEADER, LOCK, locked, make_folder
+from .run.names import SOURCE_LIST, STAGES
+from .run.records import StageRecord, load_records, load_source, recorded_config
+from .run.running import NotedProgress
+from .run.settings_file import load_settings
+from .source.opening import source_digest
+from .system.device import resolve_device
+from .system.limits import available_cpus
+from .system.progress import Progress
+from .system.wording import quoted
 
 
 def all_stages() -> list[Stage]:
     """The stages in order. Imported here so that asking for help does not load torch."""
-    from msgs_slam.pipelines.export.stage import STAGE as export
-    from msgs_slam.pipelines.frames.stage import STAGE as frames
-    from msgs_slam.pipelines.global_ba.stage import STAGE as global_ba
-    from msgs_slam.pipelines.mapping.stage import STAGE as mapping
-    from msgs_slam.pipelines.proxy.stage import STAGE as proxy
-    from msgs_slam.pipelines.tracking.stage import STAGE as tracking
+    from .export.stage import STAGE as export
+    from .frames.stage import STAGE as frames
+    from .global_ba.stage import STAGE as global_ba
+    from .mapping.stage import STAGE as mapping
+    from .proxy.stage import STAGE as proxy
+    from .tracking.stage import STAGE as tracking
 
     return [frames, proxy, tracking, mapping, global_ba, export]
 
@@ -141,7 +141,7 @@ def extend(run: RunFolder, videos: Sequence[Path], progress: Progress) -> dict[s
     Raises InputError, with nothing changed, for a run that is not finished, another camera, and a video in which
     nothing of the run is recognised.
     """
-    from msgs_slam.pipelines.tracking.extend_run import add_videos, is_added, require_extendable
+    from .tracking.extend_run import add_videos, is_added, require_extendable
 
     require_run(run)
     if run.is_piece or is_added(run, videos):

@@ -9,23 +9,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.browser_video import PLAYED, write_browser_video
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussian_files import read_gaussians
-from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.video_writer import CODECS, write_video
-from msgs_slam.pipelines.evaluation.camera_paths import around, orbit, resampled, smoothed
-from msgs_slam.pipelines.evaluation.measure import render_outcome
-from msgs_slam.pipelines.evaluation.pictures import Picture, depth_picture, depth_range, label_picture
-from msgs_slam.pipelines.evaluation.splat_views import SplatScene, draw_splats
-from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.system.progress import Progress, SilentProgress, log
-from msgs_slam.pipelines.system.wording import quoted
-from msgs_slam.pipelines.types import Intrinsics
-from msgs_slam.pipelines.upright.world import WORLD, up_in_run
-from msgs_slam.pipelines.viewer.camera_path import EXPORTED, CameraPath, read_camera_path
-from msgs_slam.pipelines.viewer.scene import up_of_file
+from ..formats.browser_video import PLAYED, write_browser_video
+from ..formats.errors import InputError
+from ..formats.gaussian_files import read_gaussians
+from ..formats.images import write_rgb
+from ..formats.video_writer import CODECS, write_video
+from .evaluation.camera_paths import around, orbit, resampled, smoothed
+from .evaluation.measure import render_outcome
+from .evaluation.pictures import Picture, depth_picture, depth_range, label_picture
+from .evaluation.splat_views import SplatScene, draw_splats
+from .outcome import Outcome, load_outcome
+from .run.folder import RunFolder
+from .system.progress import Progress, SilentProgress, log
+from .system.wording import quoted
+from .types import Intrinsics
+from .upright.world import WORLD, up_in_run
+from .viewer.camera_path import EXPORTED, CameraPath, read_camera_path
+from .viewer.scene import up_of_file
 
 KINDS = ("color", "depth", "labels", "side-by-side")
 PATHS = ("own", "smooth", "orbit")

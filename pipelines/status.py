@@ -8,23 +8,23 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.config import Config, ProxyConfig
-from msgs_slam.pipelines.engine.stages import Stage
-from msgs_slam.pipelines.engine.standing import newly_chosen, next_upstream, why_again
-from msgs_slam.pipelines.masks.people import people_cards
-from msgs_slam.pipelines.networks.card import Card
-from msgs_slam.pipelines.networks.registry import ModelStore
-from msgs_slam.pipelines.proxy.selection import choose_depth, choose_semantics, metric_card
-from msgs_slam.pipelines.run.files import CALIBRATION
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.names import STAGES
-from msgs_slam.pipelines.run.records import StageRecord, differing_settings, load_records, load_source
-from msgs_slam.pipelines.run.running import Running, load_running
-from msgs_slam.pipelines.run.settings_file import load_settings
-from msgs_slam.pipelines.structure.window_size import window_size, windows_of
-from msgs_slam.pipelines.system.memory import ALIGNED_TOGETHER, GAUSSIANS, NEEDS, memory_room, submap_size
-from msgs_slam.pipelines.system.wording import quoted
+from ..formats.errors import InputError
+from .config import Config, ProxyConfig
+from .engine.stages import Stage
+from .engine.standing import newly_chosen, next_upstream, why_again
+from .masks.people import people_cards
+from .networks.card import Card
+from .networks.registry import ModelStore
+from .proxy.selection import choose_depth, choose_semantics, metric_card
+from .run.files import CALIBRATION
+from .run.folder import RunFolder
+from .run.names import STAGES
+from .run.records import StageRecord, differing_settings, load_records, load_source
+from .run.running import Running, load_running
+from .run.settings_file import load_settings
+from .structure.window_size import window_size, windows_of
+from .system.memory import ALIGNED_TOGETHER, GAUSSIANS, NEEDS, memory_room, submap_size
+from .system.wording import quoted
 
 _BEYOND = 0.3
 """MB for each keyframe that `frames` or tracking has not in work."""
@@ -216,7 +216,7 @@ def about_new_networks(run: RunFolder, program: Sequence[Stage]) -> str:
 def expected_mb(stage: str, run: RunFolder, config: Config) -> float | None:
     """MB that a stage will need about, or has needed, by the keyframes that `frames` has found. A map in submaps needs
     that of one submap at a time."""
-    from msgs_slam.pipelines.mapping.submaps import submap_count
+    from .mapping.submaps import submap_count
 
     try:
         camera, found = run.load(CALIBRATION).intrinsics, load_records(run)["frames"].figures

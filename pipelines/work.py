@@ -6,15 +6,15 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.shards import BETWEEN_LOOKS, Shard, SharedWorkers, posted_in, withdraw_all
-from msgs_slam.pipelines.reconstruct import resume
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock import RunBusyError
-from msgs_slam.pipelines.run.records import StageRecord
-from msgs_slam.pipelines.system.limits import available_cpus
-from msgs_slam.pipelines.system.progress import Progress, log
-from msgs_slam.pipelines.system.stopping import stop_if_asked
+from .config import Config
+from .engine.shards import BETWEEN_LOOKS, Shard, SharedWorkers, posted_in, withdraw_all
+from .reconstruct import resume
+from .run.folder import RunFolder
+from .run.lock import RunBusyError
+from .run.records import StageRecord
+from .system.limits import available_cpus
+from .system.progress import Progress, log
+from .system.stopping import stop_if_asked
 
 
 def work_on_run(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
+from ..errors import InputError
 
 _LARGEST_SIDE = 65535
 _FOCAL_SIDES = 100

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from msgs_slam.formats.datasets.sequence import LabelClass
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import read_json_object
+from ..errors import InputError
+from ..jsonfile import read_json_object
+from .sequence import LabelClass
 
 _VOID_NAMES = frozenset({"none", "void", "undefined", "unlabeled", "unlabelled", "unknown", "ignore"})
 

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from msgs_slam.formats.colmap import ColmapModel, model_suffix, read_colmap_model
-from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.formats.datasets.matching import times_or_frame_numbers
-from msgs_slam.formats.datasets.sequence import Sequence
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import natural_key
-from msgs_slam.formats.safe_path import inside, named_file
+from ..colmap import ColmapModel, model_suffix, read_colmap_model
+from ..errors import InputError
+from ..images import natural_key
+from ..safe_path import inside, named_file
+from .camera import Camera
+from .matching import times_or_frame_numbers
+from .sequence import Sequence
 
 _MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0")
 _IMAGE_FOLDERS = ("images", "frames", ".", "rgb")

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.formats.datasets.matching import poses_at, read_timed_files
-from msgs_slam.formats.datasets.sequence import Sequence
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.textfile import read_table, read_text
-from msgs_slam.formats.trajectory import clean_poses, poses_from_quaternions
+from ..errors import InputError
+from ..textfile import read_table, read_text
+from ..trajectory import clean_poses, poses_from_quaternions
+from .camera import Camera
+from .matching import poses_at, read_timed_files
+from .sequence import Sequence
 
 _NANOSECONDS = 1e-9
 

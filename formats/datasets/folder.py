@@ -7,21 +7,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.formats.datasets.classes_json import read_classes_json
-from msgs_slam.formats.datasets.intrinsics_json import read_intrinsics_json
-from msgs_slam.formats.datasets.matching import (
+from ..errors import InputError
+from ..images import count_images, list_images
+from ..textfile import read_rows
+from ..trajectory import read_matrices, read_tum
+from .camera import Camera
+from .classes_json import read_classes_json
+from .intrinsics_json import read_intrinsics_json
+from .matching import (
     classes_found,
     files_for_images,
     poses_at,
     poses_for_images,
     times_or_frame_numbers,
 )
-from msgs_slam.formats.datasets.sequence import LabelClass, Sequence
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import count_images, list_images
-from msgs_slam.formats.textfile import read_rows
-from msgs_slam.formats.trajectory import read_matrices, read_tum
+from .sequence import LabelClass, Sequence
 
 _IMAGE_FOLDERS = ("rgb", "images", "color", "frames")
 _DEPTH_FOLDERS = ("depth", "depths")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from msgs_slam.formats.datasets.camera import Camera, distortion_names
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import number, optional_number, read_json_object
+from ..errors import InputError
+from ..jsonfile import number, optional_number, read_json_object
+from .camera import Camera, distortion_names
 
 
 def read_intrinsics_json(path: Path, *, integer_centres: bool) -> tuple[Camera, float | None]:

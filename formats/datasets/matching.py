@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets.sequence import LabelClass, used_label_ids
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.image_times import frame_number, read_image_times
-from msgs_slam.formats.images import IMAGE_SUFFIXES, natural_key
-from msgs_slam.formats.safe_path import inside
-from msgs_slam.formats.textfile import read_rows
+from ..errors import InputError
+from ..image_times import frame_number, read_image_times
+from ..images import IMAGE_SUFFIXES, natural_key
+from ..safe_path import inside
+from ..textfile import read_rows
+from .sequence import LabelClass, used_label_ids
 
 ASSUMED_RATE = 30.0
 """Frames per second where a data set does not say."""

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets.camera import Camera, distortion_names
-from msgs_slam.formats.datasets.matching import times_or_frame_numbers
-from msgs_slam.formats.datasets.sequence import Sequence
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import first_readable, image_size, natural_key
-from msgs_slam.formats.jsonfile import number, optional_number, read_json_object
-from msgs_slam.formats.safe_path import named_file
-from msgs_slam.formats.trajectory import clean_poses
+from ..errors import InputError
+from ..images import first_readable, image_size, natural_key
+from ..jsonfile import number, optional_number, read_json_object
+from ..safe_path import named_file
+from ..trajectory import clean_poses
+from .camera import Camera, distortion_names
+from .matching import times_or_frame_numbers
+from .sequence import Sequence
 
 _FILE_NAMES = ("transforms.json", "transforms_train.json")
 _SUFFIXES_TRIED = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")

@@ -7,7 +7,10 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 
-from msgs_slam.formats.datasets import (
+from ..errors import InputError
+from ..images import IMAGE_SUFFIXES, RAW_SUFFIXES
+from ..reading import reaching
+from . import (
     colmap,
     euroc,
     folder,
@@ -18,10 +21,7 @@ from msgs_slam.formats.datasets import (
     seven_scenes,
     tum_rgbd,
 )
-from msgs_slam.formats.datasets.sequence import Sequence
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import IMAGE_SUFFIXES, RAW_SUFFIXES
-from msgs_slam.formats.reading import reaching
+from .sequence import Sequence
 
 
 @dataclass(frozen=True)

@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.formats.datasets.classes_json import read_classes_json
-from msgs_slam.formats.datasets.intrinsics_json import read_intrinsics_json
-from msgs_slam.formats.datasets.matching import (
+from ..errors import InputError
+from ..images import first_readable, image_size, list_images
+from ..trajectory import read_matrices
+from .camera import Camera
+from .classes_json import read_classes_json
+from .intrinsics_json import read_intrinsics_json
+from .matching import (
     classes_found,
     files_for_images,
     poses_for_images,
     times_or_frame_numbers,
 )
-from msgs_slam.formats.datasets.sequence import LabelClass, Sequence
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import first_readable, image_size, list_images
-from msgs_slam.formats.trajectory import read_matrices
+from .sequence import LabelClass, Sequence
 
 _CLASS_FOLDERS = ("semantic_class", "semantic_classes")
 

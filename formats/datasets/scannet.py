@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.formats.datasets.matching import classes_found, files_for_images, times_or_frame_numbers
-from msgs_slam.formats.datasets.scannet_labels import find_label_table, read_nyu40_classes
-from msgs_slam.formats.datasets.sequence import LabelClass, Sequence
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import first_readable, image_size, list_images
-from msgs_slam.formats.textfile import read_table
-from msgs_slam.formats.trajectory import read_matrices
+from ..errors import InputError
+from ..images import first_readable, image_size, list_images
+from ..textfile import read_table
+from ..trajectory import read_matrices
+from .camera import Camera
+from .matching import classes_found, files_for_images, times_or_frame_numbers
+from .scannet_labels import find_label_table, read_nyu40_classes
+from .sequence import LabelClass, Sequence
 
 _LABEL_FOLDERS = ("label-filt", "label")
 _COLOR_SIZE, _DEPTH_SIZE = (1296, 968), (640, 480)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from msgs_slam.formats.datasets.sequence import LabelClass
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.textfile import read_text
+from ..errors import InputError
+from ..textfile import read_text
+from .sequence import LabelClass
 
 _TABLE_NAME = "scannetv2-labels.combined.tsv"
 _LEVELS_UP = 4

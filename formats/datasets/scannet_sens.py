@@ -11,13 +11,13 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets.matching import ASSUMED_RATE
-from msgs_slam.formats.datasets.scannet import scaled_camera
-from msgs_slam.formats.datasets.sequence import Sequence
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import MAX_IMAGE_PIXELS, decode_rgb
-from msgs_slam.formats.reading import opened, require_file
-from msgs_slam.formats.trajectory import clean_poses
+from ..errors import InputError
+from ..images import MAX_IMAGE_PIXELS, decode_rgb
+from ..reading import opened, require_file
+from ..trajectory import clean_poses
+from .matching import ASSUMED_RATE
+from .scannet import scaled_camera
+from .sequence import Sequence
 
 _VERSION = 4
 _JPEG, _PNG = 2, 1

@@ -10,9 +10,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets.camera import Camera, warp_nearest
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import read_depth_png, read_label_png, read_rgb
+from ..errors import InputError
+from ..images import read_depth_png, read_label_png, read_rgb
+from .camera import Camera, warp_nearest
 
 VOID_LABEL = 255
 """Label of a pixel without a class."""

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.formats.datasets.matching import ASSUMED_RATE, files_for_images
-from msgs_slam.formats.datasets.sequence import Sequence
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.image_times import frame_number
-from msgs_slam.formats.images import first_readable, image_size, list_images
-from msgs_slam.formats.textfile import read_table
-from msgs_slam.formats.trajectory import read_matrices
+from ..errors import InputError
+from ..image_times import frame_number
+from ..images import first_readable, image_size, list_images
+from ..textfile import read_table
+from ..trajectory import read_matrices
+from .camera import Camera
+from .matching import ASSUMED_RATE, files_for_images
+from .sequence import Sequence
 
 _COLOR_FOCAL, _DEPTH_FOCAL = 525.0, 585.0
 _NOTES = (

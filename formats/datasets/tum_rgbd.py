@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.formats.datasets.intrinsics_json import read_intrinsics_json
-from msgs_slam.formats.datasets.matching import SAME_INSTANT_SECONDS, nearest_index, poses_at, read_timed_files
-from msgs_slam.formats.datasets.sequence import Sequence
-from msgs_slam.formats.images import first_readable, image_size
-from msgs_slam.formats.trajectory import read_tum
+from ..images import first_readable, image_size
+from ..trajectory import read_tum
+from .camera import Camera
+from .intrinsics_json import read_intrinsics_json
+from .matching import SAME_INSTANT_SECONDS, nearest_index, poses_at, read_timed_files
+from .sequence import Sequence
 
 _DEPTH_PER_METRE = 5000.0
 _LINE = "`seconds file`"

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.correspondence.flow import corners, follow
-from msgs_slam.pipelines.correspondence.matching import VerifiedPair
-from msgs_slam.pipelines.correspondence.snapshots import Snapshots, features_name, pairs_name
-from msgs_slam.pipelines.system.lru_sequence import LruSequence
-from msgs_slam.pipelines.types import Features
+from ..system.lru_sequence import LruSequence
+from ..types import Features
+from .flow import corners, follow
+from .matching import VerifiedPair
+from .snapshots import Snapshots, features_name, pairs_name
 
 LEAST = 100
 """Features matched on both sides below which a keyframe is a weak one. On a made-up walk, steps beyond keyframes with

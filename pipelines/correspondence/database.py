@@ -9,8 +9,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.correspondence.matching import VerifiedPair
-from msgs_slam.pipelines.types import Features
+from ..types import Features
+from .matching import VerifiedPair
 
 
 def write_database(

@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.types import Features, require_shape
+from ..types import Features, require_shape
 
 _of_thread = threading.local()
 

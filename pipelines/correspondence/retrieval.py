@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2, vq
 
-from msgs_slam.pipelines.types import Features, Vocabulary
+from ..types import Features, Vocabulary
 
 _WORDS = 64
 _TRAINING_DESCRIPTORS = 20000

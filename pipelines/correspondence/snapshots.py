@@ -12,10 +12,10 @@ from typing import TypeVar
 
 import pycolmap
 
-from msgs_slam.formats.atomic import free_bytes, write_bytes
-from msgs_slam.formats.errors import DiskFullError
-from msgs_slam.formats.jsonfile import read_json, write_json
-from msgs_slam.pipelines.system.values import load_value, save_value
+from ...formats.atomic import free_bytes, write_bytes
+from ...formats.errors import DiskFullError
+from ...formats.jsonfile import read_json, write_json
+from ..system.values import load_value, save_value
 
 T = TypeVar("T")
 _DATABASE_SHARE = 3

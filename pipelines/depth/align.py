@@ -13,13 +13,13 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.depth.fields import FINE, Basis, DepthFields
-from msgs_slam.pipelines.depth.posed import PosedDepth, neighbours
-from msgs_slam.pipelines.depth.solve import Equations, Prior, solve_fields
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.system.lru_sequence import LruSequence
-from msgs_slam.pipelines.system.memory import ALIGNED_TOGETHER
-from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
+from ..geometry.sparse_model import SparseModel
+from ..system.lru_sequence import LruSequence
+from ..system.memory import ALIGNED_TOGETHER
+from ..types import Intrinsics, ProxyMaps
+from .fields import FINE, Basis, DepthFields
+from .posed import PosedDepth, neighbours
+from .solve import Equations, Prior, solve_fields
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.types import ProxyMaps
+from ..types import ProxyMaps
 
 Array = NDArray[np.float64]
 

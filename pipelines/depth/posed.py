@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from msgs_slam.pipelines.geometry.camera import project, unproject
-from msgs_slam.pipelines.types import Intrinsics
+from ..geometry.camera import project, unproject
+from ..types import Intrinsics
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.types import ProxyMaps
+from ..types import ProxyMaps
 
 _ONE_SURFACE = 0.02
 """Relative standard deviation up to which depths side by side are of one surface."""

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.depth.fields import FINE, Basis, Grid
-from msgs_slam.pipelines.depth.solve import Equations, Prior, solve_fields
-from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
+from ..types import Intrinsics, ProxyMaps
+from .fields import FINE, Basis, Grid
+from .solve import Equations, Prior, solve_fields
 
 Array = NDArray[np.float64]
 

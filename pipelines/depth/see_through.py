@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.depth.posed import PosedDepth, neighbours
-from msgs_slam.pipelines.system.jit import kernel
+from ..system.jit import kernel
+from .posed import PosedDepth, neighbours
 
 STRIDE = 2
 AGREES = 0.03

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-from msgs_slam.pipelines.depth.fields import Basis, Grid
+from .fields import Basis, Grid
 
 Array = NDArray[np.float64]
 _ROWS_AT_ONCE = 200_000

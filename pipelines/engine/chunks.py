@@ -9,11 +9,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.system.values import load_value, save_value
+from ..config import Config
+from ..run.folder import RunFolder
+from ..system.progress import Progress
+from ..system.values import load_value, save_value
+from .stages import StageContext
 
 R = TypeVar("R")
 _CHUNKS_PER_WORKER = 3

@@ -21,9 +21,9 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
-from msgs_slam.formats.errors import InputError, RecoverableError
-from msgs_slam.pipelines.system.progress import log
-from msgs_slam.pipelines.system.stopping import Stopped, is_asked, soft_stop, stop_if_asked
+from ...formats.errors import InputError, RecoverableError
+from ..system.progress import log
+from ..system.stopping import Stopped, is_asked, soft_stop, stop_if_asked
 
 TRIES, NODES = 2, 50
 """How often a call is begun when its processes are lost, and when its nodes are: machines come and go."""

@@ -16,15 +16,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from msgs_slam.formats.atomic import own_temporaries
-from msgs_slam.formats.errors import InputError, RecoverableError
-from msgs_slam.formats.jsonfile import read_json, write_json
-from msgs_slam.pipelines.engine.workers import code_identity, work_here
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock import take_lock
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.system.stopping import stop_if_asked
-from msgs_slam.pipelines.system.values import load_value, name_of, of_name, save_value
+from ...formats.atomic import own_temporaries
+from ...formats.errors import InputError, RecoverableError
+from ...formats.jsonfile import read_json, write_json
+from ..run.folder import RunFolder
+from ..run.lock import take_lock
+from ..system.progress import Progress
+from ..system.stopping import stop_if_asked
+from ..system.values import load_value, name_of, of_name, save_value
+from .workers import code_identity, work_here
 
 T = TypeVar("T")
 R = TypeVar("R")

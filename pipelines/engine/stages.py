@@ -12,23 +12,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from msgs_slam.formats.atomic import is_disk_full, watched_by, write_text
-from msgs_slam.formats.errors import DiskFullError, InputError, RecoverableError
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.standing import (
-    divided_otherwise,
-    kept_inputs,
-    next_upstream,
-    stage_fingerprint,
-    why_again,
-)
-from msgs_slam.pipelines.engine.time_left import TimeLeft
-from msgs_slam.pipelines.engine.workers import TaskWorkers
-from msgs_slam.pipelines.run.ending import FINGERPRINT, SNAPSHOT, find_sealed, move_in, results, seal, unseal
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.journal import Journal, empty
-from msgs_slam.pipelines.run.names import STAGES
-from msgs_slam.pipelines.run.records import (
+from ...formats.atomic import is_disk_full, watched_by, write_text
+from ...formats.errors import DiskFullError, InputError, RecoverableError
+from ..config import Config
+from ..run.ending import FINGERPRINT, SNAPSHOT, find_sealed, move_in, results, seal, unseal
+from ..run.folder import RunFolder
+from ..run.journal import Journal, empty
+from ..run.names import STAGES
+from ..run.records import (
     Manifest,
     Source,
     StageRecord,
@@ -38,13 +29,22 @@ from msgs_slam.pipelines.run.records import (
     settings_of,
     write_manifest,
 )
-from msgs_slam.pipelines.run.settings_file import save_settings
-from msgs_slam.pipelines.system.device import resolve_device
-from msgs_slam.pipelines.system.limits import available_cpus
-from msgs_slam.pipelines.system.memory import memory_room, release_free_memory
-from msgs_slam.pipelines.system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log
-from msgs_slam.pipelines.system.stopping import stop_if_asked
-from msgs_slam.pipelines.system.wording import quoted
+from ..run.settings_file import save_settings
+from ..system.device import resolve_device
+from ..system.limits import available_cpus
+from ..system.memory import memory_room, release_free_memory
+from ..system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log
+from ..system.stopping import stop_if_asked
+from ..system.wording import quoted
+from .standing import (
+    divided_otherwise,
+    kept_inputs,
+    next_upstream,
+    stage_fingerprint,
+    why_again,
+)
+from .time_left import TimeLeft
+from .workers import TaskWorkers
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -7,13 +7,13 @@ import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from msgs_slam.pipelines.config import Config, config_to_dict
-from msgs_slam.pipelines.run.records import StageRecord, differing_settings, recorded_config
-from msgs_slam.pipelines.system.identity import stage_identity
+from ..config import Config, config_to_dict
+from ..run.records import StageRecord, differing_settings, recorded_config
+from ..system.identity import stage_identity
 
 if TYPE_CHECKING:
-    from msgs_slam.pipelines.engine.stages import Stage
-    from msgs_slam.pipelines.run.folder import RunFolder
+    from ..run.folder import RunFolder
+    from .stages import Stage
 
 
 def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) -> str:

@@ -11,15 +11,15 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from msgs_slam.formats.atomic import own_temporaries, watched_by
-from msgs_slam.formats.errors import InputError, RecoverableError
-from msgs_slam.pipelines.engine.engines import Call, Engine
-from msgs_slam.pipelines.engine.threads import set_threads
-from msgs_slam.pipelines.run.journal import Journal
-from msgs_slam.pipelines.run.names import STAGES
-from msgs_slam.pipelines.system.identity import stage_file, stage_identity
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.system.wording import quoted
+from ...formats.atomic import own_temporaries, watched_by
+from ...formats.errors import InputError, RecoverableError
+from ..run.journal import Journal
+from ..run.names import STAGES
+from ..system.identity import stage_file, stage_identity
+from ..system.progress import Progress
+from ..system.wording import quoted
+from .engines import Call, Engine
+from .threads import set_threads
 
 T = TypeVar("T")
 R = TypeVar("R")

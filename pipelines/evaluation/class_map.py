@@ -19,11 +19,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import read_toml
-from msgs_slam.pipelines.evaluation.label_score import Counts, indices_by_name
-from msgs_slam.pipelines.system.progress import log
-from msgs_slam.pipelines.types import require_shape
+from ...formats.errors import InputError
+from ...formats.jsonfile import read_toml
+from ..system.progress import log
+from ..types import require_shape
+from .label_score import Counts, indices_by_name
 
 _SHIPPED = Path(__file__).with_name("class_maps")
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.types import require_shape
+from ..types import require_shape
 
 
 @dataclass(frozen=True)

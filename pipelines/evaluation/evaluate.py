@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets import Sequence
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.evaluation.class_map import ClassMap, Matching, match_classes
-from msgs_slam.pipelines.evaluation.measure import measure_views
-from msgs_slam.pipelines.evaluation.mesh_cells import mesh_cells
-from msgs_slam.pipelines.evaluation.trajectory_error import (
+from ...formats.datasets import Sequence
+from ...formats.errors import InputError
+from ..outcome import Outcome
+from ..system.progress import Progress, SilentProgress
+from .class_map import ClassMap, Matching, match_classes
+from .measure import measure_views
+from .mesh_cells import mesh_cells
+from .trajectory_error import (
     AbsoluteError,
     ErrorStatistics,
     absolute_error,
     relative_error,
 )
-from msgs_slam.pipelines.evaluation.truth import MatchedTruth, match_truth
-from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.system.progress import Progress, SilentProgress
+from .truth import MatchedTruth, match_truth
 
 PROTOCOL = (
     "Frames belong to the truth of the same {by}; the other frames count as picked and posed only.",

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.run.files import PROXY_MAPS
-from msgs_slam.pipelines.types import LoopEdge
+from ..geometry.sparse_model import SparseModel
+from ..outcome import Outcome
+from ..run.files import PROXY_MAPS
+from ..types import LoopEdge
 
 _BLURRED = 0.35
 _DARK, _BRIGHT = 35.0, 225.0

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.gaussians.ssim import TAPS, similarity
-from msgs_slam.pipelines.types import require_shape
+from ..gaussians.ssim import TAPS, similarity
+from ..types import require_shape
 
 
 def psnr(image: NDArray, truth: NDArray, mask: NDArray[np.bool_] | None = None) -> float:

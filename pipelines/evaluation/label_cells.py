@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from msgs_slam.pipelines.evaluation.class_map import Matching
-from msgs_slam.pipelines.evaluation.label_score import (
+from .class_map import Matching
+from .label_score import (
     Counts,
     LabelScore,
     matched_by_majority,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from msgs_slam.pipelines.types import require_shape
+from ..types import require_shape
 
 Counts = NDArray[np.int64]
 

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.export.stage import on_earth
-from msgs_slam.pipelines.geometry.rig import rig_of
-from msgs_slam.pipelines.geometry.tape import tape_text
-from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.upright.world import WORLD
+from ..export.stage import on_earth
+from ..geometry.rig import rig_of
+from ..geometry.tape import tape_text
+from ..outcome import Outcome
+from ..upright.world import WORLD
 
 Array = NDArray[np.float64]
 

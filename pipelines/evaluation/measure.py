@@ -9,20 +9,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.evaluation.class_map import Matching
-from msgs_slam.pipelines.evaluation.depth_error import DepthErrorSum
-from msgs_slam.pipelines.evaluation.image_quality import psnr, ssim
-from msgs_slam.pipelines.evaluation.label_cells import label_cells
-from msgs_slam.pipelines.evaluation.label_score import Counts, count_labels
-from msgs_slam.pipelines.evaluation.perceptual import open_lpips
-from msgs_slam.pipelines.evaluation.trajectory_error import AbsoluteError
-from msgs_slam.pipelines.evaluation.truth import MatchedTruth
-from msgs_slam.pipelines.evaluation.views import MapView, view_map
-from msgs_slam.pipelines.gaussians.render import track_gn
-from msgs_slam.pipelines.mapping.load import split_frames
-from msgs_slam.pipelines.outcome import Outcome, evenly
-from msgs_slam.pipelines.source.source_pixels import FramePixels
-from msgs_slam.pipelines.system.progress import Progress
+from ..gaussians.render import track_gn
+from ..mapping.load import split_frames
+from ..outcome import Outcome, evenly
+from ..source.source_pixels import FramePixels
+from ..system.progress import Progress
+from .class_map import Matching
+from .depth_error import DepthErrorSum
+from .image_quality import psnr, ssim
+from .label_cells import label_cells
+from .label_score import Counts, count_labels
+from .perceptual import open_lpips
+from .trajectory_error import AbsoluteError
+from .truth import MatchedTruth
+from .views import MapView, view_map
 
 KEYFRAMES, BETWEEN, HELD_OUT = "keyframes", "between", "held out"
 AT_TRUE_POSES, AT_REFINED_POSES = " at true poses", " at refined poses"

@@ -10,19 +10,19 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.evaluation.surface_error import (
+from ..outcome import Outcome
+from ..run.files import MESH
+from ..types import Intrinsics
+from ..upright.world import FIRST, WORLD
+from .surface_error import (
     depth_points,
     sample_surface,
     seen_in_depth,
     surface_error,
     thinned,
 )
-from msgs_slam.pipelines.evaluation.trajectory_error import AbsoluteError
-from msgs_slam.pipelines.evaluation.truth import MatchedTruth
-from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.run.files import MESH
-from msgs_slam.pipelines.types import Intrinsics
-from msgs_slam.pipelines.upright.world import FIRST, WORLD
+from .trajectory_error import AbsoluteError
+from .truth import MatchedTruth
 
 SAMPLES = 200_000
 VIEWS = 60

@@ -8,8 +8,8 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from msgs_slam.formats.atomic import atomic_path
-from msgs_slam.formats.errors import InputError
+from ...formats.atomic import atomic_path
+from ...formats.errors import InputError
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "microsoft-edge")
 _SECONDS = 300

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from msgs_slam.formats.digest import file_sha256
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.networks.registry import Model, ModelStore
-from msgs_slam.pipelines.networks.runtime import open_runtime
-from msgs_slam.pipelines.types import require_shape
+from ...formats.digest import file_sha256
+from ...formats.errors import InputError
+from ..networks.registry import Model, ModelStore
+from ..networks.runtime import open_runtime
+from ..types import require_shape
 
 Image = NDArray[np.uint8]
 Distance = Callable[[NDArray[np.float32], NDArray[np.float32]], float]

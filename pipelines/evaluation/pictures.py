@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.types import VOID, ClassTable
+from ..types import VOID, ClassTable
 
 Picture = NDArray[np.uint8]
 

@@ -8,31 +8,31 @@ from typing import Any
 
 import numpy as np
 
-from msgs_slam.formats.atomic import write_text
-from msgs_slam.formats.datasets.camera import distortion_names
-from msgs_slam.formats.jsonfile import read_json
-from msgs_slam.formats.reading import read_bytes
-from msgs_slam.pipelines.config import Config, config_to_dict
-from msgs_slam.pipelines.evaluation.facts import Capture, advice, lost_stretches, read_capture
-from msgs_slam.pipelines.evaluation.html import bullets, chips, drawing, page, section, table
-from msgs_slam.pipelines.evaluation.lengths import found_lengths
-from msgs_slam.pipelines.evaluation.plots import RED, Line, plot
-from msgs_slam.pipelines.evaluation.report_views import RenderedViews, class_legend, quality_section, render_views
-from msgs_slam.pipelines.evaluation.table import TABLE_HEADER, evaluation_rows
-from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, trajectory_plots
-from msgs_slam.pipelines.export.readme import lengths, readme
-from msgs_slam.pipelines.export.stage import on_earth
-from msgs_slam.pipelines.export.writers import IMAGES
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.read_config import config_to_toml
-from msgs_slam.pipelines.run.files import FIGURES, LOOPS
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import load_source
-from msgs_slam.pipelines.system.progress import Progress, SilentProgress
-from msgs_slam.pipelines.system.wording import figure_text, quoted
-from msgs_slam.pipelines.types import LoopEdge
-from msgs_slam.pipelines.upright.world import FIRST, WORLD
+from ...formats.atomic import write_text
+from ...formats.datasets.camera import distortion_names
+from ...formats.jsonfile import read_json
+from ...formats.reading import read_bytes
+from ..config import Config, config_to_dict
+from ..export.readme import lengths, readme
+from ..export.stage import on_earth
+from ..export.writers import IMAGES
+from ..geometry.sparse_model import SparseModel
+from ..outcome import Outcome, load_outcome
+from ..read_config import config_to_toml
+from ..run.files import FIGURES, LOOPS
+from ..run.folder import RunFolder
+from ..run.records import load_source
+from ..system.progress import Progress, SilentProgress
+from ..system.wording import figure_text, quoted
+from ..types import LoopEdge
+from ..upright.world import FIRST, WORLD
+from .facts import Capture, advice, lost_stretches, read_capture
+from .html import bullets, chips, drawing, page, section, table
+from .lengths import found_lengths
+from .plots import RED, Line, plot
+from .report_views import RenderedViews, class_legend, quality_section, render_views
+from .table import TABLE_HEADER, evaluation_rows
+from .write import PATH_FROM_ABOVE, trajectory_plots
 
 
 def write_report(run: RunFolder, path: Path | None = None, progress: Progress | None = None) -> Path:

@@ -8,17 +8,17 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.evaluation.facts import Capture
-from msgs_slam.pipelines.evaluation.html import image, legend, section
-from msgs_slam.pipelines.evaluation.image_quality import psnr
-from msgs_slam.pipelines.evaluation.measure import render_outcome
-from msgs_slam.pipelines.evaluation.pictures import depth_picture, depth_range, labels_on_photo
-from msgs_slam.pipelines.evaluation.plots import BLUE, GREEN, GREY, ORANGE, RED, Line, Marks, plot
-from msgs_slam.pipelines.evaluation.write import unit_name
-from msgs_slam.pipelines.outcome import Outcome, evenly
-from msgs_slam.pipelines.source.sharpness import at_most_wide
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.types import VOID
+from ..outcome import Outcome, evenly
+from ..source.sharpness import at_most_wide
+from ..system.progress import Progress
+from ..types import VOID
+from .facts import Capture
+from .html import image, legend, section
+from .image_quality import psnr
+from .measure import render_outcome
+from .pictures import depth_picture, depth_range, labels_on_photo
+from .plots import BLUE, GREEN, GREY, ORANGE, RED, Line, Marks, plot
+from .write import unit_name
 
 MEASURED_VIEWS = 60
 SHOWN_VIEWS = 8

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.formats.gaussians import GaussianCloud
-from msgs_slam.pipelines.gaussians.render.rules import ALPHA_MAX, ALPHA_MIN, CUT_SIGMAS, TRANSMITTANCE_MIN
-from msgs_slam.pipelines.system.jit import kernel
-from msgs_slam.pipelines.types import Intrinsics
+from ...formats.gaussians import GaussianCloud
+from ..gaussians.render.rules import ALPHA_MAX, ALPHA_MIN, CUT_SIGMAS, TRANSMITTANCE_MIN
+from ..system.jit import kernel
+from ..types import Intrinsics
 
 _NEAR_SHARE = 0.01
 """Of the scene's size: what is nearer to the eye is not drawn."""

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.camera import project, unproject_depth
-from msgs_slam.pipelines.types import Intrinsics
+from ..geometry import se3
+from ..geometry.camera import project, unproject_depth
+from ..types import Intrinsics
 
 Points = NDArray[np.float64]
 

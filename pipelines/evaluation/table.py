@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from msgs_slam.pipelines.system.wording import markdown_table
+from ..system.wording import markdown_table
 
 Row = tuple[str, str, str]
 TABLE_HEADER: Row = ("what", "value", "of")

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
-from msgs_slam.pipelines.types import require_shape
+from ..geometry import se3
+from ..geometry.alignment import Similarity, align_points
+from ..types import require_shape
 
 Array = NDArray[np.float64]
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets import Sequence
-from msgs_slam.formats.textfile import read_rows
-from msgs_slam.formats.trajectory import read_matrices
-from msgs_slam.pipelines.evaluation.trajectory_error import associate
-from msgs_slam.pipelines.source.originals import written_name
-from msgs_slam.pipelines.types import Frame
+from ...formats.datasets import Sequence
+from ...formats.textfile import read_rows
+from ...formats.trajectory import read_matrices
+from ..source.originals import written_name
+from ..types import Frame
+from .trajectory_error import associate
 
 _MOST_SECONDS_APART = 0.02
 

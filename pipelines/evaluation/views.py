@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.gaussian_map import GaussianMap, decided_channels
-from msgs_slam.pipelines.gaussians.render import median_depth, render
-from msgs_slam.pipelines.outcome import Exposure, labels_of_channels
-from msgs_slam.pipelines.types import Intrinsics
+from ..gaussian_map import GaussianMap, decided_channels
+from ..gaussians.render import median_depth, render
+from ..outcome import Exposure, labels_of_channels
+from ..types import Intrinsics
 
 _SEEN = 0.5
 """Less coverage than this is no surface: it has neither depth nor label."""

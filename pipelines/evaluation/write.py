@@ -6,14 +6,19 @@ from typing import Any
 
 import numpy as np
 
-from msgs_slam.formats.atomic import write_text
-from msgs_slam.formats.datasets import Sequence
-from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.jsonfile import write_json
-from msgs_slam.pipelines.evaluation.class_map import ClassMap
-from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
-from msgs_slam.pipelines.evaluation.measure import render_outcome
-from msgs_slam.pipelines.evaluation.pictures import (
+from ...formats.atomic import write_text
+from ...formats.datasets import Sequence
+from ...formats.images import write_rgb
+from ...formats.jsonfile import write_json
+from ..geometry.alignment import Similarity, align_points
+from ..outcome import Outcome, evenly, load_outcome
+from ..run.folder import RunFolder
+from ..source.source_pixels import FramePixels
+from ..system.progress import Progress
+from .class_map import ClassMap
+from .evaluate import evaluate_outcome
+from .measure import render_outcome
+from .pictures import (
     Picture,
     class_colors_by_name,
     depth_picture,
@@ -22,14 +27,9 @@ from msgs_slam.pipelines.evaluation.pictures import (
     label_picture,
     sheet,
 )
-from msgs_slam.pipelines.evaluation.plots import BLUE, GREY, Line, plot
-from msgs_slam.pipelines.evaluation.table import evaluation_table
-from msgs_slam.pipelines.evaluation.truth import MatchedTruth, match_truth
-from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
-from msgs_slam.pipelines.outcome import Outcome, evenly, load_outcome
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.source.source_pixels import FramePixels
-from msgs_slam.pipelines.system.progress import Progress
+from .plots import BLUE, GREY, Line, plot
+from .table import evaluation_table
+from .truth import MatchedTruth, match_truth
 
 PATH_FROM_ABOVE, PATH_FROM_THE_SIDE = "trajectory_top.svg", "trajectory_side.svg"
 SHEET_VIEWS = 6

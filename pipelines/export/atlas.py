@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from msgs_slam.pipelines.system.jit import kernel
-from msgs_slam.pipelines.types import SemanticMesh
+from ..system.jit import kernel
+from ..types import SemanticMesh
 
 SHARE = 0.1
 """Vertices that are kept: with a texture they need to follow the shape only."""

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from msgs_slam.formats.glb import Part, write_primitive
-from msgs_slam.pipelines.export.atlas import simplified
-from msgs_slam.pipelines.export.mesh import mesh_of_run
-from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.upright.world import World
+from ...formats.glb import Part, write_primitive
+from ..outcome import Outcome
+from ..upright.world import World
+from .atlas import simplified
+from .mesh import mesh_of_run
 
 COLLISION = "collision.glb"
 MOST_FACES = 20_000

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.atomic import write_text
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.mesh import read_mesh_ply
-from msgs_slam.pipelines.export.walls import Wall, find_walls
-from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.run.files import MESH
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.world import WORLD
+from ...formats.atomic import write_text
+from ...formats.errors import InputError
+from ...formats.mesh import read_mesh_ply
+from ..outcome import Outcome
+from ..run.files import MESH
+from ..run.folder import RunFolder
+from ..upright.world import WORLD
+from .walls import Wall, find_walls
 
 Array = NDArray[np.float64]
 

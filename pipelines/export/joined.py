@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from msgs_slam.formats.mesh import MeshBlocks
-from msgs_slam.pipelines.export.surface import Surface
+from ...formats.mesh import MeshBlocks
+from .surface import Surface
 
 LEAST_PIECE = 0.01
 """Connected pieces with fewer faces than this share of the largest one's are floaters."""

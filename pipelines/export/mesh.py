@@ -9,27 +9,27 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.mesh import MeshBlocks, read_mesh_ply
-from msgs_slam.pipelines.config import ExportConfig
-from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.depth.resize import resample_nearest
-from msgs_slam.pipelines.export.joined import Region
-from msgs_slam.pipelines.export.paint import paint
-from msgs_slam.pipelines.export.planes import Planes
-from msgs_slam.pipelines.export.straighten import planes_of, straightened
-from msgs_slam.pipelines.export.surface import chunk_surfaces, weld
-from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid
-from msgs_slam.pipelines.gaussians.render import get_threads, host_threads
-from msgs_slam.pipelines.mapping.depth_views import DrawnView, Shown, drawn_view
-from msgs_slam.pipelines.outcome import Outcome, maps_around
-from msgs_slam.pipelines.run.files import MESH
-from msgs_slam.pipelines.system.lru_sequence import LruSequence
-from msgs_slam.pipelines.system.parallel import abreast
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.system.values import load_value, save_value
-from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps, SemanticMesh
-from msgs_slam.pipelines.upright.world import WORLD, World
+from ...formats.errors import InputError
+from ...formats.mesh import MeshBlocks, read_mesh_ply
+from ..config import ExportConfig
+from ..depth.posed import PosedDepth
+from ..depth.resize import resample_nearest
+from ..gaussians.render import get_threads, host_threads
+from ..mapping.depth_views import DrawnView, Shown, drawn_view
+from ..outcome import Outcome, maps_around
+from ..run.files import MESH
+from ..system.lru_sequence import LruSequence
+from ..system.parallel import abreast
+from ..system.progress import Progress
+from ..system.values import load_value, save_value
+from ..types import VOID, Intrinsics, ProxyMaps, SemanticMesh
+from ..upright.world import WORLD, World
+from .joined import Region
+from .paint import paint
+from .planes import Planes
+from .straighten import planes_of, straightened
+from .surface import chunk_surfaces, weld
+from .volume import Grid, fuse, make_grid
 
 TRUNCATION = 3.0
 """Voxels on either side of a surface that a depth speaks for."""

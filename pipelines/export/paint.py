@@ -7,10 +7,10 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.geometry.camera import project
-from msgs_slam.pipelines.mapping.depth_views import DrawnView
-from msgs_slam.pipelines.types import VOID
+from ..depth.posed import PosedDepth
+from ..geometry.camera import project
+from ..mapping.depth_views import DrawnView
+from ..types import VOID
 
 
 def paint(

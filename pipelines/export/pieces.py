@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from msgs_slam.formats.atomic import copy_file
-from msgs_slam.formats.errors import InputError, RecoverableError
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.stages import Stage, StageContext, run_stages
-from msgs_slam.pipelines.run.files import (
+from ...formats.atomic import copy_file
+from ...formats.errors import InputError, RecoverableError
+from ..config import Config
+from ..engine.stages import Stage, StageContext, run_stages
+from ..run.files import (
     BACKBONE,
     CALIBRATION,
     FEATURES,
@@ -28,10 +28,10 @@ from msgs_slam.pipelines.run.files import (
     VOCABULARY,
     save_frames,
 )
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.journal import discard
-from msgs_slam.pipelines.run.records import load_records
-from msgs_slam.pipelines.system.progress import WithinStage
+from ..run.folder import RunFolder
+from ..run.journal import discard
+from ..run.records import load_records
+from ..system.progress import WithinStage
 
 
 def make_pieces(context: StageContext) -> list[RunFolder]:

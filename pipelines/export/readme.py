@@ -5,8 +5,8 @@ from __future__ import annotations
 import textwrap
 from dataclasses import dataclass
 
-from msgs_slam.pipelines.types import Metres
-from msgs_slam.pipelines.upright.world import World
+from ..types import Metres
+from ..upright.world import World
 
 WIDTH = 100
 """Characters a line, so that it fits a terminal, an editor and the report."""

@@ -9,17 +9,32 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from msgs_slam.formats.atomic import copy_file
-from msgs_slam.formats.digest import file_sha256
-from msgs_slam.formats.gps import read_track
-from msgs_slam.formats.mesh import mesh_blocks, read_mesh_ply, write_mesh_glb, write_mesh_ply
-from msgs_slam.pipelines.config import Config, ExportConfig
-from msgs_slam.pipelines.engine.chunks import in_chunks
-from msgs_slam.pipelines.engine.stages import Stage, StageContext
-from msgs_slam.pipelines.export.collision import write_collision
-from msgs_slam.pipelines.export.floor_plan import write_floor_plan
-from msgs_slam.pipelines.export.joined import joined
-from msgs_slam.pipelines.export.mesh import (
+from ...formats.atomic import copy_file
+from ...formats.digest import file_sha256
+from ...formats.gps import read_track
+from ...formats.mesh import mesh_blocks, read_mesh_ply, write_mesh_glb, write_mesh_ply
+from ..config import Config, ExportConfig
+from ..engine.chunks import in_chunks
+from ..engine.stages import Stage, StageContext
+from ..mapping.depth_views import Shown
+from ..metres.find import find_metres
+from ..networks.identity import card_identity
+from ..outcome import Outcome, load_outcome
+from ..proxy.selection import metric_card
+from ..run.files import METRES, SUBMAPS
+from ..run.folder import RunFolder
+from ..run.journal import empty
+from ..run.records import load_records
+from ..system.memory import release_free_memory
+from ..system.progress import Progress, SilentProgress
+from ..types import Metres, SemanticMesh
+from ..upright.find import find_upright
+from ..upright.places import AUTO, OFF, world_on_earth
+from ..upright.world import FIRST, WORLD, World, upright_world, world_figures
+from .collision import write_collision
+from .floor_plan import write_floor_plan
+from .joined import joined
+from .mesh import (
     drawn_views,
     fused_regions,
     keyframe_rows,
@@ -27,13 +42,13 @@ from msgs_slam.pipelines.export.mesh import (
     mesh_figures,
     planes_in,
 )
-from msgs_slam.pipelines.export.pieces import make_pieces
-from msgs_slam.pipelines.export.tasks import draw_keyframes, fuse_views, scratch_of, straighten_views
-from msgs_slam.pipelines.export.textured import make_textured, write_textured
-from msgs_slam.pipelines.export.tiles import write_tiles
-from msgs_slam.pipelines.export.usd import write_usd
-from msgs_slam.pipelines.export.web_page import write_web_page
-from msgs_slam.pipelines.export.writers import (
+from .pieces import make_pieces
+from .tasks import draw_keyframes, fuse_views, scratch_of, straighten_views
+from .textured import make_textured, write_textured
+from .tiles import write_tiles
+from .usd import write_usd
+from .web_page import write_web_page
+from .writers import (
     write_colmap,
     write_notes,
     write_ply,
@@ -42,21 +57,6 @@ from msgs_slam.pipelines.export.writers import (
     write_trajectory,
     write_world,
 )
-from msgs_slam.pipelines.mapping.depth_views import Shown
-from msgs_slam.pipelines.metres.find import find_metres
-from msgs_slam.pipelines.networks.identity import card_identity
-from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.proxy.selection import metric_card
-from msgs_slam.pipelines.run.files import METRES, SUBMAPS
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.journal import empty
-from msgs_slam.pipelines.run.records import load_records
-from msgs_slam.pipelines.system.memory import release_free_memory
-from msgs_slam.pipelines.system.progress import Progress, SilentProgress
-from msgs_slam.pipelines.types import Metres, SemanticMesh
-from msgs_slam.pipelines.upright.find import find_upright
-from msgs_slam.pipelines.upright.places import AUTO, OFF, world_on_earth
-from msgs_slam.pipelines.upright.world import FIRST, WORLD, World, upright_world, world_figures
 
 
 def run(context: StageContext) -> dict[str, Any]:

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.depth.resize import resample_nearest
-from msgs_slam.pipelines.export.planes import NEAR, REACH, ROUGHLY_ALONG, Planes, find_planes
-from msgs_slam.pipelines.geometry.camera import unproject_depth
-from msgs_slam.pipelines.mapping.depth_views import DrawnView
-from msgs_slam.pipelines.outcome import evenly
-from msgs_slam.pipelines.voxels.voxels import VOXELS_PER_DEPTH, find, gather_depths, normals_in_cam, voxel_keys
+from ..depth.posed import PosedDepth
+from ..depth.resize import resample_nearest
+from ..geometry.camera import unproject_depth
+from ..mapping.depth_views import DrawnView
+from ..outcome import evenly
+from ..voxels.voxels import VOXELS_PER_DEPTH, find, gather_depths, normals_in_cam, voxel_keys
+from .planes import NEAR, REACH, ROUGHLY_ALONG, Planes, find_planes
 
 _SIDE = 200
 _COMPARED = 24

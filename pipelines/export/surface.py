@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
-from msgs_slam.pipelines.export.volume import CHUNK, SIDE, Volume, chunk_keys
-from msgs_slam.pipelines.system.jit import kernel
+from ..system.jit import kernel
+from .volume import CHUNK, SIDE, Volume, chunk_keys
 
 _STEPS = 1000
 """Vertices within so small a part of a voxel are the same."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from msgs_slam.pipelines.engine.chunks import Chunk
-from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.export.mesh import draw, drawn_views, fuse_regions, straighten
-from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.system.progress import Progress
+from ..engine.chunks import Chunk
+from ..engine.stages import StageContext
+from ..outcome import load_outcome
+from ..system.progress import Progress
+from .mesh import draw, drawn_views, fuse_regions, straighten
 
 
 def draw_keyframes(task: Chunk, progress: Progress) -> None:

@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.export.atlas import Atlas, owners
-from msgs_slam.pipelines.gaussians.render.threads import for_each
-from msgs_slam.pipelines.geometry.camera import project
-from msgs_slam.pipelines.system.jit import kernel
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.types import Intrinsics
+from ..depth.posed import PosedDepth
+from ..gaussians.render.threads import for_each
+from ..geometry.camera import project
+from ..system.jit import kernel
+from ..system.progress import Progress
+from ..types import Intrinsics
+from .atlas import Atlas, owners
 
 AGREES = 0.03
 """Relative difference up to which the depth of a view confirms that it sees a place."""

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from msgs_slam.formats.textured_mesh import TexturedMesh, write_textured_glb, write_textured_obj
-from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.export.atlas import simplified, unwrapped
-from msgs_slam.pipelines.export.mesh import keyframe_rows
-from msgs_slam.pipelines.export.texture import Shot, paint_texture, texels_wanted
-from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.system.lru_sequence import LruSequence
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.types import Frame, SemanticMesh
+from ...formats.textured_mesh import TexturedMesh, write_textured_glb, write_textured_obj
+from ..depth.posed import PosedDepth
+from ..outcome import Outcome
+from ..system.lru_sequence import LruSequence
+from ..system.progress import Progress
+from ..types import Frame, SemanticMesh
+from .atlas import simplified, unwrapped
+from .mesh import keyframe_rows
+from .texture import Shot, paint_texture, texels_wanted
 
 TEXTURE_SIDE = 4096
 """A texture has at most this many pixels a side: what viewers on the web and phones take."""

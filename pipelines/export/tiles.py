@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.atomic import require_room
-from msgs_slam.formats.gaussian_glb import COMPRESSION, EXTENSION, write_compressed_glb
-from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
-from msgs_slam.formats.gps import ecef_from_enu
-from msgs_slam.formats.jsonfile import write_json
-from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.run.journal import empty
-from msgs_slam.pipelines.upright.world import World
+from ...formats.atomic import require_room
+from ...formats.gaussian_glb import COMPRESSION, EXTENSION, write_compressed_glb
+from ...formats.gaussians import GaussianCloud, isotropic_cloud
+from ...formats.gps import ecef_from_enu
+from ...formats.jsonfile import write_json
+from ..outcome import Outcome
+from ..run.journal import empty
+from ..upright.world import World
 
 Array = NDArray[np.float64]
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.atomic import atomic_path, require_room
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.export.mesh import mesh_of_run
-from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.types import SemanticMesh
-from msgs_slam.pipelines.upright.world import World
+from ...formats.atomic import atomic_path, require_room
+from ...formats.errors import InputError
+from ..outcome import Outcome
+from ..types import SemanticMesh
+from ..upright.world import World
+from .mesh import mesh_of_run
 
 USD = "mesh.usdz"
 

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.sog import morton_codes
-from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.gaussians.render.jit import kernel
-from msgs_slam.pipelines.gaussians.render.threads import for_each, get_threads
-from msgs_slam.pipelines.geometry.camera import unproject_depth
-from msgs_slam.pipelines.types import Intrinsics
-from msgs_slam.pipelines.voxels.voxels import cells_of, voxel_keys
+from ...formats.sog import morton_codes
+from ..depth.posed import PosedDepth
+from ..gaussians.render.jit import kernel
+from ..gaussians.render.threads import for_each, get_threads
+from ..geometry.camera import unproject_depth
+from ..types import Intrinsics
+from ..voxels.voxels import cells_of, voxel_keys
 
 SIDE = 8
 """Voxels along the side of a block."""

@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.atomic import require_room, write_text
-from msgs_slam.formats.gaussians import GaussianCloud
-from msgs_slam.formats.sog import morton_order
-from msgs_slam.pipelines.export.writers import map_cloud
-from msgs_slam.pipelines.geometry.rig import rig_of
-from msgs_slam.pipelines.outcome import Outcome, evenly
-from msgs_slam.pipelines.types import VOID
-from msgs_slam.pipelines.upright.world import World
+from ...formats.atomic import require_room, write_text
+from ...formats.gaussians import GaussianCloud
+from ...formats.sog import morton_order
+from ..geometry.rig import rig_of
+from ..outcome import Outcome, evenly
+from ..types import VOID
+from ..upright.world import World
+from .writers import map_cloud
 
 WEB_PAGE = "map.html"
 MOST_GAUSSIANS = 1_500_000

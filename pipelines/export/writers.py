@@ -10,25 +10,25 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.formats.atomic import copy_file, write_text
-from msgs_slam.formats.colmap import ColmapModel, write_colmap_model
-from msgs_slam.formats.gaussian_glb import write_gaussian_glb
-from msgs_slam.formats.gaussian_ply import write_gaussian_ply
-from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
-from msgs_slam.formats.nerfstudio import write_transforms
-from msgs_slam.formats.point_ply import write_point_ply
-from msgs_slam.formats.sog import write_sog
-from msgs_slam.formats.spz import write_spz
-from msgs_slam.formats.trajectory import write_tum
-from msgs_slam.pipelines.config import ExportConfig
-from msgs_slam.pipelines.export.readme import lengths, readme
-from msgs_slam.pipelines.geometry.rig import rig_of
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.run.files import CLASSES, LEFT_OUT, METRES
-from msgs_slam.pipelines.system.lru_sequence import LruSequence
-from msgs_slam.pipelines.system.wording import stretches
-from msgs_slam.pipelines.upright.world import WORLD, World
+from ...formats.atomic import copy_file, write_text
+from ...formats.colmap import ColmapModel, write_colmap_model
+from ...formats.gaussian_glb import write_gaussian_glb
+from ...formats.gaussian_ply import write_gaussian_ply
+from ...formats.gaussians import GaussianCloud, isotropic_cloud
+from ...formats.nerfstudio import write_transforms
+from ...formats.point_ply import write_point_ply
+from ...formats.sog import write_sog
+from ...formats.spz import write_spz
+from ...formats.trajectory import write_tum
+from ..config import ExportConfig
+from ..geometry.rig import rig_of
+from ..geometry.sparse_model import SparseModel
+from ..outcome import Outcome
+from ..run.files import CLASSES, LEFT_OUT, METRES
+from ..system.lru_sequence import LruSequence
+from ..system.wording import stretches
+from ..upright.world import WORLD, World
+from .readme import lengths, readme
 
 IMAGES, SPARSE = "images", "sparse/0"
 """Folders of a COLMAP data set by the names that trainers expect."""

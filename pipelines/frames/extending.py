@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.run.before import Before
-from msgs_slam.pipelines.structure.given import agreement
-from msgs_slam.pipelines.types import Frame
+from ..geometry.sparse_model import SparseModel
+from ..run.before import Before
+from ..structure.given import agreement
+from ..types import Frame
 
 
 def in_world_of(before: Before, model: SparseModel, frames: Sequence[Frame]) -> SparseModel:

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from msgs_slam.formats.reconstruction import pose_of
-from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.structure.candidates import GIVEN, GIVEN_ALONE
-from msgs_slam.pipelines.structure.given import agreement
-from msgs_slam.pipelines.structure.sfm import Structure
-from msgs_slam.pipelines.system.wording import stretches
-from msgs_slam.pipelines.types import GivenPoses
+from ...formats.reconstruction import pose_of
+from ..engine.stages import StageContext
+from ..structure.candidates import GIVEN, GIVEN_ALONE
+from ..structure.given import agreement
+from ..structure.sfm import Structure
+from ..system.wording import stretches
+from ..types import GivenPoses
 
 _LEAST_PART = 3
 

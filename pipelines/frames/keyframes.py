@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.correspondence.flow import corners, follow
-from msgs_slam.pipelines.source.sharpness import reduce_image
+from ..correspondence.flow import corners, follow
+from ..source.sharpness import reduce_image
 
 _TRACKED_SIDE = 480
 _MAX_CORNERS = 600

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.digest import file_sha256
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.config import FramesConfig
-from msgs_slam.pipelines.correspondence.features import extract_features, to_grey
-from msgs_slam.pipelines.networks.registry import Model, ModelStore
-from msgs_slam.pipelines.networks.runtime import Runtime, open_runtime
-from msgs_slam.pipelines.types import Features
+from ...formats.digest import file_sha256
+from ...formats.errors import InputError
+from ..config import FramesConfig
+from ..correspondence.features import extract_features, to_grey
+from ..networks.registry import Model, ModelStore
+from ..networks.runtime import Runtime, open_runtime
+from ..types import Features
 
 EXTRACTOR, MATCHER = "aliked-n16rot", "aliked-lightglue"
 _MULTIPLE = 32

@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.images import read_rgb
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.geometry.rig import ONE_CAMERA, Rig
-from msgs_slam.pipelines.masks.files import MaskFiles, open_masks, reduce_mask
-from msgs_slam.pipelines.masks.people import PeopleCards, PeopleFinder, people_cards
-from msgs_slam.pipelines.networks.registry import ModelStore
-from msgs_slam.pipelines.run.files import LEFT_OUT
-from msgs_slam.pipelines.source.faces import Faces
-from msgs_slam.pipelines.source.opening import Source, open_source
-from msgs_slam.pipelines.structure.lens import Lens
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.types import Frame, any_of
+from ...formats.images import read_rgb
+from ..config import Config
+from ..geometry.rig import ONE_CAMERA, Rig
+from ..masks.files import MaskFiles, open_masks, reduce_mask
+from ..masks.people import PeopleCards, PeopleFinder, people_cards
+from ..networks.registry import ModelStore
+from ..run.files import LEFT_OUT
+from ..source.faces import Faces
+from ..source.opening import Source, open_source
+from ..structure.lens import Lens
+from ..system.progress import Progress
+from ..types import Frame, any_of
 
 
 def mask_inputs(source: Path, config: Config) -> dict[str, str] | None:

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 
-from msgs_slam.formats.atomic import copy_file
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.jsonfile import read_json, write_json
-from msgs_slam.formats.video import VideoFrame
-from msgs_slam.pipelines.config import FramesConfig
-from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.frames.tasks import AnySource, picked
-from msgs_slam.pipelines.source.faces import Faces
-from msgs_slam.pipelines.source.pick import sharpest_of_windows
-from msgs_slam.pipelines.source.sharpness import reduce_image
-from msgs_slam.pipelines.types import Frame
+from ...formats.atomic import copy_file
+from ...formats.errors import InputError
+from ...formats.images import write_rgb
+from ...formats.jsonfile import read_json, write_json
+from ...formats.video import VideoFrame
+from ..config import FramesConfig
+from ..engine.stages import StageContext
+from ..source.faces import Faces
+from ..source.pick import sharpest_of_windows
+from ..source.sharpness import reduce_image
+from ..types import Frame
+from .tasks import AnySource, picked
 
 
 def pick_frames(context: StageContext, source: AnySource, faces: Faces | None) -> list[Frame]:

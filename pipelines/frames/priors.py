@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.correspondence.snapshots import Snapshots, features_name
-from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.structure.candidates import GIVEN_ALONE
-from msgs_slam.pipelines.structure.lens import FOCAL_GUESS, unknown_camera
-from msgs_slam.pipelines.structure.sfm import Structure, StructureFromMotion, when_asked
+from ...formats.errors import InputError
+from ..correspondence.snapshots import Snapshots, features_name
+from ..engine.stages import StageContext
+from ..structure.candidates import GIVEN_ALONE
+from ..structure.lens import FOCAL_GUESS, unknown_camera
+from ..structure.sfm import Structure, StructureFromMotion, when_asked
 
 _STATED_BY = {"exif": "EXIF states", "stated": "the data set states", "self-calibrated": "the data set states"}
 

@@ -11,35 +11,19 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.formats.atomic import copy_file
-from msgs_slam.formats.errors import InputError, RecoverableError
-from msgs_slam.formats.gps import photo_places
-from msgs_slam.formats.images import hint_at_inner_folder, read_rgb, write_rgb
-from msgs_slam.formats.jsonfile import read_json, write_json
-from msgs_slam.formats.video import VideoFrame
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.correspondence.bridges import Picture
-from msgs_slam.pipelines.engine.chunks import in_chunks
-from msgs_slam.pipelines.engine.stages import Stage, StageContext
-from msgs_slam.pipelines.frames.extending import in_world_of
-from msgs_slam.pipelines.frames.findings import settled_origin, warn_of_given, warn_of_structure
-from msgs_slam.pipelines.frames.keyframes import KeyframeChoice, choose_keyframes
-from msgs_slam.pipelines.frames.learned import learned_inputs, open_learned
-from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
-from msgs_slam.pipelines.frames.picking import pick_frames
-from msgs_slam.pipelines.frames.priors import solve
-from msgs_slam.pipelines.frames.tasks import (
-    TASKS,
-    AnySource,
-    grey_of,
-    known_camera,
-    masks_of,
-    picked,
-    structure_from_motion,
-)
-from msgs_slam.pipelines.geometry.rig import Rig, rig_of
-from msgs_slam.pipelines.run.before import before_inputs, before_of
-from msgs_slam.pipelines.run.files import (
+from ...formats.atomic import copy_file
+from ...formats.errors import InputError, RecoverableError
+from ...formats.gps import photo_places
+from ...formats.images import hint_at_inner_folder, read_rgb, write_rgb
+from ...formats.jsonfile import read_json, write_json
+from ...formats.video import VideoFrame
+from ..config import Config
+from ..correspondence.bridges import Picture
+from ..engine.chunks import in_chunks
+from ..engine.stages import Stage, StageContext
+from ..geometry.rig import Rig, rig_of
+from ..run.before import before_inputs, before_of
+from ..run.files import (
     BACKBONE,
     CALIBRATION,
     FEATURES,
@@ -49,21 +33,37 @@ from msgs_slam.pipelines.run.files import (
     VOCABULARY,
     save_frames,
 )
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import load_records
-from msgs_slam.pipelines.source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
-from msgs_slam.pipelines.source.known_poses import check_poses, given_poses, pose_inputs
-from msgs_slam.pipelines.source.opening import FolderSource, Source, Warn, open_source
-from msgs_slam.pipelines.source.sharpness import reduce_image
-from msgs_slam.pipelines.structure.backbone import to_sparse_model
-from msgs_slam.pipelines.structure.calibration import read_intrinsics
-from msgs_slam.pipelines.structure.lens import Lens, distortion_of, make_lens
-from msgs_slam.pipelines.structure.parallax import require_motion
-from msgs_slam.pipelines.structure.rolling import read_readout
-from msgs_slam.pipelines.structure.sfm import Structure
-from msgs_slam.pipelines.structure.window_size import window_size, windows_of
-from msgs_slam.pipelines.system.parallel import parallel_map
-from msgs_slam.pipelines.types import Calibration, Frame, GivenPoses
+from ..run.folder import RunFolder
+from ..run.records import load_records
+from ..source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
+from ..source.known_poses import check_poses, given_poses, pose_inputs
+from ..source.opening import FolderSource, Source, Warn, open_source
+from ..source.sharpness import reduce_image
+from ..structure.backbone import to_sparse_model
+from ..structure.calibration import read_intrinsics
+from ..structure.lens import Lens, distortion_of, make_lens
+from ..structure.parallax import require_motion
+from ..structure.rolling import read_readout
+from ..structure.sfm import Structure
+from ..structure.window_size import window_size, windows_of
+from ..system.parallel import parallel_map
+from ..types import Calibration, Frame, GivenPoses
+from .extending import in_world_of
+from .findings import settled_origin, warn_of_given, warn_of_structure
+from .keyframes import KeyframeChoice, choose_keyframes
+from .learned import learned_inputs, open_learned
+from .masks import FrameMasks, check_masks, mask_inputs
+from .picking import pick_frames
+from .priors import solve
+from .tasks import (
+    TASKS,
+    AnySource,
+    grey_of,
+    known_camera,
+    masks_of,
+    picked,
+    structure_from_motion,
+)
 
 _SIGNIFICANT_SHIFT_PX = 0.3
 _FEW_KEYFRAMES = 12

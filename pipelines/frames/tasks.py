@@ -9,29 +9,29 @@ from pathlib import Path
 
 import pycolmap
 
-from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.formats.images import read_rgb
-from msgs_slam.pipelines.correspondence.bridges import Picture
-from msgs_slam.pipelines.correspondence.features import to_grey
-from msgs_slam.pipelines.correspondence.matching import match_features
-from msgs_slam.pipelines.correspondence.snapshots import Snapshots
-from msgs_slam.pipelines.engine.chunks import Chunk
-from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.frames.learned import open_learned, picture_features
-from msgs_slam.pipelines.frames.masks import FrameMasks
-from msgs_slam.pipelines.geometry.rig import Rig, rig_of
-from msgs_slam.pipelines.run.before import before_of
-from msgs_slam.pipelines.source.faces import Faces, find_faces
-from msgs_slam.pipelines.source.known_poses import given_poses
-from msgs_slam.pipelines.source.opening import FolderSource, VideoSource, open_source
-from msgs_slam.pipelines.source.recording import RecordingSource
-from msgs_slam.pipelines.source.sharpness import reduced_size
-from msgs_slam.pipelines.structure.calibration import read_intrinsics
-from msgs_slam.pipelines.structure.lens import FOCAL_GUESS, calibrated_camera, to_pycolmap, unknown_camera
-from msgs_slam.pipelines.structure.sfm import Divide, StructureFromMotion, when_asked
-from msgs_slam.pipelines.structure.window_size import window_size
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.types import Features, Frame, GivenPoses
+from ...formats.datasets.camera import Camera
+from ...formats.images import read_rgb
+from ..correspondence.bridges import Picture
+from ..correspondence.features import to_grey
+from ..correspondence.matching import match_features
+from ..correspondence.snapshots import Snapshots
+from ..engine.chunks import Chunk
+from ..engine.stages import StageContext
+from ..geometry.rig import Rig, rig_of
+from ..run.before import before_of
+from ..source.faces import Faces, find_faces
+from ..source.known_poses import given_poses
+from ..source.opening import FolderSource, VideoSource, open_source
+from ..source.recording import RecordingSource
+from ..source.sharpness import reduced_size
+from ..structure.calibration import read_intrinsics
+from ..structure.lens import FOCAL_GUESS, calibrated_camera, to_pycolmap, unknown_camera
+from ..structure.sfm import Divide, StructureFromMotion, when_asked
+from ..structure.window_size import window_size
+from ..system.progress import Progress
+from ..types import Features, Frame, GivenPoses
+from .learned import open_learned, picture_features
+from .masks import FrameMasks
 
 AnySource = VideoSource | FolderSource | RecordingSource
 

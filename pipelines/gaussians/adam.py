@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-import msgs_slam.pipelines.gaussians.render.cards as cards
-from msgs_slam.pipelines.gaussians.render.jit import kernel
-from msgs_slam.pipelines.gaussians.render.threads import for_each
+from .render import cards
+from .render.jit import kernel
+from .render.threads import for_each
 
 _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15
 _ROWS = 8192
@@ -145,7 +145,7 @@ def descend_by_kernel(
     rows: Tensor | None = None,
 ) -> None:  # fmt: skip
     """The same by a kernel of Triton, on contiguous float32 values of one card."""
-    from msgs_slam.pipelines.gaussians.adam_kernels import descend_rows  # imports triton
+    from .adam_kernels import descend_rows  # imports triton
 
     count, width = gradient.numel(), math.prod(value.shape[1:])
     if count == 0:

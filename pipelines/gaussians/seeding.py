@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.types import Intrinsics
+from ..gaussian_map import GaussianMap
+from ..types import Intrinsics
 
 SEED_OPACITY = 0.73
 SEED_RADIUS = 0.7

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.types import Intrinsics
+from ..types import Intrinsics
 
 
 def project(

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from msgs_slam.pipelines.geometry.alignment import Similarity
-from msgs_slam.pipelines.types import require_shape, rows_by
+from ..types import require_shape, rows_by
+from .alignment import Similarity
 
 
 @dataclass(frozen=True)

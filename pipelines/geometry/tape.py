@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.formats.gaussians import GaussianCloud
-from msgs_slam.pipelines.types import Metres
+from ...formats.gaussians import GaussianCloud
+from ..types import Metres
 
 Array = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from msgs_slam.pipelines.config import GlobalBaConfig
-from msgs_slam.pipelines.correspondence.retrieval import GlobalDescriptors, far_apart, loop_pairs
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.global_ba.semantics import LabelSummary, richness, similarity
+from ..config import GlobalBaConfig
+from ..correspondence.retrieval import GlobalDescriptors, far_apart, loop_pairs
+from ..geometry.sparse_model import SparseModel
+from .semantics import LabelSummary, richness, similarity
 
 GAP = 8
 """A loop joins keyframes at least this many apart."""

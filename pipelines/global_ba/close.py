@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.config import TrackingConfig
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.global_ba.pose_graph import Edges, optimise_pose_graph
-from msgs_slam.pipelines.global_ba.verify import Loop
-from msgs_slam.pipelines.structure.bundle import reprojection_errors
-from msgs_slam.pipelines.tracking.adjust import LoadProxy, Report, adjust_state
-from msgs_slam.pipelines.tracking.state import Sightings, TrackState
-from msgs_slam.pipelines.types import Intrinsics
+from ..config import TrackingConfig
+from ..geometry import se3
+from ..structure.bundle import reprojection_errors
+from ..tracking.adjust import LoadProxy, Report, adjust_state
+from ..tracking.state import Sightings, TrackState
+from ..types import Intrinsics
+from .pose_graph import Edges, optimise_pose_graph
+from .verify import Loop
 
 Array = NDArray[np.float64]
 

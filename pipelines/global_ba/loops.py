@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.global_ba.verify import ROTATION, TRANSLATION, KeyframeView, Loop, verify_loop
-from msgs_slam.pipelines.types import Intrinsics
+from ..geometry import se3
+from ..types import Intrinsics
+from .verify import ROTATION, TRANSLATION, KeyframeView, Loop, verify_loop
 
 Array = NDArray[np.float64]
 

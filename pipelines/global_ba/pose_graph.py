@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
-from msgs_slam.pipelines.geometry import se3
+from ..geometry import se3
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.proxy.reliability import mean_iou
-from msgs_slam.pipelines.types import VOID
+from ..proxy.reliability import mean_iou
+from ..types import VOID
 
 Array = NDArray[np.float64]
 GRID = (40, 30)

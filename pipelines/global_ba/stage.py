@@ -8,23 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.atomic import copy_file
-from msgs_slam.pipelines.correspondence.retrieval import GlobalDescriptors, compute_global_descriptors, unit
-from msgs_slam.pipelines.depth.scales import sample_proxy
-from msgs_slam.pipelines.engine.stages import Stage, StageContext
-from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.global_ba.candidates import loop_candidates
-from msgs_slam.pipelines.global_ba.close import Closed, close_loops
-from msgs_slam.pipelines.global_ba.loops import FoundLoops, find_loops
-from msgs_slam.pipelines.global_ba.semantics import LabelSummary, summarise_labels
-from msgs_slam.pipelines.global_ba.verify import KeyframeView, Loop, make_view
-from msgs_slam.pipelines.mapping.build import Refined, refine_map
-from msgs_slam.pipelines.mapping.load import with_rigid_panoramas
-from msgs_slam.pipelines.mapping.move_map import follow_keyframes, move_map
-from msgs_slam.pipelines.mapping.poses import move_trajectory
-from msgs_slam.pipelines.run.files import (
+from ...formats.atomic import copy_file
+from ..correspondence.retrieval import GlobalDescriptors, compute_global_descriptors, unit
+from ..depth.scales import sample_proxy
+from ..engine.stages import Stage, StageContext
+from ..gaussian_map import GaussianMap
+from ..geometry import se3
+from ..geometry.sparse_model import SparseModel
+from ..mapping.build import Refined, refine_map
+from ..mapping.load import with_rigid_panoramas
+from ..mapping.move_map import follow_keyframes, move_map
+from ..mapping.poses import move_trajectory
+from ..run.files import (
     CALIBRATION,
     CLASSES,
     DEPTH_FIELDS,
@@ -37,15 +32,20 @@ from msgs_slam.pipelines.run.files import (
     SPARSE,
     TRAJECTORY,
 )
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.structure.bundle import reprojection_errors
-from msgs_slam.pipelines.system.lru_sequence import LruSequence
-from msgs_slam.pipelines.system.values import load_value, save_value
-from msgs_slam.pipelines.tracking.adjust import align_depths, without_dependent_depth
-from msgs_slam.pipelines.tracking.pictures import Pictures, load_shutter
-from msgs_slam.pipelines.tracking.result import to_sparse_model
-from msgs_slam.pipelines.tracking.state import FEATURE_SD, TrackState
-from msgs_slam.pipelines.types import VOID, Intrinsics, Trajectory
+from ..run.folder import RunFolder
+from ..structure.bundle import reprojection_errors
+from ..system.lru_sequence import LruSequence
+from ..system.values import load_value, save_value
+from ..tracking.adjust import align_depths, without_dependent_depth
+from ..tracking.pictures import Pictures, load_shutter
+from ..tracking.result import to_sparse_model
+from ..tracking.state import FEATURE_SD, TrackState
+from ..types import VOID, Intrinsics, Trajectory
+from .candidates import loop_candidates
+from .close import Closed, close_loops
+from .loops import FoundLoops, find_loops
+from .semantics import LabelSummary, summarise_labels
+from .verify import KeyframeView, Loop, make_view
 
 Array = NDArray[np.float64]
 

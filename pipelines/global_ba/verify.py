@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.correspondence.matching import match_descriptors
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.camera import unproject
-from msgs_slam.pipelines.tracking.pnp import FramePose, solve_pose
-from msgs_slam.pipelines.tracking.state import Sightings
-from msgs_slam.pipelines.types import Features, Intrinsics, LoopEdge
+from ..correspondence.matching import match_descriptors
+from ..geometry import se3
+from ..geometry.camera import unproject
+from ..tracking.pnp import FramePose, solve_pose
+from ..tracking.state import Sightings
+from ..types import Features, Intrinsics, LoopEdge
 
 Array = NDArray[np.float64]
 

@@ -10,16 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.depth.fields import DepthFields
-from msgs_slam.pipelines.depth.posed import PosedDepth, overlaps
-from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.mapping.extending import GROWN, grow_submap
-from msgs_slam.pipelines.mapping.load import split_frames
-from msgs_slam.pipelines.mapping.measure import ViewFigures
-from msgs_slam.pipelines.mapping.poses import interpolate_rows, move_trajectory, rows_of
-from msgs_slam.pipelines.mapping.state import Exposures, OptimisedMap
-from msgs_slam.pipelines.mapping.submap_tasks import (
+from ..depth.fields import DepthFields
+from ..depth.posed import PosedDepth, overlaps
+from ..engine.stages import StageContext
+from ..gaussian_map import GaussianMap
+from ..run.before import Before
+from ..run.files import CALIBRATION, CLASS_IDS, DEPTH_FIELDS, EXPOSURE, SUBMAPS
+from ..run.folder import RunFolder
+from ..system.memory import submap_size
+from ..types import Trajectory
+from .extending import GROWN, grow_submap
+from .load import split_frames
+from .measure import ViewFigures
+from .poses import interpolate_rows, move_trajectory, rows_of
+from .state import Exposures, OptimisedMap
+from .submap_tasks import (
     AGREED,
     JOINED,
     MADE,
@@ -31,12 +36,7 @@ from msgs_slam.pipelines.mapping.submap_tasks import (
     in_order,
     measure_submap,
 )
-from msgs_slam.pipelines.mapping.submaps import Submap, divide, submap_count
-from msgs_slam.pipelines.run.before import Before
-from msgs_slam.pipelines.run.files import CALIBRATION, CLASS_IDS, DEPTH_FIELDS, EXPOSURE, SUBMAPS
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.system.memory import submap_size
-from msgs_slam.pipelines.types import Trajectory
+from .submaps import Submap, divide, submap_count
 
 
 @dataclass(frozen=True)

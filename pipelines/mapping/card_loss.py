@@ -13,13 +13,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import msgs_slam.pipelines.gaussians.render.cards as cards
-from msgs_slam.pipelines.gaussians.render import Rendering
-from msgs_slam.pipelines.gaussians.ssim import C1, C2, TAPS, WINDOW
-from msgs_slam.pipelines.mapping.exposure import LEAST, MOST_GAIN, OUTLIER, RIDGE, SOLID, STRIDE
-from msgs_slam.pipelines.mapping.losses import NU, SIZE_LIMIT
-from msgs_slam.pipelines.mapping.photo_loss import SSIM_WEIGHT
-from msgs_slam.pipelines.mapping.views import View
+from ..gaussians.render import Rendering, cards
+from ..gaussians.ssim import C1, C2, TAPS, WINDOW
+from .exposure import LEAST, MOST_GAIN, OUTLIER, RIDGE, SOLID, STRIDE
+from .losses import NU, SIZE_LIMIT
+from .photo_loss import SSIM_WEIGHT
+from .views import View
 
 _BLOCK = 512
 """Numbers a program of the kernels."""
@@ -45,7 +44,7 @@ def card_loss(
 @torch.no_grad()
 def fit_exposure_on_card(rendering: Rendering, view: View, exposure: Tensor) -> None:
     """`fit_exposure` of what the map covers in a view, in place, on a contiguous exposure (2, 3)."""
-    from msgs_slam.pipelines.mapping.photo_kernels import fit_color  # imports triton
+    from .photo_kernels import fit_color  # imports triton
 
     height, width = rendering.silhouette.shape
     shown, silhouette = rendering.features.detach(), rendering.silhouette.detach().contiguous()
@@ -56,7 +55,7 @@ def fit_exposure_on_card(rendering: Rendering, view: View, exposure: Tensor) -> 
 
 def color_errors_on_card(colors: Tensor, view: View, exposure: Tensor) -> Tensor:
     """(H, W) mean difference between the exposed (H, W, C) colours and the view's photo, 0 where that is no scene."""
-    from msgs_slam.pipelines.mapping.photo_kernels import color_errors  # imports triton
+    from .photo_kernels import color_errors  # imports triton
 
     errors = torch.empty(colors.shape[:2], device=colors.device)
     given = (colors.contiguous(), colors.shape[-1], exposure, view.image, _mask(view), errors)
@@ -97,7 +96,7 @@ class _CardLoss(torch.autograd.Function):
 
 def _add_photo(features: Tensor, exposure: Tensor, view: View, loss: Tensor, gradient: Tensor) -> None:
     """`photo_loss` of the first three features, their gradient into the gradient's first three."""
-    import msgs_slam.pipelines.mapping.photo_kernels as kernels  # imports triton
+    from . import photo_kernels as kernels  # imports triton
 
     size, row, stride = view.image.numel(), 3 * view.image.shape[1], features.shape[-1]
     planes, moments, half = (features.new_empty(5, size) for _ in range(3))
@@ -120,7 +119,7 @@ def _add_maps(
     depth: Tensor, silhouette: Tensor, view: View, weights: TermWeights, loss: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Silhouette and depth; returns their gradients."""
-    from msgs_slam.pipelines.mapping.map_kernels import compare_maps  # imports triton
+    from .map_kernels import compare_maps  # imports triton
 
     d_depth, d_silhouette, pixels = torch.empty_like(depth), torch.empty_like(silhouette), depth.numel()
     given = (depth, silhouette, view.depth, view.reliability, _mask(view), loss, d_depth, d_silhouette, pixels)
@@ -131,7 +130,7 @@ def _add_maps(
 
 def _add_sizes(log_radii: Tensor, in_view: Tensor, unit: float, loss: Tensor) -> Tensor:
     """`size_loss`; returns the gradient."""
-    from msgs_slam.pipelines.mapping.map_kernels import weigh_sizes  # imports triton
+    from .map_kernels import weigh_sizes  # imports triton
 
     gradient, limit = torch.empty_like(log_radii), math.log(SIZE_LIMIT * unit)
     given = (log_radii, in_view.view(torch.uint8), in_view.sum(), loss, gradient, limit, len(log_radii))

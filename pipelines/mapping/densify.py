@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussian_map import GaussianMap
+from ..gaussian_map import GaussianMap
 
 
 def holes(silhouette: Tensor, least: float) -> Tensor:

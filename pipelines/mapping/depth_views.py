@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.gaussian_map import GaussianMap, decided_channels
-from msgs_slam.pipelines.gaussians.render import median_and_seen, render
-from msgs_slam.pipelines.types import Intrinsics
+from ..depth.posed import PosedDepth
+from ..gaussian_map import GaussianMap, decided_channels
+from ..gaussians.render import median_and_seen, render
+from ..types import Intrinsics
 
 
 @dataclass(frozen=True)

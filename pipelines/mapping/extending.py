@@ -10,19 +10,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.depth.posed import overlaps
-from msgs_slam.pipelines.gaussian_map import GaussianMap, decided_channels
-from msgs_slam.pipelines.geometry.camera import project
-from msgs_slam.pipelines.mapping.move_map import move_map
-from msgs_slam.pipelines.mapping.optimise import optimise_map
-from msgs_slam.pipelines.mapping.poses import rows_of
-from msgs_slam.pipelines.mapping.submap_tasks import SubmapResult, SubmapTask, pixels_filled, together
-from msgs_slam.pipelines.mapping.views import View
-from msgs_slam.pipelines.run.before import Before
-from msgs_slam.pipelines.run.files import FRAMES
-from msgs_slam.pipelines.structure.given import agreement
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.types import Trajectory
+from ..depth.posed import overlaps
+from ..gaussian_map import GaussianMap, decided_channels
+from ..geometry.camera import project
+from ..run.before import Before
+from ..run.files import FRAMES
+from ..structure.given import agreement
+from ..system.progress import Progress
+from ..types import Trajectory
+from .move_map import move_map
+from .optimise import optimise_map
+from .poses import rows_of
+from .submap_tasks import SubmapResult, SubmapTask, pixels_filled, together
+from .views import View
 
 GROWN = "grown"
 """Kind of a submap's result: the map of the run that is extended, grown."""

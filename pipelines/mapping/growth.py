@@ -11,16 +11,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from msgs_slam.pipelines.config import MappingConfig
-from msgs_slam.pipelines.gaussians.render import Rendering
-from msgs_slam.pipelines.gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
-from msgs_slam.pipelines.mapping import densify
-from msgs_slam.pipelines.mapping.region_prior import with_region_prior
-from msgs_slam.pipelines.mapping.schedule import Seeding
-from msgs_slam.pipelines.mapping.splitting import CHILDREN, DensificationError, split
-from msgs_slam.pipelines.mapping.state import OptimiserState
-from msgs_slam.pipelines.mapping.views import View
-from msgs_slam.pipelines.system.lru_sequence import LruSequence
+from ..config import MappingConfig
+from ..gaussians.render import Rendering
+from ..gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
+from ..system.lru_sequence import LruSequence
+from . import densify
+from .region_prior import with_region_prior
+from .schedule import Seeding
+from .splitting import CHILDREN, DensificationError, split
+from .state import OptimiserState
+from .views import View
 
 GROWN_OPACITY = 0.3
 """Of Gaussians added to a map that is already there: opaque ones would hide what has been learnt."""

@@ -13,10 +13,10 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.gaussians.render import class_weights
-from msgs_slam.pipelines.gaussians.seeding import SEED_LOGIT
-from msgs_slam.pipelines.mapping.views import View
+from ..gaussian_map import GaussianMap
+from ..gaussians.render import class_weights
+from ..gaussians.seeding import SEED_LOGIT
+from .views import View
 
 _FLOOR = 1 / (math.exp(SEED_LOGIT) - 1)
 """Added to every share of a class: one that has all votes gets the logit of a seed's own class, one without any 0."""

@@ -10,17 +10,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.config import MappingConfig
-from msgs_slam.pipelines.depth.fields import DepthFields
-from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.depth.see_through import contradicted
-from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes
-from msgs_slam.pipelines.run.files import CALIBRATION, DEPTH_FIELDS, FRAMES
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.system.lru_sequence import LruSequence
-from msgs_slam.pipelines.system.memory import VIEWS_SHARE, room_on
-from msgs_slam.pipelines.types import Frame, Intrinsics, ProxyMaps, Trajectory
+from ..config import MappingConfig
+from ..depth.fields import DepthFields
+from ..depth.posed import PosedDepth
+from ..depth.see_through import contradicted
+from ..engine.stages import StageContext
+from ..run.files import CALIBRATION, DEPTH_FIELDS, FRAMES
+from ..run.folder import RunFolder
+from ..system.lru_sequence import LruSequence
+from ..system.memory import VIEWS_SHARE, room_on
+from ..types import Frame, Intrinsics, ProxyMaps, Trajectory
+from .views import View, make_view, occurring_classes
 
 _COMPARED_ROOM = 60e6
 """Bytes of depths and trust that are kept while each view is compared with some others, mostly those beside it."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from msgs_slam.pipelines.mapping.photo_kernels import scene_at
+from .photo_kernels import scene_at
 
 
 @triton.jit

@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.gaussians.render import Rendering, render
-from msgs_slam.pipelines.gaussians.ssim import ssim_map
-from msgs_slam.pipelines.mapping.views import View
-from msgs_slam.pipelines.types import VOID
+from ..gaussian_map import GaussianMap
+from ..gaussians.render import Rendering, render
+from ..gaussians.ssim import ssim_map
+from ..types import VOID
+from .views import View
 
 
 @dataclass(frozen=True)

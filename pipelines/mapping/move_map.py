@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.geometry import se3
+from ..gaussian_map import GaussianMap
+from ..geometry import se3
 
 Array = NDArray[np.float64]
 

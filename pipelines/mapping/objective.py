@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from msgs_slam.pipelines.config import MappingConfig
-from msgs_slam.pipelines.gaussians.render import Rendering
-from msgs_slam.pipelines.mapping import losses
-from msgs_slam.pipelines.mapping.card_loss import TermWeights, card_loss
-from msgs_slam.pipelines.mapping.photo_loss import photo_loss
-from msgs_slam.pipelines.mapping.views import View
+from ..config import MappingConfig
+from ..gaussians.render import Rendering
+from . import losses
+from .card_loss import TermWeights, card_loss
+from .photo_loss import photo_loss
+from .views import View
 
 SILHOUETTE_WEIGHT = 0.05
 """Of the pressure towards an opaque map."""

@@ -11,32 +11,32 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-import msgs_slam.pipelines.gaussians.render.cards as cards
-from msgs_slam.pipelines.config import MappingConfig
-from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.gaussians.adam import gradients_of
-from msgs_slam.pipelines.gaussians.render import (
+from ..config import MappingConfig
+from ..gaussian_map import GaussianMap
+from ..gaussians.adam import gradients_of
+from ..gaussians.render import (
     Rendering,
     blending_weights,
+    cards,
     host_threads,
     in_view,
     marked_in_view,
     render,
 )
-from msgs_slam.pipelines.mapping.card_loss import color_errors_on_card, fit_exposure_on_card
-from msgs_slam.pipelines.mapping.exposure import SOLID, expose, fit_exposure
-from msgs_slam.pipelines.mapping.growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
-from msgs_slam.pipelines.mapping.label_votes import voted_logits
-from msgs_slam.pipelines.mapping.objective import Objective
-from msgs_slam.pipelines.mapping.parameters import KEYS
-from msgs_slam.pipelines.mapping.schedule import Schedule, Seeding, Step
-from msgs_slam.pipelines.mapping.splitting import DensificationError, densification_error
-from msgs_slam.pipelines.mapping.state import Exposures, OptimisedMap, OptimiserState
-from msgs_slam.pipelines.mapping.views import View, halved
-from msgs_slam.pipelines.system.lru_sequence import LruSequence
-from msgs_slam.pipelines.system.parallel import abreast
-from msgs_slam.pipelines.system.progress import Progress, SilentProgress
-from msgs_slam.pipelines.system.stopping import is_asked
+from ..system.lru_sequence import LruSequence
+from ..system.parallel import abreast
+from ..system.progress import Progress, SilentProgress
+from ..system.stopping import is_asked
+from .card_loss import color_errors_on_card, fit_exposure_on_card
+from .exposure import SOLID, expose, fit_exposure
+from .growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
+from .label_votes import voted_logits
+from .objective import Objective
+from .parameters import KEYS
+from .schedule import Schedule, Seeding, Step
+from .splitting import DensificationError, densification_error
+from .state import Exposures, OptimisedMap, OptimiserState
+from .views import View, halved
 
 T = TypeVar("T")
 MAP_RATES = {"means": 0.1, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2}

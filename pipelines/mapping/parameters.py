@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.gaussians.adam import AdamTable
-from msgs_slam.pipelines.gaussians.render.compositing import require_all_finite
+from ..gaussian_map import GaussianMap
+from ..gaussians.adam import AdamTable
+from ..gaussians.render.compositing import require_all_finite
 
 KEYS = ("means", "log_radii", "opacity_logits", "colors")
 """What is optimised."""

@@ -11,11 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
-from msgs_slam.pipelines.gaussians.render.lanes import counting, load, splat, store, total, where
-from msgs_slam.pipelines.gaussians.render.threads import for_each
-from msgs_slam.pipelines.gaussians.ssim import C1, C2, blur_array, ssim_map
-from msgs_slam.pipelines.mapping.exposure import expose
+from ..gaussians.render.jit import inner, kernel
+from ..gaussians.render.lanes import counting, load, splat, store, total, where
+from ..gaussians.render.threads import for_each
+from ..gaussians.ssim import C1, C2, blur_array, ssim_map
+from .exposure import expose
 
 SSIM_WEIGHT = 0.2
 """Share of 1 - SSIM in eq. (20)."""

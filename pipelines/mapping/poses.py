@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.types import Trajectory
+from ..geometry import se3
+from ..types import Trajectory
 
 
 def move_trajectory(

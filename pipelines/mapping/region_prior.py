@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.types import VOID
+from ..types import VOID
 
 _MIN_REGION = 64
 _REGION_SAMPLES = 4000

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from msgs_slam.pipelines.config import MappingConfig
-from msgs_slam.pipelines.depth.posed import overlaps
-from msgs_slam.pipelines.mapping.covisibility import keyframe_weights
-from msgs_slam.pipelines.mapping.views import View
+from ..config import MappingConfig
+from ..depth.posed import overlaps
+from .covisibility import keyframe_weights
+from .views import View
 
 WINDOW_STEPS = 2
 """Coarse steps after each keyframe while the map is seeded: on it, covisible and random past keyframes."""

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.gaussians.render import error_shares
-from msgs_slam.pipelines.types import Intrinsics
+from ..gaussian_map import GaussianMap
+from ..gaussians.render import error_shares
+from ..types import Intrinsics
 
 CHILDREN = 4
 CHILD_RADIUS, CHILD_OFFSET = 0.55, 0.6

@@ -6,17 +6,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.stages import Stage, StageContext
-from msgs_slam.pipelines.mapping.build import Mapped, build_map
-from msgs_slam.pipelines.mapping.load import split_frames, survey, with_rigid_panoramas
-from msgs_slam.pipelines.mapping.measure import mean_figures
-from msgs_slam.pipelines.mapping.submaps import submap_count
-from msgs_slam.pipelines.run.before import before_inputs, before_of
-from msgs_slam.pipelines.run.files import CALIBRATION, EXPOSURE, FIGURES, MAP, TRAJECTORY
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.system.memory import submap_size
+from ...formats.errors import InputError
+from ..config import Config
+from ..engine.stages import Stage, StageContext
+from ..run.before import before_inputs, before_of
+from ..run.files import CALIBRATION, EXPOSURE, FIGURES, MAP, TRAJECTORY
+from ..run.folder import RunFolder
+from ..system.memory import submap_size
+from .build import Mapped, build_map
+from .load import split_frames, survey, with_rigid_panoramas
+from .measure import mean_figures
+from .submaps import submap_count
 
 
 def run(context: StageContext) -> dict[str, Any]:

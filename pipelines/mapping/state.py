@@ -11,13 +11,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.formats.tensors import load_tensors, save_tensors
-from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.gaussians.adam import AdamTable
-from msgs_slam.pipelines.gaussians.render.rendering import moved
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.mapping.parameters import MapParameters, empty_map
-from msgs_slam.pipelines.mapping.views import View
+from ...formats.tensors import load_tensors, save_tensors
+from ..gaussian_map import GaussianMap
+from ..gaussians.adam import AdamTable
+from ..gaussians.render.rendering import moved
+from ..geometry import se3
+from .parameters import MapParameters, empty_map
+from .views import View
 
 VIEW_KEYS = ("twist",)
 

@@ -16,26 +16,26 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.depth.fields import DepthFields
-from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.gaussians.render import blending_weights, median_depth
-from msgs_slam.pipelines.mapping.gauge import SeenExposures, common_exposure
-from msgs_slam.pipelines.mapping.load import MappingInput, load_views
-from msgs_slam.pipelines.mapping.measure import ViewFigures, features_of, measure_view
-from msgs_slam.pipelines.mapping.optimise import optimise_map
-from msgs_slam.pipelines.mapping.parameters import KEYS
-from msgs_slam.pipelines.mapping.state import Exposures, OptimisedMap
-from msgs_slam.pipelines.mapping.submaps import Submap, nearest_seeing
-from msgs_slam.pipelines.mapping.views import View
-from msgs_slam.pipelines.run.before import Before
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.system.device import resolve_device
-from msgs_slam.pipelines.system.memory import memory_room
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.types import Intrinsics, Trajectory
+from ...formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
+from ..config import Config
+from ..depth.fields import DepthFields
+from ..depth.posed import PosedDepth
+from ..gaussian_map import GaussianMap
+from ..gaussians.render import blending_weights, median_depth
+from ..run.before import Before
+from ..run.folder import RunFolder
+from ..system.device import resolve_device
+from ..system.memory import memory_room
+from ..system.progress import Progress
+from ..types import Intrinsics, Trajectory
+from .gauge import SeenExposures, common_exposure
+from .load import MappingInput, load_views
+from .measure import ViewFigures, features_of, measure_view
+from .optimise import optimise_map
+from .parameters import KEYS
+from .state import Exposures, OptimisedMap
+from .submaps import Submap, nearest_seeing
+from .views import View
 
 MADE, JOINED, REFINED, AGREED = "made", "joined", "refined", "agreed"
 _LABELS = {MADE: "mapping", REFINED: "refining"}

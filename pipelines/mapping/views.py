@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.depth.resize import resize_depth, resize_maps
-from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
+from ..depth.posed import PosedDepth
+from ..depth.resize import resize_depth, resize_maps
+from ..types import VOID, Intrinsics, ProxyMaps
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.digest import files_sha256
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.image_times import frame_number
-from msgs_slam.formats.images import image_size, natural_key, read_rgb
-from msgs_slam.pipelines.source.opening import FolderSource, Source, VideoSource
+from ...formats.digest import files_sha256
+from ...formats.errors import InputError
+from ...formats.image_times import frame_number
+from ...formats.images import image_size, natural_key, read_rgb
+from ..source.opening import FolderSource, Source, VideoSource
 
 
 @dataclass(frozen=True)

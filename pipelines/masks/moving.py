@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.geometry.camera import project, unproject_depth
-from msgs_slam.pipelines.system.jit import kernel
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.types import Intrinsics
+from ..geometry.camera import project, unproject_depth
+from ..system.jit import kernel
+from ..system.progress import Progress
+from ..types import Intrinsics
 
 SIDE = 160
 """Pixels along the long side; all numbers below were chosen with it, on a woman pasted into the keyframes of one room

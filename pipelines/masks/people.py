@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.networks.card import Card
-from msgs_slam.pipelines.networks.identity import card_identity
-from msgs_slam.pipelines.networks.person import person_probability
-from msgs_slam.pipelines.networks.registry import ModelStore
-from msgs_slam.pipelines.networks.session import Network
+from ..networks.card import Card
+from ..networks.identity import card_identity
+from ..networks.person import person_probability
+from ..networks.registry import ModelStore
+from ..networks.session import Network
 
 _MAYBE = 0.3
 """Probability of the class from which pixels form a candidate."""

@@ -8,18 +8,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msgs_slam.pipelines.depth.fields import DepthFields
-from msgs_slam.pipelines.metres.evidence import Combined, Evidence, combine, independence
-from msgs_slam.pipelines.metres.heights import camera_height, ceiling_height, usual_distance
-from msgs_slam.pipelines.metres.known import MEASURED, known_scale
-from msgs_slam.pipelines.metres.network import network_scale
-from msgs_slam.pipelines.metres.scene import Scene, SeenFrame, build_scene
-from msgs_slam.pipelines.metres.sizes import OUTDOORS, THINGS
-from msgs_slam.pipelines.metres.things import sizes_of_things
-from msgs_slam.pipelines.networks.card import Card
-from msgs_slam.pipelines.run.files import CALIBRATION, CLASSES, DEPTH_FIELDS, FIGURES, FRAME_SCALES, FRAMES, PROXY_MAPS
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.types import Intrinsics, Metres, MetresSource, Trajectory
+from ..depth.fields import DepthFields
+from ..networks.card import Card
+from ..run.files import CALIBRATION, CLASSES, DEPTH_FIELDS, FIGURES, FRAME_SCALES, FRAMES, PROXY_MAPS
+from ..run.folder import RunFolder
+from ..types import Intrinsics, Metres, MetresSource, Trajectory
+from .evidence import Combined, Evidence, combine, independence
+from .heights import camera_height, ceiling_height, usual_distance
+from .known import MEASURED, known_scale
+from .network import network_scale
+from .scene import Scene, SeenFrame, build_scene
+from .sizes import OUTDOORS, THINGS
+from .things import sizes_of_things
 
 _MOST_FRAMES = 40
 _MOST_NETWORK_FRAMES = 24

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.metres.evidence import Evidence, Mode, measured
-from msgs_slam.pipelines.metres.scene import Scene
-from msgs_slam.pipelines.metres.sizes import (
+from ..voxels.layout import FLOOR
+from .evidence import Evidence, Mode, measured
+from .scene import Scene
+from .sizes import (
     CAMERA_OVER_FLOOR,
     CAMERA_OVER_TABLE,
     CEILING_OVER_FLOOR,
@@ -15,7 +16,6 @@ from msgs_slam.pipelines.metres.sizes import (
     FLOORS,
     FURNITURE,
 )
-from msgs_slam.pipelines.voxels.layout import FLOOR
 
 Array = NDArray[np.float64]
 

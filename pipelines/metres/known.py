@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from msgs_slam.pipelines.metres.evidence import Evidence, Mode
-from msgs_slam.pipelines.metres.network import LARGE_SD
+from .evidence import Evidence, Mode
+from .network import LARGE_SD
 
 _SENSOR_SD = 0.02
 """Depth cameras: 1 to 3 % at room distances after the factory's calibration (Khoshelham and Oude Elberink, Sensors

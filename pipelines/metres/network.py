@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.metres.evidence import Evidence, Mode
-from msgs_slam.pipelines.metres.scene import LEAST_CONFIDENCE, SeenFrame
-from msgs_slam.pipelines.networks.card import Card
-from msgs_slam.pipelines.networks.depth import network_depth
-from msgs_slam.pipelines.networks.letterbox import Letterbox
-from msgs_slam.pipelines.networks.session import Network
-from msgs_slam.pipelines.types import Intrinsics
+from ..networks.card import Card
+from ..networks.depth import network_depth
+from ..networks.letterbox import Letterbox
+from ..networks.session import Network
+from ..types import Intrinsics
+from .evidence import Evidence, Mode
+from .scene import LEAST_CONFIDENCE, SeenFrame
 
 Array = NDArray[np.float64]
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.depth.resize import resize_maps
-from msgs_slam.pipelines.geometry.camera import unproject_depth
-from msgs_slam.pipelines.proxy.interface.sequence import resize_area
-from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
-from msgs_slam.pipelines.voxels.layout import (
+from ..depth.resize import resize_maps
+from ..geometry.camera import unproject_depth
+from ..proxy.interface.sequence import resize_area
+from ..types import VOID, Intrinsics, ProxyMaps
+from ..voxels.layout import (
     CEILING,
     FLOOR,
     FloorPlane,
@@ -22,7 +22,7 @@ from msgs_slam.pipelines.voxels.layout import (
     floor_plane,
     name_structure,
 )
-from msgs_slam.pipelines.voxels.voxels import (
+from ..voxels.voxels import (
     LEAST_WEIGHT,
     VOXELS_PER_DEPTH,
     Voxels,

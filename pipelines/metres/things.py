@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label as connected
 
-from msgs_slam.pipelines.metres.evidence import Evidence, measured
-from msgs_slam.pipelines.metres.heights import floor_trust, over_floor, stays_on_floor
-from msgs_slam.pipelines.metres.scene import Scene
-from msgs_slam.pipelines.metres.sizes import DOOR, DOORS, SURFACE, TOPS, Sizes
-from msgs_slam.pipelines.proxy.regions.belonging import disputed
-from msgs_slam.pipelines.voxels.layout import SURFACE as UNNAMED
-from msgs_slam.pipelines.voxels.layout import levels
+from ..proxy.regions.belonging import disputed
+from ..voxels.layout import SURFACE as UNNAMED
+from ..voxels.layout import levels
+from .evidence import Evidence, measured
+from .heights import floor_trust, over_floor, stays_on_floor
+from .scene import Scene
+from .sizes import DOOR, DOORS, SURFACE, TOPS, Sizes
 
 Array = NDArray[np.float64]
 

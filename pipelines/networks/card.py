@@ -39,10 +39,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import read_json, read_toml
-from msgs_slam.formats.reading import parsing
-from msgs_slam.pipelines.networks.classes import read_class_table
+from ...formats.errors import InputError
+from ...formats.jsonfile import read_json, read_toml
+from ...formats.reading import parsing
+from .classes import read_class_table
 
 _MAX_CARD_BYTES = 1 << 20
 _MAX_SIDE = 8192

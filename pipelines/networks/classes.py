@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import read_json
-from msgs_slam.formats.reading import parsing
-from msgs_slam.formats.textfile import read_text
+from ...formats.errors import InputError
+from ...formats.jsonfile import read_json
+from ...formats.reading import parsing
+from ...formats.textfile import read_text
 
 VOID_NAMES = frozenset({"void", "none", "unknown", "undefined", "unlabeled", "unlabelled", "ignore"})
 _FILES = ("classes.json", "info_semantic.json", "classes.txt", "labels.txt", "classes_used.txt")

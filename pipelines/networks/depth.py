@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.geometry.camera import unproject_depth
-from msgs_slam.pipelines.networks.letterbox import Letterbox
-from msgs_slam.pipelines.networks.session import Network
-from msgs_slam.pipelines.types import Intrinsics
-from msgs_slam.pipelines.voxels.voxels import normals_in_cam
+from ...formats.errors import InputError
+from ..geometry.camera import unproject_depth
+from ..types import Intrinsics
+from ..voxels.voxels import normals_in_cam
+from .letterbox import Letterbox
+from .session import Network
 
 _ALIKE = np.radians(30)
 _LEAST_COSINE = 0.7

@@ -23,9 +23,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from msgs_slam.formats.digest import file_sha256
-from msgs_slam.formats.errors import DiskFullError, InputError
-from msgs_slam.pipelines.system.progress import log
+from ...formats.digest import file_sha256
+from ...formats.errors import DiskFullError, InputError
+from ..system.progress import log
 
 _CHUNK = 1 << 18
 _MAX_UNKNOWN = 1 << 30

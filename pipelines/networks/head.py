@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.reading import parsing, require_file
+from ...formats.errors import InputError
+from ...formats.reading import parsing, require_file
 
 _BATCH_NORM_EPSILON = 1e-5
 _MAX_BYTES = 1 << 28

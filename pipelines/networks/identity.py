@@ -6,10 +6,10 @@ import hashlib
 from dataclasses import replace
 from pathlib import Path
 
-from msgs_slam.formats.digest import files_sha256
-from msgs_slam.pipelines.networks.card import Card
-from msgs_slam.pipelines.networks.onnx_file import external_locations, require_own_weights
-from msgs_slam.pipelines.networks.runtime import is_tflite
+from ...formats.digest import files_sha256
+from .card import Card
+from .onnx_file import external_locations, require_own_weights
+from .runtime import is_tflite
 
 
 def card_identity(card: Card) -> str:

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.networks.card import Card
-from msgs_slam.pipelines.networks.letterbox import Letterbox
-from msgs_slam.pipelines.networks.session import Network
+from ...formats.errors import InputError
+from .card import Card
+from .letterbox import Letterbox
+from .session import Network
 
 
 def network_probabilities(network: Network, output: NDArray, width: int, height: int, side: int = 0) -> NDArray:

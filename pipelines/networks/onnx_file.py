@@ -6,8 +6,8 @@ import mmap
 from collections.abc import Iterator
 from pathlib import Path
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.reading import opened, parsing
+from ...formats.errors import InputError
+from ...formats.reading import opened, parsing
 
 # Field numbers of onnx.proto: which fields lead to tensors, by message.
 _DESCEND = {

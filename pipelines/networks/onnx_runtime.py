@@ -9,10 +9,10 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from msgs_slam.formats.reading import parsing
-from msgs_slam.pipelines.networks.onnx_file import require_own_weights
-from msgs_slam.pipelines.networks.port import Port
-from msgs_slam.pipelines.system.progress import log
+from ...formats.reading import parsing
+from ..system.progress import log
+from .onnx_file import require_own_weights
+from .port import Port
 
 _TYPES: dict[str, type[np.generic]] = {
     "tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(int64)": np.int64, "tensor(int32)": np.int32,

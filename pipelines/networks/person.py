@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.networks.session import Network
+from ...formats.errors import InputError
+from .session import Network
 
 
 def person_probability(network: Network, image: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from msgs_slam.formats.atomic import atomic_path
-from msgs_slam.formats.digest import file_sha256
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import read_json_object, write_json
-from msgs_slam.formats.reading import reaching, require_file
-from msgs_slam.pipelines.networks.card import Card, card_from_values
-from msgs_slam.pipelines.networks.download import fetch
+from ...formats.atomic import atomic_path
+from ...formats.digest import file_sha256
+from ...formats.errors import InputError
+from ...formats.jsonfile import read_json_object, write_json
+from ...formats.reading import reaching, require_file
+from .card import Card, card_from_values
+from .download import fetch
 
 _TABLE = Path(__file__).with_name("registry.toml")
 _NOT_IN_CARDS = ("suffix", "ade20k", "metres_only")
@@ -179,7 +179,7 @@ class ModelStore:
         if family not in known:
             raise InputError(f"there is no family {family!r}; known: {', '.join(known)}")
         require_file(file)
-        from msgs_slam.pipelines.networks.session import Network
+        from .session import Network
 
         digest, size = file_sha256(file), file.stat().st_size
         model = Model(name or file.stem, family, (), size, digest, "the user's own file", False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from msgs_slam.pipelines.networks.port import Runtime
+from .port import Runtime
 
 
 def is_tflite(path: Path) -> bool:
@@ -19,9 +19,9 @@ def open_runtime(path: Path, outputs: Sequence[str], threads: int, device: str) 
     Raises InputError for a file that is none, or keeps weights outside its own folder.
     """
     if is_tflite(path):
-        from msgs_slam.pipelines.networks.tflite_runtime import TfliteRuntime
+        from .tflite_runtime import TfliteRuntime
 
         return TfliteRuntime(path, outputs, threads)
-    from msgs_slam.pipelines.networks.onnx_runtime import OnnxRuntime
+    from .onnx_runtime import OnnxRuntime
 
     return OnnxRuntime(path, threads, device)

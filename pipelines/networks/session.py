@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.digest import file_sha256
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.networks.card import Card
-from msgs_slam.pipelines.networks.head import LinearHead, load_linear_head
-from msgs_slam.pipelines.networks.letterbox import Letterbox, choose_box
-from msgs_slam.pipelines.networks.runtime import open_runtime
-from msgs_slam.pipelines.networks.words import WordHead, load_word_head
+from ...formats.digest import file_sha256
+from ...formats.errors import InputError
+from .card import Card
+from .head import LinearHead, load_linear_head
+from .letterbox import Letterbox, choose_box
+from .runtime import open_runtime
+from .words import WordHead, load_word_head
 
 _MAX_OUTPUT_VALUES = 200_000_000
 _IMAGENET_MEAN = (123.675, 116.28, 103.53)

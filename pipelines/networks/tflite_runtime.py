@@ -18,9 +18,9 @@ from ai_edge_litert import schema_py_generated as schema
 from ai_edge_litert.interpreter import Interpreter
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.reading import parsing, read_bytes
-from msgs_slam.pipelines.networks.port import Port
+from ...formats.errors import InputError
+from ...formats.reading import parsing, read_bytes
+from .port import Port
 
 _MAGIC = b"TFL3"
 _MAX_BYTES = 1 << 30

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.reading import require_file
-from msgs_slam.formats.tensors import load_arrays
-from msgs_slam.pipelines.networks.card import Card
-from msgs_slam.pipelines.networks.runtime import open_runtime
+from ...formats.errors import InputError
+from ...formats.reading import require_file
+from ...formats.tensors import load_arrays
+from .card import Card
+from .runtime import open_runtime
 
 OTHER = "other"
 MOST_WORDS = 200

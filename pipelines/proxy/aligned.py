@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, DepthProvider
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
-from msgs_slam.pipelines.proxy.learned.depth import OnnxDepth
-from msgs_slam.pipelines.proxy.scale import depth_at_points
-from msgs_slam.pipelines.types import Frame
+from ...formats.errors import InputError
+from ..types import Frame
+from .interface.providers import DepthEstimate, DepthProvider
+from .interface.sequence import Sequence
+from .learned.depth import OnnxDepth
+from .scale import depth_at_points
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.types import ProxyMaps
+from ..types import ProxyMaps
 
 _CONFIDENCE_STEPS = 31
 _LABEL_STEPS = 15

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, DepthProvider
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
-from msgs_slam.pipelines.proxy.scale import DepthScale, measure_scale
-from msgs_slam.pipelines.proxy.stereo.fill import SURE
-from msgs_slam.pipelines.proxy.stereo.provider import MultiviewDepth
-from msgs_slam.pipelines.types import Frame
+from ..types import Frame
+from .interface.providers import DepthEstimate, DepthProvider
+from .interface.sequence import Sequence
+from .scale import DepthScale, measure_scale
+from .stereo.fill import SURE
+from .stereo.provider import MultiviewDepth
 
 _GRID_REACH = 1 / 10
 """Standard deviation of the scale grid's smoothing, as a part of the image's width."""

@@ -5,15 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from msgs_slam.formats.digest import files_sha256
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.networks.identity import card_identity
-from msgs_slam.pipelines.proxy.files.depth import FilesDepth, require_sizes
-from msgs_slam.pipelines.proxy.files.labels import FilesLabels
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
-from msgs_slam.pipelines.proxy.scale_reference import POSES, require_reference_in
-from msgs_slam.pipelines.proxy.selection import (
+from ...formats.digest import files_sha256
+from ...formats.errors import InputError
+from ..config import Config
+from ..networks.identity import card_identity
+from ..source.opening import open_source
+from ..source.recording import RecordingSource
+from ..system.progress import SilentProgress, log
+from ..types import Calibration, Frame, Intrinsics
+from .files.depth import FilesDepth, require_sizes
+from .files.labels import FilesLabels
+from .interface.sequence import Sequence
+from .scale_reference import POSES, require_reference_in
+from .selection import (
     ProviderContext,
     choose_depth,
     choose_semantics,
@@ -23,10 +27,6 @@ from msgs_slam.pipelines.proxy.selection import (
     open_learned_depth,
     open_learned_semantics,
 )
-from msgs_slam.pipelines.source.opening import open_source
-from msgs_slam.pipelines.source.recording import RecordingSource
-from msgs_slam.pipelines.system.progress import SilentProgress, log
-from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics
 
 
 def proxy_inputs(source: Path, config: Config) -> dict[str, Any]:

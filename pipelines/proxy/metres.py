@@ -7,24 +7,24 @@ from typing import Any
 
 import numpy as np
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, DepthProvider
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
-from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
-from msgs_slam.pipelines.proxy.scale import DepthScale
-from msgs_slam.pipelines.proxy.scale_reference import (
+from ...formats.errors import InputError
+from ..engine.stages import StageContext
+from ..run.files import BACKBONE, GIVEN_POSES
+from ..run.folder import RunFolder
+from ..source.opening import open_source
+from ..structure.given import agreement
+from ..types import Frame
+from .interface.providers import DepthEstimate, DepthProvider
+from .interface.sequence import Sequence
+from .regions.provider import SegmentLabels
+from .scale import DepthScale
+from .scale_reference import (
     POSES,
     ReferenceScale,
     distance_scale,
     height_scale,
     parse_reference,
 )
-from msgs_slam.pipelines.run.files import BACKBONE, GIVEN_POSES
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.source.opening import open_source
-from msgs_slam.pipelines.structure.given import agreement
-from msgs_slam.pipelines.types import Frame
 
 
 def reference_scale(

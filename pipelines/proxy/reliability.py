@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.types import VOID
+from ..types import VOID
 
 ALPHA, BETA = 0.7, 0.8
 """Eq. (2): how much depth edges lower the reliability; exponent of the depth's confidence."""

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.geometry.camera import project
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
-from msgs_slam.pipelines.types import Frame
+from ..geometry.camera import project
+from ..types import Frame
+from .interface.providers import DepthEstimate
+from .interface.sequence import Sequence
 
 _LEAST_POINTS = 20
 

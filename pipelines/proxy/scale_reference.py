@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.correspondence.features import to_grey
-from msgs_slam.pipelines.correspondence.flow import follow
-from msgs_slam.pipelines.geometry.camera import unproject
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence, resize_area
-from msgs_slam.pipelines.source.opening import Source, VideoSource
-from msgs_slam.pipelines.types import Frame, Intrinsics
+from ...formats.errors import InputError
+from ..correspondence.features import to_grey
+from ..correspondence.flow import follow
+from ..geometry.camera import unproject
+from ..source.opening import Source, VideoSource
+from ..types import Frame, Intrinsics
+from .interface.providers import DepthEstimate
+from .interface.sequence import Sequence, resize_area
 
 Array = NDArray[np.float64]
 DepthOf = Callable[[Frame], DepthEstimate]

@@ -8,27 +8,27 @@ from difflib import get_close_matches
 from pathlib import Path
 from statistics import median
 
-from msgs_slam.formats.datasets import Sequence as Recording
-from msgs_slam.formats.errors import InputError, SettingError
-from msgs_slam.pipelines.config import ProxyConfig
-from msgs_slam.pipelines.networks.card import Card, read_card
-from msgs_slam.pipelines.networks.registry import ModelStore, default_cache
-from msgs_slam.pipelines.networks.words import with_words
-from msgs_slam.pipelines.proxy.aligned import AlignedDepth
-from msgs_slam.pipelines.proxy.files.depth import FilesDepth
-from msgs_slam.pipelines.proxy.files.labels import FilesLabels
-from msgs_slam.pipelines.proxy.files.recording import RecordingDepth, RecordingLabels
-from msgs_slam.pipelines.proxy.fused import FusedDepth
-from msgs_slam.pipelines.proxy.interface.providers import DepthProvider, SemanticsProvider
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
-from msgs_slam.pipelines.proxy.learned.clusters import OnnxClusters
-from msgs_slam.pipelines.proxy.learned.depth import OnnxDepth
-from msgs_slam.pipelines.proxy.learned.labels import OnnxLabels
-from msgs_slam.pipelines.proxy.learned.network_pass import ResultCache, Workplace
-from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
-from msgs_slam.pipelines.proxy.scale import measure_scale
-from msgs_slam.pipelines.proxy.stereo.provider import MultiviewDepth
-from msgs_slam.pipelines.system.progress import Progress
+from ...formats.datasets import Sequence as Recording
+from ...formats.errors import InputError, SettingError
+from ..config import ProxyConfig
+from ..networks.card import Card, read_card
+from ..networks.registry import ModelStore, default_cache
+from ..networks.words import with_words
+from ..system.progress import Progress
+from .aligned import AlignedDepth
+from .files.depth import FilesDepth
+from .files.labels import FilesLabels
+from .files.recording import RecordingDepth, RecordingLabels
+from .fused import FusedDepth
+from .interface.providers import DepthProvider, SemanticsProvider
+from .interface.sequence import Sequence
+from .learned.clusters import OnnxClusters
+from .learned.depth import OnnxDepth
+from .learned.labels import OnnxLabels
+from .learned.network_pass import ResultCache, Workplace
+from .regions.provider import SegmentLabels
+from .scale import measure_scale
+from .stereo.provider import MultiviewDepth
 
 LEARNED_SPREAD = 0.02
 """Files whose depths stray by more from the triangulated points, relatively and within one frame, are taken for a

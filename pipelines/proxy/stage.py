@@ -7,16 +7,19 @@ from typing import Any
 import cv2
 import numpy as np
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.engine.stages import Stage, StageContext
-from msgs_slam.pipelines.masks.moving import find_moving
-from msgs_slam.pipelines.proxy.inputs import check_proxy, left_to_auto, proxy_inputs
-from msgs_slam.pipelines.proxy.interface.providers import prepared
-from msgs_slam.pipelines.proxy.metres import reference_scale, scale_figures
-from msgs_slam.pipelines.proxy.scale import DepthScale, measure_scale
-from msgs_slam.pipelines.proxy.scale_reference import ReferenceScale
-from msgs_slam.pipelines.proxy.stereo.provider import MultiviewDepth
-from msgs_slam.pipelines.proxy.tasks import (
+from ...formats.errors import InputError
+from ..engine.stages import Stage, StageContext
+from ..masks.moving import find_moving
+from ..run.files import CLASSES, DESCRIPTORS, FIGURES, FRAME_SCALES, LEFT_OUT, PROXY_MAPS
+from ..system.progress import log
+from ..types import VOID, Frame
+from .inputs import check_proxy, left_to_auto, proxy_inputs
+from .interface.providers import prepared
+from .metres import reference_scale, scale_figures
+from .scale import DepthScale, measure_scale
+from .scale_reference import ReferenceScale
+from .stereo.provider import MultiviewDepth
+from .tasks import (
     ProxyWork,
     in_frames,
     look_for_depth,
@@ -25,9 +28,6 @@ from msgs_slam.pipelines.proxy.tasks import (
     make_depths,
     make_maps,
 )
-from msgs_slam.pipelines.run.files import CLASSES, DESCRIPTORS, FIGURES, FRAME_SCALES, LEFT_OUT, PROXY_MAPS
-from msgs_slam.pipelines.system.progress import log
-from msgs_slam.pipelines.types import VOID, Frame
 
 _MOSTLY_MATCHED = 0.55
 """Share of reliable pixels below which depth is a guess in large parts: of five recordings two have less (0.40, 0.49;

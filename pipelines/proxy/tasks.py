@@ -11,29 +11,29 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.depth.resize import resample_nearest
-from msgs_slam.pipelines.engine.chunks import Chunk, in_chunks
-from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.masks.moving import SIDE, MovingView, look_once
-from msgs_slam.pipelines.proxy.compact import compact
-from msgs_slam.pipelines.proxy.interface.providers import (
+from ..depth.resize import resample_nearest
+from ..engine.chunks import Chunk, in_chunks
+from ..engine.stages import StageContext
+from ..masks.moving import SIDE, MovingView, look_once
+from ..run.files import BACKBONE, CALIBRATION, FRAMES, LEFT_OUT, PROXY_MAPS
+from ..source.recording import open_recording
+from ..system.parallel import abreast
+from ..system.progress import Progress
+from ..system.values import load_value, save_value
+from ..types import Frame, Intrinsics, ProxyMaps, any_of
+from ..voxels.voxels import to_lab
+from .compact import compact
+from .interface.providers import (
     DepthEstimate,
     DepthProvider,
     LabelEstimate,
     SemanticsProvider,
     take_prepared,
 )
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence, resize_area
-from msgs_slam.pipelines.proxy.reliability import reliability
-from msgs_slam.pipelines.proxy.scale import DepthScale
-from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth, open_semantics
-from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, LEFT_OUT, PROXY_MAPS
-from msgs_slam.pipelines.source.recording import open_recording
-from msgs_slam.pipelines.system.parallel import abreast
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.system.values import load_value, save_value
-from msgs_slam.pipelines.types import Frame, Intrinsics, ProxyMaps, any_of
-from msgs_slam.pipelines.voxels.voxels import to_lab
+from .interface.sequence import Sequence, resize_area
+from .reliability import reliability
+from .scale import DepthScale
+from .selection import ProviderContext, open_depth, open_semantics
 
 R = TypeVar("R")
 

@@ -15,19 +15,19 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.atomic import copy_file
-from msgs_slam.formats.digest import file_sha256
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import read_json_object, write_json
-from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, EXPOSURE, FRAMES, MAP, TRAJECTORY
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.layouts import RunFile, dataclass_from_json, reading
-from msgs_slam.pipelines.run.names import SOURCE_LIST
-from msgs_slam.pipelines.run.records import load_source
-from msgs_slam.pipelines.types import Calibration, Frame
+from ...formats.atomic import copy_file
+from ...formats.digest import file_sha256
+from ...formats.errors import InputError
+from ...formats.jsonfile import read_json_object, write_json
+from ..types import Calibration, Frame
+from .files import BACKBONE, CALIBRATION, EXPOSURE, FRAMES, MAP, TRAJECTORY
+from .folder import RunFolder
+from .layouts import RunFile, dataclass_from_json, reading
+from .names import SOURCE_LIST
+from .records import load_source
 
 if TYPE_CHECKING:
-    from msgs_slam.pipelines.gaussian_map import GaussianMap
+    from ..gaussian_map import GaussianMap
 
 T = TypeVar("T")
 

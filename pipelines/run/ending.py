@@ -18,13 +18,13 @@ from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import read_json_object, write_json
-from msgs_slam.formats.reading import parsing
-from msgs_slam.pipelines.run.finished_files import FinishedFiles
-from msgs_slam.pipelines.run.journal import Journal, discard
-from msgs_slam.pipelines.run.layouts import dataclass_from_json
-from msgs_slam.pipelines.run.records import StageRecord, checksums, content_digest
+from ...formats.errors import InputError
+from ...formats.jsonfile import read_json_object, write_json
+from ...formats.reading import parsing
+from .finished_files import FinishedFiles
+from .journal import Journal, discard
+from .layouts import dataclass_from_json
+from .records import StageRecord, checksums, content_digest
 
 FINGERPRINT, SNAPSHOT, RECORD = "fingerprint", "snapshot", ".record.json"
 """In an unfinished folder: the work that it belongs to, the folder of snapshots, the record of a stage that ended."""

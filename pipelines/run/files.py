@@ -14,17 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.atomic import write_text
-from msgs_slam.pipelines.depth.fields import FINE, DepthFields
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.run.layouts import (
-    RunFile,
-    dataclass_from_json,
-    require_increasing,
-    require_indices,
-    require_rigid,
-)
-from msgs_slam.pipelines.types import (
+from ...formats.atomic import write_text
+from ..depth.fields import FINE, DepthFields
+from ..geometry.sparse_model import SparseModel
+from ..types import (
     VOID,
     Calibration,
     ClassTable,
@@ -37,9 +30,16 @@ from msgs_slam.pipelines.types import (
     Trajectory,
     Vocabulary,
 )
+from .layouts import (
+    RunFile,
+    dataclass_from_json,
+    require_increasing,
+    require_indices,
+    require_rigid,
+)
 
 if TYPE_CHECKING:
-    from msgs_slam.pipelines.gaussian_map import GaussianMap
+    from ..gaussian_map import GaussianMap
 
 Arrays = Mapping[str, NDArray]
 MESH = "mesh.ply"
@@ -250,7 +250,7 @@ EXPOSURE: RunFile[dict[str, NDArray]] = RunFile(
 
 
 def _map(tensors: Mapping[str, Any]) -> GaussianMap:
-    from msgs_slam.pipelines.gaussian_map import GaussianMap  # imports torch, and few who read a run need it
+    from ..gaussian_map import GaussianMap  # imports torch, and few who read a run need it
 
     if not all(bool(t.isfinite().all()) for t in tensors.values()):
         raise ValueError("it holds numbers that are not finite")

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from msgs_slam.formats.digest import file_sha256
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.run.records import Manifest, read_manifest
-from msgs_slam.pipelines.system.wording import quoted
+from ...formats.digest import file_sha256
+from ...formats.errors import InputError
+from ..system.wording import quoted
+from .records import Manifest, read_manifest
 
 Stamp = tuple[int, int, int]
 """Inode, bytes and time of change: another one means that the file may be another."""

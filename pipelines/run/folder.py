@@ -20,11 +20,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.images import read_rgb
-from msgs_slam.pipelines.run.files import LEFT_OUT, PROXY_MAPS, SPARSE
-from msgs_slam.pipelines.run.finished_files import FinishedFiles
-from msgs_slam.pipelines.run.layouts import RunFile
-from msgs_slam.pipelines.types import Frame, ProxyMaps, any_of
+from ...formats.images import read_rgb
+from ..types import Frame, ProxyMaps, any_of
+from .files import LEFT_OUT, PROXY_MAPS, SPARSE
+from .finished_files import FinishedFiles
+from .layouts import RunFile
 
 T = TypeVar("T")
 

@@ -10,11 +10,11 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from msgs_slam.formats.atomic import process_mark
-from msgs_slam.formats.digest import file_sha256
-from msgs_slam.formats.errors import RecoverableError
-from msgs_slam.pipelines.system.stopping import stop_if_asked
-from msgs_slam.pipelines.system.wording import quoted
+from ...formats.atomic import process_mark
+from ...formats.digest import file_sha256
+from ...formats.errors import RecoverableError
+from ..system.stopping import stop_if_asked
+from ..system.wording import quoted
 
 JOURNAL = ".written"
 

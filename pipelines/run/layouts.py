@@ -16,11 +16,11 @@ from typing import Any, Generic, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import read_grey_png, write_grey_png
-from msgs_slam.formats.jsonfile import read_json, write_json
-from msgs_slam.formats.reading import parsing
-from msgs_slam.formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
+from ...formats.errors import InputError
+from ...formats.images import read_grey_png, write_grey_png
+from ...formats.jsonfile import read_json, write_json
+from ...formats.reading import parsing
+from ...formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
 
 T = TypeVar("T")
 _KINDS = {"f": "f", "i": "iu", "b": "b", "u": "U"}

@@ -10,10 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-from msgs_slam.formats.errors import InputError, RecoverableError
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock_file import leading, shows_life
-from msgs_slam.pipelines.run.records import load_records
+from ...formats.errors import InputError, RecoverableError
+from .folder import RunFolder
+from .lock_file import leading, shows_life
+from .records import load_records
 
 LOCK, LEADER = ".lock", ".leader"
 _LOOKS, _A_MOMENT = 3, 0.05

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from msgs_slam.formats.atomic import machine_mark, process_mark
-from msgs_slam.pipelines.system.progress import log
+from ...formats.atomic import machine_mark, process_mark
+from ..system.progress import log
 
 BEAT, SILENT = 15.0, 180.0
 """Seconds between two signs of life, and without one after which a process is taken for dead: network disks show a

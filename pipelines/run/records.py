@@ -10,18 +10,18 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from msgs_slam.formats.digest import file_sha256
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import read_json_object, write_json
-from msgs_slam.formats.reading import parsing
-from msgs_slam.pipelines.config import Config, config_to_dict
-from msgs_slam.pipelines.read_config import merge_known_settings
-from msgs_slam.pipelines.run.layouts import dataclass_from_json
-from msgs_slam.pipelines.run.names import EXTENSION, SOURCE_LIST, STAGES
-from msgs_slam.pipelines.system.wording import quoted
+from ...formats.digest import file_sha256
+from ...formats.errors import InputError
+from ...formats.jsonfile import read_json_object, write_json
+from ...formats.reading import parsing
+from ..config import Config, config_to_dict
+from ..read_config import merge_known_settings
+from ..system.wording import quoted
+from .layouts import dataclass_from_json
+from .names import EXTENSION, SOURCE_LIST, STAGES
 
 if TYPE_CHECKING:
-    from msgs_slam.pipelines.run.folder import RunFolder
+    from .folder import RunFolder
 
 FORMAT = 2
 """Of manifest.json."""

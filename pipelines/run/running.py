@@ -11,12 +11,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import read_json
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.layouts import dataclass_from_json
-from msgs_slam.pipelines.run.lock import is_led
-from msgs_slam.pipelines.system.progress import BEGUN, Progress, StageEvent, about
+from ...formats.errors import InputError
+from ...formats.jsonfile import read_json
+from ..system.progress import BEGUN, Progress, StageEvent, about
+from .folder import RunFolder
+from .layouts import dataclass_from_json
+from .lock import is_led
 
 T = TypeVar("T")
 FILE = ".progress.json"

@@ -7,19 +7,19 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from msgs_slam.formats.atomic import write_text
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import MAX_TOML_BYTES, read_toml
-from msgs_slam.formats.reading import opened
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.read_config import config_to_toml, merge_known_settings
-from msgs_slam.pipelines.run.before import before_of
-from msgs_slam.pipelines.run.records import load_records, load_source, recorded_config
-from msgs_slam.pipelines.system.progress import log
-from msgs_slam.pipelines.system.wording import quoted
+from ...formats.atomic import write_text
+from ...formats.errors import InputError
+from ...formats.jsonfile import MAX_TOML_BYTES, read_toml
+from ...formats.reading import opened
+from ..config import Config
+from ..read_config import config_to_toml, merge_known_settings
+from ..system.progress import log
+from ..system.wording import quoted
+from .before import before_of
+from .records import load_records, load_source, recorded_config
 
 if TYPE_CHECKING:
-    from msgs_slam.pipelines.run.folder import RunFolder
+    from .folder import RunFolder
 
 _MARK = re.compile(r"# Written by msgs-slam\. Change settings with --set or --config\. Check: ([0-9a-f]{64})\n")
 

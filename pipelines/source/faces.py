@@ -13,17 +13,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.spherical import PART, WHOLE, image_sphere, video_sphere
-from msgs_slam.pipelines.config import FramesConfig
-from msgs_slam.pipelines.geometry.rig import CUBE, LEVEL
-from msgs_slam.pipelines.source.opening import FolderSource, VideoSource
-from msgs_slam.pipelines.source.recording import RecordingSource
-from msgs_slam.pipelines.source.sharpness import reduced_size
-from msgs_slam.pipelines.structure.calibration import read_intrinsics
-from msgs_slam.pipelines.structure.lens import make_lens, to_pycolmap
-from msgs_slam.pipelines.types import Intrinsics
+from ...formats.datasets.camera import Camera
+from ...formats.errors import InputError
+from ...formats.spherical import PART, WHOLE, image_sphere, video_sphere
+from ..config import FramesConfig
+from ..geometry.rig import CUBE, LEVEL
+from ..structure.calibration import read_intrinsics
+from ..structure.lens import make_lens, to_pycolmap
+from ..types import Intrinsics
+from .opening import FolderSource, VideoSource
+from .recording import RecordingSource
+from .sharpness import reduced_size
 
 Pixel = TypeVar("Pixel", np.uint8, np.bool_)
 Map = tuple[NDArray[np.float32], NDArray[np.float32]]

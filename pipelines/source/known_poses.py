@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets.matching import SAME_INSTANT_SECONDS, poses_at
-from msgs_slam.formats.digest import files_sha256
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.image_times import frame_number
-from msgs_slam.formats.poses import PoseFile, read_poses, stem
-from msgs_slam.formats.reading import home_expanded
-from msgs_slam.pipelines.config import FramesConfig
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.source.opening import FolderSource, VideoSource, Warn
-from msgs_slam.pipelines.source.recording import RecordingSource
-from msgs_slam.pipelines.types import Frame, GivenPoses
+from ...formats.datasets.matching import SAME_INSTANT_SECONDS, poses_at
+from ...formats.digest import files_sha256
+from ...formats.errors import InputError
+from ...formats.image_times import frame_number
+from ...formats.poses import PoseFile, read_poses, stem
+from ...formats.reading import home_expanded
+from ..config import FramesConfig
+from ..geometry import se3
+from ..types import Frame, GivenPoses
+from .opening import FolderSource, VideoSource, Warn
+from .recording import RecordingSource
 
 AnySource = VideoSource | FolderSource | RecordingSource
 LEAST = 3

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.exif import QUARTER_TURNS, ExifLens
-from msgs_slam.formats.images import Header, read_deep, read_header
+from ...formats.errors import InputError
+from ...formats.exif import QUARTER_TURNS, ExifLens
+from ...formats.images import Header, read_deep, read_header
 
 _ALIKE = 1.05
 """Focal lengths that differ by less are one: EXIF rounds to whole millimetres, which are 4 % of 25, and the focus moves

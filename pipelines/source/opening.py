@@ -12,16 +12,16 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.digest import file_sha256, files_sha256
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.image_times import read_image_times, times_file
-from msgs_slam.formats.images import Reading, is_depth_map, list_images, read_rgb, read_transparent
-from msgs_slam.formats.reading import opened, reaching, require_file
-from msgs_slam.formats.textfile import read_text
-from msgs_slam.formats.video import VideoFrame, VideoReader, probe_video
-from msgs_slam.pipelines.source.one_camera import Headers, common_span, read_headers, require_one_lens
-from msgs_slam.pipelines.source.originals import reusable, written_names
-from msgs_slam.pipelines.source.recording import RecordingSource, open_recording
+from ...formats.digest import file_sha256, files_sha256
+from ...formats.errors import InputError
+from ...formats.image_times import read_image_times, times_file
+from ...formats.images import Reading, is_depth_map, list_images, read_rgb, read_transparent
+from ...formats.reading import opened, reaching, require_file
+from ...formats.textfile import read_text
+from ...formats.video import VideoFrame, VideoReader, probe_video
+from .one_camera import Headers, common_span, read_headers, require_one_lens
+from .originals import reusable, written_names
+from .recording import RecordingSource, open_recording
 
 Warn = Callable[[str], None]
 LIST_SUFFIX = ".videos"

@@ -6,8 +6,8 @@ import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import is_plain
+from ...formats.errors import InputError
+from ...formats.images import is_plain
 
 WRITTEN_SUFFIXES = (".jpg", ".jpeg", ".png")
 _LONGEST_NAME = 255

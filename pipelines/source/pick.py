@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.video import VideoFrame
-from msgs_slam.pipelines.source.sharpness import sharpness
+from ...formats.video import VideoFrame
+from .sharpness import sharpness
 
 _TIME_SLACK = 1e-6
 """Seconds: a frame due exactly at a window's start must not fall into the window before by rounding."""

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets import Camera, Sequence, open_sequence, recognise_source
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import Reading, read_rgb, read_transparent
-from msgs_slam.formats.video import VideoFrame
-from msgs_slam.pipelines.source.one_camera import Headers, common_span, read_headers, require_one_lens
-from msgs_slam.pipelines.source.originals import reusable, written_names
+from ...formats.datasets import Camera, Sequence, open_sequence, recognise_source
+from ...formats.errors import InputError
+from ...formats.images import Reading, read_rgb, read_transparent
+from ...formats.video import VideoFrame
+from .one_camera import Headers, common_span, read_headers, require_one_lens
+from .originals import reusable, written_names
 
 Warn = Callable[[str], None]
 

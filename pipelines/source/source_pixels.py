@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.pipelines.structure.lens import make_lens, to_pycolmap
-from msgs_slam.pipelines.types import Calibration
+from ...formats.datasets.camera import Camera
+from ..structure.lens import make_lens, to_pycolmap
+from ..types import Calibration
 
 
 class FramePixels:

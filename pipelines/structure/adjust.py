@@ -9,8 +9,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.formats.reconstruction import ModelArrays
-from msgs_slam.pipelines.structure.lens import set_lens
+from ...formats.reconstruction import ModelArrays
+from .lens import set_lens
 
 CAUCHY_PX = 1.0
 _MAX_REPROJECTION_PX = 4.0

@@ -8,9 +8,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.formats.reconstruction import ModelArrays
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.structure.lens import Lens
+from ...formats.reconstruction import ModelArrays
+from ..geometry.sparse_model import SparseModel
+from .lens import Lens
 
 
 def to_sparse_model(

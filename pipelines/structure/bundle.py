@@ -16,11 +16,11 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import bsr_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.camera import project
-from msgs_slam.pipelines.geometry.rig import ONE_CAMERA, Rig, tie_cameras
-from msgs_slam.pipelines.structure import bundle_kernels as kernels
-from msgs_slam.pipelines.types import Intrinsics, require_shape
+from ..geometry import se3
+from ..geometry.camera import project
+from ..geometry.rig import ONE_CAMERA, Rig, tie_cameras
+from ..types import Intrinsics, require_shape
+from . import bundle_kernels as kernels
 
 Array = NDArray[np.float64]
 

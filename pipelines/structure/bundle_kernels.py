@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.system.jit import kernel
+from ..system.jit import kernel
 
 MIN_DEPTH = 1e-6
 """Relative to nothing: a point behind the camera is treated as an outlier of zero weight."""

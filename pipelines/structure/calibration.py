@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.formats.datasets.intrinsics_json import read_intrinsics_json
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.reading import home_expanded, reaching
-from msgs_slam.formats.textfile import read_rows
+from ...formats.datasets.camera import Camera
+from ...formats.datasets.intrinsics_json import read_intrinsics_json
+from ...formats.errors import InputError
+from ...formats.reading import home_expanded, reaching
+from ...formats.textfile import read_rows
 
 _HOW = "give fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file that holds them"
 _PARAMETERS = {

@@ -14,19 +14,22 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.config import FramesConfig
-from msgs_slam.pipelines.correspondence.database import write_database
-from msgs_slam.pipelines.correspondence.matching import VerifiedPair
-from msgs_slam.pipelines.correspondence.snapshots import Snapshots
-from msgs_slam.pipelines.geometry.rig import ONE_CAMERA
-from msgs_slam.pipelines.structure.adjust import CAUCHY_PX, adjust, filter_outliers, solve
-from msgs_slam.pipelines.structure.consistency import ModelReport, judge, without_misplaced
-from msgs_slam.pipelines.structure.focal import calibrated
-from msgs_slam.pipelines.structure.freeing import LEAST_BETTER, LEAST_GAIN_OF_FREEING, gain_of_freeing, unexplained
-from msgs_slam.pipelines.structure.given import posed_model
-from msgs_slam.pipelines.structure.lens import FOCAL_GUESS, unknown_camera
-from msgs_slam.pipelines.structure.mappers import map_globally, map_incrementally
-from msgs_slam.pipelines.structure.rolling import (
+from ..config import FramesConfig
+from ..correspondence.database import write_database
+from ..correspondence.matching import VerifiedPair
+from ..correspondence.snapshots import Snapshots
+from ..geometry.rig import ONE_CAMERA
+from ..system.lru_sequence import LruSequence
+from ..system.progress import Progress
+from ..types import Features
+from .adjust import CAUCHY_PX, adjust, filter_outliers, solve
+from .consistency import ModelReport, judge, without_misplaced
+from .focal import calibrated
+from .freeing import LEAST_BETTER, LEAST_GAIN_OF_FREEING, gain_of_freeing, unexplained
+from .given import posed_model
+from .lens import FOCAL_GUESS, unknown_camera
+from .mappers import map_globally, map_incrementally
+from .rolling import (
     FEATURE_SD,
     NO_READOUT,
     Readout,
@@ -34,11 +37,8 @@ from msgs_slam.pipelines.structure.rolling import (
     read_readout,
     straight_copy,
 )
-from msgs_slam.pipelines.structure.scale_repair import mended
-from msgs_slam.pipelines.structure.windows import WIDE, close_loops
-from msgs_slam.pipelines.system.lru_sequence import LruSequence
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.types import Features
+from .scale_repair import mended
+from .windows import WIDE, close_loops
 
 _MIN_KEYFRAMES = 3
 _MIN_POINTS = 30

@@ -10,9 +10,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.correspondence.matching import VerifiedPair
-from msgs_slam.pipelines.structure.adjust import median_error
-from msgs_slam.pipelines.structure.seams import (
+from ..correspondence.matching import VerifiedPair
+from .adjust import median_error
+from .seams import (
     PairCheck,
     Seam,
     find_misplaced,

@@ -16,8 +16,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.correspondence.matching import MIN_INLIERS, VerifiedPair
-from msgs_slam.pipelines.geometry import se3
+from ..correspondence.matching import MIN_INLIERS, VerifiedPair
+from ..geometry import se3
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.correspondence.matching import VerifiedPair
-from msgs_slam.pipelines.structure.adjust import reprojection_errors, solve
-from msgs_slam.pipelines.structure.consistency import matched_errors
-from msgs_slam.pipelines.structure.lens import distortion_of
+from ..correspondence.matching import VerifiedPair
+from .adjust import reprojection_errors, solve
+from .consistency import matched_errors
+from .lens import distortion_of
 
 LEAST_GAIN_OF_FREEING = 0.03
 """Of the cost that must go. Freed, a Kinect's calibration explained 0.013 more of a recording with rolling shutter and

@@ -9,13 +9,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.correspondence.matching import VerifiedPair
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.alignment import Similarity, best_rotation
-from msgs_slam.pipelines.structure.adjust import filter_outliers, solve
-from msgs_slam.pipelines.structure.freeing import unexplained
-from msgs_slam.pipelines.structure.seams import LEAST_POINTS, remove_keyframes
-from msgs_slam.pipelines.structure.tracks import complete_tracks
+from ..correspondence.matching import VerifiedPair
+from ..geometry import se3
+from ..geometry.alignment import Similarity, best_rotation
+from .adjust import filter_outliers, solve
+from .freeing import unexplained
+from .seams import LEAST_POINTS, remove_keyframes
+from .tracks import complete_tracks
 
 Array = NDArray[np.float64]
 

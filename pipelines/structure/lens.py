@@ -10,8 +10,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.pipelines.types import Calibration, Intrinsics
+from ...formats.datasets.camera import Camera
+from ..types import Calibration, Intrinsics
 
 _BORDER_POINTS = 65
 _FOCAL_ROUNDS = 6

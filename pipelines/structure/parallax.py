@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.correspondence.matching import VerifiedPair
-from msgs_slam.pipelines.geometry.alignment import best_rotation
+from ...formats.errors import InputError
+from ..correspondence.matching import VerifiedPair
+from ..geometry.alignment import best_rotation
 
 HOW_TO_FILM = (
     "Film again while walking: move the camera sideways by a tenth of the distance to what it shows, rather than "

@@ -17,13 +17,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.reconstruction import ModelArrays
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.structure import bundle_kernels as kernels
-from msgs_slam.pipelines.structure.adjust import adjust, solve
-from msgs_slam.pipelines.structure.bundle import Bundle, Problem
-from msgs_slam.pipelines.types import Intrinsics
+from ...formats.errors import InputError
+from ...formats.reconstruction import ModelArrays
+from ..geometry import se3
+from ..types import Intrinsics
+from . import bundle_kernels as kernels
+from .adjust import adjust, solve
+from .bundle import Bundle, Problem
 
 Array = NDArray[np.float64]
 Readout = tuple[float, float]

@@ -13,12 +13,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.formats.reconstruction import pose_of, set_pose
-from msgs_slam.pipelines.correspondence.matching import VerifiedPair
-from msgs_slam.pipelines.structure.adjust import filter_outliers, solve
-from msgs_slam.pipelines.structure.consistency import ModelReport, judge
-from msgs_slam.pipelines.structure.seams import LEAST_POINTS, parts_of, tracks_of
-from msgs_slam.pipelines.structure.tracks import complete_tracks
+from ...formats.reconstruction import pose_of, set_pose
+from ..correspondence.matching import VerifiedPair
+from .adjust import filter_outliers, solve
+from .consistency import ModelReport, judge
+from .seams import LEAST_POINTS, parts_of, tracks_of
+from .tracks import complete_tracks
 
 _LEAST_ANGLE = 0.01
 """Radians between the rays of two cameras below which they give no depth."""

@@ -13,11 +13,11 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import read_json, write_json
-from msgs_slam.pipelines.correspondence.bridges import Picture, weakly_connected, with_bridges
-from msgs_slam.pipelines.correspondence.matching import VerifiedPair, match_pair
-from msgs_slam.pipelines.correspondence.retrieval import (
+from ...formats.errors import InputError
+from ...formats.jsonfile import read_json, write_json
+from ..correspondence.bridges import Picture, weakly_connected, with_bridges
+from ..correspondence.matching import VerifiedPair, match_pair
+from ..correspondence.retrieval import (
     GlobalDescriptors,
     compute_global_descriptors,
     far_apart,
@@ -25,23 +25,23 @@ from msgs_slam.pipelines.correspondence.retrieval import (
     loop_pairs,
     sequential_pairs,
 )
-from msgs_slam.pipelines.correspondence.snapshots import Snapshots, features_name, pairs_name
-from msgs_slam.pipelines.structure.adjust import adjust
-from msgs_slam.pipelines.structure.candidates import GIVEN_ALONE, Adjusted, Candidates, Views
-from msgs_slam.pipelines.structure.consistency import ModelReport, judge
-from msgs_slam.pipelines.structure.given import bare_model, set_best_focal
-from msgs_slam.pipelines.structure.lens import set_lens
-from msgs_slam.pipelines.structure.parallax import HOW_TO_FILM, require_parallax
-from msgs_slam.pipelines.structure.rolling import NO_READOUT, Readout, adjust_rolling, read_readout
-from msgs_slam.pipelines.structure.seams import cut, remove_keyframes
-from msgs_slam.pipelines.structure.window_models import WindowModels
-from msgs_slam.pipelines.structure.window_size import SIZE, windows_of
-from msgs_slam.pipelines.structure.windows import adjust_joined
-from msgs_slam.pipelines.system.lru_sequence import LruSequence
-from msgs_slam.pipelines.system.memory import release_free_memory
-from msgs_slam.pipelines.system.parallel import parallel_map
-from msgs_slam.pipelines.system.progress import log
-from msgs_slam.pipelines.types import Features, Vocabulary
+from ..correspondence.snapshots import Snapshots, features_name, pairs_name
+from ..system.lru_sequence import LruSequence
+from ..system.memory import release_free_memory
+from ..system.parallel import parallel_map
+from ..system.progress import log
+from ..types import Features, Vocabulary
+from .adjust import adjust
+from .candidates import GIVEN_ALONE, Adjusted, Candidates, Views
+from .consistency import ModelReport, judge
+from .given import bare_model, set_best_focal
+from .lens import set_lens
+from .parallax import HOW_TO_FILM, require_parallax
+from .rolling import NO_READOUT, Readout, adjust_rolling, read_readout
+from .seams import cut, remove_keyframes
+from .window_models import WindowModels
+from .window_size import SIZE, windows_of
+from .windows import adjust_joined
 
 _PAIRS_PER_BLOCK = 64
 _FEATURES_SHARE = 0.25

@@ -9,9 +9,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.structure.rolling import Readout
-from msgs_slam.pipelines.structure.seams import remove_keyframes
-from msgs_slam.pipelines.structure.windows import Joined
+from .rolling import Readout
+from .seams import remove_keyframes
+from .windows import Joined
 
 Array = NDArray[np.float64]
 _SUREST_PX = 1e-3

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from msgs_slam.pipelines.system.memory import NEEDS
+from ..system.memory import NEEDS
 
 SIZE, SHARED = 500, 40
 """Keyframes of a window, and those that it shares with the one before. All at once is surer (0.20 cm against 0.26 in

@@ -14,14 +14,14 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.formats.reconstruction import pose_of, set_pose
-from msgs_slam.pipelines.correspondence.matching import VerifiedPair
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.alignment import Similarity, best_rotation
-from msgs_slam.pipelines.structure.adjust import filter_outliers, median_error
-from msgs_slam.pipelines.structure.bundle import adjust_bundle
-from msgs_slam.pipelines.structure.given import bare_model
-from msgs_slam.pipelines.structure.rolling import (
+from ...formats.reconstruction import pose_of, set_pose
+from ..correspondence.matching import VerifiedPair
+from ..geometry import se3
+from ..geometry.alignment import Similarity, best_rotation
+from .adjust import filter_outliers, median_error
+from .bundle import adjust_bundle
+from .given import bare_model
+from .rolling import (
     FEATURE_SD,
     LEAST_GAIN,
     NO_READOUT,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.system.progress import log
+from ...formats.errors import InputError
+from .progress import log
 
 
 def resolve_device(wanted: str = "auto") -> str:

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import numba
 
-from msgs_slam.pipelines.system.identity import source_digest
+from .identity import source_digest
 
 F = TypeVar("F", bound=Callable[..., Any])
 

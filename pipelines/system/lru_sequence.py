@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from threading import RLock
 from typing import Generic, TypeVar, overload
 
-from msgs_slam.pipelines.system.memory import release_free_memory
+from .memory import release_free_memory
 
 T = TypeVar("T")
 

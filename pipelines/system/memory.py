@@ -6,9 +6,9 @@ import ctypes
 import os
 import sys
 
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.system.limits import memory_limits
-from msgs_slam.pipelines.types import Intrinsics
+from ..config import Config
+from ..types import Intrinsics
+from .limits import memory_limits
 
 NEEDS = {
     "frames": (380, 640, 1.7, 0), "proxy": (750, 730, 1.8, 0), "tracking": (460, 450, 1.9, 0),

@@ -14,9 +14,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.reading import parsing
-from msgs_slam.formats.tensors import load_arrays, save_arrays
+from ...formats.errors import InputError
+from ...formats.reading import parsing
+from ...formats.tensors import load_arrays, save_arrays
 
 _TREE = "tree"
 _OURS = "msgs_slam.pipelines."

@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.config import TrackingConfig
-from msgs_slam.pipelines.depth import scales
-from msgs_slam.pipelines.depth.align import align_keyframes
-from msgs_slam.pipelines.depth.fields import DepthFields
-from msgs_slam.pipelines.depth.scales import COARSE, WorldScale
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.camera import project
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.structure.bundle import Bundle, adjust_bundle, adjust_pose
-from msgs_slam.pipelines.structure.rolling import rectified_bundle, rectified_pixels, velocities
-from msgs_slam.pipelines.tracking.rig_poses import sync_rig_poses
-from msgs_slam.pipelines.tracking.state import Sightings, TrackState
-from msgs_slam.pipelines.types import Intrinsics, ProxyMaps, rows_by
+from ..config import TrackingConfig
+from ..depth import scales
+from ..depth.align import align_keyframes
+from ..depth.fields import DepthFields
+from ..depth.scales import COARSE, WorldScale
+from ..geometry import se3
+from ..geometry.camera import project
+from ..geometry.sparse_model import SparseModel
+from ..structure.bundle import Bundle, adjust_bundle, adjust_pose
+from ..structure.rolling import rectified_bundle, rectified_pixels, velocities
+from ..types import Intrinsics, ProxyMaps, rows_by
+from .rig_poses import sync_rig_poses
+from .state import Sightings, TrackState
 
 Array = NDArray[np.float64]
 

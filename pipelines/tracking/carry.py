@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.alignment import Similarity
-from msgs_slam.pipelines.run.files import GIVEN_POSES
-from msgs_slam.pipelines.structure.given import agreement
-from msgs_slam.pipelines.system.wording import stretches
-from msgs_slam.pipelines.tracking.segments import move_segment
-from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, TrackState
-from msgs_slam.pipelines.types import GivenPoses
+from ..engine.stages import StageContext
+from ..geometry import se3
+from ..geometry.alignment import Similarity
+from ..run.files import GIVEN_POSES
+from ..structure.given import agreement
+from ..system.wording import stretches
+from ..types import GivenPoses
+from .segments import move_segment
+from .state import NO_SIGHTINGS, TrackState
 
 Array = NDArray[np.float64]
 

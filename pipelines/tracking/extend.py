@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.correspondence.flow import FLOW_SD, corners, follow
-from msgs_slam.pipelines.depth.scales import sample_proxy, scale_at_points
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.camera import project, unproject
-from msgs_slam.pipelines.tracking.pictures import Pictures
-from msgs_slam.pipelines.tracking.pnp import MIN_INLIERS, POSE_ERROR
-from msgs_slam.pipelines.tracking.state import FEATURE_SD, NO_SIGHTINGS, Sightings, TrackState
-from msgs_slam.pipelines.types import Intrinsics
+from ..correspondence.flow import FLOW_SD, corners, follow
+from ..depth.scales import sample_proxy, scale_at_points
+from ..geometry import se3
+from ..geometry.camera import project, unproject
+from ..types import Intrinsics
+from .pictures import Pictures
+from .pnp import MIN_INLIERS, POSE_ERROR
+from .state import FEATURE_SD, NO_SIGHTINGS, Sightings, TrackState
 
 Array = NDArray[np.float64]
 

@@ -6,21 +6,21 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from msgs_slam.formats.atomic import write_text
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.safe_path import require_listable
-from msgs_slam.formats.video import probe_video
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.run.before import FINAL, save_before
-from msgs_slam.pipelines.run.files import CALIBRATION
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.names import EXTENSION, SOURCE_LIST, STAGES
-from msgs_slam.pipelines.run.records import Manifest, Source, load_records, load_source, write_manifest
-from msgs_slam.pipelines.source.opening import open_source, source_digest, video_files
-from msgs_slam.pipelines.source.recording import RecordingSource
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.system.wording import quoted
-from msgs_slam.pipelines.tracking.localise import require_overlap
+from ...formats.atomic import write_text
+from ...formats.errors import InputError
+from ...formats.safe_path import require_listable
+from ...formats.video import probe_video
+from ..config import Config
+from ..run.before import FINAL, save_before
+from ..run.files import CALIBRATION
+from ..run.folder import RunFolder
+from ..run.names import EXTENSION, SOURCE_LIST, STAGES
+from ..run.records import Manifest, Source, load_records, load_source, write_manifest
+from ..source.opening import open_source, source_digest, video_files
+from ..source.recording import RecordingSource
+from ..system.progress import Progress
+from ..system.wording import quoted
+from .localise import require_overlap
 
 
 def is_added(run: RunFolder, videos: Sequence[Path]) -> bool:

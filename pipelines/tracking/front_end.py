@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.correspondence.flow import FLOW_SD, follow
-from msgs_slam.pipelines.geometry.camera import project
-from msgs_slam.pipelines.tracking.extend import promote, start_segment
-from msgs_slam.pipelines.tracking.motion import predict_pose
-from msgs_slam.pipelines.tracking.pictures import Pictures
-from msgs_slam.pipelines.tracking.pnp import MIN_INLIERS, FramePose, solve_pose
-from msgs_slam.pipelines.tracking.refine import compare_frame
-from msgs_slam.pipelines.tracking.relocalise import relocalise
-from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
+from ..correspondence.flow import FLOW_SD, follow
+from ..geometry.camera import project
+from .extend import promote, start_segment
+from .motion import predict_pose
+from .pictures import Pictures
+from .pnp import MIN_INLIERS, FramePose, solve_pose
+from .refine import compare_frame
+from .relocalise import relocalise
+from .state import NO_SIGHTINGS, Sightings, TrackState
 
 Array = NDArray[np.float64]
 

@@ -9,23 +9,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.video import VideoFrame
-from msgs_slam.pipelines.config import FramesConfig
-from msgs_slam.pipelines.frames.learned import open_learned, picture_features
-from msgs_slam.pipelines.run.files import CALIBRATION, SPARSE
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.source.opening import VideoSource
-from msgs_slam.pipelines.source.sharpness import reduce_image
-from msgs_slam.pipelines.structure.calibration import read_intrinsics
-from msgs_slam.pipelines.structure.lens import Lens, calibrated_camera, make_lens, to_pycolmap
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.system.wording import quoted
-from msgs_slam.pipelines.tracking.pictures import Pictures, load_shutter
-from msgs_slam.pipelines.tracking.pnp import MIN_INLIERS, solve_pose
-from msgs_slam.pipelines.tracking.relocalise import relocalise
-from msgs_slam.pipelines.tracking.state import FEATURE_SD, Sightings, TrackState
-from msgs_slam.pipelines.types import Features
+from ...formats.errors import InputError
+from ...formats.video import VideoFrame
+from ..config import FramesConfig
+from ..frames.learned import open_learned, picture_features
+from ..run.files import CALIBRATION, SPARSE
+from ..run.folder import RunFolder
+from ..source.opening import VideoSource
+from ..source.sharpness import reduce_image
+from ..structure.calibration import read_intrinsics
+from ..structure.lens import Lens, calibrated_camera, make_lens, to_pycolmap
+from ..system.progress import Progress
+from ..system.wording import quoted
+from ..types import Features
+from .pictures import Pictures, load_shutter
+from .pnp import MIN_INLIERS, solve_pose
+from .relocalise import relocalise
+from .state import FEATURE_SD, Sightings, TrackState
 
 _SAMPLES, _ENOUGH, _LEAST = 24, 4, 2
 """Pictures of a video that are looked at; recognised ones that are enough to stop at, and that are needed."""

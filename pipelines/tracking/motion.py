@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.geometry import se3
+from ..geometry import se3
 
 Array = NDArray[np.float64]
 

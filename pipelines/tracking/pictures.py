@@ -10,15 +10,15 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.config import FramesConfig
-from msgs_slam.pipelines.correspondence.features import to_grey
-from msgs_slam.pipelines.correspondence.retrieval import describe
-from msgs_slam.pipelines.frames.learned import open_learned, picture_features
-from msgs_slam.pipelines.run.files import CALIBRATION, FEATURES, FRAMES, VOCABULARY
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.structure.rolling import Shutter
-from msgs_slam.pipelines.system.lru_sequence import LruSequence
-from msgs_slam.pipelines.types import Features, ProxyMaps
+from ..config import FramesConfig
+from ..correspondence.features import to_grey
+from ..correspondence.retrieval import describe
+from ..frames.learned import open_learned, picture_features
+from ..run.files import CALIBRATION, FEATURES, FRAMES, VOCABULARY
+from ..run.folder import RunFolder
+from ..structure.rolling import Shutter
+from ..system.lru_sequence import LruSequence
+from ..types import Features, ProxyMaps
 
 T = TypeVar("T")
 _DESCRIPTORS_SHARE = 0.05

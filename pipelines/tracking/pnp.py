@@ -8,8 +8,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.structure.bundle import adjust_pose, reprojection_errors
-from msgs_slam.pipelines.types import Intrinsics
+from ..structure.bundle import adjust_pose, reprojection_errors
+from ..types import Intrinsics
 
 Array = NDArray[np.float64]
 

@@ -13,11 +13,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render import render, track_gn
-from msgs_slam.pipelines.tracking.pictures import Pictures
-from msgs_slam.pipelines.tracking.state import TrackState
-from msgs_slam.pipelines.tracking.working_map import WORKING_SIDE, WorkingMap, reduced_image, seed_map
-from msgs_slam.pipelines.types import Intrinsics
+from ..gaussians.render import render, track_gn
+from ..types import Intrinsics
+from .pictures import Pictures
+from .state import TrackState
+from .working_map import WORKING_SIDE, WorkingMap, reduced_image, seed_map
 
 Array = NDArray[np.float64]
 

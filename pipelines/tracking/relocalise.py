@@ -7,11 +7,11 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.correspondence.matching import match_descriptors
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.tracking.pictures import Pictures
-from msgs_slam.pipelines.tracking.pnp import MIN_INLIERS, FramePose, solve_pose
-from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
+from ..correspondence.matching import match_descriptors
+from ..geometry import se3
+from .pictures import Pictures
+from .pnp import MIN_INLIERS, FramePose, solve_pose
+from .state import NO_SIGHTINGS, Sightings, TrackState
 
 Array = NDArray[np.float64]
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.tracking.state import TrackState
-from msgs_slam.pipelines.types import Frame, Trajectory
+from ..geometry import se3
+from ..geometry.sparse_model import SparseModel
+from ..types import Frame, Trajectory
+from .state import TrackState
 
 
 def split_worlds(state: TrackState, least: int) -> list[TrackState]:

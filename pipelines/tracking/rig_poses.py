@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, TrackState
+from ..geometry import se3
+from .state import NO_SIGHTINGS, TrackState
 
 
 def sync_rig_poses(state: TrackState) -> None:

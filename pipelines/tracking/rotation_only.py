@@ -7,15 +7,15 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.correspondence.flow import corners, follow
-from msgs_slam.pipelines.correspondence.matching import match_descriptors
-from msgs_slam.pipelines.geometry.alignment import best_rotation
-from msgs_slam.pipelines.geometry.camera import project, unproject
-from msgs_slam.pipelines.tracking.motion import MAX_GAP
-from msgs_slam.pipelines.tracking.pictures import Pictures
-from msgs_slam.pipelines.tracking.pnp import MIN_INLIERS
-from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, TrackState
-from msgs_slam.pipelines.types import Intrinsics
+from ..correspondence.flow import corners, follow
+from ..correspondence.matching import match_descriptors
+from ..geometry.alignment import best_rotation
+from ..geometry.camera import project, unproject
+from ..types import Intrinsics
+from .motion import MAX_GAP
+from .pictures import Pictures
+from .pnp import MIN_INLIERS
+from .state import NO_SIGHTINGS, TrackState
 
 Array = NDArray[np.float64]
 

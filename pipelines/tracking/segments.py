@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.alignment import Similarity
-from msgs_slam.pipelines.tracking.pictures import Pictures
-from msgs_slam.pipelines.tracking.pnp import MIN_INLIERS
-from msgs_slam.pipelines.tracking.relocalise import group_by_points, recognise
-from msgs_slam.pipelines.tracking.state import Sightings, TrackState
+from ..geometry import se3
+from ..geometry.alignment import Similarity
+from .pictures import Pictures
+from .pnp import MIN_INLIERS
+from .relocalise import group_by_points, recognise
+from .state import Sightings, TrackState
 
 Array = NDArray[np.float64]
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.engine.stages import Stage, StageContext
-from msgs_slam.pipelines.geometry.rig import Rig, rig_of
-from msgs_slam.pipelines.run.files import (
+from ...formats.errors import InputError
+from ..engine.stages import Stage, StageContext
+from ..geometry.rig import Rig, rig_of
+from ..run.files import (
     BACKBONE,
     CALIBRATION,
     DEPTH_FIELDS,
@@ -17,21 +17,21 @@ from msgs_slam.pipelines.run.files import (
     SPARSE,
     TRAJECTORY,
 )
-from msgs_slam.pipelines.structure.rolling import Shutter
-from msgs_slam.pipelines.system.memory import release_free_memory
-from msgs_slam.pipelines.system.stopping import is_asked
-from msgs_slam.pipelines.system.values import load_value, save_value
-from msgs_slam.pipelines.system.wording import stretches
-from msgs_slam.pipelines.tracking.adjust import Report, adjust_state, align_depths, without_dependent_depth
-from msgs_slam.pipelines.tracking.carry import carry_given
-from msgs_slam.pipelines.tracking.front_end import FrontEnd
-from msgs_slam.pipelines.tracking.pictures import Pictures, load_shutter
-from msgs_slam.pipelines.tracking.result import split_worlds, to_sparse_model, to_trajectory
-from msgs_slam.pipelines.tracking.rig_poses import sync_rig_poses
-from msgs_slam.pipelines.tracking.rotation_only import set_rotation_only_poses
-from msgs_slam.pipelines.tracking.segments import join_segments, split_segments
-from msgs_slam.pipelines.tracking.state import FEATURE_SD, TrackState
-from msgs_slam.pipelines.types import Frame
+from ..structure.rolling import Shutter
+from ..system.memory import release_free_memory
+from ..system.stopping import is_asked
+from ..system.values import load_value, save_value
+from ..system.wording import stretches
+from ..types import Frame
+from .adjust import Report, adjust_state, align_depths, without_dependent_depth
+from .carry import carry_given
+from .front_end import FrontEnd
+from .pictures import Pictures, load_shutter
+from .result import split_worlds, to_sparse_model, to_trajectory
+from .rig_poses import sync_rig_poses
+from .rotation_only import set_rotation_only_poses
+from .segments import join_segments, split_segments
+from .state import FEATURE_SD, TrackState
 
 SNAPSHOT_EVERY, SNAPSHOTS = 50, 20
 """Frames between two; of a long recording no more are taken in all, since each holds all that is known so far."""

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from msgs_slam.pipelines.geometry.rig import ONE_CAMERA, Rig
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.structure.rolling import Shutter, velocities
+from ..geometry.rig import ONE_CAMERA, Rig
+from ..geometry.sparse_model import SparseModel
+from ..structure.rolling import Shutter, velocities
 
 Array = NDArray[np.float64]
 

@@ -10,12 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.depth.resize import resize_maps
-from msgs_slam.pipelines.depth.scales import scale_at_points
-from msgs_slam.pipelines.gaussians.seeding import seed_gaussians, seed_grid
-from msgs_slam.pipelines.tracking.pictures import Pictures
-from msgs_slam.pipelines.tracking.state import TrackState
-from msgs_slam.pipelines.types import Intrinsics
+from ..depth.resize import resize_maps
+from ..depth.scales import scale_at_points
+from ..gaussians.seeding import seed_gaussians, seed_grid
+from ..types import Intrinsics
+from .pictures import Pictures
+from .state import TrackState
 
 Array = NDArray[np.float64]
 WORKING_SIDE = 320

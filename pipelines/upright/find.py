@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.depth.posed import PosedDepth
-from msgs_slam.pipelines.gaussians.render import get_threads, host_threads
-from msgs_slam.pipelines.mapping.depth_views import depth_view
-from msgs_slam.pipelines.outcome import Outcome, evenly, maps_around
-from msgs_slam.pipelines.system.parallel import abreast
-from msgs_slam.pipelines.upright.lines import up_of_lines
-from msgs_slam.pipelines.voxels.layout import Gravity, find_gravity, floor_plane, name_structure
-from msgs_slam.pipelines.voxels.voxels import VOXELS_PER_DEPTH, Voxels, gather_depths
+from ..depth.posed import PosedDepth
+from ..gaussians.render import get_threads, host_threads
+from ..mapping.depth_views import depth_view
+from ..outcome import Outcome, evenly, maps_around
+from ..system.parallel import abreast
+from ..voxels.layout import Gravity, find_gravity, floor_plane, name_structure
+from ..voxels.voxels import VOXELS_PER_DEPTH, Voxels, gather_depths
+from .lines import up_of_lines
 
 Array = NDArray[np.float64]
 

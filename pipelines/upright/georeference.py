@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.gps import enu_from_geodetic
-from msgs_slam.pipelines.geometry.alignment import Similarity
+from ...formats.gps import enu_from_geodetic
+from ..geometry.alignment import Similarity
 
 Array = NDArray[np.float64]
 

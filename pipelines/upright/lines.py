@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.system.parallel import parallel_map
-from msgs_slam.pipelines.types import Intrinsics
+from ..system.parallel import parallel_map
+from ..types import Intrinsics
 
 Array = NDArray[np.float64]
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gps import Track, photo_places, read_track
-from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.run.records import load_source
-from msgs_slam.pipelines.source.opening import FolderSource, open_source
-from msgs_slam.pipelines.system.progress import log
-from msgs_slam.pipelines.upright.georeference import georeference
-from msgs_slam.pipelines.upright.world import World
+from ...formats.errors import InputError
+from ...formats.gps import Track, photo_places, read_track
+from ..outcome import Outcome
+from ..run.records import load_source
+from ..source.opening import FolderSource, open_source
+from ..system.progress import log
+from .georeference import georeference
+from .world import World
 
 Array = NDArray[np.float64]
 OFF, AUTO = "off", "auto"

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.geometry.alignment import Similarity
-from msgs_slam.pipelines.outcome import Outcome
-from msgs_slam.pipelines.run.layouts import RunFile, dataclass_from_json
-from msgs_slam.pipelines.upright.find import Upright, cameras_up
-from msgs_slam.pipelines.upright.georeference import Georeference
+from ..geometry.alignment import Similarity
+from ..outcome import Outcome
+from ..run.layouts import RunFile, dataclass_from_json
+from .find import Upright, cameras_up
+from .georeference import Georeference
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import number, read_json_object
+from ...formats.errors import InputError
+from ...formats.jsonfile import number, read_json_object
 
 Array = NDArray[np.float64]
 

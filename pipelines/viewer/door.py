@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from typing import Any
 from urllib.parse import urlsplit
 
-from msgs_slam.formats.errors import InputError
+from ...formats.errors import InputError
 
 
 def is_welcome(host_header: str, origin: str | None, served_host: str) -> bool:

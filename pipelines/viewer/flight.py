@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from msgs_slam.pipelines.system.wording import quoted
-from msgs_slam.pipelines.viewer.camera_path import CameraPath, Keyframe
-from msgs_slam.pipelines.viewer.scene import ViewerScene
-from msgs_slam.pipelines.viewer.views import client_view, move_client, shown_pose
+from ..system.wording import quoted
+from .camera_path import CameraPath, Keyframe
+from .scene import ViewerScene
+from .views import client_view, move_client, shown_pose
 
 _GREEN = (22, 163, 74)
 _PREVIEW_FPS, _LINE_FPS = 25.0, 8.0

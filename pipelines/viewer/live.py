@@ -6,14 +6,14 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.names import STAGES
-from msgs_slam.pipelines.run.records import load_records
-from msgs_slam.pipelines.run.running import load_running
-from msgs_slam.pipelines.system.progress import log
-from msgs_slam.pipelines.system.wording import quoted
-from msgs_slam.pipelines.viewer.scene import ViewerScene, load_scenes
+from ...formats.errors import InputError
+from ..run.folder import RunFolder
+from ..run.names import STAGES
+from ..run.records import load_records
+from ..run.running import load_running
+from ..system.progress import log
+from ..system.wording import quoted
+from .scene import ViewerScene, load_scenes
 
 _BETWEEN_LOOKS = 2.0
 """Seconds."""

@@ -11,23 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussian_files import read_gaussians
-from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
-from msgs_slam.formats.reading import reaching
-from msgs_slam.pipelines.export.stage import on_earth
-from msgs_slam.pipelines.export.writers import map_cloud
-from msgs_slam.pipelines.gaussian_map import decided_channels
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.outcome import Outcome, evenly, labels_of_channels, load_outcome
-from msgs_slam.pipelines.proxy.interface.palette import class_colors
-from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, MESH
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import load_records
-from msgs_slam.pipelines.types import Frame, Intrinsics, Metres
-from msgs_slam.pipelines.upright.find import cameras_up
-from msgs_slam.pipelines.upright.world import WORLD, up_in_run
-from msgs_slam.pipelines.viewer.camera_path import EXPORTED, RUN
+from ...formats.errors import InputError
+from ...formats.gaussian_files import read_gaussians
+from ...formats.gaussians import GaussianCloud, isotropic_cloud
+from ...formats.reading import reaching
+from ..export.stage import on_earth
+from ..export.writers import map_cloud
+from ..gaussian_map import decided_channels
+from ..geometry.sparse_model import SparseModel
+from ..outcome import Outcome, evenly, labels_of_channels, load_outcome
+from ..proxy.interface.palette import class_colors
+from ..run.files import BACKBONE, CALIBRATION, FRAMES, MESH
+from ..run.folder import RunFolder
+from ..run.records import load_records
+from ..types import Frame, Intrinsics, Metres
+from ..upright.find import cameras_up
+from ..upright.world import WORLD, up_in_run
+from .camera_path import EXPORTED, RUN
 
 MODES = ("colour", "classes", "depth")
 MOST_CAMERAS = 60

@@ -12,16 +12,16 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.mesh import read_mesh_ply
-from msgs_slam.pipelines.export.floor_plan import walls_of_run
-from msgs_slam.pipelines.source.sharpness import at_most_wide
-from msgs_slam.pipelines.viewer.door import guarding
-from msgs_slam.pipelines.viewer.flight import Flight
-from msgs_slam.pipelines.viewer.live import Watch
-from msgs_slam.pipelines.viewer.scene import MODES, ViewerCamera, ViewerScene, load_scenes
-from msgs_slam.pipelines.viewer.tools import Selection, Tape, class_name, length_text, unit_text
-from msgs_slam.pipelines.viewer.views import client_view, move_client, shown_pose
+from ...formats.errors import InputError
+from ...formats.mesh import read_mesh_ply
+from ..export.floor_plan import walls_of_run
+from ..source.sharpness import at_most_wide
+from .door import guarding
+from .flight import Flight
+from .live import Watch
+from .scene import MODES, ViewerCamera, ViewerScene, load_scenes
+from .tools import Selection, Tape, class_name, length_text, unit_text
+from .views import client_view, move_client, shown_pose
 
 _FRUSTUM = 0.09
 _PREVIEW_WIDTH = 480

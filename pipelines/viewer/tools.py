@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.gaussian_ply import write_gaussian_ply
-from msgs_slam.pipelines.geometry.tape import Touch, area, area_text, tape, tape_text, touch
-from msgs_slam.pipelines.types import VOID
-from msgs_slam.pipelines.viewer.scene import ViewerScene
-from msgs_slam.pipelines.viewer.views import client_view
+from ...formats.gaussian_ply import write_gaussian_ply
+from ..geometry.tape import Touch, area, area_text, tape, tape_text, touch
+from ..types import VOID
+from .scene import ViewerScene
+from .views import client_view
 
 _SETTLE_SECONDS = 0.25
 """A slider is dragged through many values; the map is sent again once it rests."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.voxels.voxels import Voxels
+from .voxels import Voxels
 
 OTHER, FLOOR, CEILING, WALL, SURFACE = range(5)
 NAMES = {FLOOR: "floor", CEILING: "ceiling", WALL: "wall", SURFACE: "surface"}

@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.geometry.camera import unproject_depth
-from msgs_slam.pipelines.types import Intrinsics
+from ..geometry.camera import unproject_depth
+from ..types import Intrinsics
 
 if TYPE_CHECKING:
-    from msgs_slam.pipelines.depth.posed import PosedDepth
+    from ..depth.posed import PosedDepth
 
 VOXELS_PER_DEPTH = 60
 """A voxel is this fraction of the scene's median depth: 5 cm at 3 m."""

@@ -4,9 +4,9 @@
 `track_gn` fits a pose to an image, `median_depth` and `blending_weights` look at a map without gradients.
 """
 
-from msgs_slam.pipelines.gaussians.render.compositing import Composite, composite
-from msgs_slam.pipelines.gaussians.render.culling import in_view, marked_in_view
-from msgs_slam.pipelines.gaussians.render.inspection import (
+from .compositing import Composite, composite
+from .culling import in_view, marked_in_view
+from .inspection import (
     BlendingWeights,
     blending_weights,
     class_weights,
@@ -14,9 +14,9 @@ from msgs_slam.pipelines.gaussians.render.inspection import (
     median_and_seen,
     median_depth,
 )
-from msgs_slam.pipelines.gaussians.render.rendering import Rendering, render
-from msgs_slam.pipelines.gaussians.render.threads import get_threads, host_threads, set_threads
-from msgs_slam.pipelines.gaussians.render.tracking import PoseFit, track_gn
+from .rendering import Rendering, render
+from .threads import get_threads, host_threads, set_threads
+from .tracking import PoseFit, track_gn
 
 __all__ = [
     "BlendingWeights",

@@ -12,7 +12,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from msgs_slam.pipelines.gaussians.render.lanes import (
+from .lanes import (
     FLAGS,
     I64,
     WIDTH,

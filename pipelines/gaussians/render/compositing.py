@@ -9,8 +9,7 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-import msgs_slam.pipelines.gaussians.render.cards as cards
-import msgs_slam.pipelines.gaussians.render.reference as reference
+from . import cards, reference
 
 
 @dataclass(frozen=True)
@@ -92,13 +91,13 @@ def choose_backend(backend: str | None, example: Tensor) -> ModuleType:
     if name == "reference":
         return reference
     if name == "cpu":
-        import msgs_slam.pipelines.gaussians.render.cpu as cpu  # importing numba takes a while: only where it is used
+        from . import cpu  # importing numba takes a while: only where it is used
 
         return cpu
     if name == "cuda":
         if not cards.has_triton():
             raise ValueError("backend: 'cuda' needs triton >= 3.3, which comes with torch >= 2.7 built for CUDA")
-        import msgs_slam.pipelines.gaussians.render.cuda as cuda
+        from . import cuda
 
         return cuda
     raise ValueError(f"backend: got {backend!r}, expected 'reference', 'cpu', 'cuda' or None")

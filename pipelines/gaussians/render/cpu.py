@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render.cpu_backward import COLORS, backward_band, sum_shared
-from msgs_slam.pipelines.gaussians.render.cpu_bands import for_each_band, split_into_bands
-from msgs_slam.pipelines.gaussians.render.cpu_forward import draw_bands
-from msgs_slam.pipelines.gaussians.render.cpu_inspect import class_weights, inspect, weighted_errors
-from msgs_slam.pipelines.gaussians.render.jit import as_array
-from msgs_slam.pipelines.gaussians.render.threads import PART, for_each
+from .cpu_backward import COLORS, backward_band, sum_shared
+from .cpu_bands import for_each_band, split_into_bands
+from .cpu_forward import draw_bands
+from .cpu_inspect import class_weights, inspect, weighted_errors
+from .jit import as_array
+from .threads import PART, for_each
 
 __all__ = ["class_weights", "composite", "inspect", "weighted_errors"]
 

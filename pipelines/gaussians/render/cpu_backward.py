@@ -10,22 +10,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-import msgs_slam.pipelines.gaussians.render.rules as rules
-from msgs_slam.pipelines.gaussians.render.cpu_bands import (
+from . import rules
+from .cpu_bands import (
     BAND_ROWS,
     RECORD,
     TILE,
     first_pixel,
     last_pixel,
 )
-from msgs_slam.pipelines.gaussians.render.cpu_forward import (
+from .cpu_forward import (
     CHECK_EVERY,
     PIXELS,
     clear,
     is_opaque,
 )
-from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
-from msgs_slam.pipelines.gaussians.render.lanes import (
+from .jit import inner, kernel
+from .lanes import (
     add_totals,
     at_most,
     counting,

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-import msgs_slam.pipelines.gaussians.render.rules as rules
-from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
-from msgs_slam.pipelines.gaussians.render.threads import PART, for_each
+from . import rules
+from .jit import inner, kernel
+from .threads import PART, for_each
 
 F32 = np.float32
 TILE = 16

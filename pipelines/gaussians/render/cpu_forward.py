@@ -11,9 +11,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-import msgs_slam.pipelines.gaussians.render.rules as rules
-from msgs_slam.pipelines.gaussians.render.boxes import add_to_box
-from msgs_slam.pipelines.gaussians.render.cpu_bands import (
+from . import rules
+from .boxes import add_to_box
+from .cpu_bands import (
     BAND_ROWS,
     RECORD,
     TILE,
@@ -22,8 +22,8 @@ from msgs_slam.pipelines.gaussians.render.cpu_bands import (
     for_each_band,
     last_pixel,
 )
-from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
-from msgs_slam.pipelines.gaussians.render.lanes import (
+from .jit import inner, kernel
+from .lanes import (
     any_of,
     at_most,
     counting,

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render.cpu_bands import (
+from .cpu_bands import (
     BAND_ROWS,
     RECORD,
     TILE,
@@ -19,7 +19,7 @@ from msgs_slam.pipelines.gaussians.render.cpu_bands import (
     last_pixel,
     split_into_bands,
 )
-from msgs_slam.pipelines.gaussians.render.cpu_forward import (
+from .cpu_forward import (
     CHECK_EVERY,
     LIGHT,
     PIXELS,
@@ -30,8 +30,8 @@ from msgs_slam.pipelines.gaussians.render.cpu_forward import (
     is_opaque,
     open_tile,
 )
-from msgs_slam.pipelines.gaussians.render.jit import kernel
-from msgs_slam.pipelines.gaussians.render.lanes import (
+from .jit import kernel
+from .lanes import (
     counting,
     exp,
     largest,

@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render.jit import as_array, inner, kernel
-from msgs_slam.pipelines.gaussians.render.threads import PART, for_each
-from msgs_slam.pipelines.types import Intrinsics
+from ...types import Intrinsics
+from .jit import as_array, inner, kernel
+from .threads import PART, for_each
 
 
 def project(

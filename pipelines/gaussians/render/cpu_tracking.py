@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-import msgs_slam.pipelines.gaussians.render.rules as rules
-from msgs_slam.pipelines.gaussians.render.cpu_bands import (
+from . import rules
+from .cpu_bands import (
     BAND_ROWS,
     RECORD,
     TILE,
@@ -18,9 +18,9 @@ from msgs_slam.pipelines.gaussians.render.cpu_bands import (
     last_pixel,
     split_into_bands,
 )
-from msgs_slam.pipelines.gaussians.render.cpu_forward import CHECK_EVERY, LIGHT, PIXELS, clear, is_opaque
-from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
-from msgs_slam.pipelines.gaussians.render.lanes import (
+from .cpu_forward import CHECK_EVERY, LIGHT, PIXELS, clear, is_opaque
+from .jit import inner, kernel
+from .lanes import (
     add_products,
     at_most,
     counting,
@@ -32,7 +32,7 @@ from msgs_slam.pipelines.gaussians.render.lanes import (
     store,
     where,
 )
-from msgs_slam.pipelines.gaussians.render.threads import for_each
+from .threads import for_each
 
 F32 = np.float32
 ALPHA, PLANES = PIXELS, 2

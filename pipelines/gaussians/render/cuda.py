@@ -10,17 +10,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import msgs_slam.pipelines.gaussians.render.cards as cards
-import msgs_slam.pipelines.gaussians.render.rules as rules
-from msgs_slam.pipelines.gaussians.render.cuda_kernels import (
+from . import cards, rules
+from .cuda_kernels import (
     backward_tile,
     divide_back_pixels,
     divide_pixels,
     forward_tile,
     inspect_tile,
 )
-from msgs_slam.pipelines.gaussians.render.cuda_projection import project, record
-from msgs_slam.pipelines.gaussians.render.cuda_tiles import TILE, list_tiles
+from .cuda_projection import project, record
+from .cuda_tiles import TILE, list_tiles
 
 __all__ = ["composite", "composite_records", "depth_ratio", "inspect", "inspect_records", "list_tiles", "project"]
 

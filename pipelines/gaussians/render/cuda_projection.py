@@ -13,9 +13,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-import msgs_slam.pipelines.gaussians.render.cards as cards
-import msgs_slam.pipelines.gaussians.render.rules as rules
-from msgs_slam.pipelines.types import Intrinsics
+from ...types import Intrinsics
+from . import cards, rules
 
 RECORD = 6
 """Numbers of a record."""

@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-import msgs_slam.pipelines.gaussians.render.cards as cards
+from . import cards
 
 TILE = 16
 """Pixels along a tile."""

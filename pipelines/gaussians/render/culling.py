@@ -7,14 +7,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-import msgs_slam.pipelines.gaussians.render.cards as cards
-import msgs_slam.pipelines.gaussians.render.rules as rules
-from msgs_slam.pipelines.gaussians.render.compositing import require_finite
-from msgs_slam.pipelines.gaussians.render.jit import kernel
-from msgs_slam.pipelines.gaussians.render.threads import PART, for_each
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.camera import project_gaussians
-from msgs_slam.pipelines.types import Intrinsics
+from ...geometry import se3
+from ...geometry.camera import project_gaussians
+from ...types import Intrinsics
+from . import cards, rules
+from .compositing import require_finite
+from .jit import kernel
+from .threads import PART, for_each
 
 NEAR = 0.01
 """Gaussians whose centre is nearer than this (or behind the camera) are not drawn; in the unit of the map."""
@@ -50,7 +49,7 @@ def marked_in_view(
     means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float = NEAR
 ) -> Tensor:
     """(M,) bool: which are `in_view`, of tensors of one card; unlike a list it keeps nobody waiting for its length."""
-    from msgs_slam.pipelines.gaussians.render.cuda_projection import mark_in_view  # imports triton
+    from .cuda_projection import mark_in_view  # imports triton
 
     return mark_in_view(means, radii, cam_from_world.to(means), intrinsics, near)
 

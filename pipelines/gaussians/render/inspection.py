@@ -9,10 +9,10 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render.compositing import choose_backend, require_finite
-from msgs_slam.pipelines.gaussians.render.culling import NEAR, in_view
-from msgs_slam.pipelines.gaussians.render.rendering import kernels_for, project_map, render
-from msgs_slam.pipelines.types import Intrinsics
+from ...types import Intrinsics
+from .compositing import choose_backend, require_finite
+from .culling import NEAR, in_view
+from .rendering import kernels_for, project_map, render
 
 
 @dataclass(frozen=True)

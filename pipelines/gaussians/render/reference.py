@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render.rules import ALPHA_MAX, ALPHA_MIN, CUT_SIGMAS, TRANSMITTANCE_MIN
+from .rules import ALPHA_MAX, ALPHA_MIN, CUT_SIGMAS, TRANSMITTANCE_MIN
 
 
 @dataclass(frozen=True)

@@ -9,17 +9,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import msgs_slam.pipelines.gaussians.render.cards as cards
-from msgs_slam.pipelines.gaussians.render.compositing import (
+from ...geometry import se3
+from ...geometry.camera import project_gaussians
+from ...types import Intrinsics
+from . import cards
+from .compositing import (
     check_arguments,
     choose_backend,
     composite,
     require_finite,
 )
-from msgs_slam.pipelines.gaussians.render.culling import NEAR, in_view
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.camera import project_gaussians
-from msgs_slam.pipelines.types import Intrinsics
+from .culling import NEAR, in_view
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def project_map(
     for name, tensor in (("means", means), ("radii", radii), ("cam_from_world", cam_from_world)):
         require_finite(name, tensor)
     if means.device.type == "cpu" and means.dtype == torch.float32:
-        from msgs_slam.pipelines.gaussians.render.cpu_projection import project  # imports numba
+        from .cpu_projection import project  # imports numba
 
         return project(means, radii, beside(cam_from_world, means), intrinsics, near)
     points_in_cam = se3.transform(beside(cam_from_world, means), means)

@@ -9,8 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 from torch import Tensor
 
-import msgs_slam.pipelines.gaussians.render.cards as cards
-from msgs_slam.pipelines.system.limits import available_cpus
+from ...system.limits import available_cpus
+from . import cards
 
 PART = 16384
 """Gaussians that a thread takes at a time."""

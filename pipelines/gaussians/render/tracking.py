@@ -13,11 +13,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render.compositing import require_finite
-from msgs_slam.pipelines.gaussians.render.culling import NEAR
-from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.camera import project_gaussians
-from msgs_slam.pipelines.types import Intrinsics
+from ...geometry import se3
+from ...geometry.camera import project_gaussians
+from ...types import Intrinsics
+from .compositing import require_finite
+from .culling import NEAR
 
 FIRST_FLOOR, FLOOR_FACTOR, LAST_FLOOR = 0.3, 0.6, 0.02
 """Residuals below the floor count quadratically, above it absolutely; the floor falls with every evaluation."""
@@ -105,7 +105,7 @@ class _Problem:
         self, pose: Tensor, floor: float, min_silhouette: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, int, float]:
         """JᵀWJ, JᵀWr, cost, pixels, and the median depth of the Gaussians in front of the camera."""
-        from msgs_slam.pipelines.gaussians.render.cpu_tracking import normal_equations  # imports numba
+        from .cpu_tracking import normal_equations  # imports numba
 
         points_in_cam = se3.transform(pose.float(), self.means)
         u, v, sigma_px, z = project_gaussians(points_in_cam, self.radii, self.intrinsics, NEAR)

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import MAX_IMAGE_PIXELS, image_size, read_depth_png, read_grey_png
-from msgs_slam.formats.reading import parsing, reaching, require_file
-from msgs_slam.formats.tensors import HEADERS
-from msgs_slam.pipelines.depth.resize import resample_nearest, resize_depth
-from msgs_slam.pipelines.proxy.files.matching import find_folder, match_files
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, DepthProvider
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
-from msgs_slam.pipelines.types import Frame
+from ....formats.errors import InputError
+from ....formats.images import MAX_IMAGE_PIXELS, image_size, read_depth_png, read_grey_png
+from ....formats.reading import parsing, reaching, require_file
+from ....formats.tensors import HEADERS
+from ...depth.resize import resample_nearest, resize_depth
+from ...types import Frame
+from ..interface.providers import DepthEstimate, DepthProvider
+from ..interface.sequence import Sequence
+from .matching import find_folder, match_files
 
 _SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 _NAMES = ("depth",)

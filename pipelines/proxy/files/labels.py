@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import read_label_png
-from msgs_slam.pipelines.depth.resize import resample_nearest
-from msgs_slam.pipelines.networks.classes import MAX_ID, NamedClass, find_class_table, read_class_table
-from msgs_slam.pipelines.proxy.files.depth import require_aspect
-from msgs_slam.pipelines.proxy.files.matching import find_folder, match_files
-from msgs_slam.pipelines.proxy.interface.palette import class_colors
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate, SemanticsProvider
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.types import VOID, ClassTable, Frame
+from ....formats.errors import InputError
+from ....formats.images import read_label_png
+from ...depth.resize import resample_nearest
+from ...networks.classes import MAX_ID, NamedClass, find_class_table, read_class_table
+from ...system.progress import Progress
+from ...types import VOID, ClassTable, Frame
+from ..interface.palette import class_colors
+from ..interface.providers import DepthEstimate, LabelEstimate, SemanticsProvider
+from ..interface.sequence import Sequence
+from .depth import require_aspect
+from .matching import find_folder, match_files
 
 _SUFFIXES = (".png", ".tif", ".tiff")
 _NAMES = ("labels", "label", "semantic_class", "semantic", "semantics", "segmentation")

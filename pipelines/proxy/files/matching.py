@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import natural_key
-from msgs_slam.formats.reading import home_expanded, reaching
-from msgs_slam.pipelines.types import Frame
+from ....formats.errors import InputError
+from ....formats.images import natural_key
+from ....formats.reading import home_expanded, reaching
+from ...types import Frame
 
 _KINDS = r"(colou?r|rgb|image|img|depth|disp|labels?|semantic|segmentation|class|conf|confidence)"
 _PREFIX = re.compile(rf"^{_KINDS}[._-]", re.IGNORECASE)

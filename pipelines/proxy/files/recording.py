@@ -10,19 +10,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets import Sequence as Recording
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.proxy.interface.palette import class_colors
-from msgs_slam.pipelines.proxy.interface.providers import (
+from ....formats.datasets import Sequence as Recording
+from ....formats.errors import InputError
+from ...source.source_pixels import FramePixels
+from ...system.progress import Progress
+from ...types import VOID, ClassTable, Frame
+from ..interface.palette import class_colors
+from ..interface.providers import (
     DepthEstimate,
     DepthProvider,
     LabelEstimate,
     SemanticsProvider,
 )
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
-from msgs_slam.pipelines.source.source_pixels import FramePixels
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.types import VOID, ClassTable, Frame
+from ..interface.sequence import Sequence
 
 
 class _RecordingMaps:

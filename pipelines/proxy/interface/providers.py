@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.types import VOID, ClassTable, Frame, require_shape
+from ...types import VOID, ClassTable, Frame, require_shape
 
 
 @dataclass(frozen=True)

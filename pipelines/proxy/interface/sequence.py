@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics
+from ...geometry.sparse_model import SparseModel
+from ...types import Calibration, Frame, Intrinsics
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.networks.card import Card
-from msgs_slam.pipelines.networks.labels import class_token, patch_features, softmax
-from msgs_slam.pipelines.proxy.learned.labels import OnnxLabels
-from msgs_slam.pipelines.proxy.learned.network_pass import Arrays, Workplace
-from msgs_slam.pipelines.types import Frame
+from ...networks.card import Card
+from ...networks.labels import class_token, patch_features, softmax
+from ...types import Frame
+from .labels import OnnxLabels
+from .network_pass import Arrays, Workplace
 
 _SAMPLE = 20000
 _ROUNDS = 20

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.networks.card import Card
-from msgs_slam.pipelines.networks.depth import network_depth
-from msgs_slam.pipelines.networks.identity import card_identity
-from msgs_slam.pipelines.networks.session import Network
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, DepthProvider
-from msgs_slam.pipelines.proxy.learned.network_pass import Arrays, NetworkPass, Workplace
-from msgs_slam.pipelines.types import Frame
+from ....formats.errors import InputError
+from ...networks.card import Card
+from ...networks.depth import network_depth
+from ...networks.identity import card_identity
+from ...networks.session import Network
+from ...types import Frame
+from ..interface.providers import DepthEstimate, DepthProvider
+from .network_pass import Arrays, NetworkPass, Workplace
 
 
 class OnnxDepth(DepthProvider):

@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.networks.card import Card
-from msgs_slam.pipelines.networks.identity import card_identity
-from msgs_slam.pipelines.networks.labels import best_classes, class_token, network_probabilities
-from msgs_slam.pipelines.networks.session import Network
-from msgs_slam.pipelines.proxy.interface.palette import class_colors
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate, SemanticsProvider
-from msgs_slam.pipelines.proxy.interface.sequence import resample_linear
-from msgs_slam.pipelines.proxy.learned.network_pass import Arrays, NetworkPass, Workplace
-from msgs_slam.pipelines.proxy.regions.named import NamedScene, Vocabulary
-from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
-from msgs_slam.pipelines.types import VOID, ClassTable, Frame
+from ....formats.errors import InputError
+from ...networks.card import Card
+from ...networks.identity import card_identity
+from ...networks.labels import best_classes, class_token, network_probabilities
+from ...networks.session import Network
+from ...types import VOID, ClassTable, Frame
+from ..interface.palette import class_colors
+from ..interface.providers import DepthEstimate, LabelEstimate, SemanticsProvider
+from ..interface.sequence import resample_linear
+from ..regions.named import NamedScene, Vocabulary
+from ..regions.provider import SegmentLabels
+from .network_pass import Arrays, NetworkPass, Workplace
 
 _LEAST_SHARE = 0.001
 """A class on a smaller share of all pixels is noise of the network and becomes void."""

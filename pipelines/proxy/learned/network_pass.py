@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.atomic import atomic_path
-from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.tensors import load_arrays
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
-from msgs_slam.pipelines.system.progress import Progress, log
-from msgs_slam.pipelines.system.values import load_value, save_value
-from msgs_slam.pipelines.types import Frame
+from ....formats.atomic import atomic_path
+from ....formats.errors import InputError
+from ....formats.tensors import load_arrays
+from ...system.progress import Progress, log
+from ...system.values import load_value, save_value
+from ...types import Frame
+from ..interface.sequence import Sequence
 
 Arrays = dict[str, NDArray]
 _STAMP = "stamp"

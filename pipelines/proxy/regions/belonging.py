@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from msgs_slam.pipelines.voxels.voxels import Voxels, touching
+from ...voxels.voxels import Voxels, touching
 
 _ALIKE = (
     frozenset({"bed", "seating", "sofa", "armchair", "chair", "seat", "swivel chair", "bench", "ottoman", "stool"}),

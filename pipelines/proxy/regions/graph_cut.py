@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.system.jit import kernel
+from ...system.jit import kernel
 
 
 def cut_graph(

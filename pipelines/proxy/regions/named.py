@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from msgs_slam.pipelines.depth.resize import resample_nearest
-from msgs_slam.pipelines.geometry.camera import unproject_depth
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence, resample_linear
-from msgs_slam.pipelines.proxy.regions.belonging import one_name_each
-from msgs_slam.pipelines.proxy.regions.orientation import name_likelihood
-from msgs_slam.pipelines.proxy.regions.parts import cut_parts, cut_patches
-from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels, label_pixels
-from msgs_slam.pipelines.types import Frame
-from msgs_slam.pipelines.voxels.voxels import Voxels, find, find_near, select, voxel_keys
+from ...depth.resize import resample_nearest
+from ...geometry.camera import unproject_depth
+from ...types import Frame
+from ...voxels.voxels import Voxels, find, find_near, select, voxel_keys
+from ..interface.providers import DepthEstimate, LabelEstimate
+from ..interface.sequence import Sequence, resample_linear
+from .belonging import one_name_each
+from .orientation import name_likelihood
+from .parts import cut_parts, cut_patches
+from .provider import SegmentLabels, label_pixels
 
 _LEAST_CONFIDENCE = 0.3
 _ALONE = 0.3

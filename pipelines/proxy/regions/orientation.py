@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.voxels.layout import FLOOR, Gravity
-from msgs_slam.pipelines.voxels.voxels import Voxels
+from ...voxels.layout import FLOOR, Gravity
+from ...voxels.voxels import Voxels
 
 _LYING = frozenset({"floor", "rug", "carpet", "floor mat", "earth", "road", "sidewalk", "grass", "field", "path"})
 _OVERHEAD = frozenset({"ceiling"})

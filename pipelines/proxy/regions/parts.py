@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.proxy.regions.graph_cut import cut_graph
-from msgs_slam.pipelines.voxels.voxels import Voxels, touching
+from ...voxels.voxels import Voxels, touching
+from .graph_cut import cut_graph
 
 _COLOR_UNIT = 12.0
 """Difference in CIE Lab that counts as much as a right angle between the normals."""

@@ -12,20 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.depth.resize import resample_nearest
-from msgs_slam.pipelines.geometry.camera import unproject_depth
-from msgs_slam.pipelines.proxy.interface.palette import class_colors
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate, SemanticsProvider
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
-from msgs_slam.pipelines.proxy.regions.parts import cut_parts
-from msgs_slam.pipelines.proxy.regions.spread import spread_in_place
-from msgs_slam.pipelines.system.jit import kernel
-from msgs_slam.pipelines.system.memory import release_free_memory
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.types import VOID, ClassTable, Frame
-from msgs_slam.pipelines.voxels.layout import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
-from msgs_slam.pipelines.voxels.voxels import (
+from ....formats.errors import InputError
+from ...depth.resize import resample_nearest
+from ...geometry.camera import unproject_depth
+from ...system.jit import kernel
+from ...system.memory import release_free_memory
+from ...system.progress import Progress
+from ...types import VOID, ClassTable, Frame
+from ...voxels.layout import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
+from ...voxels.voxels import (
     LEAST_WEIGHT,
     VOXELS_PER_DEPTH,
     Voxels,
@@ -35,6 +30,11 @@ from msgs_slam.pipelines.voxels.voxels import (
     select,
     voxel_keys,
 )
+from ..interface.palette import class_colors
+from ..interface.providers import DepthEstimate, LabelEstimate, SemanticsProvider
+from ..interface.sequence import Sequence
+from .parts import cut_parts
+from .spread import spread_in_place
 
 _GATHER_SIDE = 200
 _LEAST_CONFIDENCE = 0.3

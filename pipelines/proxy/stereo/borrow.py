@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.proxy.stereo.fill import SURE
-from msgs_slam.pipelines.system.jit import kernel
+from ...system.jit import kernel
+from .fill import SURE
 
 _COLOR_SD = 3.0
 _LIGHT = 0.5

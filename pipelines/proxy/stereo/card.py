@@ -11,13 +11,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-import msgs_slam.pipelines.gaussians.render.cards as cards
-import msgs_slam.pipelines.proxy.stereo.matching as rules
-from msgs_slam.pipelines.proxy.stereo.refine import ALIKE
-from msgs_slam.pipelines.proxy.stereo.smoothing import DIRECTIONS, path_starts
-from msgs_slam.pipelines.proxy.stereo.tiles import TILE
-from msgs_slam.pipelines.proxy.stereo.volume import UNREACHED
-from msgs_slam.pipelines.proxy.stereo.window import LIKENESS, OUTSIDE, RADIUS, SIDE, STEP, VARIANCE_FLOOR
+from ...gaussians.render import cards
+from . import matching as rules
+from .refine import ALIKE
+from .smoothing import DIRECTIONS, path_starts
+from .tiles import TILE
+from .volume import UNREACHED
+from .window import LIKENESS, OUTSIDE, RADIUS, SIDE, STEP, VARIANCE_FLOOR
 
 Array = NDArray[np.float32]
 _BLOCK = 64
@@ -61,7 +61,7 @@ def fuse_depths(
     device: str,
 ) -> tuple[Array, Array, Array]:
     """Return what `consistency.fuse_depths` does."""
-    from msgs_slam.pipelines.proxy.stereo.card_kernels import fuse_pixels  # imports triton
+    from .card_kernels import fuse_pixels  # imports triton
 
     pictures = (_there(depth, device), _there(others, device))
     places = (torch.from_numpy(np.ascontiguousarray(x)).to(device) for x in (warps.reshape(-1, 12), back_rows))
@@ -90,7 +90,7 @@ class Matching:
 
     def picked(self, total: Tensor, planes: NDArray[np.float64]) -> Tensor:
         """(H, W) inverse depth of least total cost (H, W, D)."""
-        from msgs_slam.pipelines.proxy.stereo.card_kernels import pick_pixels
+        from .card_kernels import pick_pixels
 
         inverse = torch.empty_like(self._image)
         numbers = (inverse.numel(), len(planes), float(planes[0]), float(planes[1] - planes[0]))
@@ -100,7 +100,7 @@ class Matching:
 
     def cost(self, planes: NDArray[np.float64]) -> Tensor:
         """(H, W, D) as of `sweep_cost`."""
-        from msgs_slam.pipelines.proxy.stereo.card_kernels import sweep_pixels
+        from .card_kernels import sweep_pixels
 
         cost = self._image.new_empty(*self._image.shape, len(planes))
         numbers = (len(self._given[1]), len(planes), *self._size, -0.5 / LIKENESS**2)
@@ -111,7 +111,7 @@ class Matching:
     def smoothed(self, cost: Tensor, small: float) -> Tensor:
         """(H, W, D) as of `smooth_cost`, `small` the price of a step of one plane; a launch for each direction, a
         program for each path."""
-        from msgs_slam.pipelines.proxy.stereo.card_kernels import scan_paths
+        from .card_kernels import scan_paths
 
         total, count = torch.zeros_like(cost), cost.shape[2]
         numbers = (count, small, rules.JUMP, rules.EDGE)
@@ -123,7 +123,7 @@ class Matching:
 
     def soften(self, values: Tensor, spread: float) -> Tensor:
         """(H, W) after the bilateral filter, `spread` the sd of its values."""
-        from msgs_slam.pipelines.proxy.stereo.card_kernels import soften_pixels
+        from .card_kernels import soften_pixels
 
         out, numbers = torch.empty_like(values), (-0.5 / spread**2, -0.5 / rules.SOFT_PLACE**2)
         _run(soften_pixels, out.numel(), values, out, *self._size, *numbers, REACH=rules.SOFT_SIZE // 2)
@@ -131,7 +131,7 @@ class Matching:
 
     def refined(self, inverse: Tensor, step: float) -> Tensor:
         """(H, W) as of `refine_inverse_depth`."""
-        from msgs_slam.pipelines.proxy.stereo.card_kernels import refine_pixels
+        from .card_kernels import refine_pixels
 
         refined = torch.empty_like(inverse)
         numbers = (len(self._given[1]), *self._size, -0.5 / ALIKE**2, float(step), rules.STIFFNESS)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
-from msgs_slam.pipelines.gaussians.render.lanes import (
+from ...gaussians.render.jit import inner, kernel
+from ...gaussians.render.lanes import (
     any_of,
     at_most,
     counting,
@@ -19,8 +19,8 @@ from msgs_slam.pipelines.gaussians.render.lanes import (
     store,
     where,
 )
-from msgs_slam.pipelines.proxy.stereo.bands import Bands
-from msgs_slam.pipelines.proxy.stereo.lane_sampling import choose, corners, smallest
+from .bands import Bands
+from .lane_sampling import choose, corners, smallest
 
 _LANES = 16
 _ZERO, _HALF, _ONE, _THREE, _FOUR = (np.float32(x) for x in (0, 0.5, 1, 3, 4))

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.gaussians.render.jit import kernel
-from msgs_slam.pipelines.proxy.stereo.window import LIKENESS, pad_rows, row_length, weigh_windows
+from ...gaussians.render.jit import kernel
+from .window import LIKENESS, pad_rows, row_length, weigh_windows
 
 _FAINT, _POWER = 5e-5, 0.25
 """Variance (intensities 0..1; two grey levels) and power by which agreement on a blank surface counts less."""

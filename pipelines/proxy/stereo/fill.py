@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.proxy.regions.spread import spread_votes
+from ..regions.spread import spread_votes
 
 Array = NDArray[np.float64]
 

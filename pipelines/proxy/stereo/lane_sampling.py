@@ -9,7 +9,7 @@ from llvmlite import ir
 from numba import types
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.gaussians.render.lanes import (
+from ...gaussians.render.lanes import (
     FLAGS,
     I32,
     I64,

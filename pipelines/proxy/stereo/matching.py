@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
-from msgs_slam.pipelines.proxy.stereo.bands import Bands
-from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth
-from msgs_slam.pipelines.proxy.stereo.smoothing import smooth_cost
-from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost
-from msgs_slam.pipelines.proxy.stereo.tiles import TILE, tiles_of
-from msgs_slam.pipelines.proxy.stereo.volume import least_planes, pick_planes
+from .bands import Bands
+from .refine import refine_inverse_depth
+from .smoothing import smooth_cost
+from .sweep import sweep_cost
+from .tiles import TILE, tiles_of
+from .volume import least_planes, pick_planes
 
 LEAST_BEST, MOST_BEST = 3, 5
 """Of the views that one is matched with, the better half counts at a pixel, but not fewer or more than these."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.geometry.camera import project
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.types import Intrinsics
+from ...geometry.camera import project
+from ...geometry.sparse_model import SparseModel
+from ...types import Intrinsics
 
 _MAX_POINTS = 400
 _UNSEEN_WEIGHT = 0.3

@@ -17,24 +17,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence, resize_area
-from msgs_slam.pipelines.proxy.stereo.bands import Bands
-from msgs_slam.pipelines.proxy.stereo.borrow import agreed_depth, borrow_depth, carry_depth
-from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
-from msgs_slam.pipelines.proxy.stereo.evidence import evidence_of, prefer_matches, surface_contrast
-from msgs_slam.pipelines.proxy.stereo.fill import SURE, fill_unsure, judge_by_company
-from msgs_slam.pipelines.proxy.stereo.matching import StereoImages, match_planes
-from msgs_slam.pipelines.proxy.stereo.neighbours import choose_neighbours, depth_range
-from msgs_slam.pipelines.proxy.stereo.sweep import warps_to
-from msgs_slam.pipelines.proxy.stereo.upsample import upsample_depth
-from msgs_slam.pipelines.system.parallel import Kept, abreast
-from msgs_slam.pipelines.system.progress import Progress
-from msgs_slam.pipelines.system.values import load_value, save_value
-from msgs_slam.pipelines.types import Frame, Intrinsics
-from msgs_slam.pipelines.voxels.voxels import to_lab
+from ....formats.errors import InputError
+from ...geometry.sparse_model import SparseModel
+from ...system.parallel import Kept, abreast
+from ...system.progress import Progress
+from ...system.values import load_value, save_value
+from ...types import Frame, Intrinsics
+from ...voxels.voxels import to_lab
+from ..interface.providers import DepthEstimate
+from ..interface.sequence import Sequence, resize_area
+from .bands import Bands
+from .borrow import agreed_depth, borrow_depth, carry_depth
+from .consistency import fuse_depths
+from .evidence import evidence_of, prefer_matches, surface_contrast
+from .fill import SURE, fill_unsure, judge_by_company
+from .matching import StereoImages, match_planes
+from .neighbours import choose_neighbours, depth_range
+from .sweep import warps_to
+from .upsample import upsample_depth
 
 _CACHED_FRAMES = 48
 _VIEWS, _FUSE_VIEWS, _LENDERS = 12, 8, 16
@@ -204,7 +204,7 @@ class MultiviewDepth:
         """The same by kernels where the device takes them."""
         if self._device == "cpu":
             return None
-        import msgs_slam.pipelines.proxy.stereo.card as card  # imports torch
+        from . import card  # imports torch
 
         return card if card.takes_kernels_on(self._device) else None
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.gaussians.render.jit import kernel
-from msgs_slam.pipelines.gaussians.render.lanes import store
-from msgs_slam.pipelines.proxy.stereo.bands import Bands
-from msgs_slam.pipelines.proxy.stereo.lane_sampling import with_row_below
-from msgs_slam.pipelines.proxy.stereo.tiles import TILE
-from msgs_slam.pipelines.proxy.stereo.window import (
+from ...gaussians.render.jit import kernel
+from ...gaussians.render.lanes import store
+from .bands import Bands
+from .lane_sampling import with_row_below
+from .tiles import TILE
+from .window import (
     RADIUS,
     SAMPLED_ROWS,
     best_mean,

@@ -7,12 +7,12 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
-from msgs_slam.pipelines.gaussians.render.lanes import load, splat, store
-from msgs_slam.pipelines.proxy.stereo.bands import Bands
-from msgs_slam.pipelines.proxy.stereo.lane_sampling import smallest, smallest_of
-from msgs_slam.pipelines.proxy.stereo.tiles import TILE
-from msgs_slam.pipelines.proxy.stereo.volume import BLOCK, UNREACHED, Volume, pixel_of_tile
+from ...gaussians.render.jit import inner, kernel
+from ...gaussians.render.lanes import load, splat, store
+from .bands import Bands
+from .lane_sampling import smallest, smallest_of
+from .tiles import TILE
+from .volume import BLOCK, UNREACHED, Volume, pixel_of_tile
 
 DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.gaussians.render.jit import inner, kernel
-from msgs_slam.pipelines.gaussians.render.lanes import splat, store
-from msgs_slam.pipelines.proxy.stereo.bands import Bands
-from msgs_slam.pipelines.proxy.stereo.lane_sampling import with_row_below
-from msgs_slam.pipelines.proxy.stereo.tiles import TILE, tiles_of
-from msgs_slam.pipelines.proxy.stereo.volume import BLOCK, UNREACHED, Volume, pixel_of_tile
-from msgs_slam.pipelines.proxy.stereo.window import (
+from ...gaussians.render.jit import inner, kernel
+from ...gaussians.render.lanes import splat, store
+from .bands import Bands
+from .lane_sampling import with_row_below
+from .tiles import TILE, tiles_of
+from .volume import BLOCK, UNREACHED, Volume, pixel_of_tile
+from .window import (
     LIKENESS,
     RADIUS,
     SAMPLED_ROWS,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from msgs_slam.pipelines.proxy.stereo.bands import BAND_ROWS
+from .bands import BAND_ROWS
 
 TILE = BAND_ROWS
 """Pixels across and down: the rows of a band, and the pixels that one vector holds."""

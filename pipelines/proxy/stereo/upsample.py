@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
-from msgs_slam.pipelines.system.jit import kernel
+from ...system.jit import kernel
+from ..interface.providers import DepthEstimate
 
 _COLOR_SD = 10.0
 _SURFACE = 0.05

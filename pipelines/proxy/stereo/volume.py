@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.gaussians.render.jit import inner
-from msgs_slam.pipelines.proxy.stereo.tiles import TILE, tiles_of
-from msgs_slam.pipelines.system.jit import kernel
+from ...gaussians.render.jit import inner
+from ...system.jit import kernel
+from .tiles import TILE, tiles_of
 
 BLOCK = 16
 """Planes of a block, as many as a vector holds."""

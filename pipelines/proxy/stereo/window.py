@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.gaussians.render.jit import inner
-from msgs_slam.pipelines.gaussians.render.lanes import (
+from ...gaussians.render.jit import inner
+from ...gaussians.render.lanes import (
     at_most,
     counting,
     exp,
@@ -24,8 +24,8 @@ from msgs_slam.pipelines.gaussians.render.lanes import (
     store,
     where,
 )
-from msgs_slam.pipelines.proxy.stereo.bands import BAND_ROWS
-from msgs_slam.pipelines.proxy.stereo.lane_sampling import choose, interpolate, smallest, square_root
+from .bands import BAND_ROWS
+from .lane_sampling import choose, interpolate, smallest, square_root
 
 RADIUS = 3
 STEP = 2

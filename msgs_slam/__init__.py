@@ -19,16 +19,16 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from msgs_slam.formats.errors import InputError
+from .formats.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from msgs_slam.pipelines.evaluation.views import MapView
-    from msgs_slam.pipelines.outcome import Outcome
-    from msgs_slam.pipelines.system.progress import Progress
-    from msgs_slam.pipelines.types import Intrinsics
+    from .pipelines.evaluation.views import MapView
+    from .pipelines.outcome import Outcome
+    from .pipelines.system.progress import Progress
+    from .pipelines.types import Intrinsics
 
 __all__ = ["InputError", "Run", "__version__", "main", "open_run", "reconstruct"]
 __version__ = version("msgs-slam")
@@ -43,9 +43,9 @@ class Run:
     @cached_property
     def outcome(self) -> Outcome:
         """All that the run has found; raises InputError where the folder is no run or its map is not done."""
-        from msgs_slam.pipelines.outcome import load_outcome
-        from msgs_slam.pipelines.run.folder import RunFolder
-        from msgs_slam.pipelines.upright.world import WORLD
+        from .pipelines.outcome import load_outcome
+        from .pipelines.run.folder import RunFolder
+        from .pipelines.upright.world import WORLD
 
         found = load_outcome(RunFolder(self.path))
         found.require_map()
@@ -82,7 +82,7 @@ class Run:
         """
         import numpy as np
 
-        from msgs_slam.pipelines.evaluation.measure import render_outcome
+        from .pipelines.evaluation.measure import render_outcome
 
         pose = np.asarray(world_from_cam, np.float64)
         if pose.shape != (4, 4):
@@ -92,8 +92,8 @@ class Run:
 
 def open_run(path: Path | str) -> Run:
     """A finished run folder. Raises InputError where it is none, or its map is not done."""
-    from msgs_slam.pipelines.reconstruct import require_run
-    from msgs_slam.pipelines.run.folder import RunFolder
+    from .pipelines.reconstruct import require_run
+    from .pipelines.run.folder import RunFolder
 
     run = Run(Path(path))
     require_run(RunFolder(run.path))
@@ -114,10 +114,10 @@ def reconstruct(
     for bars on a terminal and a line a stage elsewhere, or an object with `track` and `stage`
     (`msgs_slam.pipelines.system.progress.Progress`). Raises InputError for a source or setting that cannot be used.
     """
-    from msgs_slam.pipelines.read_config import load_config, merge_settings
-    from msgs_slam.pipelines.reconstruct import default_run_folder, existing_config
-    from msgs_slam.pipelines.reconstruct import reconstruct as run_reconstruct
-    from msgs_slam.pipelines.run.folder import RunFolder
+    from .pipelines.read_config import load_config, merge_settings
+    from .pipelines.reconstruct import default_run_folder, existing_config
+    from .pipelines.reconstruct import reconstruct as run_reconstruct
+    from .pipelines.run.folder import RunFolder
 
     source = Path(source)
     run = RunFolder(Path(out)) if out is not None else default_run_folder(source)
@@ -141,13 +141,13 @@ def _nested(changes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _progress(wanted: Progress | bool) -> Progress:
-    from msgs_slam.msgs_cli.output import Output
+    from .msgs_cli.output import Output
 
     return Output(quiet=not wanted).progress() if isinstance(wanted, bool) else wanted
 
 
 def main() -> None:
     """Run the command `msgs-slam`."""
-    from msgs_slam.msgs_cli.main import main as command
+    from .msgs_cli.main import main as command
 
     command()
