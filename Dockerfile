@@ -7,8 +7,9 @@
 ARG PYTHON=3.12
 FROM python:${PYTHON}-slim AS build
 WORKDIR /src
-COPY pyproject.toml setup.py README.md LICENSE ./
+COPY pyproject.toml README.md LICENSE ./
 COPY docs/msgs-slam.1 docs/
+COPY msgs_slam msgs_slam
 COPY msgs_cli msgs_cli
 COPY pipelines pipelines
 COPY formats formats

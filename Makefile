@@ -5,9 +5,8 @@ VENV := .venv
 CACHE := $(if $(XDG_CACHE_HOME),$(XDG_CACHE_HOME),$(HOME)/.cache)
 TESTED := $(or $(MSGS_SLAM_TESTED),$(CACHE)/msgs-slam/tested-$(shell pwd | cksum | cut -d' ' -f1))
 PIP := -m pip install --quiet --disable-pip-version-check
-NAMES := build/names/msgs_slam
 
-.PHONY: demo test lint docs names wheel clean
+.PHONY: demo test lint docs wheel clean
 
 demo:
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
@@ -24,18 +23,12 @@ wheel: $(TESTED)/.installed # by way of the source distribution, which is releas
 	rm -rf build/dist
 	$(TESTED)/bin/python -m build --no-isolation --outdir build/dist . > build/wheel.log || (cat build/wheel.log; exit 1)
 
-lint: $(TESTED)/.installed names
+lint: $(TESTED)/.installed
 	$(TESTED)/bin/ruff check .
 	$(TESTED)/bin/ruff format --check .
 	$(TESTED)/bin/mypy
 
-# The folders under the names by which they are imported, for tools that read sources (mypy, editors).
-names:
-	mkdir -p $(NAMES)
-	for folder in msgs_cli pipelines formats; do ln -sfn ../../../$$folder $(NAMES)/$$folder; done
-	for file in __init__ __main__; do ln -sf ../../../msgs_cli/msgs_slam/$$file.py $(NAMES)/$$file.py; done
-
-docs: $(TESTED)/.installed names
+docs: $(TESTED)/.installed
 	NO_MKDOCS_2_WARNING=1 $(TESTED)/bin/mkdocs build --strict
 
 $(TESTED)/.installed: pyproject.toml

@@ -1,11 +1,18 @@
 """Shared fixtures."""
 
 import logging
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+# `tests.world` and its like are importable without the checkout on the path: its sources would be found before the
+# installed program that is tested.
+tests = sys.modules.setdefault("tests", ModuleType("tests"))
+tests.__path__ = [str(Path(__file__).resolve().parent)]
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

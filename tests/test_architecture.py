@@ -27,15 +27,37 @@ FLOORS = (
 MOST_FLAT = 12
 
 
+def names_imported_by(node: ast.AST, path: Path) -> set[str]:
+    """Absolute names that an import statement in a file asks for, as in `msgs_slam.formats.errors.InputError`."""
+    if isinstance(node, ast.Import):
+        return {alias.name for alias in node.names}
+    if not isinstance(node, ast.ImportFrom):
+        return set()
+    folders = path.relative_to(ROOT).parts[:-1]
+    package = folders if folders[0] == "msgs_slam" else ("msgs_slam", *folders)
+    above = package[: len(package) - node.level + 1] if node.level else ()
+    return {".".join([*above, *filter(None, [node.module]), alias.name]) for alias in node.names}
+
+
 def imported_packages(path: Path) -> set[str]:
     """Top-level packages and folders of this project that a file imports anywhere."""
-    found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    found = {name for node in ast.walk(tree) for name in names_imported_by(node, path)}
     return {name.removeprefix("msgs_slam.").split(".")[0] for name in found}
+
+
+def test_imports_inside_the_folders_are_relative() -> None:
+    """So that whoever follows imports by the folders (editors, readers of a repository) arrives."""
+    files = [p for room in (*FORBIDDEN, "msgs_slam") for p in (ROOT / room).rglob("*.py")]
+    trees = {p: ast.parse(p.read_text(encoding="utf-8")) for p in files}
+    absolute = {
+        f"{path}:{node.lineno}"
+        for path, tree in trees.items()
+        for node in ast.walk(tree)
+        if (isinstance(node, ast.Import) and any(a.name.split(".")[0] == "msgs_slam" for a in node.names))
+        or (isinstance(node, ast.ImportFrom) and not node.level and (node.module or "").split(".")[0] == "msgs_slam")
+    }
+    assert not absolute
 
 
 def test_the_program_has_one_import_name() -> None:
@@ -70,11 +92,8 @@ def imported_modules(path: Path, known: Iterable[str]) -> set[str]:
     for node in ast.walk(tree):
         if id(node) in idle:
             continue
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            inside = {f"{node.module}.{alias.name}" for alias in node.names}
-            found |= {name if name in known else node.module for name in inside}
+        for name in names_imported_by(node, path):
+            found.add(name if name in known else name.rpartition(".")[0])
     return found & set(known)
 
 

@@ -247,7 +247,7 @@ def test_the_man_page_is_that_of_todays_commands() -> None:
 def test_dockerfile_copies_what_is_here_and_asks_for_the_same_torch() -> None:
     text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
     copied = [name for line in re.findall(r"^COPY (?!--from)(.*) \S+$", text, re.MULTILINE) for name in line.split()]
-    assert {"setup.py", "pipelines", "formats", "msgs_cli"} <= set(copied)
+    assert {"msgs_slam", "pipelines", "formats", "msgs_cli"} <= set(copied)
     assert [name for name in copied if not (ROOT / name).exists()] == []
     wanted = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
     assert re.findall(r'"(torch[^"]*)"', text) == [name for name in wanted if name.startswith("torch")]

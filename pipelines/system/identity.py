@@ -84,12 +84,12 @@ def stage_sources(file: Path, root: Path = ROOT) -> set[Path]:
 @functools.cache
 def _imported_files(path: Path, root: Path) -> tuple[Path, ...]:
     """Files of the modules that a file imports anywhere in it, and of the packages they are in."""
+    package = [PACKAGE, *path.relative_to(root.resolve()).parts[:-1]]
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_bytes())):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        if isinstance(node, ast.ImportFrom) and node.level:  # imports inside the project are relative
+            module = ".".join([*package[: len(package) - node.level + 1], *filter(None, [node.module])])
+            names |= {module, *(f"{module}.{alias.name}" for alias in node.names)}
     inside = {n for n in names if n.startswith(f"{PACKAGE}.")}
     inside |= {n.rsplit(".", k)[0] for n in inside for k in range(1, n.count("."))}
     files = (file for name in sorted(inside - PLUMBING) for file in _files_of(name, root))

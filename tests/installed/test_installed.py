@@ -91,7 +91,7 @@ def module_of(path: Path) -> str:
     """Import name of a file of the package."""
     inside = path.relative_to(PACKAGE).with_suffix("").parts
     parts = inside[:-1] if inside[-1] == "__init__" else inside
-    return "msgs_slam" if parts == ("msgs_cli", "msgs_slam") else ".".join(("msgs_slam", *parts))
+    return ".".join(("msgs_slam", *parts))
 
 
 def test_names_of_modules_in_strings_are_modules() -> None:

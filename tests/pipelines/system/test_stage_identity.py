@@ -31,11 +31,10 @@ def test_any_change_of_them_is_another_digest(tmp_path: Path) -> None:
     room = tmp_path / "pipelines"
     room.mkdir()
     (room / "__init__.py").write_text("")
-    (room / "stage.py").write_text("def run():\n    from msgs_slam.pipelines import far\n    return far\n")
-    name = "msgs_slam.pipelines"
-    (room / "far.py").write_text(f"from {name}.config import Config\nfrom {name}.farther import VALUE\n")
+    (room / "stage.py").write_text("def run():\n    from . import far\n    return far\n")
+    (room / "far.py").write_text("from .config import Config\nfrom ..pipelines.farther import VALUE\n")
     (room / "farther.py").write_text("VALUE = 1\n")
-    (room / "config.py").write_text("import msgs_slam.pipelines.beside\n")
+    (room / "config.py").write_text("from . import beside\n")
     (room / "beside.py").write_text("")
     before = source_digest(room / "stage.py", tmp_path)
     (room / "beside.py").write_text("# not imported but by the plumbing\n")
