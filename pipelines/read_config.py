@@ -45,9 +45,6 @@ def merge_settings(config: Config, changes: Mapping[str, Any], where: str) -> Co
     for section, values in changes.items():
         if not isinstance(values, Mapping):
             raise SettingError(f"{where}: {section} is a section of settings, got {values!r:.80}")
-        known = {f.name for f in fields(sections[section])} if section in sections else set()
-        if retired := explain_retired(f"{section}.{key}" for key in values if key not in known):
-            raise SettingError(f"{where}: settings of an earlier version: {retired}")
         if section not in sections:
             raise SettingError(f"{where}: there is no section {section!r}{nearest(section, sections)}")
         sections[section] = _merge_section(sections[section], section, values, where)
@@ -150,57 +147,6 @@ def toml_value(value: bool | int | float | str) -> str:
         return str(value).lower()
     # A JSON string is a TOML basic string, but for pairs of surrogates, which TOML refuses, and a bare DEL.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f") if isinstance(value, str) else repr(value)
-
-
-_FIXED = {
-    "frames": "max_match_error peak_threshold",
-    "proxy": "alpha beta gamma theta_slope theta_middle",
-    "tracking": "flow_window flow_levels flow_error flow_sd feature_sd pose_error min_inliers new_points "
-    "keyframe_share relocalise_candidates silhouette color_weight render_loss depth_sd grid_rows grid_columns "
-    "adjust_iterations adjust_frames snapshot_every",
-    "mapping": "fine_share flat_share window_steps coarse_share color_weight ssim_weight depth_nu label_every "
-    "edge_sharpness size_weight size_limit silhouette_weight depth_fields depth_check silhouette_threshold "
-    "depth_tolerance densify_every densify_until split_radius prune_opacity prune_weight prune_radius mean_rate "
-    "radius_rate opacity_rate color_rate class_rate rate_decay pose_rate exposure_rate low_trust_step time_decay "
-    "reliability_decay region_prior split_error",
-    "global_ba": "features words loop_shared_points richness loop_similarity miou_weight appearance_weight "
-    "structure_weight loop_error loop_share loop_sure_inliers loop_rotation loop_translation loop_drift "
-    "loop_angle_drift loop_scale_drift loop_inliers drift_px joint_px loop_candidates loop_appearance "
-    "loop_gap joint_passes",
-    "export": "truncation least_weight least_piece",
-}
-FIXED = frozenset(f"{section}.{name}" for section, names in _FIXED.items() for name in names.split())
-"""Constants now, beside the code that uses them, at what was their default."""
-
-
-_NOTHING = "it brought nothing that could be measured (docs/method.md)"
-GONE = {
-    "frames.max_frames": "however many frames there are, they are taken",
-    "tracking.new_segments": "after a loss tracking begins anew, and the segments are joined later",
-    "tracking.render": "frames that are lost otherwise are compared with Gaussians, no others",
-    **dict.fromkeys(
-        ("mapping.label_loss", "mapping.label_weight", "paper.label_image", "paper.label_weight"),
-        "classes are counted when the map is done, which is as good as learning them",
-    ),
-    "paper.symmetry_weight": "pulling mirror-symmetric halves together cost 0.1 dB",
-    **dict.fromkeys(
-        (
-            "paper.kappa", "paper.edge_weight", "paper.class_growth", "paper.keyframe_miou",
-            "paper.loop_steps", "paper.boundary_clip", "paper.tracking_depth_weight", "paper.tracking_label_weight",
-        ),
-        _NOTHING,
-    ),
-}  # fmt: skip
-"""What has left the program, and why."""
-
-
-def explain_retired(keys: Iterable[str]) -> str:
-    """Explain what became of the retired settings among `keys` (section.name); "" where there are none."""
-    keys = list(keys)
-    told = [f"{k} is no more: {GONE[k]}" for k in keys if k in GONE]
-    if fixed := [k for k in keys if k in FIXED]:
-        told.append(f"{', '.join(fixed)}: fixed at what was the default")
-    return "; ".join(told)
 
 
 _SAME_AS = {"gpu": "cuda", "nvidia": "cuda", "cuda:0": "cuda", "video": "images", "mp4": "images"}
