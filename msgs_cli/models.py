@@ -43,14 +43,18 @@ def list_models() -> None:
 
 @models.command()
 @click.argument("names", nargs=-1)
-@click.option("--best", is_flag=True, help="The large networks for metric depth and named classes.")
+@click.option("--best", is_flag=True, help="The small ones and the large network for metric depth (80 MB in all).")
 @click.option(
     "--from",
     "folder",
     type=click.Path(path_type=Path),
     help="Take the files from this folder, under whatever names, instead of the network.",
 )
-@click.option("--trust", is_flag=True, help="Accept a model of unknown sha256 and record the hash of what comes.")
+@click.option(
+    "--trust",
+    is_flag=True,
+    help="Accept a model whose sha256 nobody has published (DINOv2's head), and keep the hash of what comes.",
+)
 @click.option("--offline", is_flag=True, help="Only check what is here; download nothing.")
 @click.option("--yes", is_flag=True, help="Do not ask about the licences.")
 def pull(names: tuple[str, ...], best: bool, folder: Path | None, trust: bool, offline: bool, yes: bool) -> None:
@@ -74,6 +78,7 @@ def pull(names: tuple[str, ...], best: bool, folder: Path | None, trust: bool, o
     wanted = store.with_needed(names, best)
     lacking = [m for m in wanted if not store.is_here(m)]
     if lacking and not offline:
+        store.require_pullable(lacking, trust)
         for model in lacking:
             click.echo(f"{model.name}: {_size(model)}, licence: {model.licence}")
         if not yes:

@@ -31,7 +31,7 @@ class Model:
     """One row of the table. `sha256` is "" and `bytes` 0 while unknown; `needs` names another model it works with.
 
     `revision` is the commit that the addresses name, "" where they name a branch whose file may be replaced. `pull`
-    says what brings it without its name: "default" a plain pull, "best" a pull of the large ones.
+    says what brings it without its name: "default" every pull, "best" one of the large ones, too.
     """
 
     name: str
@@ -84,9 +84,9 @@ class ModelStore:
         raise InputError(f"there is no model {name!r}; known: {', '.join(m.name for m in self.models)}")
 
     def with_needed(self, names: Sequence[str], best: bool = False) -> list[Model]:
-        """The named models and those they work with; without names the small ones, or the `best`."""
-        wanted = "best" if best else "default"
-        chosen = [self.get(n) for n in names] if names else [m for m in self.models if m.pull == wanted]
+        """The named models and those they work with; without names the small ones, and with `best` the large ones."""
+        wanted = ("default", "best") if best else ("default",)
+        chosen = [self.get(n) for n in names] if names else [m for m in self.models if m.pull in wanted]
         both = [m for model in chosen for m in (model, *([self.get(model.needs)] if model.needs else []))]
         return list(dict.fromkeys(both))
 
@@ -138,6 +138,24 @@ class ModelStore:
                 found.append(model)
         return found
 
+    def _is_whole(self, model: Model) -> bool:
+        path = self.path(model)
+        return bool(model.sha256) and path.is_file() and file_sha256(path) == model.sha256
+
+    def require_pullable(self, models: Sequence[Model], trust: bool = False) -> None:
+        """Raise InputError for a model that is not here and cannot be downloaded: it has no address, or its hash is
+        unknown and `trust` does not accept what comes."""
+        for model in (m for m in models if not self._is_whole(m)):
+            if not model.urls:
+                raise InputError(
+                    f"{model.name} has no address. Bring its file: msgs-slam models pull {model.name} --from FOLDER"
+                )
+            if not model.sha256 and not trust:
+                raise InputError(
+                    f"{model.name}: nobody has published its sha256, so what is downloaded cannot be checked. Pull it "
+                    "with --trust to accept the first download, whose hash is kept. Nothing was downloaded"
+                )
+
     def pull(
         self, model: Model, progress: Callable[[int, int], None], trust: bool = False, offline: bool = False
     ) -> Path:
@@ -146,14 +164,9 @@ class ModelStore:
         Raises InputError when no mirror delivers it, when it is not what the table says, and when offline.
         """
         path = self.path(model)
-        if model.sha256 and path.is_file() and file_sha256(path) == model.sha256:
+        if self._is_whole(model):
             return path
-        if not model.urls:
-            raise InputError(
-                f"{model.name} has no address. Bring its file: msgs-slam models pull {model.name} --from FOLDER"
-            )
-        if not model.sha256 and not trust:
-            raise InputError(f"{model.name}: its sha256 is unknown. Pull it with --trust to accept the first download")
+        self.require_pullable([model], trust)
         if offline:
             raise InputError(
                 f"{model.name} is not in {self.cache} and this is offline. Pull it where there is a network"

@@ -92,7 +92,7 @@ def test_empty_file_and_text_file(tmp_path: Path) -> None:
 
 def test_a_user_who_does_not_exist(tmp_path: Path) -> None:
     source = tmp_path / "room.avi"
-    write_video(source, [np.full((48, 64, 3), 9 * i, np.uint8) for i in range(5)], 10.0)
+    write_video(source, np.random.default_rng(0).integers(0, 255, (5, 48, 64, 3), np.uint8), 10.0)
     for option, value in (
         ("--poses", "~nosuch/p.txt"), ("--intrinsics", "~nosuch/c.json"), ("--masks", "~nosuch/m"),
         ("--gps", "~nosuch/g.gpx"), ("--depth", "onnx:~nosuch/card.toml"),

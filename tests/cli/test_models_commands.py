@@ -8,6 +8,7 @@ from click.testing import CliRunner, Result
 from onnx import TensorProto, helper
 
 from msgs_slam.msgs_cli.main import main
+from msgs_slam.pipelines.networks import registry
 from msgs_slam.pipelines.networks.registry import ModelStore
 
 
@@ -47,13 +48,35 @@ def test_pull_without_a_network_says_what_to_do_and_asks_for_the_licence_first(c
     assert offline.exit_code == 1
     assert "ade20k-small is not in" in offline.stderr
     assert "metric3d-small is not in" in models("pull", "--best", "--offline").stderr
+    assert "--trust" not in models("pull", "--best", "--yes", "--offline").stderr
     refused = CliRunner().invoke(main, ["models", "pull", "moge2-small"], input="n\n")
     assert refused.exit_code == 1
     assert "licence: MIT" in refused.output
-    unknown = models("pull", "dinov2-small-head", "--yes")
+    unknown = models("pull", "person", "dinov2-small", "--yes")
     assert unknown.exit_code == 1
+    assert "dinov2-small-head: nobody has published its sha256" in unknown.stderr, "before the first byte"
     assert "--trust" in unknown.stderr
     assert not cache.exists() or not list(cache.glob("*.onnx"))
+
+
+@pytest.mark.parametrize("words", [[], ["--best"]])
+def test_what_the_program_recommends_can_be_pulled(
+    words: list[str], cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every file of these pulls has a size and a hash, so that all arrive where the addresses deliver."""
+    fetched = []
+
+    def deliver(urls: tuple[str, ...], target: Path, size: int, sha256: str, progress: object) -> str:
+        assert size > 0
+        assert len(sha256) == 64
+        fetched.append(target.stem)
+        return sha256
+
+    monkeypatch.setattr(registry, "fetch", deliver)
+    done = models("pull", "--yes", *words)
+    assert done.exit_code == 0, done.output
+    assert {"ade20k-small", "fast-depth", "person"} <= set(fetched)
+    assert ("metric3d-small" in fetched) == bool(words)
 
 
 def test_files_of_a_folder_are_taken_by_their_content(cache: Path, tmp_path: Path, shared_data: Path) -> None:

@@ -75,8 +75,7 @@ def test_a_stage_is_made_again_on_demand_with_the_networks_of_now(
     assert load_records(RunFolder(run))["proxy"].figures["semantics"] != "segments"
     assert files_below(run / "frames", run / "tracking") == {k: v for k, v in times.items() if "/frames/" in k}
     assert "proxy keeps" not in invoke("status", run).stdout
-    for file in cache.iterdir():
-        file.unlink()
+    shutil.rmtree(cache)
     gone = "proxy keeps what auto chose when it was made (labels); the networks that it used are not installed any more"
     assert gone in invoke("status", run).stdout
     assert "Networks installed" not in invoke("resume", run, "--until", "proxy").stdout
