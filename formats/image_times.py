@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
-from .images import exif_time
+from .images import exif_time, read_rgb
 from .reading import reaching
 from .textfile import read_rows
 
@@ -69,6 +69,15 @@ def _require_increasing(times: NDArray[np.float64], path: Path) -> NDArray[np.fl
     return times
 
 
+def _is_damaged(path: Path) -> bool:
+    """Whether an image with a whole header cannot be decoded."""
+    try:
+        read_rgb(path)
+    except InputError:
+        return True
+    return False
+
+
 def _from_exif(images: list[Path]) -> NDArray[np.float64] | None:
     """None where an image states no time, or times do not increase: cameras that write whole seconds say no order."""
     stored = np.full(len(images), np.nan)
@@ -78,6 +87,8 @@ def _from_exif(images: list[Path]) -> NDArray[np.float64] | None:
             time = exif_time(path)
         except InputError:
             continue  # damaged: left out when it is read, whatever its time
+        if time is None and _is_damaged(path):
+            continue
         if time is None:
             return None
         stored[i], readable[i] = time, True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -60,7 +61,7 @@ class Pictures:
         self._features = _Recent(self._load_features, 4 * kept)
         # 64 x 128 numbers a frame: 32 MB for a thousand.
         self._descriptor = LruSequence(
-            max(self.frames, default=-1) + 1,
+            sys.maxsize,  # images that are added have numbers beyond the frames'
             lambda i: describe(self.features(i), self.vocabulary),
             lambda d: d.nbytes,
             _DESCRIPTORS_SHARE * memory,

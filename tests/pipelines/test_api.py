@@ -117,7 +117,15 @@ class StopAfterFrames(SilentProgress):
 
 def test_an_installation_brings_one_name_only(tmp_path: Path) -> None:
     pytest.importorskip("setuptools")
-    command = [sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path)]
+    command = [
+        sys.executable,
+        "-c",
+        "import setuptools; setuptools.setup()",
+        "-q",
+        "egg_info",
+        "--egg-base",
+        str(tmp_path),
+    ]
     command += ["build_py", "--build-lib", str(tmp_path / "built")]
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True, env=environment)

@@ -114,9 +114,14 @@ def test_they_are_kept_for_the_stages_behind(tmp_path: Path) -> None:
     assert given.known.sum() == 18
 
 
+def _ramp(start: int) -> np.ndarray:
+    """An image (48, 64, 3) that is not of one colour."""
+    return np.broadcast_to(np.arange(start, start + 64, dtype=np.uint8)[None, :, None], (48, 64, 3)).copy()
+
+
 def test_poses_named_by_frame_numbers_belong_to_a_videos_frames(tmp_path: Path) -> None:
     """The last number in a name counts: those before it are the clip's, the camera's, the date's."""
-    video = write_video(tmp_path / "clip1.avi", (np.full((48, 64, 3), 9 * i, np.uint8) for i in range(8)), 10, "MJPG")
+    video = write_video(tmp_path / "clip1.avi", (_ramp(9 * i) for i in range(8)), 10, "MJPG")
     frames = [{"file_path": f"clip1_4k/clip1.{i:05d}.jpg", "transform_matrix": np.eye(4).tolist()} for i in range(8)]
     for i, frame in enumerate(frames):
         frame["transform_matrix"][0][3] = float("nan") if i == 6 else float(i)

@@ -82,7 +82,7 @@ def test_a_kernel_follows_what_other_files_put_into_it(tmp_path):
     (room.parent / "__init__.py").write_text("")
     (room / "__init__.py").write_text("")
     (room / "kernel.py").write_text(
-        "from msgs_slam.pipelines.inlined import value\nfrom msgs_slam.pipelines.system.jit import kernel\n\n"
+        "from .inlined import value\nfrom .system.jit import kernel\n\n"
         "@kernel\ndef twice(x):\n    return 2 * value(x)\n\n"
         "print(twice(1.0), sum(twice.stats.cache_hits.values()))\n"
     )
@@ -90,7 +90,7 @@ def test_a_kernel_follows_what_other_files_put_into_it(tmp_path):
     said = []
     for factor in (3, 3, 5):
         (room / "inlined.py").write_text(
-            f"from msgs_slam.pipelines.system.jit import kernel\n\n@kernel\ndef value(x):\n    return {factor} * x\n"
+            f"from .system.jit import kernel\n\n@kernel\ndef value(x):\n    return {factor} * x\n"
         )
         command = [sys.executable, "-m", "msgs_slam.pipelines.kernel"]
         done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)

@@ -11,6 +11,7 @@ import pytest
 
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import StageContext
+from msgs_slam.pipelines.gaussians.render import threads
 from msgs_slam.pipelines.gaussians.render.threads import get_threads
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system import limits
@@ -144,6 +145,7 @@ def test_room_is_half_of_the_machine_or_container(cgroups: Callable[..., None]) 
 def test_cpus_are_those_of_the_process(cgroups: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
     """By its affinity (SLURM, docker --cpuset-cpus) and by quotas (docker --cpus, Kubernetes)."""
     monkeypatch.setattr("os.cpu_count", lambda: 128)
+    monkeypatch.setitem(threads._state, "threads", 0)  # another test of this process may have set it
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(8)), raising=False)
     run = RunFolder(Path("run.msgs"))
     for own, files, wanted in (

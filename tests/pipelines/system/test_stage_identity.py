@@ -71,4 +71,4 @@ def test_identity_is_a_number_only_where_the_sources_are_the_released_ones(
 
 def test_every_stage_lies_where_the_release_looks_for_it() -> None:
     for stage in all_stages():
-        assert stage.file == ROOT / "pipelines" / stage.name / "stage.py"
+        assert stage.file.resolve() == ROOT / "pipelines" / stage.name / "stage.py"
