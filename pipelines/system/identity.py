@@ -84,6 +84,8 @@ def stage_sources(file: Path, root: Path = ROOT) -> set[Path]:
 @functools.cache
 def _imported_files(path: Path, root: Path) -> tuple[Path, ...]:
     """Files of the modules that a file imports anywhere in it, and of the packages they are in."""
+    if not path.is_relative_to(root.resolve()):  # of somebody else: its relative imports lead nowhere here
+        return ()
     package = [PACKAGE, *path.relative_to(root.resolve()).parts[:-1]]
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_bytes())):
