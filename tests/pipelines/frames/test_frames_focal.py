@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.pipelines.structure.focal import _errors, _rotation, calibrated, two_view_focal
+from msgs_slam.pipelines.structure.focal import _errors, _rotation, calibrated, two_view_lens
 from msgs_slam.pipelines.structure.lens import to_pycolmap, unknown_camera
-from tests.pipelines.frames.made_views import walk_round
+from tests.pipelines.frames.made_views import structure_of, walk_round
 
 SIZE = (640, 480)
 GUESS = unknown_camera(*SIZE, 768.0, is_prior=False)
@@ -21,9 +22,10 @@ GUESS = unknown_camera(*SIZE, 768.0, is_prior=False)
 def test_the_focal_length_is_found_without_poses(focal: float) -> None:
     made = walk_round(to_pycolmap(Camera(*SIZE, focal, focal, 320.0, 240.0)))
     pairs, xy = made.pairs(GUESS), [f.xy for f in made.features]
-    found = two_view_focal(pairs, xy, SIZE)
+    found, bend = two_view_lens(pairs, xy, SIZE) or (0.0, 1.0)
     assert found == pytest.approx(focal, rel=0.06)
-    assert two_view_focal(pairs, xy, SIZE) == found
+    assert bend == 0
+    assert two_view_lens(pairs, xy, SIZE) == (found, bend)
     camera, posed = calibrated(GUESS, pairs, xy)
     assert (camera.mean_focal_length(), camera.has_prior_focal_length) == (found, True)
     assert (GUESS.mean_focal_length(), GUESS.has_prior_focal_length) == (768.0, False)
@@ -43,7 +45,35 @@ def test_false_pairs_do_not_turn_it() -> None:
     false = [
         replace(p, matches=np.column_stack([p.matches[:, 0], rng.permutation(p.matches[:, 1])])) for p in pairs[::4]
     ]
-    assert two_view_focal([*pairs, *false], xy, SIZE) == pytest.approx(520, rel=0.08)
+    assert two_view_lens([*pairs, *false], xy, SIZE) == (pytest.approx(520, rel=0.08), 0.0)
+
+
+@pytest.mark.parametrize(("focal", "k1"), [(512.0, -0.1), (384.0, -0.2), (384.0, -0.3), (512.0, 0.1)])
+def test_a_lens_that_bends_keeps_its_matches(focal: float, k1: float) -> None:
+    """Up to 40 % of them contradict a pinhole."""
+    camera = unknown_camera(*SIZE, focal, is_prior=True)
+    camera.params = [focal, 320.0, 240.0, k1]
+    made = walk_round(camera, 16)
+    pairs, xy = made.pairs(GUESS), [f.xy for f in made.features]
+    found, posed = calibrated(GUESS, pairs, xy)
+    assert found.params[3] / k1 > 0.4
+    assert [len(p.matches) for p in posed] == [len(p.matches) for p in pairs]
+    assert all(p.matrices[1].any() for p in posed)
+
+
+@pytest.mark.parametrize(("focal", "k1"), [(512.0, 0.0), (384.0, -0.2), (384.0, -0.3), (512.0, 0.1)])
+def test_the_lens_of_a_path_is_found_and_none_where_there_is_none(focal: float, k1: float, tmp_path: Path) -> None:
+    camera = unknown_camera(*SIZE, focal, is_prior=True)
+    camera.params = [focal, 320.0, 240.0, k1]
+    made = walk_round(camera, 16)
+    structure = structure_of(made, GUESS, tmp_path, is_fixed=False)
+    found = structure._calibrated(made.views(), made.pairs(GUESS))
+    assert found is not None
+    params = found.model.cameras[1].params
+    assert abs(params[0] - focal) < min(2 * found.focal_sd, 0.01 * focal)
+    assert found.focal_sd < 0.03 * focal
+    assert params[3] == pytest.approx(k1, abs=0.01 if k1 else 0)
+    assert 0 < made.off(found.model) < 0.004
 
 
 def test_a_known_focal_length_is_kept_and_none_is_made_of_nothing() -> None:
@@ -51,7 +81,7 @@ def test_a_known_focal_length_is_kept_and_none_is_made_of_nothing() -> None:
     made = walk_round(known)
     pairs, xy = made.pairs(known), [f.xy for f in made.features]
     assert calibrated(known, pairs, xy) == (known, pairs)
-    assert two_view_focal([], xy, SIZE) is None
+    assert two_view_lens([], xy, SIZE) is None
     camera, none = calibrated(GUESS, [], xy)
     assert (camera.mean_focal_length(), none) == (768.0, [])
 
