@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 from .reading import parsing, read_bytes
@@ -31,12 +32,19 @@ def require_whole_files(folder: Path) -> None:
 
 
 def _walk_cameras(data: bytes) -> int:
+    return sum(_CAMERA_HEAD_BYTES + 8 * len(params) for *_, params in cameras_in(data)) + 8
+
+
+def cameras_in(data: bytes) -> Iterator[tuple[int, int, int, int, tuple[float, ...]]]:
+    """Read id, number of the model, width, height and parameters of each camera of a cameras.bin. Raises struct.error
+    and KeyError for damage."""
     (count,) = struct.unpack_from("<Q", data, 0)
     at = 8
     for _ in range(count):
-        (model,) = struct.unpack_from("<i", data, at + 4)
-        at += _CAMERA_HEAD_BYTES + 8 * _PARAMETER_COUNTS[model]
-    return at
+        head = struct.unpack_from("<IiQQ", data, at)
+        params = struct.unpack_from(f"<{_PARAMETER_COUNTS[head[1]]}d", data, at + _CAMERA_HEAD_BYTES)
+        at += _CAMERA_HEAD_BYTES + 8 * len(params)
+        yield *head, params
 
 
 def _walk_images(data: bytes) -> int:

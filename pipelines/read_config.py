@@ -136,7 +136,7 @@ def with_absolute_paths(config: Config) -> Config:
         if before is None or text in ("", before, "auto", "off"):
             continue
         path = os.path.abspath(home_expanded(text.removeprefix(before)))
-        if os.path.exists(path):
+        if os.path.exists(path) or os.path.exists(path.rpartition("#")[0]):  # a file, or FILE#CAMERA
             changes.setdefault(section, {})[name] = before + path
     return merge_settings(config, changes, "paths")
 

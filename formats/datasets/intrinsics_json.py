@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from ..errors import InputError
 from ..jsonfile import number, optional_number, read_json_object
@@ -19,25 +20,30 @@ def read_intrinsics_json(path: Path, *, integer_centres: bool) -> tuple[Camera, 
     """
     top = read_json_object(path)
     table = top["camera"] if isinstance(top.get("camera"), dict) else top
+    camera = camera_from_table(table, path, integer_centres=integer_centres)
+    scale = optional_number(table, path, "depth_scale", "scale")
+    if scale is not None and not scale > 0:
+        raise InputError(f"{path}: depth_scale is {scale:g}, expected raw units a metre: correct it")
+    return camera, scale
+
+
+def camera_from_table(table: dict[str, Any], path: Path, *, integer_centres: bool) -> Camera:
+    """The camera in a table of the keys that `read_intrinsics_json` understands. Raises InputError as that does."""
     said = str(table.get("pixel_centre", "integer" if integer_centres else "half")).lower()
     if not said.startswith(("integer", "half")):
         raise InputError(f"{path}: pixel_centre is {said!r}, expected it to begin with 'integer' or 'half'")
     shift = 0.5 if said.startswith("integer") else 0.0
     fisheye = "FISHEYE" in str(table.get("camera_model", table.get("model", ""))).upper()
-    camera = Camera(
+    return Camera(
         int(number(table, path, "w", "width")),
         int(number(table, path, "h", "height")),
-        number(table, path, "fx"),
-        number(table, path, "fy"),
-        number(table, path, "cx") + shift,
-        number(table, path, "cy") + shift,
+        number(table, path, "fx", "fl_x"),
+        number(table, path, "fy", "fl_y"),
+        number(table, path, "cx", "ppx") + shift,
+        number(table, path, "cy", "ppy") + shift,
         _distortion(table, path, distortion_names(fisheye)),
         fisheye,
     )
-    scale = optional_number(table, path, "depth_scale", "scale")
-    if scale is not None and not scale > 0:
-        raise InputError(f"{path}: depth_scale is {scale:g}, expected raw units a metre: correct it")
-    return camera, scale
 
 
 def _distortion(table: dict, path: Path, names: tuple[str, ...]) -> tuple[float, ...]:

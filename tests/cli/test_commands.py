@@ -100,6 +100,15 @@ def test_a_user_who_does_not_exist(tmp_path: Path) -> None:
         assert "~nosuch/" in refused(source, tmp_path / "run", option, value)
 
 
+def test_a_calibration_of_several_cameras(tmp_path: Path) -> None:
+    source, cameras = tmp_path / "room.avi", tmp_path / "cameras.txt"
+    write_video(source, np.random.default_rng(0).integers(0, 255, (5, 48, 64, 3), np.uint8), 10.0)
+    cameras.write_text("1 PINHOLE 64 48 60 60 32 24\n2 PINHOLE 64 48 90 90 32 24\n")
+    said = refused(source, tmp_path / "run", "--intrinsics", str(cameras))
+    assert "2 cameras that differ: 1 (64x48, fx 60), 2 (64x48, fx 90)" in " ".join(said.split())
+    assert "cameras.txt#1'" in said
+
+
 def test_names_that_are_no_utf_8(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/K\xfcche 2019"))
     folder.mkdir()

@@ -516,6 +516,10 @@ DOORS: dict[str, Door] = {
         text("cameras.txt", "# camera\n1 OPENCV 640 480 500 501 320 240 .1 .01 0 0\n"),
         lambda p: judge_camera(read_intrinsics(str(p), 640, 480)), "cameras.txt", in_text,
     ),
+    "--intrinsics YAML": Door(
+        text("ros.yaml", "camera_matrix:\n  data: [500, 0, 320, 0, 501, 240, 0, 0, 1]\n"),
+        lambda p: judge_camera(read_intrinsics(str(p), 640, 480)), "ros.yaml", in_text,
+    ),
     "classes": Door(make_truth, read_classes_json, "classes.json", in_json, "classes.json"),
     "class table, JSON": Door(make_truth, read_class_table, "classes.json", in_json, "classes.json"),
     "class table, text": Door(text("labels.txt", "0 wall x\n1 sofa\n2 floor\n"), read_class_table, "labels.txt"),

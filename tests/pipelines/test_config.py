@@ -67,6 +67,8 @@ def test_paths_of_files_that_are_there_become_absolute(tmp_path: Path, monkeypat
     whole = with_absolute_paths(config)
     assert (whole.frames.masks, whole.frames.poses) == (str(tmp_path / "masks"), "gone")
     assert whole.frames.intrinsics == str(tmp_path / "camera.json")
+    named = with_absolute_paths(load_config(overrides=["frames.intrinsics=camera.json#cam0"]))
+    assert named.frames.intrinsics == f"{tmp_path / 'camera.json'}#cam0"
     assert (whole.proxy.depth, whole.proxy.semantics) == (f"files:{tmp_path / 'depth'}", "files")
     assert whole.export.gps == "auto"
     assert with_absolute_paths(load_config(overrides=["proxy.depth=multiview"])).proxy.depth == "multiview"

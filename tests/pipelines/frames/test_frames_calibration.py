@@ -73,7 +73,7 @@ def test_wrong_text_is_refused(text: str, what: str) -> None:
     ("content", "what"),
     [
         ("1 PINHOLE 480 640 525 526 240 320\n", "another shape"),
-        ("1 RAD_TAN_THIN_PRISM_FISHEYE 640 480 525 526 320 240 0 0 0 0\n", "not supported"),
+        ("1 RAD_TAN_THIN_PRISM_FISHEYE 640 480 525 526 320 240 0 0 0 0 0 0 0 0 0 0 0 0\n", "not supported"),
         ("1 PINHOLE 640 480 525 526 320\n", "4 parameters"),
         ("hello world\n", "holds no camera"),
         ("1 2 3 4 5 6 7 8 9\n", "no calibration matrix"),
@@ -83,6 +83,125 @@ def test_wrong_files_are_refused(content: str, what: str, tmp_path: Path) -> Non
     (tmp_path / "camera.txt").write_text(content)
     with pytest.raises(InputError, match=what):
         read_intrinsics(str(tmp_path / "camera.txt"), 640, 480)
+
+
+KALIBR = """cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.28, 0.07, 0.0001, 1.7e-05]
+  distortion_model: radtan
+  intrinsics: [525, 526, 319.5, 239.5]
+  resolution: [640, 480]
+  rostopic: /cam0/image_raw
+cam1:
+  T_cn_cnm1:
+  - [1.0, 0.0, 0.0, 0.1]
+  - [0.0, 1.0, 0.0, 0.0]
+  camera_model: pinhole
+  distortion_coeffs: [0.01, -0.02, 0.003, 0.0004]
+  distortion_model: equidistant
+  intrinsics: [460, 461, 330, 250]
+  resolution: [640, 480]
+"""
+ROS = """image_width: 640
+image_height: 480
+camera_name: narrow
+camera_matrix: {rows: 3, cols: 3, data: [525, 0, 319.5, 0, 526, 239.5, 0, 0, 1]}
+distortion_model: rational_polynomial
+distortion_coefficients:
+  rows: 1
+  cols: 8
+  data: [0.1, 0.2, 0, 0, 0.3, 0.4, 0.5, 0.6]
+"""
+ORB_SLAM = """%YAML:1.0
+Camera.type: "PinHole"
+Camera.fx: 525.0
+Camera.fy: 526.0
+Camera.cx: 319.5
+Camera.cy: 239.5
+Camera.k1: 0.262
+Camera.width: 640
+Camera.height: 480
+"""
+PLAIN = (0.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "distortion"),
+    [
+        ("ros.yaml", ROS, (0.1, 0.2, 0, 0, 0.3, 0.4, 0.5, 0.6)),
+        ("windows.yaml", ROS.replace("\n", "\r\n"), (0.1, 0.2, 0, 0, 0.3, 0.4, 0.5, 0.6)),
+        ("chain.yaml#cam0", KALIBR, (-0.28, 0.07, 0.0001, 1.7e-05)),
+        ("orb.yaml", ORB_SLAM, (0.262, 0, 0, 0)),
+        ("arkit.json", '{"cameraIntrinsics": [525, 0, 0, 0, 526, 0, 319.5, 239.5, 1]}', PLAIN),
+        ("open3d.json", '{"width": 640, "height": 480, "intrinsic_matrix": [525,0,0,0,526,0,319.5,239.5,1]}', PLAIN),
+        ("calib.txt", "P0: 525 0 319.5 0 0 526 239.5 0 0 0 1 0\nP1: 525 0 319.5 -9 0 526 239.5 0 0 0 1 0\nTr: 1 2\n",
+         PLAIN),
+        ("raw.txt", "calib_time: 09-Jan\nS_02: 640 480\nK_02: 525 0 319.5 0 526 239.5 0 0 1\nD_02: .1 0 0 0 0\n",
+         (0.1, 0, 0, 0)),
+        ("calib.cam", "cam0=[525 0 319.5; 0 526 239.5; 0 0 1]\nwidth=640\nheight=480\n", PLAIN),
+    ],
+)  # fmt: skip
+def test_files_of_other_programs_count_pixels_from_zero(
+    name: str, text: str, distortion: tuple[float, ...], tmp_path: Path
+) -> None:
+    (tmp_path / name.partition("#")[0]).write_bytes(text.encode())
+    found = read_intrinsics(str(tmp_path / name), 640, 480)
+    padded = (*distortion, *[0.0] * 8)[:8]
+    assert Camera(640, 480, found.fx, found.fy, found.cx, found.cy) == Camera(640, 480, 525, 526, 320, 240)
+    assert (*found.distortion, *[0.0] * 8)[:8] == padded
+    assert not found.fisheye
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".xml", ".json"])
+def test_what_opencv_writes_is_read(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"calibration{suffix}"
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    file.write("image_width", 640)
+    file.write("image_height", 480)
+    file.write("camera_matrix", np.array([[525.0, 0, 319.5], [0, 526, 239.5], [0, 0, 1]]))
+    file.write("distortion_coefficients", np.array([[0.1, -0.2, 1e-5, 0, 0.05]]))
+    file.release()
+    assert read_intrinsics(str(path), 640, 480) == Camera(640, 480, 525, 526, 320, 240, (0.1, -0.2, 1e-5, 0, 0.05))
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".bin"])
+def test_one_of_several_cameras_must_be_named(suffix: str, tmp_path: Path) -> None:
+    made = pycolmap.Reconstruction()
+    for number, focal in ((1, 500.0), (7, 900.0)):
+        camera = pycolmap.Camera.create_from_model_name(number, "RADIAL_FISHEYE", focal, 640, 480)
+        camera.params = [*camera.params[:3], 0.02, -0.01]
+        made.add_camera_with_trivial_rig(camera)
+    (made.write_text if suffix == ".txt" else made.write_binary)(str(tmp_path))
+    path = tmp_path / f"cameras{suffix}"
+    with pytest.raises(InputError, match=r"2 cameras that differ: 1 \(640x480, fx 500\), 7 \(.*name the one .*#1"):
+        read_intrinsics(str(path), 640, 480)
+    found = read_intrinsics(f"{path}#7", 640, 480)
+    assert (found.fx, found.fisheye, found.distortion) == (900, True, (0.02, -0.01, 0, 0))
+    with pytest.raises(InputError, match="no camera '2' but 1"):
+        read_intrinsics(f"{path}#2", 640, 480)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "what"),
+    [
+        ("a.yaml", KALIBR, r"cam0 \(640x480, fx 525\), cam1"),
+        ("fov.yaml", ROS.replace("rational_polynomial", "fov"), "lens model fov is not supported"),
+        ("ds.json",
+         '{"a": [{"camera_type": "ds", "intrinsics": {"fx": 1, "fy": 1, "cx": 1, "cy": 1, "xi": 2}}]}', "model ds"),
+        ("xi.yaml", ORB_SLAM + "Camera.xi: 0.9\n", "'xi' is not understood"),
+        ("odd.yaml", ROS.replace("distortion_coefficients", "lens_distortion"), "'lens_distortion' is not understood"),
+        ("tilt.yaml", ROS.replace("0.6]", "0.6, 0.1, 0, 0, 0]"), "distortion is"),
+        ("bomb.yaml", "a: &a [1, 2]\nb: [*a, *a]\n", "aliases"),
+        ("empty.yaml", "{}\n", "files that work: JSON .*ROS"),
+        ("other.xml", "<?xml version='1.0'?><a><f>3</f></a>", "files that work: JSON .*ROS"),
+        ("short.bin", "nonsense", "damaged or no calibration file"),
+    ],
+)  # fmt: skip
+def test_what_would_be_lost_is_refused(name: str, text: str, what: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=what):
+        read_intrinsics(str(tmp_path / name), 640, 480)
 
 
 def test_a_fifth_coefficient_is_kept(tmp_path: Path) -> None:

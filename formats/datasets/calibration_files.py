@@ -1,0 +1,194 @@
+"""Calibrations as other programs write them: ROS, Kalibr, EuRoC and ORB-SLAM (YAML), OpenCV (YAML, XML), ARKit, Open3D
+and RealSense (JSON), COLMAP (text, binary), KITTI and Middlebury (text)."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from ..colmap_binary import cameras_in
+from ..errors import InputError
+from ..jsonfile import read_json
+from ..reading import parsing, read_bytes
+from ..textfile import read_rows, read_text
+from .camera import Camera, distortion_names
+from .colmap import camera_from_colmap
+from .intrinsics_json import camera_from_table
+
+FORMATS = (
+    "JSON (fx, fy, cx, cy, width, height, distortion; or as of ARKit, Open3D, nerfstudio), YAML of ROS, Kalibr, EuRoC "
+    "or ORB-SLAM, OpenCV's YAML or XML, COLMAP's cameras.txt or cameras.bin, KITTI's calib.txt, a 3x3 matrix as text"
+)
+_MATRIX = ("camera_matrix", "cameramatrix", "k", "intrinsic_matrix", "intrinsicmatrix", "cameraintrinsics",
+           "intrinsics", "intrinsic", "mtx")  # fmt: skip
+_DISTORTION = ("distortion_coefficients", "distortion_coeffs", "distcoeffs", "dist_coeffs", "dist_coeff", "distortion",
+               "coeffs", "dist", "d")  # fmt: skip
+_SAYS_DISTORTION = re.compile(r"^(xi|alpha|beta|d\d*)$|dist(?!ance)|coeff|radial|tangential")
+_MODEL = ("distortion_model", "camera_model", "camera_type", "model_type", "type", "model")
+_PERSPECTIVE = ("", "none", "opencv", "full_opencv", "perspective", "pinhole", "plumb_bob", "radtan",
+                "radial-tangential", "rational_polynomial", "simple_pinhole", "rectified", "camera")  # fmt: skip
+_FISHEYE = ("equidistant", "equi", "fisheye", "opencv_fisheye", "kannala_brandt", "kannala_brandt4", "kannalabrandt8")
+_PARTS = ("projection_parameters", "distortion_parameters")
+_SIDES = (("width", "w", "image_width", "imagewidth"), ("height", "h", "image_height", "imageheight"))
+_SIZE = ("resolution", "image_size", "imagesize", "size")
+_KITTI = re.compile(r"^(P|K|cam|[PK]_|P_rect_)\d*$")
+_DEEPEST, _LARGEST, _MOST = 8, 2_000_000, 1000
+
+
+def read_calibration_file(path: Path, size: tuple[int, int]) -> dict[str, Camera]:
+    """The cameras of a file by their names there; of `size` (width, height) where it states none.
+
+    Raises InputError for a file without any, a lens that is not supported, and coefficients that would be lost.
+    """
+    suffix, found = path.suffix.lower(), dict[str, Camera]()
+    data = read_bytes(path, _LARGEST)
+    with parsing(path, "calibration file", f"files that work: {FORMATS}"):
+        if suffix == ".bin":
+            return {str(i): _colmap(model, (w, h, *params), path) for i, model, w, h, params in cameras_in(data)}
+        rows = read_rows(path) if suffix == ".txt" else []
+        if rows and len(rows[0]) > 4 and rows[0][1].isupper():
+            return {row[0]: _colmap(row[1], tuple(map(float, row[2:])), path) for row in rows}
+        _collect(_tables(path, suffix), "", found, path, size)
+    if not found:
+        raise InputError(f"{path} holds no camera: files that work: {FORMATS}")
+    return found
+
+
+def _tables(path: Path, suffix: str) -> Any:
+    """What a file of JSON, YAML, XML or of KITTI's lines holds, as lists and dicts."""
+    if suffix == ".json":
+        return read_json(path)
+    text = read_text(path)
+    return _of_xml(text) if text.lstrip().startswith("<") else _of_kitti(text) or _of_yaml(text)
+
+
+def _of_yaml(text: str) -> Any:
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        """Reads a table with a tag, as OpenCV's matrices are, like any other; no aliases, which multiply."""
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise ValueError("it has aliases")
+            return super().compose_node(parent, index)
+
+    Loader.add_multi_constructor("", lambda loader, _, node: loader.construct_mapping(node, deep=True))
+    # OpenCV writes %YAML:1.0 where the standard has %YAML 1.0.
+    return next(iter(yaml.load_all(re.sub(r"\A\s*%YAML[^\n]*\n", "", text), Loader)), None)
+
+
+def _of_xml(text: str) -> Any:
+    import cv2
+
+    def plain(node: Any) -> Any:
+        if node.isMap():
+            return {key: plain(node.getNode(key)) for key in node.keys()}  # noqa: SIM118, a node is no dict
+        if node.isSeq():
+            return [plain(node.at(i)) for i in range(node.size())]
+        return node.string() if node.isString() else node.real()
+
+    file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    try:
+        return plain(file.root())
+    finally:
+        file.release()
+
+
+def _of_kitti(text: str) -> dict[str, Any]:
+    """A table for each camera of lines `P0: 12 numbers`, or `K_00: 9 numbers` beside D_00 and S_00, or `cam0=[a b c;
+    ...]` beside width and height."""
+    lines = re.findall(r"^\s*(\w+)\s*[:=]\s*\[?([-+\d.eE\s,;]+?)\]?\s*$", text, re.MULTILINE)
+    found = {name: [float(word) for word in re.split(r"[\s,;]+", numbers) if word] for name, numbers in lines}
+    sides = {side: found[side][0] for side in ("width", "height") if side in found}
+    cameras = {}
+    for key in (key for key in found if _KITTI.match(key)):
+        size = found.get("S" + key[1:])
+        lens = {"d": found[key.replace("K", "D")]} if key.startswith("K") and key.replace("K", "D") in found else {}
+        cameras[key] = {"k": found[key], **sides, **lens, **({"size": size} if size else {})}
+    return cameras
+
+
+def _colmap(model: str | int, numbers: tuple[float, ...], path: Path) -> Camera:
+    import pycolmap
+
+    members = pycolmap.CameraModelId.__members__
+    name = pycolmap.CameraModelId(model).name if isinstance(model, int) else model
+    if name not in members:
+        raise InputError(f"{path}: the camera model {name} is not supported: undistort the images first")
+    expected = len(pycolmap.Camera.create_from_model_name(1, name, 1.0, 1, 1).params)
+    if len(numbers) != 2 + expected or not all(1 <= side <= 1e6 for side in numbers[:2]):
+        raise InputError(f"{path}: a {name} camera has width, height and {expected} parameters: check its line")
+    camera, notes = camera_from_colmap(name, int(numbers[0]), int(numbers[1]), numbers[2:])
+    if camera is None:
+        raise InputError(f"{path}: {notes[0].partition(':')[0]}: undistort the images first, for example with `colmap "
+                         "image_undistorter`")  # fmt: skip
+    return camera
+
+
+def _collect(value: Any, name: str, found: dict[str, Camera], path: Path, size: tuple[int, int]) -> None:
+    """Add the cameras of a table and of the tables in it to those found, by the path of their keys."""
+    if isinstance(value, list) and _numbers(value) is None:
+        value = {str(i): inner for i, inner in enumerate(value)}
+    if not isinstance(value, dict) or name.count("/") > _DEEPEST or len(found) > _MOST:
+        return
+    table = {str(key).removeprefix("Camera.").removeprefix("Camera1.").lower(): v for key, v in value.items()}
+    for inner in [table.get(key) for key in (*_MATRIX, *_DISTORTION, *_PARTS)]:
+        table |= inner if isinstance(inner, dict) and "data" not in inner else {}
+    matrix = next((k for key in _MATRIX if (k := _matrix(_numbers(table.get(key)) or [])) is not None), None)
+    if matrix is not None or _first(table, ("fx", "fl_x")) is not None:
+        found[name or "camera"] = _camera(table, matrix, path, size)
+        return
+    for key, inner in value.items():
+        _collect(inner, f"{name}/{key}" if name else str(key), found, path, size)
+
+
+def _camera(table: dict[str, Any], matrix: list[float] | None, path: Path, size: tuple[int, int]) -> Camera:
+    model = next((m for key in _MODEL if (m := str(table.get(key) or "").lower()) not in _PERSPECTIVE), "")
+    if model and model not in _FISHEYE and "fisheye" not in model:
+        raise InputError(f"{path}: the lens model {model} is not supported: undistort the images first")
+    width, height = _numbers(_first(table, _SIZE)) or [_first(table, names) for names in _SIDES]
+    plain = {
+        **{key: table[key] for key in (*distortion_names(bool(model)), "pixel_centre") if key in table},
+        **(dict(zip(("fx", "fy", "cx", "cy"), matrix, strict=True)) if matrix else table),
+        "w": size[0] if width is None else width, "h": size[1] if height is None else height,
+        "model": "FISHEYE" if model else "", "distortion": _numbers(_first(table, _DISTORTION)),
+    }  # fmt: skip
+    lost = [
+        key
+        for key in table
+        if _SAYS_DISTORTION.search(key) and any(_numbers(table[key]) or _numbers([table[key]]) or ())
+    ]
+    if plain["distortion"] is None and lost:
+        raise InputError(f"{path}: its distortion under {lost[0]!r} is not understood: undistort the images first")
+    return camera_from_table(plain, path, integer_centres=matrix is not None or path.suffix.lower() != ".json")
+
+
+def _matrix(numbers: list[float]) -> list[float] | None:
+    """fx, fy, cx, cy of four numbers, or of a calibration matrix without skew, of 9, 12 or 16 numbers by rows or
+    columns."""
+    if len(numbers) == 4:
+        return numbers
+    if len(numbers) not in (9, 12, 16):
+        return None
+    across = 3 if len(numbers) == 9 else 4
+    k = [numbers[i * across : i * across + 3] for i in range(3)]
+    k = k if k[0][2] or k[1][2] else [list(column) for column in zip(*k, strict=True)]
+    is_one = not any((k[0][1], k[1][0], k[2][0], k[2][1])) and k[2][2] == 1 and min(k[0][0], k[1][1]) > 0
+    return [k[0][0], k[1][1], k[0][2], k[1][2]] if is_one else None
+
+
+def _first(table: dict[str, Any], keys: tuple[str, ...]) -> Any:
+    return next((table[key] for key in keys if table.get(key) is not None), None)
+
+
+def _numbers(value: Any) -> list[float] | None:
+    """The numbers of a list, a list of lists, or a table with `data`; YAML calls 1e-5 a text."""
+    value = value.get("data") if isinstance(value, dict) else value
+    rows = value if isinstance(value, list) else []
+    flat = [v for row in rows for v in (row if isinstance(row, list) else [row])]
+    try:
+        return [float(v) for v in flat] or None
+    except (TypeError, ValueError):
+        return None
