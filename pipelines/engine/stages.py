@@ -37,8 +37,8 @@ from ..system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progre
 from ..system.stopping import stop_if_asked
 from ..system.wording import quoted
 from .standing import (
-    divided_otherwise,
     kept_inputs,
+    memory_of,
     next_upstream,
     stage_fingerprint,
     why_again,
@@ -274,9 +274,13 @@ def _check_inputs(
 
 
 def _find_ended(stage: Stage, run: RunFolder, config: Config, fingerprint: str) -> StageRecord | None:
-    """The record of this very work, if it had ended when its process was killed."""
+    """The record of this very work, if it had ended when its process was killed.
+
+    How other memory would divide it cannot be asked: what the division reads may be the stage's own results, which are
+    not in the manifest yet.
+    """
     record = find_sealed(run, stage.name, fingerprint)
-    if record is None or divided_otherwise(stage, run, record, config):
+    if record is None or (stage.division is not None and memory_of(stage, record, config) != config.run.memory_mb):
         return None
     log.warning("%s had ended before it was interrupted: its results are taken over", stage.name)
     return record

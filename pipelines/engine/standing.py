@@ -65,11 +65,16 @@ def why_again(
 
 def divided_otherwise(stage: Stage, run: RunFolder, record: StageRecord, config: Config) -> str:
     """Say that a stage was made in other parts than the memory that is given now would divide it into, "" if not."""
-    if stage.division is not None:
+    if stage.division is not None and (memory := memory_of(stage, record, config)) != config.run.memory_mb:
         was = recorded_config({stage.name: record}, config)
         if stage.division(run, config) != stage.division(run, was):
-            return f"run.memory_mb={config.run.memory_mb} divides it otherwise than {was.run.memory_mb} has"
+            return f"run.memory_mb={config.run.memory_mb} divides it otherwise than {memory} has"
     return ""
+
+
+def memory_of(stage: Stage, record: StageRecord, config: Config) -> int:
+    """Return the run.memory_mb that a stage was made with."""
+    return recorded_config({stage.name: record}, config).run.memory_mb
 
 
 def _what_differs(stage: Stage, record: StageRecord, config: Config, upstream: str) -> str:

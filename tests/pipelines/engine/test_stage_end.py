@@ -151,11 +151,11 @@ def test_a_changed_file_or_other_work_is_not_taken_over(tmp_path: Path, monkeypa
 
 def test_parts_of_another_size_are_not_taken_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def division(run: RunFolder, config: Config) -> int:
-        return config.run.memory_mb // 1000
+        return len(run.file("frames", "folder/0.txt").read_text()) * config.run.memory_mb
 
     interrupted(tmp_path / "r", monkeypatch, "run.memory_mb=2100", division=division)
     shutil.copytree(tmp_path / "r", tmp_path / "s")
-    same, other = (load_config(overrides=[f"run.memory_mb={mb}"]) for mb in (2900, 900))
+    same, other = (load_config(overrides=[f"run.memory_mb={mb}"]) for mb in (2100, 900))
     assert Stages().bring(tmp_path / "r", same, division=division)[0] == "proxy"
     assert Stages().bring(tmp_path / "s", other, division=division)[0] == "frames"
 
