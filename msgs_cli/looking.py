@@ -144,9 +144,9 @@ def render(
         raise click.UsageError("a splat file has colours and no cameras: --kind color, --path orbit or FILE")
     with on_sigterm(signal.SIG_DFL):
         if is_file:
-            made = render_file(source, target, fps, output.progress(), size, camera_path)
+            made = render_file(source, target, fps, output.progress(), size, camera_path, output.tell)
         else:
-            made = render_run(open_run(source), target, kind, camera_path, fps, output.progress(), size)
+            made = render_run(open_run(source), target, kind, camera_path, fps, output.progress(), size, output.tell)
     say(made)
     output.tell_result(video=made)
 

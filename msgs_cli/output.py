@@ -78,6 +78,13 @@ class Output:
         returns its progress: bars here, lines from elsewhere."""
         return partial(_worker_progress, self, remote)
 
+    def tell(self, text: str) -> None:
+        """Print a line on stderr, or log it as JSON, for people who wait."""
+        if self.as_json and not self.quiet:
+            write_line("log", level="info", message=text)
+        elif not self.quiet:
+            say(text, err=True)
+
     def tell_result(self, exit_code: int = 0, /, **paths: Path | list[Path]) -> None:
         """Write the last event of a command that came to its end, for programs: where its results are."""
         if self.as_json and not self.quiet:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,6 +31,9 @@ from .viewer.scene import up_of_file
 KINDS = ("color", "depth", "labels", "side-by-side")
 PATHS = ("own", "smooth", "orbit")
 _SMOOTHING_SECONDS = 0.5
+_MOST_GAP, _MOST_OF_PHOTOS = 1.0, 60.0
+"""Seconds of film between two neighbouring frames, and of a film along photos, which may be days apart."""
+_FILE_SUFFIX = re.compile(r"\.[a-z][a-z0-9]{1,4}")
 _FILE_SIZE, _FIELD_OF_VIEW = (960, 540), 50.0
 """Of images of a splat file, which stores no cameras: the field of view is from top to bottom, in degrees."""
 
@@ -42,12 +46,14 @@ def render_run(
     fps: float | None = None,
     progress: Progress | None = None,
     size: tuple[int, int] | None = None,
+    tell: Callable[[str], None] = log.info,
 ) -> Path:
-    """Draw the map along a path into a video (.mp4, .avi, .mkv) or, for any other name, a folder of PNG files.
+    """Draw the map along a path into a video (.mp4, .avi, .mkv) or, for a name without a suffix, a folder of PNG files.
 
-    kind: one of `KINDS`; path: one of `PATHS`, or the file of a camera path, which takes as long as the walk took (an
-    orbit: ten seconds; a file: as long as it says); fps: None = 30, or as the file says; size: (width, height) of an
-    image, by default the run's. Returns `target`; where browsers will not play the video, a warning says so. Raises
+    kind: one of `KINDS`; path: one of `PATHS`, or the file of a camera path, which takes as long as the walk took (of
+    photos: a second each at most, a minute in all; an orbit: ten seconds; a file: as long as it says); fps: None = 30,
+    or as the file says; size: (width, height) of an image, by default the run's; tell: is given the length of the film
+    before the first image is drawn. Returns `target`; where browsers will not play the video, a warning says so. Raises
     InputError for an unknown kind or path, a bad file, or a run without a map.
     """
     _require_choice("kind", kind, KINDS)
@@ -64,9 +70,14 @@ def render_run(
         views = [(outcome, pose) for pose in poses]
     else:
         views = [(_seeing(outcome, fov), pose) for pose, fov in zip(*flown, strict=True)]
+    rate = rate if given is None else given.fps
+    tell(_length(len(views), rate))
     steps = (progress or SilentProgress()).track(views, "rendering", len(views))
-    pictures = (_draw(seen, pose, kind, near, far) for seen, pose in steps)
-    return _write(target, pictures, rate if given is None else given.fps)
+    return _write(target, (_draw(seen, pose, kind, near, far) for seen, pose in steps), rate)
+
+
+def _length(count: int, fps: float) -> str:
+    return f"rendering {count} images: a film of {count / fps:.0f} s at {fps:g} images a second"
 
 
 def render_file(
@@ -76,6 +87,7 @@ def render_file(
     progress: Progress | None = None,
     size: tuple[int, int] | None = None,
     path: str | Path = "orbit",
+    tell: Callable[[str], None] = log.info,
 ) -> Path:
     """Draw a splat file by any program along a circle round it, or the camera path in the file `path`, otherwise as
     `render_run`; by default 960x540.
@@ -95,6 +107,7 @@ def render_file(
     else:
         (poses, fovs), rate = given.flight(), given.fps
     cameras = [_camera(width, height, fov) for fov in fovs]
+    tell(_length(len(poses), rate))
     steps = (progress or SilentProgress()).track(range(len(poses)), "rendering", len(poses))
     return _write(target, (draw_splats(scene, cameras[i], np.linalg.inv(poses[i])) for i in steps), rate)
 
@@ -150,8 +163,12 @@ def _seeing(outcome: Outcome, fov: float) -> Outcome:
 def _require_target(target: Path, fps: float) -> None:
     if not 0.1 <= fps <= 240:
         raise InputError(f"--fps is 0.1 to 240 frames a second; got {fps}")
-    if target.suffix.lower() not in CODECS and target.is_file():
-        raise InputError(f"{target} is a file. Name a folder for images, or a video ending in {', '.join(CODECS)}")
+    suffix = target.suffix.lower()
+    if suffix in CODECS or target.is_dir():
+        return
+    if target.is_file() or _FILE_SUFFIX.fullmatch(suffix):
+        what = "is a file" if target.is_file() else f"cannot be written as {suffix}"
+        raise InputError(f"{target} {what}: name a video that ends in {', '.join(CODECS)}, or a folder for PNG images")
 
 
 def _write(target: Path, pictures: Iterator[Picture], fps: float) -> Path:
@@ -206,9 +223,17 @@ def _path(outcome: Outcome, path: str, fps: float, scene_depth: float) -> NDArra
     times = t.timestamps[t.is_posed]
     if path == "orbit":
         return orbit(own, scene_depth, round(10 * fps), up_in_run(outcome))
-    seconds = float(times[-1] - times[0]) if len(times) > 1 else 1.0
+    seconds = film_seconds(times) if len(times) > 1 else 1.0
     dense = resampled(own, max(2, round(seconds * fps)))
     return dense if path == "own" else smoothed(dense, _SMOOTHING_SECONDS * len(dense) / max(seconds, 1e-6))
+
+
+def film_seconds(times: NDArray[np.float64]) -> float:
+    """Length in seconds of a film along frames taken at `times` (N,) seconds: their own, without gaps above a second;
+    of photos, which have such gaps throughout, at most a minute."""
+    gaps = np.diff(times)
+    seconds = float(np.minimum(gaps, _MOST_GAP).sum())
+    return min(seconds, _MOST_OF_PHOTOS) if np.median(gaps) >= _MOST_GAP else seconds
 
 
 def _depth_range(outcome: Outcome) -> tuple[float, float]:

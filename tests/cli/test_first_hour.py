@@ -1,6 +1,7 @@
 """What somebody types in the first hour: it works, or the message says what was meant."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -124,6 +125,8 @@ def test_render_draws_colour_for_a_browser_in_the_size_that_is_asked_for(
     assert (capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (96, 64)
     code = int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode()
     assert code in ("h264", "avc1", "vp09")
+    assert re.search(r"rendering \d+ images: a film of \d+ s at 3 images a second", result.stderr)
+    assert "name a video that ends in .mp4" in invoke("render", finished_run.folder, tmp_path / "walk.gif").stderr
     wrong = invoke("render", finished_run.folder, made, "--size", "96")
     assert wrong.exit_code == 2
     assert "1280x720" in wrong.stderr

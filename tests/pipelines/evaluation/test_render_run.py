@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.demo import TRUTH, VIDEO, demo_summary, run_demo, unpack_demo_clip
 from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.render_run import render_run
+from msgs_slam.pipelines.render_run import film_seconds, render_run
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import Manifest, Source, load_records, write_manifest
 from msgs_slam.pipelines.system.progress import SilentProgress
@@ -53,6 +54,34 @@ def test_a_video_whose_name_has_no_suffix_is_no_folder(oracle_run: OracleRun, tm
         there()  # what is gone is judged by its name
         write_manifest(run.manifest_file, Manifest(Source(str(clip), ""), load_records(run)))
         assert load_outcome(RunFolder(run.root)).source_is_folder is is_folder
+
+
+@pytest.mark.parametrize(
+    ("count", "apart", "seconds"), [(32, 0.2, 6.2), (32, 300.0, 31), (11, 3e7, 10), (320, 90.0, 60), (3000, 0.1, 299.9)]
+)
+def test_photos_are_a_second_of_film_each_and_a_minute_in_all(count: int, apart: float, seconds: float) -> None:
+    assert film_seconds(np.arange(count) * apart) == pytest.approx(seconds)
+
+
+def test_the_length_of_a_film_is_said_first(
+    oracle_run: OracleRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = oracle_run()
+    outcome, told = load_outcome(run), list[str]()
+    walk = replace(outcome.trajectory, timestamps=np.arange(32) * 300.0)
+    monkeypatch.setattr("msgs_slam.pipelines.render_run.load_outcome", lambda _: replace(outcome, trajectory=walk))
+    folder = render_run(run, tmp_path / "film", path="own", fps=0.2, size=(24, 18), tell=told.append)
+    assert len(list_images(folder)) == 6  # of 31 seconds, not of 9,300
+    assert told == ["rendering 6 images: a film of 30 s at 0.2 images a second"]
+
+
+@pytest.mark.parametrize("name", ["out.gif", "out.mov", "OUT.WEBM", "out.mpg4"])
+def test_suffixes_that_cannot_be_written_are_refused_before_the_work(
+    name: str, oracle_run: OracleRun, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=r"cannot be written as .*\.mp4, \.avi, \.mkv, or a folder"):
+        render_run(oracle_run(), tmp_path / name)
+    assert not (tmp_path / name).exists()
 
 
 def test_side_by_side_video_of_an_orbit(oracle_run: OracleRun, tmp_path: Path) -> None:
