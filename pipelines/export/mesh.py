@@ -15,7 +15,7 @@ from ..config import ExportConfig
 from ..depth.posed import PosedDepth
 from ..depth.resize import resample_nearest
 from ..gaussians.render import get_threads, host_threads
-from ..mapping.depth_views import DrawnView, Shown, drawn_view
+from ..mapping.measure import DrawnView, Shown, drawn_view
 from ..outcome import Outcome, maps_around
 from ..run.files import MESH
 from ..system.lru_sequence import LruSequence

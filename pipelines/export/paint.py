@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..depth.posed import PosedDepth
 from ..geometry.camera import project
-from ..mapping.depth_views import DrawnView
+from ..mapping.measure import DrawnView
 from ..types import VOID
 
 

@@ -16,7 +16,7 @@ from ...formats.mesh import mesh_blocks, read_mesh_ply, write_mesh_glb, write_me
 from ..config import Config, ExportConfig
 from ..engine.chunks import in_chunks
 from ..engine.stages import Stage, StageContext
-from ..mapping.depth_views import Shown
+from ..mapping.measure import Shown
 from ..metres.find import find_metres
 from ..networks.identity import card_identity
 from ..outcome import Outcome, load_outcome

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..depth.posed import PosedDepth
 from ..depth.resize import resample_nearest
 from ..geometry.camera import unproject_depth
-from ..mapping.depth_views import DrawnView
+from ..mapping.measure import DrawnView
 from ..outcome import evenly
 from ..voxels.voxels import VOXELS_PER_DEPTH, find, gather_depths, normals_in_cam, voxel_keys
 from .planes import NEAR, REACH, ROUGHLY_ALONG, Planes, find_planes

@@ -17,8 +17,7 @@ from ..geometry import se3
 from ..geometry.sparse_model import SparseModel
 from ..mapping.build import Refined, refine_map
 from ..mapping.load import with_rigid_panoramas
-from ..mapping.move_map import follow_keyframes, move_map
-from ..mapping.poses import move_trajectory
+from ..mapping.move_map import follow_keyframes, move_map, move_trajectory
 from ..run.files import (
     CALIBRATION,
     CLASSES,

@@ -22,7 +22,7 @@ from ..types import Trajectory
 from .extending import GROWN, grow_submap
 from .load import split_frames
 from .measure import ViewFigures
-from .poses import interpolate_rows, move_trajectory, rows_of
+from .move_map import interpolate_rows, move_trajectory, rows_of
 from .state import Exposures, OptimisedMap
 from .submap_tasks import (
     AGREED,

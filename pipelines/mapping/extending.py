@@ -18,9 +18,8 @@ from ..run.files import FRAMES
 from ..structure.given import agreement
 from ..system.progress import Progress
 from ..types import Trajectory
-from .move_map import move_map
+from .move_map import move_map, rows_of
 from .optimise import optimise_map
-from .poses import rows_of
 from .submap_tasks import SubmapResult, SubmapTask, pixels_filled, together
 from .views import View
 

@@ -9,18 +9,26 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..config import MappingConfig
-from ..gaussians.render import Rendering
+from ..gaussian_map import GaussianMap
+from ..gaussians.render import Rendering, error_shares
 from ..gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
 from ..system.lru_sequence import LruSequence
-from . import densify
+from ..types import Intrinsics
 from .region_prior import with_region_prior
 from .schedule import Seeding
-from .splitting import CHILDREN, DensificationError, split
 from .state import OptimiserState
 from .views import View
+
+CHILDREN = 4
+CHILD_RADIUS, CHILD_OFFSET = 0.55, 0.6
+"""In radii of the parent: the children cover together what it covered, and a little less reaches over its rim."""
+_NEIGHBOURS = 12
+"""Gaussians around a parent, itself included, to which the plane of its surface is fitted."""
 
 GROWN_OPACITY = 0.3
 """Of Gaussians added to a map that is already there: opaque ones would hide what has been learnt."""
@@ -101,7 +109,7 @@ class Growth:
     def prune(self, largest_weight: Callable[[], Tensor] | None = None) -> None:
         """Drop the Gaussians that are too transparent, too large or of too low `largest_weight` (M,)."""
         parameters = self.state.parameters
-        bad = densify.useless(parameters.to_map(), PRUNE_OPACITY, PRUNE_RADIUS * self.unit)
+        bad = useless(parameters.to_map(), PRUNE_OPACITY, PRUNE_RADIUS * self.unit)
         if largest_weight is not None:
             bad |= largest_weight() < PRUNE_WEIGHT
         if bad.any():
@@ -117,19 +125,19 @@ class Growth:
 
     def _holes(self, rendering: Rendering) -> Tensor:
         """Condition (a)."""
-        return densify.holes(rendering.silhouette, HOLE)
+        return holes(rendering.silhouette, HOLE)
 
     def _needed(self, view: View, rendering: Rendering) -> Tensor:
         """Conditions (a) and (b)."""
         needed = self._holes(rendering)
         if self.settings.use_proxy_depth:
-            needed = needed | densify.hidden_surfaces(rendering.depth, view.depth, view.trust, DEPTH_TOLERANCE)
+            needed = needed | hidden_surfaces(rendering.depth, view.depth, view.trust, DEPTH_TOLERANCE)
         return needed
 
     def _grown_depth(self, view: View, rendering: Rendering) -> tuple[Tensor, Tensor]:
         """(H, W) depth and trust: the proxy where it is reliable, else the map's own; 0 where neither knows."""
         # A trusted proxy is sharp at depth edges, where the map's blended depth lies between the surfaces.
-        nearer = densify.hidden_surfaces(rendering.depth, view.depth, view.trust, DEPTH_TOLERANCE)
+        nearer = hidden_surfaces(rendering.depth, view.depth, view.trust, DEPTH_TOLERANCE)
         use_map = (rendering.silhouette > _SOLID) & ~nearer & (view.trust < HIGH_RELIABILITY)
         proxy = torch.where(view.trust > LOW_RELIABILITY, view.depth, 0.0)
         return torch.where(use_map, rendering.depth, proxy), torch.where(use_map, LOW_RELIABILITY, view.trust)
@@ -167,3 +175,81 @@ def _spacing(view: View, stride: int) -> Tensor:
     image, depth = view.image.cpu().numpy(), view.depth.cpu().numpy()
     spacing = seed_spacing(image, depth, stride, FINE_SHARE, FLAT_SHARE).astype(np.uint8)
     return view.of_scene(torch.from_numpy(spacing).to(view.image.device), 0)
+
+
+def holes(silhouette: Tensor, least: float) -> Tensor:
+    """(H, W) bool: condition (a), the map does not cover the pixel."""
+    return silhouette < least
+
+
+def hidden_surfaces(rendered: Tensor, proxy: Tensor, trust: Tensor, tolerance: float) -> Tensor:
+    """(H, W) bool: condition (b), a trusted proxy is nearer than the map by more than `tolerance` of its depth.
+
+    The less the proxy is trusted, the larger the difference has to be.
+    """
+    allowed = tolerance * proxy / trust.clamp(min=0.1)
+    return (proxy > 0) & (rendered - proxy > allowed)
+
+
+def useless(gaussian_map: GaussianMap, least_opacity: float, largest_radius: float) -> Tensor:
+    """(M,) bool: too transparent, too large or not finite."""
+    finite = torch.isfinite(gaussian_map.means).all(1) & torch.isfinite(gaussian_map.log_radii)
+    finite &= torch.isfinite(gaussian_map.colors).all(1) & torch.isfinite(gaussian_map.opacity_logits)
+    return ~finite | (gaussian_map.opacities < least_opacity) | (gaussian_map.radii > largest_radius)
+
+
+@dataclass(frozen=True)
+class DensificationError:
+    """Error of each Gaussian in the worst of several views: `error` (M,) in pixels times colour error, and `footprint`
+    (M,), its radius on that image in pixels."""
+
+    error: Tensor
+    footprint: Tensor
+
+    def worst_of(self, other: DensificationError) -> DensificationError:
+        """For each Gaussian the view of larger error."""
+        worse = other.error > self.error
+        return DensificationError(
+            torch.where(worse, other.error, self.error), torch.where(worse, other.footprint, self.footprint)
+        )
+
+
+@torch.no_grad()
+def densification_error(
+    gaussian_map: GaussianMap, cam_from_world: Tensor, intrinsics: Intrinsics, error_of: Callable[[Tensor], Tensor]
+) -> DensificationError:
+    """Compute the error of each Gaussian in one view: the errors of the pixels, weighted by its share in them, summed.
+
+    `error_of`: (H, W, 3) colours of the map to (H, W) errors (the error of Rota Bulò, Porzi and Kontschieder, "Revising
+    Densification in Gaussian Splatting", ECCV 2024).
+    """
+    m = gaussian_map
+    return DensificationError(
+        *error_shares(m.means, m.radii, m.opacities, m.colors, cam_from_world, intrinsics, error_of)
+    )
+
+
+def split(gaussian_map: GaussianMap, rows: Tensor) -> GaussianMap:
+    """Four children in place of each of the given rows (n,), in a square in the plane of the map around the parent."""
+    first, second = _tangents(gaussian_map.means.cpu().numpy(), rows.cpu().numpy())
+    along, across = (torch.from_numpy(t).to(gaussian_map.means) for t in (first, second))
+    reach = CHILD_OFFSET * gaussian_map.radii[rows, None]
+    means = [gaussian_map.means[rows] + reach * (a * along + b * across) for a in (1, -1) for b in (1, -1)]
+    four = rows.repeat(CHILDREN)
+    return GaussianMap(
+        means=torch.cat(means),
+        log_radii=gaussian_map.log_radii[four] + math.log(CHILD_RADIUS),
+        opacity_logits=gaussian_map.opacity_logits[four],
+        colors=gaussian_map.colors[four],
+        class_logits=gaussian_map.class_logits[four],
+        anchor_frame_ids=gaussian_map.anchor_frame_ids[four],
+    )
+
+
+def _tangents(means: NDArray[np.float32], rows: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two unit vectors (n, 3) each along the surface: the two main directions of the nearest Gaussians."""
+    _, nearest = cKDTree(means).query(means[rows], k=min(_NEIGHBOURS, len(means)))
+    around = means[nearest.reshape(len(rows), -1)].astype(np.float64)
+    around -= around.mean(1, keepdims=True)
+    _, directions = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    return directions[:, :, 2], directions[:, :, 1]

@@ -1,19 +1,20 @@
-"""Quality of the map in its views: PSNR, SSIM, depth against the proxies, labels against the input's."""
+"""Renderings of the finished map: what a view shows (depth, colours, classes), and its PSNR, SSIM, depth and labels."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..gaussian_map import GaussianMap
-from ..gaussians.render import Rendering, render
+from ..depth.posed import PosedDepth
+from ..gaussian_map import GaussianMap, decided_channels
+from ..gaussians.render import Rendering, median_and_seen, render
 from ..gaussians.ssim import ssim_map
-from ..types import VOID
+from ..types import VOID, Intrinsics
 from .views import View
 
 
@@ -82,4 +83,78 @@ def mean_figures(figures: Sequence[ViewFigures], prefix: str) -> dict[str, float
         values = [v for f in figures if np.isfinite(v := getattr(f, name))]
         if values:
             out[f"{prefix}_{name}"] = round(float(np.mean(values)), 5)
+    return out
+
+
+@dataclass(frozen=True)
+class DrawnView:
+    """Depth and trust, colors (H, W, 3) uint8 and class channels (H, W) int16, -1 = none; None for a map without.
+
+    unsure (H, W): where a depth may move onto a plane beside it, None for nowhere."""
+
+    shown: PosedDepth
+    colors: NDArray[np.uint8]
+    channels: NDArray[np.int16] | None
+    unsure: NDArray[np.bool_] | None = None
+
+    @property
+    def arrays(self) -> list[NDArray]:
+        """Depth, trust, colors, and channels and unsure where there are any."""
+        some = (self.channels, self.unsure)
+        return [self.shown.depth, self.shown.trust, self.colors, *(a for a in some if a is not None)]
+
+    @property
+    def size(self) -> int:
+        """Memory of the arrays, in bytes."""
+        return sum(a.nbytes for a in self.arrays)
+
+
+class Shown(Sequence[PosedDepth]):
+    """The depths alone of views that are loaded as they are asked for."""
+
+    def __init__(self, views: Sequence[DrawnView]) -> None:
+        self._views = views
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __getitem__(self, index: int) -> PosedDepth:  # type: ignore[override]
+        return self._views[index].shown
+
+
+@torch.no_grad()
+def drawn_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], camera: Intrinsics) -> DrawnView:
+    """Median depth with a weight: none where the map is thin or the depth jumps, less far away."""
+    m, pose = gaussian_map, torch.as_tensor(cam_from_world)
+    radii, opacities = m.radii, m.opacities
+    median, seen = median_and_seen(m.means, radii, opacities, pose, camera)
+    depth, features = median.cpu().numpy(), torch.cat([m.colors[seen], m.class_logits[seen]], dim=1)
+    rendering = render(m.means[seen], radii[seen], opacities[seen], features, pose, camera)
+    silhouette, features = rendering.silhouette.cpu().numpy(), rendering.features
+    solid = (silhouette > 0.7) & (depth > 0) & ~_jumps(depth)
+    typical = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
+    # The error of a depth grows with its square.
+    weight = np.where(solid, np.clip(typical / np.maximum(depth, 1e-9), 0.2, 1.5) ** 2 * silhouette, 0)
+    channels = decided_channels(features[..., 3:]).to(torch.int16).cpu().numpy() if features.shape[-1] > 3 else None
+    colors = (features[..., :3].clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    return DrawnView(
+        PosedDepth(camera, cam_from_world, depth.astype(np.float32), weight.astype(np.float32)), colors, channels
+    )
+
+
+def depth_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], camera: Intrinsics) -> PosedDepth:
+    """The depth of a `drawn_view` alone."""
+    without_classes = replace(gaussian_map, class_logits=gaussian_map.class_logits[:, :0])
+    return drawn_view(without_classes, cam_from_world, camera).shown
+
+
+def _jumps(depth: NDArray[np.float32], tolerance: float = 0.08) -> NDArray[np.bool_]:
+    """Pixels beside a step of the depth, where neither side can be trusted to a pixel."""
+    out = np.zeros(depth.shape, bool)
+    for axis in (0, 1):
+        a, b = np.moveaxis(depth, axis, 0)[:-1], np.moveaxis(depth, axis, 0)[1:]
+        step = np.abs(a - b) > tolerance * np.minimum(a, b)
+        view = np.moveaxis(out, axis, 0)
+        view[:-1] |= step
+        view[1:] |= step
     return out

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial, reduce
 from pathlib import Path
 from typing import TypeVar
@@ -18,25 +18,28 @@ from ..gaussians.render import (
     Rendering,
     blending_weights,
     cards,
+    class_weights,
     host_threads,
     in_view,
     marked_in_view,
     render,
 )
+from ..gaussians.seeding import SEED_LOGIT
 from ..system.lru_sequence import LruSequence
 from ..system.parallel import abreast
 from ..system.progress import Progress, SilentProgress
 from ..system.stopping import is_asked
-from .card_loss import color_errors_on_card, fit_exposure_on_card
 from .exposure import SOLID, expose, fit_exposure
-from .growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
-from .label_votes import voted_logits
-from .objective import Objective
-from .parameters import KEYS
+from .growth import HIGH_RELIABILITY, LOW_RELIABILITY, DensificationError, Growth, densification_error
+from .objective import Objective, color_errors_on_card, fit_exposure_on_card
 from .schedule import Schedule, Seeding, Step
-from .splitting import DensificationError, densification_error
-from .state import Exposures, OptimisedMap, OptimiserState
+from .state import KEYS, Exposures, OptimisedMap, OptimiserState
 from .views import View, halved
+
+_FLOOR = 1 / (math.exp(SEED_LOGIT) - 1)
+"""Added to every share of a class: one that has all votes gets the logit of a seed's own class, one without any 0."""
+_LEAST = 1e-6
+"""Pixels: who has less of all views keeps the classes that he has."""
 
 T = TypeVar("T")
 MAP_RATES = {"means": 0.1, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2}
@@ -236,3 +239,19 @@ def scene_depth(views: Sequence[View]) -> float:
     samples = [v.depth[::8, ::8][v.depth[::8, ::8] > 0] for v in views]
     together = torch.cat(samples)
     return float(together.median()) if len(together) else 1.0
+
+
+def voted_logits(gaussian_map: GaussianMap, posed: Iterable[tuple[View, Tensor]]) -> Tensor:
+    """(M, C) class logits by the labels of views, each with its pose (4, 4): a pixel gives its confidence to its class,
+    shared among the Gaussians as they are blended in it."""
+    votes = torch.zeros_like(gaussian_map.class_logits)
+    m, classes = gaussian_map, gaussian_map.class_logits.shape[1]
+    for view, pose in posed:
+        seen = (m.means, m.radii, m.opacities, pose, view.intrinsics)
+        votes.index_add_(0, *class_weights(*seen, view.channels, view.label_weight, classes))
+    total = votes.sum(1, keepdim=True)
+    # In place: a number for each class and Gaussian is a large table.
+    votes.div_(total.clamp(min=_LEAST)).div_(_FLOOR).log1p_()
+    unseen = total[:, 0] <= _LEAST
+    votes[unseen] = gaussian_map.class_logits[unseen]
+    return votes

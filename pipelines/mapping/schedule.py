@@ -12,7 +12,6 @@ from scipy.sparse import csr_matrix
 
 from ..config import MappingConfig
 from ..depth.posed import overlaps
-from .covisibility import keyframe_weights
 from .views import View
 
 WINDOW_STEPS = 2
@@ -167,3 +166,11 @@ class Schedule:
             prune=place == self.views - 1 and self._follows_new_ones(number),
             refine_pose=view != 0,
         )
+
+
+def keyframe_weights(
+    now: int, reliability: NDArray[np.float64], time_decay: float, reliability_decay: float
+) -> NDArray[np.float64]:
+    """(N,) eq. (13) with ρ = 1: exp(-τ (now - t)) exp(-δ (1 - mean U)), eq. (14); `reliability` (N,) is mean U."""
+    age = np.maximum(now - np.arange(len(reliability)), 0)
+    return np.exp(-time_decay * age) * np.exp(-reliability_decay * (1 - reliability))

@@ -28,12 +28,11 @@ from ..system.device import resolve_device
 from ..system.memory import memory_room
 from ..system.progress import Progress
 from ..types import Intrinsics, Trajectory
-from .gauge import SeenExposures, common_exposure
+from .exposure import SeenExposures, common_exposure
 from .load import MappingInput, load_views
 from .measure import ViewFigures, features_of, measure_view
 from .optimise import optimise_map
-from .parameters import KEYS
-from .state import Exposures, OptimisedMap
+from .state import KEYS, Exposures, OptimisedMap
 from .submaps import Submap, nearest_seeing
 from .views import View
 

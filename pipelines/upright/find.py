@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..depth.posed import PosedDepth
 from ..gaussians.render import get_threads, host_threads
-from ..mapping.depth_views import depth_view
+from ..mapping.measure import depth_view
 from ..outcome import Outcome, evenly, maps_around
 from ..system.parallel import abreast
 from ..voxels.layout import Gravity, find_gravity, floor_plane, name_structure

@@ -40,7 +40,7 @@ from msgs_slam.pipelines.gaussians.render.compositing import choose_backend
 from msgs_slam.pipelines.gaussians.render.rendering import project_map
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.mapping import losses
-from msgs_slam.pipelines.mapping.photo_loss import photo_loss
+from msgs_slam.pipelines.mapping.losses import photo_loss
 
 ROWS = [(320, 240, 50_000, 8), (320, 240, 200_000, 8), (640, 480, 200_000, 8), (640, 480, 200_000, 40)]
 WANTED = [8.2, 8.8, 12.3, 7.9]

@@ -14,10 +14,9 @@ from msgs_slam.pipelines.gaussians.adam import descend_by_kernel, plain_descend
 from msgs_slam.pipelines.gaussians.render import Rendering, composite, in_view, reference, render
 from msgs_slam.pipelines.gaussians.render.rendering import project_map
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.mapping.card_loss import color_errors_on_card, fit_exposure_on_card
 from msgs_slam.pipelines.mapping.exposure import expose, fit_exposure
-from msgs_slam.pipelines.mapping.objective import Objective
-from msgs_slam.pipelines.mapping.parameters import KEYS
+from msgs_slam.pipelines.mapping.objective import Objective, color_errors_on_card, fit_exposure_on_card
+from msgs_slam.pipelines.mapping.state import KEYS
 from msgs_slam.pipelines.proxy.stereo import card
 from msgs_slam.pipelines.proxy.stereo.bands import Bands
 from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths

@@ -16,7 +16,7 @@ from msgs_slam.pipelines.export.paint import paint
 from msgs_slam.pipelines.export.surface import Surface, chunk_surfaces, weld
 from msgs_slam.pipelines.export.volume import CHUNK, Grid, Volume, fuse, make_grid
 from msgs_slam.pipelines.gaussians.render import get_threads, set_threads
-from msgs_slam.pipelines.mapping.depth_views import DrawnView
+from msgs_slam.pipelines.mapping.measure import DrawnView
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.types import VOID, Intrinsics
 

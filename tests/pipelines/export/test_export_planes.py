@@ -13,7 +13,7 @@ from msgs_slam.pipelines.depth.posed import PosedDepth
 from msgs_slam.pipelines.export.mesh import draw, drawn_views, keyframe_rows, planes_in, straighten
 from msgs_slam.pipelines.export.planes import Planes, find_planes
 from msgs_slam.pipelines.export.straighten import planes_of, straightened
-from msgs_slam.pipelines.mapping.depth_views import DrawnView
+from msgs_slam.pipelines.mapping.measure import DrawnView
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress

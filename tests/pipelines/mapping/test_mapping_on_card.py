@@ -18,14 +18,19 @@ pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip
 from msgs_slam.pipelines.config import MappingConfig  # noqa: E402
 from msgs_slam.pipelines.gaussians.render import Rendering, cards  # noqa: E402
 from msgs_slam.pipelines.mapping import losses  # noqa: E402
-from msgs_slam.pipelines.mapping.card_loss import color_errors_on_card, fit_exposure_on_card  # noqa: E402
 from msgs_slam.pipelines.mapping.exposure import expose, fit_exposure  # noqa: E402
 from msgs_slam.pipelines.mapping.load import MappingInput  # noqa: E402
-from msgs_slam.pipelines.mapping.objective import Objective  # noqa: E402
+from msgs_slam.pipelines.mapping.objective import (  # noqa: E402
+    Objective,
+    color_errors_on_card,
+    fit_exposure_on_card,
+)
 from msgs_slam.pipelines.mapping.optimise import MapOptimiser, optimise_map  # noqa: E402
-from msgs_slam.pipelines.mapping.parameters import KEYS  # noqa: E402
 from msgs_slam.pipelines.mapping.schedule import Seeding, Step  # noqa: E402
-from msgs_slam.pipelines.mapping.state import OptimiserState  # noqa: E402
+from msgs_slam.pipelines.mapping.state import (  # noqa: E402
+    KEYS,
+    OptimiserState,
+)
 from msgs_slam.pipelines.mapping.views import View  # noqa: E402
 from msgs_slam.pipelines.types import VOID, Intrinsics  # noqa: E402
 from tests.card_builds import build  # noqa: E402
@@ -167,10 +172,10 @@ def test_visits_are_those_of_the_cpu(started: Any, monkeypatch: pytest.MonkeyPat
 @pytest.mark.skipif(ON_CARD, reason="the tests above compile and run the kernels")
 def test_the_kernels_compile_for_cards(tmp_path: Path) -> None:
     kernels = {
-        "mapping.photo_kernels": [
+        "mapping.loss_kernels": [
             "expose_colors", "blur_planes", "compare_moments", "differentiate", "color_errors", "fit_color",
+            "compare_maps", "weigh_sizes",
         ],
-        "mapping.map_kernels": ["compare_maps", "weigh_sizes"],
     }  # fmt: skip
     constants = {"MASKED": True, "BLOCK": 128, "TAPS": 11, "C1": 1e-4, "C2": 9e-4, "SHARE": 0.2, "STRIDE": 4}
     constants |= {"SOLID": 0.9, "LEAST": 100, "OUTLIER": 0.02, "RIDGE": 0.003, "MOST_GAIN": 5.0, "NU": losses.NU}

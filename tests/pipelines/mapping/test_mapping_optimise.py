@@ -15,10 +15,9 @@ from msgs_slam.pipelines.gaussians.seeding import SEED_LOGIT
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project_gaussians
 from msgs_slam.pipelines.mapping import growth, optimise, schedule
-from msgs_slam.pipelines.mapping.label_votes import voted_logits
 from msgs_slam.pipelines.mapping.load import MappingInput
 from msgs_slam.pipelines.mapping.measure import ViewFigures, measure_view
-from msgs_slam.pipelines.mapping.optimise import MapOptimiser, OptimisedMap, optimise_map
+from msgs_slam.pipelines.mapping.optimise import MapOptimiser, OptimisedMap, optimise_map, voted_logits
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View
 from msgs_slam.pipelines.types import VOID

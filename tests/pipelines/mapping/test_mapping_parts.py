@@ -14,10 +14,9 @@ from msgs_slam.pipelines.depth.resize import resize_depth
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.mapping import extending
-from msgs_slam.pipelines.mapping.covisibility import keyframe_weights
 from msgs_slam.pipelines.mapping.load import MappingInput, load_views, split_frames
-from msgs_slam.pipelines.mapping.poses import interpolate_rows, move_trajectory
-from msgs_slam.pipelines.mapping.schedule import RATE_DECAY, Schedule, Seeding
+from msgs_slam.pipelines.mapping.move_map import interpolate_rows, move_trajectory
+from msgs_slam.pipelines.mapping.schedule import RATE_DECAY, Schedule, Seeding, keyframe_weights
 from msgs_slam.pipelines.mapping.views import channel_table, halved, occurring_classes
 from msgs_slam.pipelines.run.files import CALIBRATION, CLASSES, PROXY_MAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder

@@ -17,10 +17,11 @@ from msgs_slam.pipelines.config import Config, MappingConfig, RunConfig
 from msgs_slam.pipelines.depth.posed import PosedDepth
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.mapping import gauge, submaps
+from msgs_slam.pipelines.mapping import exposure as gauge
 from msgs_slam.pipelines.mapping import stage as mapping_stage
+from msgs_slam.pipelines.mapping import submaps
 from msgs_slam.pipelines.mapping.build import refine_map
-from msgs_slam.pipelines.mapping.gauge import SeenExposures, common_exposure
+from msgs_slam.pipelines.mapping.exposure import SeenExposures, common_exposure
 from msgs_slam.pipelines.mapping.submaps import BORDER, divide, nearest_seeing
 from msgs_slam.pipelines.outcome import load_outcome, maps_around
 from msgs_slam.pipelines.run.files import DEPTH_FIELDS, MAP, SUBMAPS, TRAJECTORY

@@ -19,7 +19,7 @@ from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.mapping import growth
 from msgs_slam.pipelines.mapping import stage as mapping_stage
 from msgs_slam.pipelines.mapping.move_map import move_map
-from msgs_slam.pipelines.mapping.parameters import MapParameters, empty_map
+from msgs_slam.pipelines.mapping.state import MapParameters, empty_map
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.render_run import render_run
