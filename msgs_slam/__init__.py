@@ -45,7 +45,7 @@ class Run:
         """All that the run has found; raises InputError where the folder is no run or its map is not done."""
         from .pipelines.outcome import load_outcome
         from .pipelines.run.folder import RunFolder
-        from .pipelines.upright.world import WORLD
+        from .pipelines.scene.world import WORLD
 
         found = load_outcome(RunFolder(self.path))
         found.require_map()

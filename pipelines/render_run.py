@@ -21,10 +21,10 @@ from .evaluation.pictures import Picture, depth_picture, depth_range, label_pict
 from .evaluation.splat_views import SplatScene, draw_splats
 from .outcome import Outcome, load_outcome
 from .run.folder import RunFolder
+from .scene.world import WORLD, up_in_run
 from .system.progress import Progress, SilentProgress, log
 from .system.wording import quoted
 from .types import Intrinsics
-from .upright.world import WORLD, up_in_run
 from .viewer.camera_path import EXPORTED, CameraPath, read_camera_path
 from .viewer.scene import up_of_file
 

@@ -3,8 +3,7 @@
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, DepthProvider
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
+from msgs_slam.pipelines.providers import DepthEstimate, DepthProvider, Sequence
 from msgs_slam.pipelines.proxy.selection import ProviderContext
 from msgs_slam.pipelines.types import Frame
 

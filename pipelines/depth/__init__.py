@@ -1,5 +1,6 @@
-"""A keyframe's depth from its provider into the world: one scale field each, which makes views and points agree.
+"""Depth of the keyframes: by stereo, from a network, from files, or from stereo and a network together.
 
-`tracking` writes the fields after its adjustment and `global_ba` after its own; whoever reads a keyframe's depth
-through them has it in the unit of the world.
+In go the keyframes with their cameras (`providers.Sequence`), out come depth and confidence for each (`DepthEstimate`);
+`fields`, `scales` and `align` bring depth of another unit to the scale of the poses, once for each keyframe.
+Begin with `stereo/provider.py`, the default, then `fused.py`.
 """

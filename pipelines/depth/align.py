@@ -13,12 +13,12 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.posed_depth import PosedDepth, neighbours
 from ..geometry.sparse_model import SparseModel
 from ..system.lru_sequence import LruSequence
 from ..system.memory import ALIGNED_TOGETHER
 from ..types import Intrinsics, ProxyMaps
 from .fields import FINE, Basis, DepthFields
-from .posed import PosedDepth, neighbours
 from .solve import Equations, Prior, solve_fields
 
 Array = NDArray[np.float64]

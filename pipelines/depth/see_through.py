@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.posed_depth import PosedDepth, neighbours
 from ..system.jit import kernel
-from .posed import PosedDepth, neighbours
 
 STRIDE = 2
 AGREES = 0.03

@@ -10,7 +10,7 @@ from ..export.stage import on_earth
 from ..geometry.rig import rig_of
 from ..geometry.tape import tape_text
 from ..outcome import Outcome
-from ..upright.world import WORLD
+from ..scene.world import WORLD
 
 Array = NDArray[np.float64]
 

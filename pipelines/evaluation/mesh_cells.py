@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ..outcome import Outcome
 from ..run.files import MESH
+from ..scene.world import FIRST, WORLD
 from ..types import Intrinsics
-from ..upright.world import FIRST, WORLD
 from .surface_error import (
     depth_points,
     sample_surface,

@@ -22,10 +22,10 @@ from ..read_config import config_to_toml
 from ..run.files import FIGURES, LOOPS
 from ..run.folder import RunFolder
 from ..run.records import load_source
+from ..scene.world import FIRST, WORLD
 from ..system.progress import Progress, SilentProgress
 from ..system.wording import figure_text, quoted
 from ..types import LoopEdge
-from ..upright.world import FIRST, WORLD
 from .facts import Capture, advice, lost_stretches, read_capture
 from .html import bullets, chips, drawing, page, section, table
 from .lengths import found_lengths

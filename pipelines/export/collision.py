@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 
 from ...formats.glb import Part, write_primitive
 from ..outcome import Outcome
-from ..upright.world import World
+from ..scene.world import World
 from .atlas import simplified
 from .mesh import mesh_of_run
 

@@ -14,7 +14,7 @@ from ...formats.mesh import read_mesh_ply
 from ..outcome import Outcome
 from ..run.files import MESH
 from ..run.folder import RunFolder
-from ..upright.world import WORLD
+from ..scene.world import WORLD
 from .walls import Wall, find_walls
 
 Array = NDArray[np.float64]

@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 from ...formats.errors import InputError
 from ...formats.mesh import MeshBlocks, read_mesh_ply
 from ..config import ExportConfig
-from ..depth.posed import PosedDepth
-from ..depth.resize import resample_nearest
 from ..gaussians.render import get_threads, host_threads
+from ..geometry.posed_depth import PosedDepth
+from ..geometry.resampling import resample_nearest
 from ..mapping.measure import DrawnView, Shown, drawn_view
 from ..outcome import Outcome, maps_around
 from ..run.files import MESH
+from ..scene.world import WORLD, World
 from ..system.lru_sequence import LruSequence
 from ..system.parallel import abreast
 from ..system.progress import Progress
 from ..system.values import load_value, save_value
 from ..types import VOID, Intrinsics, ProxyMaps, SemanticMesh
-from ..upright.world import WORLD, World
 from .joined import Region
 from .paint import paint
 from .planes import Planes

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..depth.posed import PosedDepth
 from ..geometry.camera import project
+from ..geometry.posed_depth import PosedDepth
 from ..mapping.measure import DrawnView
 from ..types import VOID
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..voxels.voxels import Voxels, neighbour_keys, voxel_keys
+from ..geometry.voxels import Voxels, neighbour_keys, voxel_keys
 
 Array = NDArray[np.float64]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import textwrap
 from dataclasses import dataclass
 
+from ..scene.world import World
 from ..types import Metres
-from ..upright.world import World
 
 WIDTH = 100
 """Characters a line, so that it fits a terminal, an editor and the report."""

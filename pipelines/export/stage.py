@@ -17,7 +17,6 @@ from ..config import Config, ExportConfig
 from ..engine.chunks import in_chunks
 from ..engine.stages import Stage, StageContext
 from ..mapping.measure import Shown
-from ..metres.find import find_metres
 from ..networks.identity import card_identity
 from ..outcome import Outcome, load_outcome
 from ..proxy.selection import metric_card
@@ -25,12 +24,13 @@ from ..run.files import METRES, SUBMAPS
 from ..run.folder import RunFolder
 from ..run.journal import empty
 from ..run.records import load_records
+from ..scene.metres import find_metres
+from ..scene.places import AUTO, OFF, world_on_earth
+from ..scene.upright import find_upright
+from ..scene.world import FIRST, WORLD, World, upright_world, world_figures
 from ..system.memory import release_free_memory
 from ..system.progress import Progress, SilentProgress
 from ..types import Metres, SemanticMesh
-from ..upright.find import find_upright
-from ..upright.places import AUTO, OFF, world_on_earth
-from ..upright.world import FIRST, WORLD, World, upright_world, world_figures
 from .collision import write_collision
 from .floor_plan import write_floor_plan
 from .joined import joined

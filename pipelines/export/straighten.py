@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..depth.posed import PosedDepth
-from ..depth.resize import resample_nearest
 from ..geometry.camera import unproject_depth
+from ..geometry.posed_depth import PosedDepth
+from ..geometry.resampling import resample_nearest
+from ..geometry.voxels import VOXELS_PER_DEPTH, find, gather_depths, normals_in_cam, voxel_keys
 from ..mapping.measure import DrawnView
 from ..outcome import evenly
-from ..voxels.voxels import VOXELS_PER_DEPTH, find, gather_depths, normals_in_cam, voxel_keys
 from .planes import NEAR, REACH, ROUGHLY_ALONG, Planes, find_planes
 
 _SIDE = 200

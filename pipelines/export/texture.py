@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..depth.posed import PosedDepth
 from ..gaussians.render.threads import for_each
 from ..geometry.camera import project
+from ..geometry.posed_depth import PosedDepth
 from ..system.jit import kernel
 from ..system.progress import Progress
 from ..types import Intrinsics

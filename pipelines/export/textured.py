@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from ...formats.textured_mesh import TexturedMesh, write_textured_glb, write_textured_obj
-from ..depth.posed import PosedDepth
+from ..geometry.posed_depth import PosedDepth
 from ..outcome import Outcome
 from ..system.lru_sequence import LruSequence
 from ..system.progress import Progress

@@ -20,7 +20,7 @@ from ...formats.gps import ecef_from_enu
 from ...formats.jsonfile import write_json
 from ..outcome import Outcome
 from ..run.journal import empty
-from ..upright.world import World
+from ..scene.world import World
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ...formats.atomic import atomic_path, require_room
 from ...formats.errors import InputError
 from ..outcome import Outcome
+from ..scene.world import World
 from ..types import SemanticMesh
-from ..upright.world import World
 from .mesh import mesh_of_run
 
 USD = "mesh.usdz"

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.sog import morton_codes
-from ..depth.posed import PosedDepth
 from ..gaussians.render.jit import kernel
 from ..gaussians.render.threads import for_each, get_threads
 from ..geometry.camera import unproject_depth
+from ..geometry.posed_depth import PosedDepth
+from ..geometry.voxels import cells_of, voxel_keys
 from ..types import Intrinsics
-from ..voxels.voxels import cells_of, voxel_keys
 
 SIDE = 8
 """Voxels along the side of a block."""

@@ -22,8 +22,8 @@ from ...formats.gaussians import GaussianCloud
 from ...formats.sog import morton_order
 from ..geometry.rig import rig_of
 from ..outcome import Outcome, evenly
+from ..scene.world import World
 from ..types import VOID
-from ..upright.world import World
 from .writers import map_cloud
 
 WEB_PAGE = "map.html"

@@ -25,9 +25,9 @@ from ..geometry.rig import rig_of
 from ..geometry.sparse_model import SparseModel
 from ..outcome import Outcome
 from ..run.files import CLASSES, LEFT_OUT, METRES
+from ..scene.world import WORLD, World
 from ..system.lru_sequence import LruSequence
 from ..system.wording import stretches
-from ..upright.world import WORLD, World
 from .readme import lengths, readme
 
 IMAGES, SPARSE = "images", "sparse/0"

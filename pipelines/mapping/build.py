@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..depth.fields import DepthFields
-from ..depth.posed import PosedDepth, overlaps
 from ..engine.stages import StageContext
 from ..gaussian_map import GaussianMap
+from ..geometry.posed_depth import PosedDepth, overlaps
 from ..run.before import Before
 from ..run.files import CALIBRATION, CLASS_IDS, DEPTH_FIELDS, EXPOSURE, SUBMAPS
 from ..run.folder import RunFolder

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from ..config import MappingConfig
 from ..depth.fields import DepthFields
-from ..depth.posed import PosedDepth
 from ..depth.see_through import contradicted
 from ..engine.stages import StageContext
+from ..geometry.posed_depth import PosedDepth
 from ..run.files import CALIBRATION, DEPTH_FIELDS, FRAMES
 from ..run.folder import RunFolder
 from ..system.lru_sequence import LruSequence

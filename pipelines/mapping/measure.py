@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..depth.posed import PosedDepth
 from ..gaussian_map import GaussianMap, decided_channels
 from ..gaussians.render import Rendering, median_and_seen, render
 from ..gaussians.ssim import ssim_map
+from ..geometry.posed_depth import PosedDepth
 from ..types import VOID, Intrinsics
 from .views import View
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from ..config import MappingConfig
-from ..depth.posed import overlaps
+from ..geometry.posed_depth import overlaps
 from .views import View
 
 WINDOW_STEPS = 2

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
-from ..depth.posed import PosedDepth
+from ..geometry.posed_depth import PosedDepth
 
 BORDER = 16
 """Keyframes of other submaps that a submap is made with beside its own."""

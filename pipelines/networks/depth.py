@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ..geometry.camera import unproject_depth
+from ..geometry.voxels import normals_in_cam
 from ..types import Intrinsics
-from ..voxels.voxels import normals_in_cam
 from .letterbox import Letterbox
 from .session import Network
 

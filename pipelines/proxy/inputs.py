@@ -8,14 +8,14 @@ from typing import Any
 from ...formats.digest import files_sha256
 from ...formats.errors import InputError
 from ..config import Config
+from ..depth.files import FilesDepth, require_sizes
+from ..labels.files import FilesLabels
 from ..networks.identity import card_identity
+from ..providers import Sequence
 from ..source.opening import open_source
 from ..source.recording import RecordingSource
 from ..system.progress import SilentProgress, log
 from ..types import Calibration, Frame, Intrinsics
-from .files.depth import FilesDepth, require_sizes
-from .files.labels import FilesLabels
-from .interface.sequence import Sequence
 from .scale_reference import POSES, require_reference_in
 from .selection import (
     ProviderContext,

@@ -8,16 +8,15 @@ from typing import Any
 import numpy as np
 
 from ...formats.errors import InputError
+from ..depth.scale import DepthScale
 from ..engine.stages import StageContext
+from ..labels.segments import SegmentLabels
+from ..providers import DepthEstimate, DepthProvider, Sequence
 from ..run.files import BACKBONE, GIVEN_POSES
 from ..run.folder import RunFolder
 from ..source.opening import open_source
 from ..structure.given import agreement
 from ..types import Frame
-from .interface.providers import DepthEstimate, DepthProvider
-from .interface.sequence import Sequence
-from .regions.provider import SegmentLabels
-from .scale import DepthScale
 from .scale_reference import (
     POSES,
     ReferenceScale,

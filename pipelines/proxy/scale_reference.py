@@ -14,10 +14,9 @@ from ...formats.errors import InputError
 from ..correspondence.features import to_grey
 from ..correspondence.flow import follow
 from ..geometry.camera import unproject
+from ..providers import DepthEstimate, Sequence, resize_area
 from ..source.opening import Source, VideoSource
 from ..types import Frame, Intrinsics
-from .interface.providers import DepthEstimate
-from .interface.sequence import Sequence, resize_area
 
 Array = NDArray[np.float64]
 DepthOf = Callable[[Frame], DepthEstimate]

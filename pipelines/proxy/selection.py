@@ -11,24 +11,23 @@ from statistics import median
 from ...formats.datasets import Sequence as Recording
 from ...formats.errors import InputError, SettingError
 from ..config import ProxyConfig
+from ..depth.aligned import AlignedDepth
+from ..depth.files import FilesDepth
+from ..depth.fused import FusedDepth
+from ..depth.learned import OnnxDepth
+from ..depth.scale import measure_scale
+from ..depth.stereo.provider import MultiviewDepth
+from ..labels.clusters import OnnxClusters
+from ..labels.files import FilesLabels
+from ..labels.learned import OnnxLabels
+from ..labels.segments import SegmentLabels
 from ..networks.card import Card, read_card
+from ..networks.network_pass import ResultCache, Workplace
 from ..networks.registry import ModelStore, default_cache
 from ..networks.words import with_words
+from ..providers import DepthProvider, SemanticsProvider, Sequence
 from ..system.progress import Progress
-from .aligned import AlignedDepth
-from .files.depth import FilesDepth
-from .files.labels import FilesLabels
-from .files.recording import RecordingDepth, RecordingLabels
-from .fused import FusedDepth
-from .interface.providers import DepthProvider, SemanticsProvider
-from .interface.sequence import Sequence
-from .learned.clusters import OnnxClusters
-from .learned.depth import OnnxDepth
-from .learned.labels import OnnxLabels
-from .learned.network_pass import ResultCache, Workplace
-from .regions.provider import SegmentLabels
-from .scale import measure_scale
-from .stereo.provider import MultiviewDepth
+from .recording import RecordingDepth, RecordingLabels
 
 LEARNED_SPREAD = 0.02
 """Files whose depths stray by more from the triangulated points, relatively and within one frame, are taken for a

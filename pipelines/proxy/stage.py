@@ -8,17 +8,17 @@ import cv2
 import numpy as np
 
 from ...formats.errors import InputError
+from ..depth.scale import DepthScale, measure_scale
+from ..depth.stereo.provider import MultiviewDepth
 from ..engine.stages import Stage, StageContext
 from ..masks.moving import find_moving
+from ..providers import prepared
 from ..run.files import CLASSES, DESCRIPTORS, FIGURES, FRAME_SCALES, LEFT_OUT, PROXY_MAPS
 from ..system.progress import log
 from ..types import VOID, Frame
 from .inputs import check_proxy, left_to_auto, proxy_inputs
-from .interface.providers import prepared
 from .metres import reference_scale, scale_figures
-from .scale import DepthScale, measure_scale
 from .scale_reference import ReferenceScale
-from .stereo.provider import MultiviewDepth
 from .tasks import (
     ProxyWork,
     in_frames,

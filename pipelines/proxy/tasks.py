@@ -11,28 +11,29 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..depth.resize import resample_nearest
+from ..depth.scale import DepthScale
 from ..engine.chunks import Chunk, in_chunks
 from ..engine.stages import StageContext
+from ..geometry.resampling import resample_nearest
+from ..geometry.voxels import to_lab
 from ..masks.moving import SIDE, MovingView, look_once
+from ..providers import (
+    DepthEstimate,
+    DepthProvider,
+    LabelEstimate,
+    SemanticsProvider,
+    Sequence,
+    resize_area,
+    take_prepared,
+)
 from ..run.files import BACKBONE, CALIBRATION, FRAMES, LEFT_OUT, PROXY_MAPS
 from ..source.recording import open_recording
 from ..system.parallel import abreast
 from ..system.progress import Progress
 from ..system.values import load_value, save_value
 from ..types import Frame, Intrinsics, ProxyMaps, any_of
-from ..voxels.voxels import to_lab
 from .compact import compact
-from .interface.providers import (
-    DepthEstimate,
-    DepthProvider,
-    LabelEstimate,
-    SemanticsProvider,
-    take_prepared,
-)
-from .interface.sequence import Sequence, resize_area
 from .reliability import reliability
-from .scale import DepthScale
 from .selection import ProviderContext, open_depth, open_semantics
 
 R = TypeVar("R")

@@ -1,7 +1,7 @@
 """The table of a run's files: a row for each, with its name, the stages that leave it, and what it holds.
 
 What has no row: the images of the frames, what the export writes for other programs (`docs/files.md`; `world.json`,
-which is read again, has its row beside its type in `upright/world.py`), and snapshots, which only their stage reads.
+which is read again, has its row beside its type in `scene/world.py`), and snapshots, which only their stage reads.
 """
 
 from __future__ import annotations

@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..depth.resize import resize_maps
 from ..depth.scales import scale_at_points
 from ..gaussians.seeding import seed_gaussians, seed_grid
+from ..geometry.resampling import resize_maps
 from ..types import Intrinsics
 from .pictures import Pictures
 from .state import TrackState

@@ -19,14 +19,14 @@ from ..export.stage import on_earth
 from ..export.writers import map_cloud
 from ..gaussian_map import decided_channels
 from ..geometry.sparse_model import SparseModel
+from ..labels.palette import class_colors
 from ..outcome import Outcome, evenly, labels_of_channels, load_outcome
-from ..proxy.interface.palette import class_colors
 from ..run.files import BACKBONE, CALIBRATION, FRAMES, MESH
 from ..run.folder import RunFolder
 from ..run.records import load_records
+from ..scene.upright import cameras_up
+from ..scene.world import WORLD, up_in_run
 from ..types import Frame, Intrinsics, Metres
-from ..upright.find import cameras_up
-from ..upright.world import WORLD, up_in_run
 from .camera_path import EXPORTED, RUN
 
 MODES = ("colour", "classes", "depth")

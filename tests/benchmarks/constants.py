@@ -27,15 +27,15 @@ sys.path.insert(0, str(ROOT))
 
 from shape import gather, make_view, measure, true_depths
 
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
+from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
+from msgs_slam.pipelines.providers import Sequence
 from msgs_slam.pipelines.proxy.reliability import reliability
-from msgs_slam.pipelines.proxy.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
 
-STEREO = Path("pipelines/proxy/stereo")
+STEREO = Path("pipelines/depth/stereo")
 AS_IT_IS = "as it is"
 AFTER = {
     "agreeing depths": ("provider.py", "_TOLERANCE = 0.01", "0.01"),

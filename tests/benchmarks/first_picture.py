@@ -20,7 +20,7 @@ from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.evaluation.pictures import label_picture
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.world import WORLD
+from msgs_slam.pipelines.scene.world import WORLD
 from tests.benchmarks.textured_mesh import VertexColours
 
 WIDTH = 400

@@ -37,14 +37,14 @@ from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_mod
 from torch.utils._pytree import tree_flatten
 
 from msgs_slam.pipelines.config import MappingConfig
+from msgs_slam.pipelines.depth.stereo import card
+from msgs_slam.pipelines.depth.stereo.matching import StereoImages
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.gaussians.render import cards, compositing, inspection
 from msgs_slam.pipelines.mapping.optimise import MapOptimiser
 from msgs_slam.pipelines.mapping.schedule import Seeding, Step
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View, make_view
-from msgs_slam.pipelines.proxy.stereo import card
-from msgs_slam.pipelines.proxy.stereo.matching import StereoImages
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 from tests import pretend_device
 from tests.pretend_device import DEVICE, PretendTensor

@@ -25,15 +25,14 @@ import numpy as np
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.trajectory import read_matrices
 from msgs_slam.pipelines.geometry.alignment import align_points
-from msgs_slam.pipelines.metres.evidence import Evidence, combine
-from msgs_slam.pipelines.metres.find import Seen, describe, load_seen, usual_evidence
+from msgs_slam.pipelines.labels.learned import OnnxLabels
+from msgs_slam.pipelines.networks.network_pass import ResultCache, Workplace
 from msgs_slam.pipelines.networks.registry import ModelStore
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
-from msgs_slam.pipelines.proxy.learned.labels import OnnxLabels
-from msgs_slam.pipelines.proxy.learned.network_pass import ResultCache, Workplace
+from msgs_slam.pipelines.providers import DepthEstimate, Sequence
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, PROXY_MAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.scene.evidence import Evidence, combine
+from msgs_slam.pipelines.scene.metres import Seen, describe, load_seen, usual_evidence
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Trajectory
 

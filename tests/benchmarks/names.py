@@ -38,24 +38,24 @@ from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.pipelines.config import ProxyConfig
-from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.evaluation.class_map import ClassMap, Matching, match_classes, read_class_map
 from msgs_slam.pipelines.evaluation.label_score import count_labels, score
 from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.evaluation.pictures import Picture, label_picture
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.geometry.camera import unproject_depth
+from msgs_slam.pipelines.geometry.resampling import resample_nearest
+from msgs_slam.pipelines.labels.palette import class_colors
 from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.proxy.interface.palette import class_colors
 from msgs_slam.pipelines.proxy.selection import choose_semantics
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.scene.world import FIRST, WORLD
 from msgs_slam.pipelines.source.source_pixels import FramePixels
 from msgs_slam.pipelines.types import VOID, ClassTable
-from msgs_slam.pipelines.upright.world import FIRST, WORLD
 from tests.network_labels import network_labels
 
 DATA = ROOT.parent / "shared" / "data"

@@ -31,10 +31,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import open_sequence
-from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.evaluation.measure import render_outcome
 from msgs_slam.pipelines.evaluation.truth import match_truth
+from msgs_slam.pipelines.geometry.resampling import resample_nearest
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import CALIBRATION, FRAMES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder

@@ -25,9 +25,9 @@ from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.scene.world import WORLD
 from msgs_slam.pipelines.system.jit import kernel
 from msgs_slam.pipelines.types import Intrinsics
-from msgs_slam.pipelines.upright.world import WORLD
 
 SAMPLES = 2
 """A side of a pixel."""

@@ -24,8 +24,8 @@ from msgs_slam.pipelines.evaluation.trajectory_error import absolute_error
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.find import find_upright
-from msgs_slam.pipelines.upright.world import upright_world
+from msgs_slam.pipelines.scene.upright import find_upright
+from msgs_slam.pipelines.scene.world import upright_world
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ from msgs_slam.pipelines.export.walls import Wall, find_walls
 from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.world import WORLD
+from msgs_slam.pipelines.scene.world import WORLD
 
 STEP, VIEWS, JUMP = 4, 30, 1.06
 """Every so many pixels, of so many views; a depth that many times another's lies on another surface."""

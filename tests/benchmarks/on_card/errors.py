@@ -9,7 +9,14 @@ import torch
 from render_scenes import IMAGES, NAMES, room
 from torch import Tensor
 
-import msgs_slam.pipelines.proxy.stereo.matching as matching
+import msgs_slam.pipelines.depth.stereo.matching as matching
+from msgs_slam.pipelines.depth.stereo import card
+from msgs_slam.pipelines.depth.stereo.bands import Bands
+from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths
+from msgs_slam.pipelines.depth.stereo.refine import refine_inverse_depth
+from msgs_slam.pipelines.depth.stereo.smoothing import smooth_cost
+from msgs_slam.pipelines.depth.stereo.sweep import sweep_cost
+from msgs_slam.pipelines.depth.stereo.volume import Volume
 from msgs_slam.pipelines.gaussians.adam import descend_by_kernel, plain_descend
 from msgs_slam.pipelines.gaussians.render import Rendering, composite, in_view, reference, render
 from msgs_slam.pipelines.gaussians.render.rendering import project_map
@@ -17,13 +24,6 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.mapping.exposure import expose, fit_exposure
 from msgs_slam.pipelines.mapping.objective import Objective, color_errors_on_card, fit_exposure_on_card
 from msgs_slam.pipelines.mapping.state import KEYS
-from msgs_slam.pipelines.proxy.stereo import card
-from msgs_slam.pipelines.proxy.stereo.bands import Bands
-from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
-from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth
-from msgs_slam.pipelines.proxy.stereo.smoothing import smooth_cost
-from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost
-from msgs_slam.pipelines.proxy.stereo.volume import Volume
 from on_card.rows import Rows
 from on_card.scenes import CARD, CPU, SIZES, StereoScene, mapper, step, stereo_scene, there, world_of
 

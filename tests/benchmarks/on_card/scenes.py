@@ -16,14 +16,14 @@ from render_scenes import room
 from torch import Tensor
 
 from msgs_slam.pipelines.config import MappingConfig
+from msgs_slam.pipelines.depth.stereo.matching import StereoImages
+from msgs_slam.pipelines.depth.stereo.sweep import warps_to
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.gaussians.render import cards, render
 from msgs_slam.pipelines.mapping.optimise import MapOptimiser
 from msgs_slam.pipelines.mapping.schedule import Seeding, Step
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View, make_view
-from msgs_slam.pipelines.proxy.stereo.matching import StereoImages
-from msgs_slam.pipelines.proxy.stereo.sweep import warps_to
 from msgs_slam.pipelines.types import ProxyMaps
 
 REHEARSAL = os.environ.get("TRITON_INTERPRET") == "1"

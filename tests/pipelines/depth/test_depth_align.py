@@ -11,8 +11,8 @@ from msgs_slam.pipelines.depth import align as alignment
 from msgs_slam.pipelines.depth import solve
 from msgs_slam.pipelines.depth.align import align_keyframes, fit_fields
 from msgs_slam.pipelines.depth.fields import FINE, DepthFields, field_scales
-from msgs_slam.pipelines.depth.posed import CANDIDATES, PosedDepth, overlaps
 from msgs_slam.pipelines.depth.see_through import contradicted
+from msgs_slam.pipelines.geometry.posed_depth import CANDIDATES, PosedDepth, overlaps
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.mapping.load import MappingInput
 from msgs_slam.pipelines.run.files import CALIBRATION, DEPTH_FIELDS, PROXY_MAPS, SPARSE

@@ -20,8 +20,8 @@ from msgs_slam.pipelines.evaluation.write import write_evaluation
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.scene.world import WORLD, World
 from msgs_slam.pipelines.types import Frame
-from msgs_slam.pipelines.upright.world import WORLD, World
 from tests.pipelines.part_of_sequence import part_of
 
 OracleRun = Callable[..., RunFolder]

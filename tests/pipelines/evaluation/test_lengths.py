@@ -18,8 +18,8 @@ from msgs_slam.pipelines.geometry.tape import tape_text
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.scene.world import WORLD, World
 from msgs_slam.pipelines.types import Metres
-from msgs_slam.pipelines.upright.world import WORLD, World
 from tests.world.room import HEIGHT, LENGTH, WIDTH
 
 OracleRun = Callable[..., RunFolder]

@@ -21,8 +21,8 @@ from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.scene.world import SAME, WORLD, World
 from msgs_slam.pipelines.types import LoopEdge
-from msgs_slam.pipelines.upright.world import SAME, WORLD, World
 
 OracleRun = Callable[..., RunFolder]
 VOID_TAGS = {"img", "meta", "rect", "line", "path", "circle"}

@@ -20,7 +20,7 @@ from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.render_run import render_file, render_run
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.world import WORLD, World
+from msgs_slam.pipelines.scene.world import WORLD, World
 from msgs_slam.pipelines.viewer.camera_path import EXPORTED, RUN, CameraPath, Keyframe, read_camera_path
 from tests.browser import BROWSER, browser
 

@@ -13,7 +13,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.export.collision import MOST_FACES, with_floor
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.world import SAME, WORLD, World
+from msgs_slam.pipelines.scene.world import SAME, WORLD, World
 
 OracleRun = Callable[..., RunFolder]
 

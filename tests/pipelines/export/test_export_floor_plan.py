@@ -16,7 +16,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.export.walls import Wall, find_walls
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.world import SAME, WORLD, World
+from msgs_slam.pipelines.scene.world import SAME, WORLD, World
 
 OracleRun = Callable[..., RunFolder]
 ROOM = np.array([[0.0, 0], [6.4, 0], [6.4, 3.1], [4.2, 3.1], [4.2, 5.2], [0, 5.2]])

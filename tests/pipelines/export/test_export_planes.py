@@ -9,17 +9,17 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import ExportConfig
-from msgs_slam.pipelines.depth.posed import PosedDepth
 from msgs_slam.pipelines.export.mesh import draw, drawn_views, keyframe_rows, planes_in, straighten
 from msgs_slam.pipelines.export.planes import Planes, find_planes
 from msgs_slam.pipelines.export.straighten import planes_of, straightened
+from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
+from msgs_slam.pipelines.geometry.voxels import Voxels
 from msgs_slam.pipelines.mapping.measure import DrawnView
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.types import Intrinsics
-from msgs_slam.pipelines.voxels.voxels import Voxels
 
 Image = NDArray[np.float64]
 OracleRun = Callable[..., RunFolder]

@@ -24,7 +24,7 @@ from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.files import FRAMES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import EXPORTS
-from msgs_slam.pipelines.upright.world import WORLD
+from msgs_slam.pipelines.scene.world import WORLD
 
 OracleRun = Callable[..., RunFolder]
 SETTINGS = ExportConfig(spz=True, splat_glb=True, texture=True, voxel=0.03)

@@ -15,7 +15,7 @@ from msgs_slam.pipelines.export.stage import export_run, find_world
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import CLASSES
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.world import WORLD
+from msgs_slam.pipelines.scene.world import WORLD
 
 OracleRun = Callable[..., RunFolder]
 

@@ -25,7 +25,7 @@ from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.export.writers import map_cloud
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.upright.world import FIRST, WORLD
+from msgs_slam.pipelines.scene.world import FIRST, WORLD
 from tests.browser import browser
 
 OracleRun = Callable[..., RunFolder]

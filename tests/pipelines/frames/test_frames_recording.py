@@ -21,9 +21,9 @@ from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.frames.picking import pick_frames
 from msgs_slam.pipelines.frames.tasks import known_camera
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.proxy.files.recording import RecordingDepth, RecordingLabels
+from msgs_slam.pipelines.providers import Sequence as ProxySequence
 from msgs_slam.pipelines.proxy.inputs import proxy_inputs
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence as ProxySequence
+from msgs_slam.pipelines.proxy.recording import RecordingDepth, RecordingLabels
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth_files, open_label_files
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from msgs_slam.pipelines.config import MappingConfig
-from msgs_slam.pipelines.depth.resize import resize_depth
 from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.resampling import resize_depth
 from msgs_slam.pipelines.mapping import extending
 from msgs_slam.pipelines.mapping.load import MappingInput, load_views, split_frames
 from msgs_slam.pipelines.mapping.move_map import interpolate_rows, move_trajectory

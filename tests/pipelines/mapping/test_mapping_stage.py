@@ -24,10 +24,10 @@ from msgs_slam.pipelines.mapping import stage as mapping_stage
 from msgs_slam.pipelines.mapping.load import load_views
 from msgs_slam.pipelines.run.files import CLASSES, EXPOSURE, MAP, SPARSE, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.scene.world import WORLD
 from msgs_slam.pipelines.system.memory import room_on
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID
-from msgs_slam.pipelines.upright.world import WORLD
 from tests.pipelines.mapping.small_run import make_run
 from tests.pipelines.travelling import Travelling
 

@@ -14,9 +14,9 @@ from scipy import sparse
 
 from msgs_slam.formats.tensors import load_tensors
 from msgs_slam.pipelines.config import Config, MappingConfig, RunConfig
-from msgs_slam.pipelines.depth.posed import PosedDepth
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.mapping import exposure as gauge
 from msgs_slam.pipelines.mapping import stage as mapping_stage
 from msgs_slam.pipelines.mapping import submaps

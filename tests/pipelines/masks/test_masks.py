@@ -15,6 +15,8 @@ from msgs_slam.formats.images import read_rgb, write_grey_png, write_rgb
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.correspondence.features import extract_features
 from msgs_slam.pipelines.correspondence.flow import corners
+from msgs_slam.pipelines.depth.stereo.bands import Bands
+from msgs_slam.pipelines.depth.stereo.sweep import sweep_cost
 from msgs_slam.pipelines.frames.keyframes import choose_keyframes
 from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
 from msgs_slam.pipelines.gaussians.render import Rendering
@@ -23,9 +25,7 @@ from msgs_slam.pipelines.mapping.views import View, make_view
 from msgs_slam.pipelines.masks.files import open_masks
 from msgs_slam.pipelines.masks.people import PeopleFinder, join_people, people_cards
 from msgs_slam.pipelines.networks.registry import ModelStore
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate
-from msgs_slam.pipelines.proxy.stereo.bands import Bands
-from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost
+from msgs_slam.pipelines.providers import DepthEstimate, LabelEstimate
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.system.progress import SilentProgress

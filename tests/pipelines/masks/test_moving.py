@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from msgs_slam.pipelines.geometry.voxels import to_lab
 from msgs_slam.pipelines.masks.moving import MovingView, find_moving, look_once
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Intrinsics
-from msgs_slam.pipelines.voxels.voxels import to_lab
 
 CAMERA = Intrinsics(160, 120, 140.0, 140.0, 80.0, 60.0)
 WALL, KEYFRAMES = 4.0, 14

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from proxy_room import UNIT, Room
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.proxy.aligned import AlignedDepth, fit_relative, to_depth
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.scale import measure_scale
+from msgs_slam.pipelines.depth.aligned import AlignedDepth, fit_relative, to_depth
+from msgs_slam.pipelines.depth.scale import measure_scale
+from msgs_slam.pipelines.providers import DepthEstimate
 from msgs_slam.pipelines.types import Frame
 
 

@@ -10,12 +10,11 @@ from proxy_room import Room, write_source
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png, write_rgb
+from msgs_slam.pipelines.depth.files import FilesDepth
+from msgs_slam.pipelines.depth.matching_names import frame_key
+from msgs_slam.pipelines.labels.files import FilesLabels
 from msgs_slam.pipelines.networks.classes import find_class_table, read_class_table
-from msgs_slam.pipelines.proxy.files.depth import FilesDepth
-from msgs_slam.pipelines.proxy.files.labels import FilesLabels
-from msgs_slam.pipelines.proxy.files.matching import frame_key
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
+from msgs_slam.pipelines.providers import DepthEstimate, Sequence
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics
 

@@ -11,15 +11,14 @@ from proxy_room import UNIT, Room, write_source
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
 from msgs_slam.pipelines.config import ProxyConfig
-from msgs_slam.pipelines.proxy.fused import FusedDepth, fuse
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
-from msgs_slam.pipelines.proxy.regions.provider import SegmentLabels
+from msgs_slam.pipelines.depth.fused import FusedDepth, fuse
+from msgs_slam.pipelines.depth.scale import measure_scale
+from msgs_slam.pipelines.depth.stereo.neighbours import depth_range
+from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
+from msgs_slam.pipelines.labels.segments import SegmentLabels
+from msgs_slam.pipelines.providers import DepthEstimate, Sequence
 from msgs_slam.pipelines.proxy.reliability import mean_iou
-from msgs_slam.pipelines.proxy.scale import measure_scale
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth
-from msgs_slam.pipelines.proxy.stereo.neighbours import depth_range
-from msgs_slam.pipelines.proxy.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame, Intrinsics
 

@@ -11,17 +11,16 @@ from tiny_tflite import write_tflite
 
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.images import read_depth_png, read_rgb
-from msgs_slam.pipelines.depth.resize import resample_nearest
 from msgs_slam.pipelines.evaluation.class_map import match_classes
 from msgs_slam.pipelines.evaluation.label_score import count_labels, score
+from msgs_slam.pipelines.geometry.resampling import resample_nearest
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
+from msgs_slam.pipelines.labels.learned import OnnxLabels
 from msgs_slam.pipelines.networks.card import Card
+from msgs_slam.pipelines.networks.network_pass import ResultCache, Workplace
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.networks.session import Network
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
-from msgs_slam.pipelines.proxy.learned.labels import OnnxLabels
-from msgs_slam.pipelines.proxy.learned.network_pass import ResultCache, Workplace
+from msgs_slam.pipelines.providers import DepthEstimate, Sequence
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics
 from tests.network_labels import network_labels

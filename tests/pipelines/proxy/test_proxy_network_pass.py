@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from proxy_room import Room
 
+from msgs_slam.pipelines.labels.clusters import OnnxClusters, spherical_kmeans
+from msgs_slam.pipelines.networks import network_pass
 from msgs_slam.pipelines.networks.card import read_card
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate
-from msgs_slam.pipelines.proxy.interface.sequence import Sequence
-from msgs_slam.pipelines.proxy.learned import network_pass
-from msgs_slam.pipelines.proxy.learned.clusters import OnnxClusters, spherical_kmeans
-from msgs_slam.pipelines.proxy.learned.network_pass import Arrays, NetworkPass, ResultCache, Workplace
+from msgs_slam.pipelines.networks.network_pass import Arrays, NetworkPass, ResultCache, Workplace
+from msgs_slam.pipelines.providers import DepthEstimate, Sequence
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics
 

@@ -11,11 +11,11 @@ from proxy_room import UNIT, Room
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.jsonfile import read_json
+from msgs_slam.pipelines.depth.files import FilesDepth
 from msgs_slam.pipelines.engine.stages import StageContext
+from msgs_slam.pipelines.labels.files import FilesLabels
 from msgs_slam.pipelines.masks.moving import MovingView
-from msgs_slam.pipelines.proxy.files.depth import FilesDepth
-from msgs_slam.pipelines.proxy.files.labels import FilesLabels
-from msgs_slam.pipelines.proxy.interface.providers import DepthEstimate, LabelEstimate
+from msgs_slam.pipelines.providers import DepthEstimate, LabelEstimate
 from msgs_slam.pipelines.proxy.stage import run
 from msgs_slam.pipelines.run.files import CALIBRATION, CLASSES, DESCRIPTORS, PROXY_MAPS
 from msgs_slam.pipelines.types import VOID, Frame

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.proxy.stereo.bands import Bands
-from msgs_slam.pipelines.proxy.stereo.borrow import agreed_depth, borrow_depth, carry_depth
-from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths
-from msgs_slam.pipelines.proxy.stereo.evidence import evidence_of, prefer_matches, surface_contrast
-from msgs_slam.pipelines.proxy.stereo.fill import SURE, fill_unsure, judge_by_company
-from msgs_slam.pipelines.proxy.stereo.matching import (
+from msgs_slam.pipelines.depth.stereo.bands import Bands
+from msgs_slam.pipelines.depth.stereo.borrow import agreed_depth, borrow_depth, carry_depth
+from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths
+from msgs_slam.pipelines.depth.stereo.evidence import evidence_of, prefer_matches, surface_contrast
+from msgs_slam.pipelines.depth.stereo.fill import SURE, fill_unsure, judge_by_company
+from msgs_slam.pipelines.depth.stereo.matching import (
     CLEAR,
     MARGIN,
     StereoImages,
@@ -17,14 +17,14 @@ from msgs_slam.pipelines.proxy.stereo.matching import (
     match_planes,
     planes_to_try,
 )
-from msgs_slam.pipelines.proxy.stereo.provider import at_stops
-from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth
-from msgs_slam.pipelines.proxy.stereo.smoothing import smooth_cost
-from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost, warps_to
-from msgs_slam.pipelines.proxy.stereo.tiles import TILE, tiles_of
-from msgs_slam.pipelines.proxy.stereo.upsample import upsample_depth
-from msgs_slam.pipelines.proxy.stereo.volume import UNREACHED, Volume, least_planes, pick_planes
-from msgs_slam.pipelines.proxy.stereo.window import LIKENESS, RADIUS, STEP, VARIANCE_FLOOR
+from msgs_slam.pipelines.depth.stereo.provider import at_stops
+from msgs_slam.pipelines.depth.stereo.refine import refine_inverse_depth
+from msgs_slam.pipelines.depth.stereo.smoothing import smooth_cost
+from msgs_slam.pipelines.depth.stereo.sweep import sweep_cost, warps_to
+from msgs_slam.pipelines.depth.stereo.tiles import TILE, tiles_of
+from msgs_slam.pipelines.depth.stereo.upsample import upsample_depth
+from msgs_slam.pipelines.depth.stereo.volume import UNREACHED, Volume, least_planes, pick_planes
+from msgs_slam.pipelines.depth.stereo.window import LIKENESS, RADIUS, STEP, VARIANCE_FLOOR
 
 HEIGHT, WIDTH, FOCAL = 40, 60, 50.0
 MATRIX = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])

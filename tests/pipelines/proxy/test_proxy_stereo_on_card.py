@@ -15,15 +15,15 @@ pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip
 
 from test_proxy_stereo import CAMERAS, MATRIX, scene, view_of_plane  # noqa: E402
 
+from msgs_slam.pipelines.depth.stereo import card, matching  # noqa: E402
+from msgs_slam.pipelines.depth.stereo.bands import Bands  # noqa: E402
+from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths  # noqa: E402
+from msgs_slam.pipelines.depth.stereo.refine import refine_inverse_depth  # noqa: E402
+from msgs_slam.pipelines.depth.stereo.smoothing import smooth_cost  # noqa: E402
+from msgs_slam.pipelines.depth.stereo.sweep import sweep_cost, warps_to  # noqa: E402
+from msgs_slam.pipelines.depth.stereo.tiles import TILE  # noqa: E402
+from msgs_slam.pipelines.depth.stereo.volume import UNREACHED, Volume, pick_planes  # noqa: E402
 from msgs_slam.pipelines.gaussians.render import cards  # noqa: E402
-from msgs_slam.pipelines.proxy.stereo import card, matching  # noqa: E402
-from msgs_slam.pipelines.proxy.stereo.bands import Bands  # noqa: E402
-from msgs_slam.pipelines.proxy.stereo.consistency import fuse_depths  # noqa: E402
-from msgs_slam.pipelines.proxy.stereo.refine import refine_inverse_depth  # noqa: E402
-from msgs_slam.pipelines.proxy.stereo.smoothing import smooth_cost  # noqa: E402
-from msgs_slam.pipelines.proxy.stereo.sweep import sweep_cost, warps_to  # noqa: E402
-from msgs_slam.pipelines.proxy.stereo.tiles import TILE  # noqa: E402
-from msgs_slam.pipelines.proxy.stereo.volume import UNREACHED, Volume, pick_planes  # noqa: E402
 from tests.card_builds import build  # noqa: E402
 
 DEVICE = "cuda" if ON_CARD else "cpu"

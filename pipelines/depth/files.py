@@ -1,0 +1,143 @@
+"""Depth from a folder of files: the truth in tests, or the user's own model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...formats.errors import InputError
+from ...formats.images import MAX_IMAGE_PIXELS, image_size, read_depth_png, read_grey_png
+from ...formats.reading import parsing, reaching, require_file
+from ...formats.tensors import HEADERS
+from ..geometry.resampling import resample_nearest, resize_depth
+from ..providers import DepthEstimate, DepthProvider, Sequence
+from ..types import Frame
+from .matching_names import find_folder, match_files
+
+_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
+_NAMES = ("depth",)
+_CONFIDENCE_NAMES = ("confidence", "conf")
+_INVALID_U16 = 65535
+
+
+class FilesDepth(DepthProvider):
+    """One file a frame: uint16 images in units of `unit` metres (0 and 65535 unknown), or .npy of float metres.
+
+    A folder `confidence` (or `conf`) beside it, of 8 or 16 bit images, gives the confidence, first of all the one that
+    is named like the depth's: `proxy_conf` beside `proxy_depth`. Without one it is 1 where the depth is known.
+    """
+
+    metric = True
+
+    def __init__(self, folder: str, source: Path, sequence: Sequence, unit: float) -> None:
+        """Raises InputError unless the folder is there, frames find their files, and the first file fits the frames."""
+        if not unit > 0:
+            raise InputError(f"proxy.depth_scale must be positive (metres per unit of the depth files), got {unit}")
+        self._sequence, self._unit = sequence, unit
+        is_video = source.is_file()
+        path = find_folder(folder, source, _NAMES, _SUFFIXES)
+        self.name = f"files:{path}"
+        self._files = match_files(path, _SUFFIXES, _NAMES, sequence.frames, is_video)
+        self._confidences = _match_confidence(path, sequence, is_video)
+        self.estimate(next(f for f in sequence.frames if f.id in self._files))
+
+    def missing(self, frames: list[Frame]) -> list[Frame]:
+        """The frames without a file."""
+        return [f for f in frames if f.id not in self._files]
+
+    def estimate(self, frame: Frame) -> DepthEstimate:
+        """Raises InputError for a file of another shape than the frame; without a file all depth is unknown."""
+        camera = self._sequence.intrinsics
+        if frame.id not in self._files:
+            empty = np.zeros((camera.height, camera.width), np.float32)
+            return DepthEstimate(empty, empty)
+        path = self._files[frame.id]
+        depth, invalid = clean_depth(_read(path, self._unit))
+        require_aspect(path, depth, self._sequence)
+        depth = resize_depth(depth, camera.height, camera.width)
+        confidence = (depth > 0).astype(np.float32)
+        if frame.id in self._confidences:
+            given = read_grey_png(self._confidences[frame.id])
+            require_aspect(self._confidences[frame.id], given, self._sequence)
+            confidence *= resample_nearest(given, camera.height, camera.width)
+        return DepthEstimate(depth, confidence, invalid)
+
+    def files(self) -> list[Path]:
+        """Every file that it may read."""
+        return [*self._files.values(), *self._confidences.values()]
+
+    def figures(self) -> dict[str, Any]:
+        """Whether the folder had confidences too."""
+        return {"confidence_files": len(self._confidences)}
+
+
+def clean_depth(depth: NDArray[np.float32]) -> tuple[NDArray[np.float32], int]:
+    """Depth with NaN, infinite and negative values made unknown (0), and how many of them there were."""
+    bad = ~np.isfinite(depth) | (depth < 0)
+    count = int(bad.sum())
+    return (np.where(bad, 0, depth).astype(np.float32) if count else depth), count
+
+
+def require_aspect(path: Path, array: NDArray, sequence: Sequence) -> None:
+    """Raise InputError unless a map has the frames' shape at some scale (a pixel of rounding is allowed)."""
+    require_size(path, array.shape[1], array.shape[0], sequence)
+
+
+def require_sizes(files: list[Path], sequence: Sequence) -> None:
+    """`require_aspect` of many files by their headers alone, without reading what they hold."""
+    for path in files:
+        if path.suffix.lower() == ".npy":
+            height, width = _open_npy(path).shape
+            require_size(path, width, height, sequence)
+        elif path.suffix.lower() in (".png", ".tif", ".tiff"):
+            require_size(path, *image_size(path), sequence)
+
+
+def require_size(path: Path, width: int, height: int, sequence: Sequence) -> None:
+    """Raise InputError unless width x height has the frames' shape at some scale (a pixel of rounding is allowed)."""
+    frame = sequence.calibration.intrinsics
+    # Cross-multiplied aspect ratios, with one pixel of slack on the smaller image.
+    if abs(width * frame.height - height * frame.width) > max(frame.width, frame.height, width, height):
+        raise InputError(
+            f"{path} is {width}x{height}, which is not the shape of the frames ({frame.width}x{frame.height}). "
+            "The maps must show exactly what the frames show"
+        )
+
+
+def _read(path: Path, unit: float) -> NDArray[np.float32]:
+    if path.suffix.lower() == ".npy":
+        with np.errstate(over="ignore"):  # infinite is as unknown as too far
+            return np.array(_open_npy(path), dtype=np.float32)
+    stored = read_depth_png(path)
+    return np.where(stored == _INVALID_U16, 0, stored).astype(np.float32) * np.float32(unit)
+
+
+def _open_npy(path: Path) -> NDArray[np.floating]:
+    """Mapped, not read: (h, w) floats. Raises InputError for anything else."""
+    require_file(path)
+    with parsing(path, ".npy of an array", "save it again with numpy.save"):
+        with HEADERS:
+            stored = np.load(path, mmap_mode="r", allow_pickle=False)
+        if not isinstance(stored, np.ndarray):
+            raise ValueError("an archive of several")
+    shape = stored.shape
+    if not np.issubdtype(stored.dtype, np.floating) or len(shape) != 2 or 0 in shape:
+        raise InputError(f"{path}: holds {stored.dtype} {shape}; depth is a float array (height, width) in metres")
+    if stored.size > MAX_IMAGE_PIXELS:
+        raise InputError(f"{path}: holds {stored.size} values, more than {MAX_IMAGE_PIXELS}. Reduce it")
+    return stored
+
+
+def _match_confidence(depth_folder: Path, sequence: Sequence, is_video: bool) -> dict[int, Path]:
+    suffixes = (".png", ".tif", ".tiff")
+    alike = tuple(depth_folder.name.replace(_NAMES[0], n) for n in _CONFIDENCE_NAMES if _NAMES[0] in depth_folder.name)
+    for name in alike + _CONFIDENCE_NAMES:
+        folder = depth_folder.parent / name
+        with reaching(folder):
+            found = folder.is_dir() and any(p.suffix.lower() in suffixes for p in folder.iterdir())
+        if found:
+            return match_files(folder, suffixes, _CONFIDENCE_NAMES, sequence.frames, is_video)
+    return {}

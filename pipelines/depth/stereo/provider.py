@@ -1,0 +1,272 @@
+"""Depth from the video itself: multi-view stereo between the backbone's keyframes. Needs no learned weights.
+
+First every keyframe gets a depth map of its own (plane sweep, semi-global smoothing, refinement); then each is
+compared with those of its neighbours, which gives the fused depth and its confidence. Both passes go over the disk
+and hold only a few frames at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ....formats.errors import InputError
+from ...geometry.sparse_model import SparseModel
+from ...geometry.voxels import to_lab
+from ...providers import DepthEstimate, Sequence, resize_area
+from ...system.parallel import Kept, abreast
+from ...system.progress import Progress
+from ...system.values import load_value, save_value
+from ...types import Frame, Intrinsics
+from .bands import Bands
+from .borrow import agreed_depth, borrow_depth, carry_depth
+from .consistency import fuse_depths
+from .evidence import evidence_of, prefer_matches, surface_contrast
+from .fill import SURE, fill_unsure, judge_by_company
+from .matching import StereoImages, match_planes
+from .neighbours import choose_neighbours, depth_range
+from .sweep import warps_to
+from .upsample import upsample_depth
+
+_CACHED_FRAMES = 48
+_VIEWS, _FUSE_VIEWS, _LENDERS = 12, 8, 16
+"""Keyframes that one is matched with, those whose depths are compared, and those that lend theirs. What lies beside a
+near thing is hidden from half of the views."""
+_RANGE_VIEWS = 6
+"""Their points say how near and far to look."""
+_CACHED_LENDERS = _LENDERS + 4
+_BEST_ANGLE = 8.0
+"""Degrees between the views of a pair."""
+_STOP = 0.02
+"""As a part of the range of inverse depths: so near to its ends nothing is a match."""
+_TOLERANCE = 0.01
+"""Relative difference between depths that agree."""
+
+
+class MultiviewDepth:
+    """Depth of the backbone's keyframes in the backbone's unit."""
+
+    metric = False
+    name = "multiview"
+    of_all = ()
+
+    def __init__(
+        self,
+        sequence: Sequence,
+        side: int,
+        planes: int,
+        folder: Callable[[], Path],
+        threads: int,
+        progress: Progress,
+        device: str = "cpu",
+    ) -> None:
+        """side: of the images that are matched, pixels; planes: depths that are tried; `folder` gives a place for the
+        maps between the passes; what compares pictures and depths runs on the `device`. InputError without a backbone
+        of two keyframes."""
+        if sequence.backbone is None or len(sequence.backbone.frame_ids) < 2:
+            raise InputError(
+                "depth from several views needs parallax, and structure from motion found none: the camera stands "
+                "still or only turns. Move it sideways, or give depth with --depth files:FOLDER or --depth onnx:CARD"
+            )
+        self._sequence, self._planes, self._folder, self._progress = sequence, planes, folder, progress
+        self._model: SparseModel = sequence.backbone
+        self._index = {int(f): i for i, f in enumerate(self._model.frame_ids)}
+        self._frame = {f.id: f for f in sequence.frames}
+        self._bands, self._threads, self._device = Bands(threads), threads if device == "cpu" else 1, device
+        self._camera: Intrinsics = sequence.calibration.intrinsics.at_most(side)
+        self._grey = Kept(self._read_grey, _CACHED_FRAMES)
+        self._raw = Kept(self._load_raw, _CACHED_FRAMES)
+        self._fused = Kept(self._fuse, _CACHED_LENDERS)
+        self._small = Kept(self._read_small, _CACHED_LENDERS)
+        self._contrast = Kept(self._measure_contrast, _CACHED_LENDERS)
+        self._lab: Kept[int, NDArray[np.float32]] = Kept(lambda index: to_lab(self._small(index)), _CACHED_LENDERS)
+        self._nearest = Kept(self._choose_nearest, _CACHED_FRAMES)
+
+    def missing(self, frames: list[Frame]) -> list[Frame]:
+        """The frames that are no keyframes of the backbone."""
+        return [f for f in frames if f.id not in self._index]
+
+    # first pass -------------------------------------------------------------------------------------------------
+
+    def prepare(self, frames: list[Frame]) -> None:
+        """Look at all: nothing is found out of them together."""
+        self.look(frames)
+
+    def look(self, frames: list[Frame]) -> None:
+        """A raw depth map of every keyframe, on disk."""
+        known = [f for f in frames if f.id in self._index]
+        for _ in self._progress.track(abreast(self._look_at, known, self._threads), "stereo", len(known)):
+            pass
+
+    def _look_at(self, frame: Frame) -> None:
+        if not (path := self._path(frame.id)).exists():
+            save_value(path, self._sweep(self._index[frame.id]))
+
+    def _sweep(self, index: int) -> NDArray[np.float32]:
+        """(H, W) inverse depth of one keyframe from its neighbours alone; 0 where nothing matches."""
+        camera = self._camera
+        companions = self._neighbours(index, _VIEWS)
+        limits = depth_range(self._model, index, companions[:_RANGE_VIEWS])
+        if len(companions) == 0 or limits is None:
+            return np.zeros((camera.height, camera.width), np.float32)
+        planes = np.linspace(1 / limits[1], 1 / limits[0], self._planes)
+        given, card = (self._stereo_images(index, companions), planes), self._card
+        inverse = match_planes(*given, self._bands) if card is None else card.match_planes(*given, self._device)
+        left_out = self._grey(int(self._model.frame_ids[index]))[1]
+        inverse = np.clip(inverse, planes[0], planes[-1]).astype(np.float32)
+        unknown = at_stops(inverse, planes)
+        return np.where(unknown if left_out is None else unknown | left_out, np.float32(0), inverse)
+
+    def _stereo_images(self, index: int, others: NDArray[np.int64]) -> StereoImages:
+        ids = self._model.frame_ids[others].tolist()
+        image = self._grey(int(self._model.frame_ids[index]))[0]
+        return StereoImages(image, np.stack([_blanked(*self._grey(i)) for i in ids]), self._warps(index, others))
+
+    # second pass ------------------------------------------------------------------------------------------------
+
+    def estimate(self, frame: Frame) -> DepthEstimate:
+        """Fused depth and its confidence; unknown everywhere for a frame that is no keyframe."""
+        target = self._sequence.intrinsics
+        if frame.id not in self._index:
+            empty = np.zeros((target.height, target.width), np.float32)
+            return DepthEstimate(empty, empty)
+        index = self._index[frame.id]
+        borrowed, sure = self._borrow(index)
+        filled, confidence = fill_unsure(borrowed, sure, self._small(index))
+        depth = self._prefer_matches(index, filled, sure < SURE)
+        return upsample_depth(depth, confidence, self._sequence.image(frame))
+
+    def _prefer_matches(
+        self, index: int, filled: NDArray[np.float32], unsure: NDArray[np.bool_]
+    ) -> NDArray[np.float32]:
+        """The keyframe's own matches where the depths of others bear them out better than what was filled in."""
+        companions = self._present(self._neighbours(index, _VIEWS))
+        if len(companions) == 0:
+            return filled
+        others = np.stack([self._fused(j)[0] for j in companions.tolist()])
+        warps, back = self._warps(index, companions), self._rows_back(index, companions)
+
+        def borne_out(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+            _, support, conflict = self._compare(np.where(unsure, depth, 0), others, warps, back, 2 * _TOLERANCE)
+            return np.asarray(support - conflict)
+
+        return prefer_matches(filled, self._fused(index)[0], borne_out, self._contrast(index))
+
+    def _borrow(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Depth and confidence of one keyframe, with sure depths of others where its own is unsure."""
+        own, lab = self._fused(index), self._lab(index)
+        carried = []
+        for j in self._present(self._neighbours(index, _LENDERS)).tolist():
+            warp = self._warps(j, np.array([index]))[0]
+            carried.append(carry_depth(*self._fused(j), self._lab(j), warp, lab))
+        return borrow_depth(*own, *agreed_depth(carried, own[1] < SURE)) if carried else own
+
+    def _fuse(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Depth of one keyframe and those of its neighbours that agree, and its confidence."""
+        companions = self._present(self._neighbours(index, _FUSE_VIEWS))
+        depth = self._raw(index)
+        if len(companions) == 0:
+            return depth, np.where(depth > 0, 0.2, 0).astype(np.float32)
+        others = np.stack([self._raw(int(j)) for j in companions])
+        warps, back = self._warps(index, companions), self._rows_back(index, companions)
+        fused, support, conflict = self._compare(depth, others, warps, back, _TOLERANCE)
+        confidence = agreement(support, conflict) * evidence_of(self._contrast(index))
+        return fused, judge_by_company(confidence, self._small(index))
+
+    def _compare(
+        self,
+        depth: NDArray[np.float32],
+        others: NDArray[np.float32],
+        warps: NDArray[np.float64],
+        back: NDArray[np.float64],
+        tolerance: float,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Compare as `fuse_depths` does, on the device."""
+        given, card = (depth, others, warps, back, tolerance), self._card
+        return fuse_depths(*given, self._bands) if card is None else card.fuse_depths(*given, self._device)
+
+    def figures(self) -> dict[str, Any]:
+        """The size that the images were matched at."""
+        return {"stereo_size": [self._camera.width, self._camera.height]}
+
+    # what both use ----------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _card(self) -> ModuleType | None:
+        """The same by kernels where the device takes them."""
+        if self._device == "cpu":
+            return None
+        from . import card  # imports torch
+
+        return card if card.takes_kernels_on(self._device) else None
+
+    def _path(self, frame_id: int) -> Path:
+        return self._folder() / f"{frame_id:06d}.npz"
+
+    def _present(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those that have a raw depth map."""
+        return np.array([j for j in indices if self._path(int(self._model.frame_ids[j])).exists()], np.int64)
+
+    def _neighbours(self, index: int, count: int) -> NDArray[np.int64]:
+        return self._nearest(index)[:count]
+
+    def _choose_nearest(self, index: int) -> NDArray[np.int64]:
+        camera = self._sequence.calibration.intrinsics
+        return choose_neighbours(self._model, camera, index, _LENDERS, _BEST_ANGLE)
+
+    def _warps(self, index: int, others: NDArray[np.int64]) -> NDArray[np.float64]:
+        matrix, poses = self._camera.matrix, self._model.cam_from_world
+        return warps_to(matrix, poses[index], [matrix] * len(others), [poses[j] for j in others])
+
+    def _rows_back(self, index: int, others: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(N, 4) what gives this keyframe's z of the others' pixels, as `fuse_depths` wants it."""
+        return np.array([self._warps(int(j), np.array([index]))[0][2] for j in others])
+
+    def _measure_contrast(self, index: int) -> NDArray[np.float32]:
+        return surface_contrast(self._grey(int(self._model.frame_ids[index]))[0])
+
+    def _read_grey(self, frame_id: int) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
+        rgb = self._sequence.read_image(self._frame[frame_id])
+        grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        size = self._camera.width, self._camera.height
+        small = resize_area(np.asarray(grey, np.uint8), *size)
+        return small.astype(np.float32) / np.float32(255), self._sequence.left_out(self._frame[frame_id], *size)
+
+    def _read_small(self, index: int) -> NDArray[np.uint8]:
+        """(h, w, 3) RGB at the size that is matched."""
+        image = self._sequence.image(self._frame[int(self._model.frame_ids[index])])
+        return resize_area(image, self._camera.width, self._camera.height)
+
+    def _load_raw(self, index: int) -> NDArray[np.float32]:
+        return invert(load_value(self._path(int(self._model.frame_ids[index]))))
+
+
+def _blanked(grey: NDArray[np.float32], left_out: NDArray[np.bool_] | None) -> NDArray[np.float32]:
+    """Another view's picture with NaN where it shows no scene: no window that touches it is compared."""
+    return grey if left_out is None else np.where(left_out, np.float32(np.nan), grey)
+
+
+def at_stops(inverse: NDArray[np.float32], planes: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Where the sweep ended at its first or last planes: there a surface without texture ends, for no plane is better
+    than the first, and all views agree on it."""
+    place = (inverse - planes[0]) / (planes[-1] - planes[0])
+    return np.asarray((place < _STOP) | (place > 1 - _STOP))
+
+
+def invert(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """1 / values, and 0 stays 0: depth from inverse depth and back."""
+    out = np.zeros_like(values)
+    np.divide(1, values, out=out, where=values > 0)
+    return out
+
+
+def agreement(support: NDArray[np.float32], conflict: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Confidence in [0, 1]: one agreeing view gives a half, four 0.8; views that look through count against."""
+    return (support / (support + 1.0 + conflict)).astype(np.float32)

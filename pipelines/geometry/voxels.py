@@ -1,0 +1,231 @@
+"""Voxels of the world that gather what all frames saw."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..types import Intrinsics
+from .camera import unproject_depth
+
+if TYPE_CHECKING:
+    from .posed_depth import PosedDepth
+
+VOXELS_PER_DEPTH = 60
+"""A voxel is this fraction of the scene's median depth: 5 cm at 3 m."""
+LEAST_WEIGHT = 1.5
+"""A voxel of less, one sure pixel and a half, is noise."""
+_BITS = 21
+_HALF = 1 << (_BITS - 1)
+_WAITING = 500_000
+"""Voxels of single frames that wait to be summed, at least."""
+MOST, _COARSER = 750_000, 2**0.5
+"""Voxels, and how much larger they become where a scene has more: half of them are left. They take about 300 bytes each
+while they are looked at, by no recording but memory alone."""
+_BLOCK = 50_000
+"""Voxels whose surroundings are looked at together."""
+_OFFSETS = np.array([(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], np.int64)
+
+
+@dataclass(frozen=True)
+class Voxels:
+    """keys (V,) int64 sorted; weight (V,); position, normal (unit) and color (CIE Lab) (V, 3), means over points."""
+
+    size: float
+    keys: NDArray[np.int64]
+    weight: NDArray[np.float64]
+    position: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    color: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+
+def voxel_keys(points: NDArray[np.float64], size: float) -> NDArray[np.int64]:
+    """(..., 3) points → (...,) keys; equal for points in the same cube. -1 for points too far out to have one."""
+    cell = np.floor(points / size)
+    inside = np.asarray((np.abs(cell) < _HALF - 2).all(-1))
+    cell = np.where(inside[..., None], cell, 0).astype(np.int64) + _HALF
+    return np.where(inside, (cell[..., 0] << 2 * _BITS) | (cell[..., 1] << _BITS) | cell[..., 2], -1)
+
+
+def cells_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(V,) → (V, 3) the cubes that `voxel_keys` are of; sorted keys give sorted cubes."""
+    return np.stack([keys >> 2 * _BITS, keys >> _BITS & (1 << _BITS) - 1, keys & (1 << _BITS) - 1], -1) - _HALF
+
+
+def neighbour_keys(keys: NDArray[np.int64], reach: NDArray[np.int64] = _OFFSETS) -> NDArray[np.int64]:
+    """(V,) → (V, R) keys of the cubes around each, in a fixed order."""
+    return keys[:, None] + ((reach[:, 0] << 2 * _BITS) + (reach[:, 1] << _BITS) + reach[:, 2])[None]
+
+
+def find(sorted_keys: NDArray[np.int64], keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Index of every key in the sorted keys, -1 where it is not there."""
+    if len(sorted_keys) == 0:
+        return np.full(keys.shape, -1, np.int64)
+    at = np.minimum(np.searchsorted(sorted_keys, keys), len(sorted_keys) - 1)
+    return np.where(sorted_keys[at] == keys, at, -1)
+
+
+def touching(sorted_keys: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Cubes (E,) and (E,) that touch, the first of each two the one with the smaller key; a block at a time, for all 27
+    around each of a building's millions need gigabytes."""
+    later = _OFFSETS[len(_OFFSETS) // 2 + 1 :]
+    found: list[tuple[NDArray[np.int32], NDArray[np.int32]]] = []
+    for start in range(0, len(sorted_keys), _BLOCK):
+        around = find(sorted_keys, neighbour_keys(sorted_keys[start : start + _BLOCK], later))
+        a, k = np.nonzero(around >= 0)
+        found.append(((a + start).astype(np.int32), around[a, k].astype(np.int32)))
+    first, second = zip(*found, strict=True) if found else ((), ())
+    return np.concatenate([np.empty(0, np.int32), *first]), np.concatenate([np.empty(0, np.int32), *second])
+
+
+def find_near(sorted_keys: NDArray[np.int64], keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the indices of `find`, with a neighbouring voxel's where a key is missing; a block of these at a time."""
+    shape = keys.shape
+    at, keys = find(sorted_keys, keys).ravel(), keys.ravel()
+    lost = np.flatnonzero((at < 0) & (keys >= 0))
+    for start in range(0, len(lost), _BLOCK // len(_OFFSETS)):
+        block = lost[start : start + _BLOCK // len(_OFFSETS)]
+        around = find(sorted_keys, neighbour_keys(keys[block]))
+        at[block] = around[np.arange(len(block)), (around >= 0).argmax(1)]
+    return at.reshape(shape)
+
+
+def normals_in_cam(depth: NDArray[np.float32], intrinsics: Intrinsics) -> NDArray[np.float64]:
+    """(h, w, 3) unit normals that face the camera, from central differences; 0 beside unknown depth and at edges."""
+    points = unproject_depth(depth, intrinsics)
+    along_x = np.zeros_like(points)
+    along_y = np.zeros_like(points)
+    along_x[:, 1:-1] = points[:, 2:] - points[:, :-2]
+    along_y[1:-1] = points[2:] - points[:-2]
+    normal = np.cross(along_y, along_x)
+    length = np.linalg.norm(normal, axis=-1)
+    # Over an occlusion edge the difference spans a gap, not a surface.
+    smooth = (np.abs(along_x[..., 2]) < 0.15 * depth) & (np.abs(along_y[..., 2]) < 0.15 * depth)
+    known = cv2.erode((depth > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    good = smooth & known & (length > 0)
+    normal = np.where(good[..., None], normal / np.maximum(length, 1e-12)[..., None], 0)
+    facing = (normal * points).sum(-1, keepdims=True) > 0
+    return np.where(facing, -normal, normal)
+
+
+def to_lab(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(h, w, 3) RGB → CIE Lab."""
+    return np.asarray(cv2.cvtColor((image / np.float32(255)).astype(np.float32), cv2.COLOR_RGB2LAB), np.float32)
+
+
+def gather_frame(
+    depth: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    image: NDArray[np.uint8],
+    intrinsics: Intrinsics,
+    world_from_cam: NDArray[np.float64],
+    size: float,
+    given_normals: NDArray[np.int8] | None = None,
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """One frame's voxels: keys (V,), and (V, 10) weight and weighted sums of position, normal and Lab colour.
+
+    All images have the size of `intrinsics`. Normals (h, w, 3) in 127ths that a network gave take the place of those
+    of the depth where they are known: they do not suffer from its noise.
+    """
+    points = unproject_depth(depth, intrinsics) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+    normals = normals_in_cam(depth, intrinsics)
+    if given_normals is not None:
+        known = np.abs(given_normals).sum(-1, keepdims=True) > 0
+        normals = np.where(known & (np.abs(normals).sum(-1, keepdims=True) > 0), given_normals / 127.0, normals)
+    normals = normals @ world_from_cam[:3, :3].T
+    lab = to_lab(image)
+    use = (depth > 0) & (weight > 0) & (np.abs(normals).sum(-1) > 0)
+    keys = voxel_keys(points, size)
+    use &= keys >= 0
+    w = weight[use].astype(np.float64)
+    values = np.concatenate([np.ones((len(w), 1)), points[use], normals[use], lab[use]], axis=1) * w[:, None]
+    return _sum_by_key(keys[use], values)
+
+
+def gather_depths(views: Iterable[PosedDepth], size: float) -> Voxels:
+    """Gather the surface that depth images show, by their trust, where they show it well enough; without colours."""
+
+    def gathered(view: PosedDepth) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        black = np.zeros((*view.depth.shape, 3), np.uint8)
+        world_from_cam = np.linalg.inv(view.cam_from_world).astype(np.float64)
+        return gather_frame(view.depth, view.trust, black, view.intrinsics, world_from_cam, size)
+
+    return merge(size, (gathered(view) for view in views), least=1.0)
+
+
+def merge(
+    size: float,
+    frames: Iterable[tuple[NDArray[np.int64], NDArray[np.float64]]],
+    most: int = MOST,
+    least: float = 0.0,
+) -> Voxels:
+    """Merge the frames' voxels, and drop those that no more than the `least` weight speaks for.
+
+    Memory grows with the scene, not with the number of frames; where there are more than `most`, they grow instead.
+    """
+    gathered = _Gathered(size, most, np.empty(0, np.int64), [np.empty(0)] * 10)
+    waiting: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
+    for row in frames:
+        waiting.append(row)
+        if sum(len(k) for k, _ in waiting) > max(len(gathered.keys) / 2, _WAITING):
+            gathered.add(waiting, size)
+            waiting = []
+    gathered.add(waiting, size)
+    sums, weight = gathered.sums, np.maximum(gathered.sums[0], 1e-12)
+    position = np.stack([sums.pop(1) / weight for _ in range(3)], axis=1)
+    normal = np.stack([sums.pop(1) for _ in range(3)], axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    color = np.stack([sums.pop(1) / weight for _ in range(3)], axis=1)
+    voxels = Voxels(gathered.size, gathered.keys, sums[0], position, normal, color)
+    return select(voxels, voxels.weight > least)
+
+
+@dataclass
+class _Gathered:
+    """Sorted keys (V,) of cubes of a size, and ten sums (V,) each: weight, position, normal, colour."""
+
+    size: float
+    most: int
+    keys: NDArray[np.int64]
+    sums: list[NDArray[np.float64]]
+
+    def add(self, rows: Sequence[tuple[NDArray[np.int64], NDArray[np.float64]]], size: float) -> None:
+        """Rows of frames, in cubes of `size`; one of the sums at a time is there twice."""
+        keys = [k if size == self.size else voxel_keys(v[:, 1:4] / v[:, :1], self.size) for k, v in rows]
+        self._sum(np.concatenate([self.keys, *keys]), [v for _, v in rows])
+        while len(self.keys) > self.most:
+            self.size *= _COARSER
+            weight = np.maximum(self.sums[0], 1e-12)
+            self._sum(voxel_keys(np.stack([x / weight for x in self.sums[1:4]], axis=1), self.size), [])
+
+    def _sum(self, keys: NDArray[np.int64], more: Sequence[NDArray[np.float64]]) -> None:
+        self.keys, place = np.unique(keys, return_inverse=True)
+        for c in range(len(self.sums)):
+            values = np.concatenate([self.sums[c], *(v[:, c] for v in more)])
+            self.sums[c] = np.asarray(np.bincount(place, weights=values, minlength=len(self.keys)), np.float64)
+
+
+def select(voxels: Voxels, keep: NDArray[np.bool_]) -> Voxels:
+    """The voxels where `keep` (V,) is true."""
+    return Voxels(
+        voxels.size,
+        voxels.keys[keep],
+        voxels.weight[keep],
+        voxels.position[keep],
+        voxels.normal[keep],
+        voxels.color[keep],
+    )
+
+
+def _sum_by_key(keys: NDArray[np.int64], values: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    unique, place = np.unique(keys, return_inverse=True)
+    columns = [np.bincount(place, weights=values[:, c], minlength=len(unique)) for c in range(values.shape[1])]
+    return unique, np.stack(columns, axis=1)

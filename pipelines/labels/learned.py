@@ -1,0 +1,135 @@
+"""Classes by a network that a card describes, brought together over the video in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...formats.errors import InputError
+from ..networks.card import Card
+from ..networks.identity import card_identity
+from ..networks.labels import best_classes, class_token, network_probabilities
+from ..networks.network_pass import Arrays, NetworkPass, Workplace
+from ..networks.session import Network
+from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, resample_linear
+from ..types import VOID, ClassTable, Frame
+from .named import NamedScene, Vocabulary
+from .palette import class_colors
+from .segments import SegmentLabels
+
+_LEAST_SHARE = 0.001
+"""A class on a smaller share of all pixels is noise of the network and becomes void."""
+_SIDE = 160
+"""Samples of the probabilities that are kept along the longer side of an image: networks give 33 to 128."""
+_STEPS = 16
+"""Steps of the stored probabilities in each halving: 4 %; 255 of them reach down to 2e-5."""
+
+
+class OnnxLabels(SemanticsProvider):
+    """Only the classes that occur in the video are kept."""
+
+    of_all: tuple[str, ...] = ("_label_of", "_scene")
+
+    def __init__(self, card: Card, place: Workplace, most: int) -> None:
+        """Opens the network; `most` numbered objects of what has no name. Raises InputError when the network cannot be
+        what the card says."""
+        if card.task != "segmentation":
+            raise InputError(
+                f"{card.model}: its card says {card.task}, but proxy.semantics needs a segmentation network"
+            )
+        self._network = Network(card, place.threads, place.device)
+        self._sequence = place.sequence
+        self.name = card.name
+        self._names, self._void = card.labels, card.void
+        self._most = most
+        self._progress = place.progress
+        self._classes = ClassTable((), ())
+        self._label_of = np.empty(0, np.uint8)
+        self._scene: NamedScene | None = None
+        identity = f"{card_identity(card)} {place.sequence.intrinsics.width}x{place.sequence.intrinsics.height}"
+        self._pass = NetworkPass(self.name, identity, place, self._compute)
+        if card.text is not None:  # no file says whether an image's features are as long as a word's
+            camera = place.sequence.intrinsics
+            self._compute(np.full((camera.height, camera.width, 3), 128, np.uint8))
+
+    def look(self, frames: list[Frame]) -> None:
+        """Run the network; what is on disk stays."""
+        self._pass.run(frames)
+
+    def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
+        """Let the network look, let all frames vote on the names of the places they see, and settle the classes."""
+        self.look(frames)
+        self._learn(frames)
+        if self._has_world(frames, depth_of):
+            segments = SegmentLabels(self._sequence, self._most, self._progress)
+            vocabulary = Vocabulary(self._names, self._void, self._most)
+            self._scene = NamedScene.gather(segments, frames, depth_of, self._probabilities, vocabulary)
+            names, kept = self._scene.names, self._scene.kept
+        else:
+            kept = self._settle_alone(frames)
+            names = tuple(self._names[i] for i in kept)
+        if not 0 < len(names) < VOID:
+            raise InputError(f"{self.name}: {len(names)} classes occur; 1 to {VOID - 1} are needed. Check the card")
+        # By the place in the network's own list: a name has the same colour in every video.
+        colors = class_colors(len(self._names) + len(names))
+        self._classes = ClassTable(
+            names, tuple(colors[i if i >= 0 else len(self._names) + n] for n, i in enumerate(kept))
+        )
+
+    def _has_world(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> bool:
+        """Whether two frames or more with a pose have depth that can be relied on."""
+        posed = [f for f in frames if f.id in self._sequence.cam_from_world]
+        return sum(bool((depth_of(f).confidence > 0.3).any()) for f in posed[:: max(1, len(posed) // 10)]) >= 2
+
+    def _settle_alone(self, frames: list[Frame]) -> NDArray[np.int64]:
+        """(K,) the classes that occur in the frames by themselves."""
+        counts = np.zeros(len(self._names) + 1, np.int64)
+        for frame in frames:
+            counts += np.bincount(
+                best_classes(self._probabilities(frame), self._void)[0].ravel() + 1, None, len(counts)
+            )
+        kept = np.flatnonzero(counts[1:] >= _LEAST_SHARE * counts.sum())
+        # Index 0 of the table is void: ids are stored plus one.
+        self._label_of = np.full(len(self._names) + 1, VOID, np.uint8)
+        self._label_of[kept + 1] = np.arange(len(kept), dtype=np.uint8)
+        return kept
+
+    def _compute(self, image: NDArray[np.uint8]) -> Arrays:
+        height, width = image.shape[:2]
+        output = self._network.run(image, self._network.box(width, height))["output"]
+        halvings = -np.log2(np.maximum(network_probabilities(self._network, output, width, height, _SIDE), 1e-9))
+        arrays: Arrays = {"halvings": np.minimum(np.round(halvings * _STEPS), 255).astype(np.uint8)}
+        token = class_token(self._network, output, width, height)
+        return arrays if token is None else {**arrays, "descriptor": token}
+
+    def _learn(self, frames: list[Frame]) -> None:
+        """What has to be known of all frames before `_probabilities`: nothing, the network knows its classes."""
+
+    def _probabilities(self, frame: Frame) -> NDArray[np.float32]:
+        """(rows, columns, C) over the whole image; 0 where the network says nothing."""
+        halvings = self._pass.load(frame)["halvings"]
+        said = np.exp2(-halvings.astype(np.float32) / np.float32(_STEPS))
+        return np.where(halvings.min(-1, keepdims=True) < 255, said, 0).astype(np.float32)
+
+    def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
+        """Return labels fused over all frames that see the same places; without a world, this frame's alone."""
+        own = self._probabilities(frame)
+        if self._scene is not None:
+            found = self._scene.estimate(self._sequence, frame, depth, own)
+        else:
+            ids, probability = best_classes(resample_linear(own, *depth.depth.shape), self._void)
+            labels = self._label_of[ids + 1]
+            found = LabelEstimate(labels, np.where(labels == VOID, 0, probability).astype(np.float32))
+        return replace(found, descriptor=self._pass.load(frame).get("descriptor"))
+
+    def classes(self) -> ClassTable:
+        """The classes that occur, in the network's order, then the objects that it has no name for."""
+        return self._classes
+
+    def figures(self) -> dict[str, Any]:
+        """The names that the network knows, whether or not they occur."""
+        return {"vocabulary": [n for i, n in enumerate(self._names) if i not in self._void]}

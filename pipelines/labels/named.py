@@ -1,0 +1,165 @@
+"""Names in the world: what a network says of a place in all frames, agreed on by patches of like surface.
+
+A network is sure of what and vague about where: its samples are 16 and more pixels apart, and its mistakes change from
+view to view. Depth and poses bring all that it said of a place together; patches of one colour and slope give the names
+their outlines; slope and height speak against names that do not fit. What remains without a name ("other" to the
+network) stays apart as numbered objects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+
+from ..geometry.camera import unproject_depth
+from ..geometry.resampling import resample_nearest
+from ..geometry.voxels import Voxels, find, find_near, select, voxel_keys
+from ..providers import DepthEstimate, LabelEstimate, Sequence, resample_linear
+from ..types import Frame
+from .belonging import one_name_each
+from .orientation import name_likelihood
+from .parts import cut_parts, cut_patches
+from .segments import SegmentLabels, label_pixels
+
+_LEAST_CONFIDENCE = 0.3
+_ALONE = 0.3
+"""Weight of what one frame says of a pixel whose place is not known."""
+_LEAST_SHARE = 0.0005
+"""A class on a smaller share of what was seen is noise of the network."""
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """The network's names; `void`: those that say nothing; `most`: numbered objects fill up to this many classes."""
+
+    names: tuple[str, ...]
+    void: tuple[int, ...]
+    most: int
+
+
+@dataclass(frozen=True)
+class NamedScene:
+    """keys (V,) of voxels of `size`; share (V, K) probability of each of `names`; kept (K,) the network's class that
+    each name is, -1 for a numbered object."""
+
+    size: float
+    keys: NDArray[np.int64]
+    share: NDArray[np.float32]
+    names: tuple[str, ...]
+    kept: NDArray[np.int64]
+
+    @staticmethod
+    def gather(
+        segments: SegmentLabels,
+        frames: list[Frame],
+        depth_of: Callable[[Frame], DepthEstimate],
+        probabilities_of: Callable[[Frame], NDArray[np.float32]],
+        vocabulary: Vocabulary,
+    ) -> NamedScene:
+        """All frames vote; `probabilities_of` gives (rows, columns, C) over the frame's image, 0 for nothing said."""
+        sequence = segments.sequence
+        voxels, gravity, kind = segments.structure(frames, depth_of)
+        votes = np.zeros((len(voxels), len(vocabulary.names) + 1), np.float32)
+        elsewhere = np.zeros(len(vocabulary.names))
+        for frame in frames:
+            if frame.id in sequence.cam_from_world:
+                elsewhere += _vote(votes, sequence, voxels, frame, depth_of(frame), probabilities_of(frame)) / len(
+                    frames
+                )
+        share = _agreed(votes, cut_patches(voxels))
+        centres = [np.linalg.inv(pose)[:3, 3] for pose in sequence.cam_from_world.values()]
+        eye = float(np.median(np.array(centres) @ gravity.up))
+        share *= name_likelihood(vocabulary.names, voxels, gravity, kind, eye)
+        share /= np.maximum(share.sum(1, keepdims=True), 1e-9)
+        one_name_each(share, vocabulary.names, voxels)
+        columns, names, kept = _settle(share, voxels, vocabulary, elsewhere)
+        return NamedScene(voxels.size, voxels.keys, columns, names, kept)
+
+    def estimate(
+        self, sequence: Sequence, frame: Frame, depth: DepthEstimate, own: NDArray[np.float32]
+    ) -> LabelEstimate:
+        """Names of the places that the pixels (h, w) show, spread along like colours to where the depth is unsure.
+
+        own (rows, columns, C): what the network says of this frame, for pixels that show no place that is known.
+        """
+        at = self._places(sequence, frame, depth)
+        known = self.kept >= 0
+        votes = np.zeros((*at.shape, len(self.names)), np.float32)
+        votes[..., known] = resample_linear(own[..., self.kept[known]], *at.shape)
+        seen = at >= 0
+        votes[seen] = self.share[at[seen]]
+        trust = np.where(seen, depth.confidence, _ALONE).astype(np.float32)
+        return label_pixels(votes, trust, sequence.image(frame))
+
+    def _places(self, sequence: Sequence, frame: Frame, depth: DepthEstimate) -> NDArray[np.int64]:
+        """(h, w) index of the voxel that every pixel shows, or of one beside it; -1 for none."""
+        if frame.id not in sequence.cam_from_world:
+            return np.full(depth.depth.shape, -1, np.int64)
+        return find_near(self.keys, _keys(sequence, frame, depth.depth, self.size))
+
+
+def _vote(
+    votes: NDArray[np.float32],
+    sequence: Sequence,
+    voxels: Voxels,
+    frame: Frame,
+    depth: DepthEstimate,
+    probabilities: NDArray[np.float32],
+) -> NDArray[np.float64]:
+    """Add one frame's vote: to every voxel the mean of what it says of it, times at most one; last column: how much.
+    Returns the share (C,) of the frame's pixels that show no known place, by their likeliest class.
+
+    Means of probabilities, not of their logarithms: one view's firm mistake must not veto what the others saw.
+    """
+    rows, columns, classes = probabilities.shape
+    at = find(voxels.keys, _keys(sequence, frame, resample_nearest(depth.depth, rows, columns), voxels.size))
+    confidence = resample_nearest(depth.confidence, rows, columns)
+    use = (at >= 0) & (confidence >= _LEAST_CONFIDENCE) & (probabilities.sum(-1) > 0)
+    seen, place = np.unique(at[use], return_inverse=True)
+    weight = confidence[use]
+    heard = np.bincount(place, weight, len(seen)).astype(np.float32)
+    said = csr_matrix((weight, (place, np.arange(len(place)))), (len(seen), len(place))) @ probabilities[use]
+    loudness = np.minimum(heard, 1.0)
+    votes[seen, :classes] += said * (loudness / heard)[:, None]
+    votes[seen, classes] += loudness
+    return np.bincount(probabilities[at < 0].argmax(-1), None, classes) / at.size
+
+
+def _agreed(votes: NDArray[np.float32], patch: NDArray[np.int64]) -> NDArray[np.float32]:
+    """(V, C) mean of the votes over each voxel's patch; 0 where nobody voted. votes (V, C + 1)."""
+    count = int(patch.max(initial=-1)) + 1
+    total = csr_matrix((np.ones(len(patch), np.float32), (patch, np.arange(len(patch)))), (count, len(patch))) @ votes
+    return np.asarray((total[:, :-1] / np.maximum(total[:, -1:], 1e-9))[patch], np.float32)
+
+
+def _settle(
+    share: NDArray[np.float32], voxels: Voxels, vocabulary: Vocabulary, elsewhere: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], tuple[str, ...], NDArray[np.int64]]:
+    """(V, K) shares of the names that occur, and of the objects into which what has none is cut; names; kept (K,)."""
+    best, said = share.argmax(1), share.sum(1) > 0
+    void = np.isin(best, vocabulary.void) & said
+    weight = voxels.weight / voxels.weight.sum()
+    mass = np.bincount(best[said], weight[said], len(vocabulary.names)) * (1 - elsewhere.sum()) + elsewhere
+    named = np.setdiff1d(np.flatnonzero(mass >= _LEAST_SHARE), vocabulary.void)
+    columns, names = share[:, named], [vocabulary.names[i] for i in named]
+    objects = np.full(len(voxels), -1, np.int64)
+    if weight[void].sum() >= _LEAST_SHARE:
+        objects[void] = cut_parts(select(voxels, void), max(vocabulary.most - len(named), 1))
+    count = int(objects.max(initial=-1)) + 1
+    own = np.zeros((len(voxels), count), np.float32)
+    inside = np.flatnonzero(objects >= 0)
+    own[inside, objects[inside]] = share[inside][:, list(vocabulary.void)].sum(1)
+    names += [f"object {i + 1}" for i in range(count)]
+    return np.concatenate([columns, own], 1), tuple(names), np.concatenate([named, np.full(count, -1)])
+
+
+def _keys(sequence: Sequence, frame: Frame, depth: NDArray[np.float32], size: float) -> NDArray[np.int64]:
+    """(h, w) keys of the voxels that a depth map hits, -1 without depth."""
+    camera = sequence.intrinsics.resized(depth.shape[1], depth.shape[0])
+    world_from_cam = np.linalg.inv(sequence.cam_from_world[frame.id])
+    points = unproject_depth(depth, camera) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+    return np.where(depth > 0, voxel_keys(points, size), -1)

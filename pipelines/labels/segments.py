@@ -1,0 +1,179 @@
+"""Classes without any learned model: regions of the reconstructed scene, named by geometry where that is sure.
+
+All frames' depths are gathered in one grid of voxels, the grid is cut into floor, ceiling, walls, surfaces and parts,
+and every frame reads its labels from the grid. So a class means the same in the whole video.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...formats.errors import InputError
+from ..depth.stereo.spread import spread_in_place
+from ..geometry.camera import unproject_depth
+from ..geometry.resampling import resample_nearest
+from ..geometry.room_layout import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
+from ..geometry.voxels import LEAST_WEIGHT, VOXELS_PER_DEPTH, Voxels, find_near, gather_frame, merge, select, voxel_keys
+from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, Sequence
+from ..system.jit import kernel
+from ..system.memory import release_free_memory
+from ..system.progress import Progress
+from ..types import VOID, ClassTable, Frame
+from .palette import class_colors
+from .parts import cut_parts
+
+_GATHER_SIDE = 200
+_LEAST_CONFIDENCE = 0.3
+_REACH = 40.0
+_COLOR_SD = 40.0
+_LEAST_VOTE = 1e-3
+
+
+class SegmentLabels(SemanticsProvider):
+    """Unsupervised regions; needs poses (a backbone), because they make the regions consistent over the video."""
+
+    name = "segments"
+    of_all = ("_size", "_keys", "_label", "_classes")
+
+    def __init__(self, sequence: Sequence, most: int, progress: Progress) -> None:
+        """`most` classes at the most. Raises InputError without a backbone."""
+        if not sequence.cam_from_world:
+            raise InputError(
+                "regions of the scene need camera poses, and structure from motion found none: the camera stands still "
+                "or only turns. Move it sideways, or give classes with --semantics files:FOLDER or onnx:CARD"
+            )
+        self.sequence, self._most, self._progress = sequence, most, progress
+        self._size = 1.0
+        self._keys = np.empty(0, np.int64)
+        self._label = np.empty(0, np.uint8)
+        self._classes = ClassTable((), ())
+        self._gravity: list[float] = []
+        self._world_from_cam = {k: np.linalg.inv(v).astype(np.float64) for k, v in sequence.cam_from_world.items()}
+
+    def missing(self, frames: list[Frame]) -> list[Frame]:
+        """The frames without a pose."""
+        return [f for f in frames if f.id not in self._world_from_cam]
+
+    def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
+        """Gather all frames and cut the scene."""
+        voxels, gravity, kind = self.structure(frames, depth_of)
+        self._name(kind, cut_parts(select(voxels, kind == OTHER), self._most - len(NAMES) - 1))
+        self._keys = voxels.keys
+        self._gravity = [round(float(v), 4) for v in gravity.up] if gravity.is_sure else []
+
+    def structure(
+        self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]
+    ) -> tuple[Voxels, Gravity, NDArray[np.int64]]:
+        """All frames' surface in voxels (V,), gravity, and floor, ceiling, wall, surface or other (V,)."""
+        posed = [f for f in frames if f.id in self._world_from_cam]
+        self._size = _scene_depth([depth_of(f) for f in posed[:: max(1, len(posed) // 12)]]) / VOXELS_PER_DEPTH
+        release_free_memory()  # what depths and moving things have needed
+        tracked = self._progress.track(posed, "regions", len(posed))
+        voxels = merge(self._size, (self._gather(f, depth_of(f)) for f in tracked), least=LEAST_WEIGHT)
+        self._size = voxels.size
+        cameras = np.array([self._world_from_cam[f.id] for f in posed])
+        gravity = find_gravity(voxels, -cameras[:, :3, 1].mean(0))
+        return voxels, gravity, name_structure(voxels, gravity, cameras[:, :3, 3])
+
+    def heights(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> NDArray[np.float64]:
+        """(N,) height of each posed camera over the floor, in the unit of the depth; (0,) without a sure floor."""
+        voxels, gravity, kind = self.structure(frames, depth_of)
+        floor = floor_plane(voxels, kind, gravity.up)
+        if floor is None:
+            return np.empty(0)
+        centres = np.array([self._world_from_cam[f.id][:3, 3] for f in frames if f.id in self._world_from_cam])
+        return np.asarray((centres - floor.point) @ floor.normal)
+
+    def _gather(self, frame: Frame, estimate: DepthEstimate) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        small = self.sequence.intrinsics.at_most(_GATHER_SIDE)
+        confidence = resample_nearest(estimate.confidence, small.height, small.width)
+        return gather_frame(
+            resample_nearest(estimate.depth, small.height, small.width),
+            np.where(confidence >= _LEAST_CONFIDENCE, confidence, 0).astype(np.float32),
+            resample_nearest(self.sequence.image(frame), small.height, small.width),
+            small,
+            self._world_from_cam[frame.id],
+            self._size,
+            None if estimate.normals is None else resample_nearest(estimate.normals, small.height, small.width),
+        )
+
+    def _name(self, kind: NDArray[np.int64], parts: NDArray[np.int64]) -> None:
+        """Number the kinds that occur, then the parts, largest first; what is left over is the class "other"."""
+        label = np.full(len(kind), VOID, np.uint8)
+        names: list[str] = []
+        for k, name in NAMES.items():
+            if (kind == k).any():
+                label[kind == k] = len(names)
+                names.append(name)
+        own = np.full(len(parts), VOID, np.uint8)
+        for part in range(int(parts.max(initial=-1)) + 1):
+            own[parts == part] = len(names)
+            names.append(f"object {part + 1}")
+        if (own == VOID).any():
+            own[own == VOID] = len(names)
+            names.append("other")
+        label[kind == OTHER] = own
+        self._label = label
+        self._classes = ClassTable(tuple(names), class_colors(len(names)))
+
+    def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
+        """Votes of the voxels under the pixels, spread along like colours to where the depth is unsure."""
+        camera = self.sequence.intrinsics
+        if frame.id not in self._world_from_cam or len(self._keys) == 0:
+            return LabelEstimate(np.full(depth.depth.shape, VOID, np.uint8), np.zeros(depth.depth.shape, np.float32))
+        world_from_cam = self._world_from_cam[frame.id]
+        points = unproject_depth(depth.depth, camera) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+        at = find_near(self._keys, voxel_keys(points, self._size))
+        label = np.where((at >= 0) & (depth.depth > 0), self._label[at], VOID)
+        votes = np.zeros((*label.shape, len(self._classes)), np.float32)
+        rows, columns = np.nonzero(label != VOID)
+        votes[rows, columns, label[rows, columns]] = 1
+        return label_pixels(votes, depth.confidence, self.sequence.image(frame))
+
+    def classes(self) -> ClassTable:
+        """Named structure first, then the objects by size."""
+        return self._classes
+
+    def figures(self) -> dict[str, Any]:
+        """The up direction in the world, when a dominant plane made it sure."""
+        return {"up": self._gravity} if self._gravity else {}
+
+
+def label_pixels(votes: NDArray[np.float32], trust: NDArray[np.float32], image: NDArray[np.uint8]) -> LabelEstimate:
+    """Labels (h, w) from votes (h, w, C) that count by the `trust` (h, w) in the place they are of, spread along like
+    colours of the image to where it is low; VOID where nothing is known from near or far. The votes are spread in
+    place: of a network's classes each copy takes as much memory as all else of a frame."""
+    votes *= (_LEAST_VOTE + trust**2)[..., None]
+    spread_in_place(votes, image, _REACH, _COLOR_SD)
+    return LabelEstimate(*_settle(votes))
+
+
+@kernel
+def _settle(total: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """(h, w) the label with the most of the votes (h, w, C) and its share of them; VOID and 0 where hardly any are."""
+    height, width, classes = total.shape
+    labels = np.full((height, width), VOID, np.uint8)
+    confidence = np.zeros((height, width), np.float32)
+    for y in range(height):
+        for x in range(width):
+            best, heard = 0, total[y, x, 0]
+            for c in range(1, classes):
+                heard += total[y, x, c]
+                if total[y, x, c] > total[y, x, best]:
+                    best = c
+            if heard >= 1e-4:
+                labels[y, x] = best
+                confidence[y, x] = total[y, x, best] / heard * min(1.0, 2 * heard)
+    return labels, confidence
+
+
+def _scene_depth(estimates: list[DepthEstimate]) -> float:
+    """Median of the known depths. Raises InputError when there is none."""
+    known = [e.depth[(e.depth > 0) & (e.confidence >= _LEAST_CONFIDENCE)][::7] for e in estimates]
+    if not sum(map(len, known)):
+        raise InputError("no reliable depth in any frame, so there are no regions; give another --depth provider")
+    return float(np.median(np.concatenate(known)))

@@ -1,0 +1,183 @@
+"""Interfaces of providers of proxy depth and proxy semantics, with what one has that says nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .geometry.sparse_model import SparseModel
+from .types import VOID, Calibration, ClassTable, Frame, Intrinsics, require_shape
+
+
+@dataclass(frozen=True)
+class DepthEstimate:
+    """depth (h, w) float32, 0 = unknown; confidence (h, w) float32 in [0, 1], 0 where the depth is unknown.
+
+    `invalid` counts the values of the source that were no depth: NaN, infinite or negative. normals (h, w, 3) int8 in
+    127ths, unit vectors in the camera that face it, where a network gives them; 0 = unknown.
+    """
+
+    depth: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    invalid: int = 0
+    normals: NDArray[np.int8] | None = None
+
+    def __post_init__(self) -> None:
+        require_shape("depth", self.depth, (None, None))
+        require_shape("confidence", self.confidence, self.depth.shape)
+        if self.normals is not None:
+            require_shape("normals", self.normals, (*self.depth.shape, 3))
+
+    def without(self, left_out: NDArray[np.bool_] | None) -> DepthEstimate:
+        """Unknown in a mask (h, w)."""
+        if left_out is None:
+            return self
+        normals = None if self.normals is None else np.where(left_out[..., None], np.int8(0), self.normals)
+        depth, confidence = (np.where(left_out, np.float32(0), a) for a in (self.depth, self.confidence))
+        return DepthEstimate(depth, confidence, self.invalid, normals)
+
+
+@dataclass(frozen=True)
+class LabelEstimate:
+    """labels (h, w) uint8 indices into the provider's class table or VOID; confidence (h, w) float32 in [0, 1].
+
+    descriptor (F,) is a unit vector that says how the image looks, where a network gives one.
+    """
+
+    labels: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    descriptor: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        require_shape("labels", self.labels, (None, None))
+        require_shape("confidence", self.confidence, self.labels.shape)
+
+    def without(self, left_out: NDArray[np.bool_] | None) -> LabelEstimate:
+        """Void in a mask (h, w)."""
+        if left_out is None:
+            return self
+        labels = np.where(left_out, np.uint8(VOID), self.labels)
+        return LabelEstimate(labels, np.where(left_out, np.float32(0), self.confidence), self.descriptor)
+
+
+class Provider(Protocol):
+    """Common part of all providers: a pass over all frames first, then estimates frame by frame."""
+
+    name: str
+
+    @property
+    def of_all(self) -> tuple[str, ...]:
+        """The names of what `prepare` finds out of all frames together, and of the providers inside this one."""
+        return ()
+
+    def missing(self, frames: list[Frame]) -> list[Frame]:
+        """The frames it will know nothing of."""
+        return []
+
+    def look(self, frames: list[Frame]) -> None:
+        """Do the part of `prepare` that concerns single frames, for these; results are kept."""
+        return
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures of the pass for the report, as plain values."""
+        return {}
+
+
+def prepared(provider: Provider) -> dict[str, Any]:
+    """Return the state that `prepare` left, to send to the processes that estimate single frames."""
+    found = {name: getattr(provider, name) for name in provider.of_all}
+    return {name: prepared(v) if hasattr(v, "of_all") else v for name, v in found.items()}
+
+
+def take_prepared(provider: Provider, found: dict[str, Any]) -> None:
+    """Take over the state of `prepared` in place of calling `prepare`; `estimate` may be called afterwards."""
+    for name, value in found.items():
+        if hasattr(own := getattr(provider, name), "of_all"):
+            take_prepared(own, value)
+        else:
+            setattr(provider, name, value)
+
+
+class DepthProvider(Provider, Protocol):
+    """Depth of every frame. What can be refused without slow work is refused when the provider is made."""
+
+    metric: bool
+    """Whether depths are metres; else they are in the unit of the run's backbone."""
+
+    def prepare(self, frames: list[Frame]) -> None:
+        """Slow passes over all frames that `estimate` builds on; goes on where it was interrupted."""
+        return
+
+    def estimate(self, frame: Frame) -> DepthEstimate:
+        """Depth at the size of the proxy maps. May be asked from two threads at once."""
+        ...
+
+
+class SemanticsProvider(Provider, Protocol):
+    """Class of every pixel of every frame."""
+
+    def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
+        """Slow passes over all frames that `estimate` and `classes` build on."""
+
+    def warnings(self) -> list[str]:
+        """Return the problems that `prepare` found, for the report."""
+        return []
+
+    def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
+        """Labels at the size of the proxy maps. May be asked from two threads at once."""
+        ...
+
+    def classes(self) -> ClassTable:
+        """Return the table of classes; valid after `prepare`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """All picked frames with their camera at map size, and what structure from motion knows of them."""
+
+    frames: list[Frame]
+    calibration: Calibration
+    intrinsics: Intrinsics
+    backbone: SparseModel | None
+    read_image: Callable[[Frame], NDArray[np.uint8]]
+    read_left_out: Callable[[Frame], NDArray[np.bool_] | None] = lambda frame: None
+
+    @cached_property
+    def cam_from_world(self) -> dict[int, NDArray[np.float64]]:
+        """Frame id → (4, 4) of the backbone's keyframes."""
+        if self.backbone is None:
+            return {}
+        return dict(zip(self.backbone.frame_ids.tolist(), self.backbone.cam_from_world, strict=True))
+
+    def image(self, frame: Frame) -> NDArray[np.uint8]:
+        """(h, w, 3) RGB at map size."""
+        return resize_area(self.read_image(frame), self.intrinsics.width, self.intrinsics.height)
+
+    def left_out(self, frame: Frame, width: int = 0, height: int = 0) -> NDArray[np.bool_] | None:
+        """(h, w) at map size, or another: the pixels that show anything which is no part of the scene; None where all
+        of the frame is scene."""
+        full = self.read_left_out(frame)
+        if full is None:
+            return None
+        size = width or self.intrinsics.width, height or self.intrinsics.height
+        return np.asarray(cv2.resize(full.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0)
+
+
+def resize_area(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """(H, W, ...) → (height, width, ...) by averaging."""
+    if image.shape[:2] == (height, width):
+        return image
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def resample_linear(array: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
+    """(H, W, C) → (height, width, C) by linear interpolation between the centres of the pixels."""
+    out = cv2.resize(np.ascontiguousarray(array), (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(out, np.float32).reshape(height, width, array.shape[-1])

@@ -1,1 +1,0 @@
-"""Depth and labels from files of the user or of a data set."""

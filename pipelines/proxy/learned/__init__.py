@@ -1,1 +1,0 @@
-"""Depth and classes of keyframes by networks."""

@@ -1,1 +1,0 @@
-"""Unsupervised regions of the whole video: voxels of all frames, named by geometry where that is sure."""

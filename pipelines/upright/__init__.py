@@ -1,1 +1,0 @@
-"""The gravity direction, and the world of the exported files."""

@@ -1,1 +1,0 @@
-"""Voxels of the reconstructed room, and its floor, walls and ceiling."""
