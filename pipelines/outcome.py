@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from ..formats.errors import InputError
 from .config import Config
-from .gaussian_map import GaussianMap
 from .geometry.alignment import Similarity
 from .geometry.sparse_model import SparseModel
+from .render.gaussian_map import GaussianMap
 from .run.files import (
     CALIBRATION,
     CLASS_IDS,

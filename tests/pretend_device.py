@@ -18,8 +18,8 @@ from torch.utils._pytree import tree_flatten, tree_map
 
 from msgs_slam.pipelines import outcome
 from msgs_slam.pipelines.engine import stages
-from msgs_slam.pipelines.gaussians.render import compositing, cpu, inspection, reference
 from msgs_slam.pipelines.mapping import submap_tasks
+from msgs_slam.pipelines.render import api, cpu, inspection, reference
 
 DEVICE = "meta"
 _COPIES = {torch.ops.aten.copy_.default, torch.ops.aten._to_copy.default}
@@ -170,12 +170,12 @@ class _Composite(torch.autograd.Function):
 @contextmanager
 def pretended(patch: pytest.MonkeyPatch) -> Iterator[str]:
     """Within: `DEVICE` is there, is what `auto` chooses, and the renderer has kernels for it."""
-    right = compositing.choose_backend
+    right = api.choose_backend
 
     def choose(backend: str | None, example: torch.Tensor) -> Any:
         return PretendBackend if isinstance(example, PretendTensor) else right(backend, example)
 
-    patch.setattr(compositing, "choose_backend", choose)
+    patch.setattr(api, "choose_backend", choose)
     patch.setattr(inspection, "choose_backend", choose)
     for user in (outcome, stages, submap_tasks):
         patch.setattr(user, "resolve_device", lambda wanted="auto": DEVICE)

@@ -10,7 +10,7 @@ def set_threads(threads: int) -> None:
     import torch
     from threadpoolctl import threadpool_limits
 
-    from ..gaussians.render import set_threads
+    from ..compute.threads import set_threads
 
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)

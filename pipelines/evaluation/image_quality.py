@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..gaussians.ssim import TAPS, similarity
+from ..compute.ssim import TAPS, similarity
 from ..types import require_shape
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..gaussians.render import track_gn
 from ..mapping.load import split_frames
 from ..outcome import Outcome, evenly
+from ..render.tracking import track_gn
 from ..source.source_pixels import FramePixels
 from ..system.progress import Progress
 from .class_map import Matching

@@ -8,9 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..gaussian_map import GaussianMap, decided_channels
-from ..gaussians.render import median_depth, render
 from ..outcome import Exposure, labels_of_channels
+from ..render.api import render
+from ..render.gaussian_map import GaussianMap, decided_channels
+from ..render.inspection import median_depth
 from ..types import Intrinsics
 
 _SEEN = 0.5

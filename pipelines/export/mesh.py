@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ...formats.mesh import MeshBlocks, read_mesh_ply
+from ..compute.threads import get_threads, host_threads
 from ..config import ExportConfig
-from ..gaussians.render import get_threads, host_threads
 from ..geometry.posed_depth import PosedDepth
 from ..geometry.resampling import resample_nearest
 from ..mapping.measure import DrawnView, Shown, drawn_view

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussians.render.threads import for_each
+from ..compute.threads import for_each
 from ..geometry.camera import project
 from ..geometry.posed_depth import PosedDepth
 from ..system.jit import kernel

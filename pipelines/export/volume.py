@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.sog import morton_codes
-from ..gaussians.render.jit import kernel
-from ..gaussians.render.threads import for_each, get_threads
+from ..compute.jit import kernel
+from ..compute.threads import for_each, get_threads
 from ..geometry.camera import unproject_depth
 from ..geometry.posed_depth import PosedDepth
 from ..geometry.voxels import cells_of, voxel_keys

@@ -1,7 +1,7 @@
 """The map as one HTML file that opens from the disk, without a server or a network, on a computer and on a phone.
 
 The page holds the Gaussians and a renderer of its own for them (`page/`, WebGL 2): isotropic ones are circles on the
-screen, a square each, sorted by depth. What it draws is what `gaussians/render` draws, up to the 8 bits of a screen.
+screen, a square each, sorted by depth. What it draws is what `render` draws, up to the 8 bits of a screen.
 """
 
 from __future__ import annotations

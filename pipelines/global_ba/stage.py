@@ -12,12 +12,12 @@ from ...formats.atomic import copy_file
 from ..correspondence.retrieval import GlobalDescriptors, compute_global_descriptors, unit
 from ..depth.scales import sample_proxy
 from ..engine.stages import Stage, StageContext
-from ..gaussian_map import GaussianMap
 from ..geometry import se3
 from ..geometry.sparse_model import SparseModel
 from ..mapping.build import Refined, refine_map
 from ..mapping.load import with_rigid_panoramas
 from ..mapping.move_map import follow_keyframes, move_map, move_trajectory
+from ..render.gaussian_map import GaussianMap
 from ..run.files import (
     CALIBRATION,
     CLASSES,

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ..depth.fields import DepthFields
 from ..engine.stages import StageContext
-from ..gaussian_map import GaussianMap
 from ..geometry.posed_depth import PosedDepth, overlaps
+from ..render.gaussian_map import GaussianMap
 from ..run.before import Before
 from ..run.files import CALIBRATION, CLASS_IDS, DEPTH_FIELDS, EXPOSURE, SUBMAPS
 from ..run.folder import RunFolder

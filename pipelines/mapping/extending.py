@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..gaussian_map import GaussianMap, decided_channels
 from ..geometry.camera import project
 from ..geometry.posed_depth import overlaps
+from ..render.gaussian_map import GaussianMap, decided_channels
 from ..run.before import Before
 from ..run.files import FRAMES
 from ..structure.given import agreement

@@ -14,9 +14,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..config import MappingConfig
-from ..gaussian_map import GaussianMap
-from ..gaussians.render import Rendering, error_shares
-from ..gaussians.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
+from ..render.api import Rendering
+from ..render.gaussian_map import GaussianMap
+from ..render.inspection import error_shares
+from ..render.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
 from ..system.lru_sequence import LruSequence
 from ..types import Intrinsics
 from .region_prior import with_region_prior

@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..gaussians.render.jit import inner, kernel
-from ..gaussians.render.lanes import counting, load, splat, store, total, where
-from ..gaussians.render.threads import for_each
-from ..gaussians.ssim import C1, C2, blur_array, ssim_map
+from ..compute.jit import inner, kernel
+from ..compute.lanes import counting, load, splat, store, total, where
+from ..compute.ssim import C1, C2, blur_array, ssim_map
+from ..compute.threads import for_each
 from .exposure import expose
 
 SSIM_WEIGHT = 0.2
@@ -168,7 +168,7 @@ def _similarity(
 ) -> None:  # fmt: skip
     """The derivatives of a band's similarity by mean, variance and covariance, into planes 2 to 4, and its sum.
 
-    As `pipelines.gaussians.ssim.similarity`, with one division.
+    As `pipelines.compute.ssim.similarity`, with one division.
     """
     size = planes.shape[1]
     flat, out = moments.reshape(-1), planes.reshape(-1)

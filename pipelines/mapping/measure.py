@@ -10,10 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..gaussian_map import GaussianMap, decided_channels
-from ..gaussians.render import Rendering, median_and_seen, render
-from ..gaussians.ssim import ssim_map
+from ..compute.ssim import ssim_map
 from ..geometry.posed_depth import PosedDepth
+from ..render.api import Rendering, render
+from ..render.gaussian_map import GaussianMap, decided_channels
+from ..render.inspection import median_and_seen
 from ..types import VOID, Intrinsics
 from .views import View
 

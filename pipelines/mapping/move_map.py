@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..gaussian_map import GaussianMap
 from ..geometry import se3
+from ..render.gaussian_map import GaussianMap
 from ..types import Trajectory
 
 Array = NDArray[np.float64]

@@ -10,9 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..compute import gpu
+from ..compute.ssim import C1, C2, TAPS, WINDOW
 from ..config import MappingConfig
-from ..gaussians.render import Rendering, cards
-from ..gaussians.ssim import C1, C2, TAPS, WINDOW
+from ..render.api import Rendering
 from . import losses
 from .exposure import LEAST, MOST_GAIN, OUTLIER, RIDGE, SOLID, STRIDE
 from .losses import NU, SIZE_LIMIT, SSIM_WEIGHT, photo_loss
@@ -87,7 +88,7 @@ def fit_exposure_on_card(rendering: Rendering, view: View, exposure: Tensor) -> 
     shown, silhouette = rendering.features.detach(), rendering.silhouette.detach().contiguous()
     given = (shown, shown.shape[-1], silhouette, view.image, _mask(view), exposure, width, height)
     rules = {"SOLID": SOLID, "LEAST": LEAST, "OUTLIER": OUTLIER, "RIDGE": RIDGE, "MOST_GAIN": MOST_GAIN}
-    cards.launch(fit_color, 3, *given, STRIDE=STRIDE, **rules, MASKED=view.scene is not None, BLOCK=1024)
+    gpu.launch(fit_color, 3, *given, STRIDE=STRIDE, **rules, MASKED=view.scene is not None, BLOCK=1024)
 
 
 def color_errors_on_card(colors: Tensor, view: View, exposure: Tensor) -> Tensor:
@@ -106,7 +107,7 @@ def _mask(view: View) -> Tensor:
 
 
 def _run(kernel: Any, count: int, *arguments: Any, BLOCK: int = _BLOCK, **settings: Any) -> None:
-    cards.launch(kernel, -(-count // BLOCK), *arguments, BLOCK=BLOCK, **settings)
+    gpu.launch(kernel, -(-count // BLOCK), *arguments, BLOCK=BLOCK, **settings)
 
 
 @lru_cache(maxsize=2)

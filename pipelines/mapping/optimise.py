@@ -11,20 +11,14 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from ..compute import gpu
+from ..compute.adam import gradients_of
+from ..compute.threads import host_threads
 from ..config import MappingConfig
-from ..gaussian_map import GaussianMap
-from ..gaussians.adam import gradients_of
-from ..gaussians.render import (
-    Rendering,
-    blending_weights,
-    cards,
-    class_weights,
-    host_threads,
-    in_view,
-    marked_in_view,
-    render,
-)
-from ..gaussians.seeding import SEED_LOGIT
+from ..render.api import Rendering, in_view, marked_in_view, render
+from ..render.gaussian_map import GaussianMap
+from ..render.inspection import blending_weights, class_weights
+from ..render.seeding import SEED_LOGIT
 from ..system.lru_sequence import LruSequence
 from ..system.parallel import abreast
 from ..system.progress import Progress, SilentProgress
@@ -127,7 +121,7 @@ class MapOptimiser:
 
     def _step(self, step: Step, view: View) -> Rendering:
         """Compare and move the map, the view's pose and its exposure; returns what the view showed before."""
-        parameters, on_card = self.state.parameters, cards.takes_kernels(self.state.parameters["means"])
+        parameters, on_card = self.state.parameters, gpu.supports_triton(self.state.parameters["means"])
         pose, radii = self.state.cam_from_world(step.view, view), torch.exp(parameters["log_radii"].detach())
         seeing = (parameters["means"].detach(), radii, pose, view.intrinsics)
         rows, seen = None, None
@@ -182,13 +176,13 @@ class MapOptimiser:
     def _color_errors(self, index: int, colors: Tensor) -> Tensor:
         """(H, W) mean difference between the view's photo and the (H, W, 3) colours of the map."""
         view, exposure = self.views[index], self.state.exposures[index]
-        if cards.takes_kernels(colors):
+        if gpu.supports_triton(colors):
             return color_errors_on_card(colors, view, exposure)
         return view.of_scene((expose(colors, exposure) - view.colors).abs().mean(-1))
 
     def _expose(self, index: int, view: View, rendering: Rendering) -> None:
         """The view's exposure by what the map shows of it now."""
-        if cards.takes_kernels(rendering.silhouette):
+        if gpu.supports_triton(rendering.silhouette):
             fit_exposure_on_card(rendering, view, self.state.exposures[index])
             return
         known, shown = view.of_scene(rendering.silhouette.detach()) > SOLID, rendering.features.detach()[..., :3]

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...formats.tensors import load_tensors, save_tensors
-from ..gaussian_map import GaussianMap
-from ..gaussians.adam import AdamTable
-from ..gaussians.render.compositing import require_all_finite
-from ..gaussians.render.rendering import moved
+from ..compute.adam import AdamTable
 from ..geometry import se3
+from ..render.api import moved, require_all_finite
+from ..render.gaussian_map import GaussianMap
 from .views import View
 
 KEYS = ("means", "log_radii", "opacity_logits", "colors")

@@ -19,9 +19,9 @@ from torch import Tensor
 from ...formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
 from ..config import Config
 from ..depth.fields import DepthFields
-from ..gaussian_map import GaussianMap
-from ..gaussians.render import blending_weights, median_depth
 from ..geometry.posed_depth import PosedDepth
+from ..render.gaussian_map import GaussianMap
+from ..render.inspection import blending_weights, median_depth
 from ..run.before import Before
 from ..run.folder import RunFolder
 from ..system.device import resolve_device

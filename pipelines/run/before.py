@@ -27,7 +27,7 @@ from .names import SOURCE_LIST
 from .records import load_source
 
 if TYPE_CHECKING:
-    from ..gaussian_map import GaussianMap
+    from ..render.gaussian_map import GaussianMap
 
 T = TypeVar("T")
 

@@ -39,7 +39,7 @@ from .layouts import (
 )
 
 if TYPE_CHECKING:
-    from ..gaussian_map import GaussianMap
+    from ..render.gaussian_map import GaussianMap
 
 Arrays = Mapping[str, NDArray]
 MESH = "mesh.ply"
@@ -250,7 +250,7 @@ EXPOSURE: RunFile[dict[str, NDArray]] = RunFile(
 
 
 def _map(tensors: Mapping[str, Any]) -> GaussianMap:
-    from ..gaussian_map import GaussianMap  # imports torch, and few who read a run need it
+    from ..render.gaussian_map import GaussianMap  # imports torch, and few who read a run need it
 
     if not all(bool(t.isfinite().all()) for t in tensors.values()):
         raise ValueError("it holds numbers that are not finite")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussians.render import get_threads, host_threads
+from ..compute.threads import get_threads, host_threads
 from ..geometry.posed_depth import PosedDepth
 from ..geometry.room_layout import Gravity, find_gravity, floor_plane, name_structure
 from ..geometry.voxels import VOXELS_PER_DEPTH, Voxels, gather_depths

@@ -13,7 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..gaussians.render import render, track_gn
+from ..render.api import render
+from ..render.tracking import track_gn
 from ..types import Intrinsics
 from .pictures import Pictures
 from .state import TrackState

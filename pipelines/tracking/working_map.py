@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..depth.scales import scale_at_points
-from ..gaussians.seeding import seed_gaussians, seed_grid
 from ..geometry.resampling import resize_maps
+from ..render.seeding import seed_gaussians, seed_grid
 from ..types import Intrinsics
 from .pictures import Pictures
 from .state import TrackState

@@ -17,10 +17,10 @@ from ...formats.gaussians import GaussianCloud, isotropic_cloud
 from ...formats.reading import reaching
 from ..export.stage import on_earth
 from ..export.writers import map_cloud
-from ..gaussian_map import decided_channels
 from ..geometry.sparse_model import SparseModel
 from ..labels.palette import class_colors
 from ..outcome import Outcome, evenly, labels_of_channels, load_outcome
+from ..render.gaussian_map import decided_channels
 from ..run.files import BACKBONE, CALIBRATION, FRAMES, MESH
 from ..run.folder import RunFolder
 from ..run.records import load_records

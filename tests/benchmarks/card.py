@@ -24,7 +24,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests/benchmarks"), str(ROOT / "tests/pipelines/gaussians/render")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests/benchmarks"), str(ROOT / "tests/pipelines/render")]
 if "--rehearse" in sys.argv:
     os.environ["TRITON_INTERPRET"] = "1"  # read when triton is imported
 
@@ -37,7 +37,7 @@ SLOWER = 4 if "--rehearse" in sys.argv else 1
 CARD_SHARE = 0.45
 """Of the whole job's seconds, those that the card may take."""
 TESTS = (
-    "pipelines/gaussians/render/test_render_cuda.py", "pipelines/mapping/test_mapping_on_card.py",
+    "pipelines/render/test_render_cuda.py", "pipelines/mapping/test_mapping_on_card.py",
     "pipelines/proxy/test_proxy_stereo_on_card.py",
 )  # fmt: skip
 

@@ -36,20 +36,21 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_flatten
 
+from msgs_slam.pipelines.compute import gpu
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.depth.stereo import card
 from msgs_slam.pipelines.depth.stereo.matching import StereoImages
-from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.gaussians.render import cards, compositing, inspection
 from msgs_slam.pipelines.mapping.optimise import MapOptimiser
 from msgs_slam.pipelines.mapping.schedule import Seeding, Step
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View, make_view
+from msgs_slam.pipelines.render import api, inspection
+from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 from tests import pretend_device
 from tests.pretend_device import DEVICE, PretendTensor
 
-_choose_backend = compositing.choose_backend  # before the pretended device puts its own in its place
+_choose_backend = api.choose_backend  # before the pretended device puts its own in its place
 SIZE, COUNT, CLASSES, VIEWS = (48, 32), 300, 5, 3
 COLUMNS = ("launches", "reads", "bytes to the card", "bytes from it")
 _NO_WORK = ("aten::empty", "aten::new_empty", "aten::_local_scalar_dense", "aten::_unsafe_view", "aten::detach")
@@ -137,7 +138,7 @@ def counted(work: Callable[[], object]) -> Counting:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pretend_device._Mode, "__torch_function__", watched)
-        patch.setattr(cards, "launch", partial(_launch, counting))
+        patch.setattr(gpu, "launch", partial(_launch, counting))
         with counting:
             work()
     return counting
@@ -158,9 +159,9 @@ def as_on_a_card(patch: pytest.MonkeyPatch) -> None:
     def backend(name: str | None, example: torch.Tensor) -> Any:
         return _choose_backend("cuda" if isinstance(example, PretendTensor) else name, example)
 
-    patch.setattr(cards, "takes_kernels", lambda example: isinstance(example, PretendTensor))
-    patch.setattr(cards, "launch", partial(_launch, None))
-    for user in (compositing, inspection):
+    patch.setattr(gpu, "supports_triton", lambda example: isinstance(example, PretendTensor))
+    patch.setattr(gpu, "launch", partial(_launch, None))
+    for user in (api, inspection):
         patch.setattr(user, "choose_backend", backend)
 
 

@@ -28,19 +28,19 @@ from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests/pipelines/gaussians/render")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests/pipelines/render")]
 
 import numpy as np
 import torch
 from render_scenes import room
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render import Rendering, composite, render, set_threads, track_gn
-from msgs_slam.pipelines.gaussians.render.compositing import choose_backend
-from msgs_slam.pipelines.gaussians.render.rendering import project_map
+from msgs_slam.pipelines.compute.threads import set_threads
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.mapping import losses
 from msgs_slam.pipelines.mapping.losses import photo_loss
+from msgs_slam.pipelines.render.api import Rendering, choose_backend, composite, project_map, render
+from msgs_slam.pipelines.render.tracking import track_gn
 
 ROWS = [(320, 240, 50_000, 8), (320, 240, 200_000, 8), (640, 480, 200_000, 8), (640, 480, 200_000, 40)]
 WANTED = [8.2, 8.8, 12.3, 7.9]
@@ -256,7 +256,7 @@ FIRST_USE = """
 import sys, time; sys.path[:0] = {paths}
 import torch
 from render_scenes import random_gaussians
-from msgs_slam.pipelines.gaussians.render import composite
+from msgs_slam.pipelines.render.api import composite
 scene = {{k: x.requires_grad_() for k, x in random_gaussians(100, 40, 30, 3, 0).items()}}
 start = time.perf_counter(), time.process_time()
 composite(**scene, width=40, height=30).features.sum().backward()

@@ -14,8 +14,8 @@ from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.jsonfile import write_json
 from msgs_slam.pipelines.config import Config, MappingConfig
-from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.run.files import CALIBRATION, CLASSES, MAP, PROXY_MAPS, TRAJECTORY, save_frames
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import VOID, Calibration, ClassTable, Frame, Intrinsics, ProxyMaps, Trajectory

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...gaussians.render import cards
+from ...compute import gpu
 from . import matching as rules
 from .refine import ALIKE
 from .smoothing import DIRECTIONS, path_starts
@@ -26,7 +26,7 @@ _BLOCK = 64
 
 def takes_kernels_on(device: str) -> bool:
     """Whether there is a card that runs them."""
-    return cards.takes_kernels(torch.empty(0, device=device))
+    return gpu.supports_triton(torch.empty(0, device=device))
 
 
 def match_planes(images: rules.StereoImages, planes: NDArray[np.float64], device: str) -> Array:
@@ -118,7 +118,7 @@ class Matching:
         for direction in DIRECTIONS:
             starts = _starts(*self._size, *direction, cost.device)
             given = (cost, self._image, starts, total, *self._size, *direction, *numbers)
-            cards.launch(scan_paths, len(starts), *given, PLANES=_power_of_two(count))
+            gpu.launch(scan_paths, len(starts), *given, PLANES=_power_of_two(count))
         return total
 
     def soften(self, values: Tensor, spread: float) -> Tensor:
@@ -149,7 +149,7 @@ def _power_of_two(count: int) -> int:
 
 
 def _run(kernel: Any, count: int, *arguments: Any, **settings: Any) -> None:
-    cards.launch(kernel, -(-count // _BLOCK), *arguments, BLOCK=_BLOCK, **settings)
+    gpu.launch(kernel, -(-count // _BLOCK), *arguments, BLOCK=_BLOCK, **settings)
 
 
 @lru_cache(maxsize=16)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...gaussians.render.jit import inner, kernel
-from ...gaussians.render.lanes import any_of, at_most, counting, exp, largest, load, splat, store, where
+from ...compute.jit import inner, kernel
+from ...compute.lanes import any_of, at_most, counting, exp, largest, load, splat, store, where
 from .bands import Bands
 from .lane_sampling import choose, corners, smallest
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ...gaussians.render.jit import kernel
+from ...compute.jit import kernel
 from .window import LIKENESS, pad_rows, row_length, weigh_windows
 
 _FAINT, _POWER = 5e-5, 0.25

@@ -9,7 +9,7 @@ from llvmlite import ir
 from numba import types
 from numpy.typing import NDArray
 
-from ...gaussians.render.lanes import (
+from ...compute.lanes import (
     FLAGS,
     I32,
     I64,

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...gaussians.render.jit import kernel
-from ...gaussians.render.lanes import store
+from ...compute.jit import kernel
+from ...compute.lanes import store
 from .bands import Bands
 from .lane_sampling import with_row_below
 from .tiles import TILE

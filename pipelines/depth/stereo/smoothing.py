@@ -7,8 +7,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ...gaussians.render.jit import inner, kernel
-from ...gaussians.render.lanes import load, splat, store
+from ...compute.jit import inner, kernel
+from ...compute.lanes import load, splat, store
 from .bands import Bands
 from .lane_sampling import smallest, smallest_of
 from .tiles import TILE

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...gaussians.render.jit import inner, kernel
-from ...gaussians.render.lanes import splat, store
+from ...compute.jit import inner, kernel
+from ...compute.lanes import splat, store
 from .bands import Bands
 from .lane_sampling import with_row_below
 from .tiles import TILE, tiles_of

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...gaussians.render.jit import inner
+from ...compute.jit import inner
 from ...system.jit import kernel
 from .tiles import TILE, tiles_of
 

@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...gaussians.render.jit import inner
-from ...gaussians.render.lanes import at_most, counting, exp, largest, load, splat, store, where
+from ...compute.jit import inner
+from ...compute.lanes import at_most, counting, exp, largest, load, splat, store, where
 from .bands import BAND_ROWS
 from .lane_sampling import choose, interpolate, smallest, square_root
 

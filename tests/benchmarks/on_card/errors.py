@@ -10,6 +10,7 @@ from render_scenes import IMAGES, NAMES, room
 from torch import Tensor
 
 import msgs_slam.pipelines.depth.stereo.matching as matching
+from msgs_slam.pipelines.compute.adam import descend_by_kernel, plain_descend
 from msgs_slam.pipelines.depth.stereo import card
 from msgs_slam.pipelines.depth.stereo.bands import Bands
 from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths
@@ -17,13 +18,12 @@ from msgs_slam.pipelines.depth.stereo.refine import refine_inverse_depth
 from msgs_slam.pipelines.depth.stereo.smoothing import smooth_cost
 from msgs_slam.pipelines.depth.stereo.sweep import sweep_cost
 from msgs_slam.pipelines.depth.stereo.volume import Volume
-from msgs_slam.pipelines.gaussians.adam import descend_by_kernel, plain_descend
-from msgs_slam.pipelines.gaussians.render import Rendering, composite, in_view, reference, render
-from msgs_slam.pipelines.gaussians.render.rendering import project_map
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.mapping.exposure import expose, fit_exposure
 from msgs_slam.pipelines.mapping.objective import Objective, color_errors_on_card, fit_exposure_on_card
 from msgs_slam.pipelines.mapping.state import KEYS
+from msgs_slam.pipelines.render import reference
+from msgs_slam.pipelines.render.api import Rendering, composite, in_view, project_map, render
 from on_card.rows import Rows
 from on_card.scenes import CARD, CPU, SIZES, StereoScene, mapper, step, stereo_scene, there, world_of
 
@@ -101,7 +101,7 @@ def _rendering(rows: Rows, row: tuple[int, int, int, int]) -> None:
 
 
 def _inspection(rows: Rows, row: tuple[int, int, int, int]) -> None:
-    import msgs_slam.pipelines.gaussians.render.cuda as cuda
+    import msgs_slam.pipelines.render.cuda as cuda
 
     found = []
     for module, device, kind in ((cuda, CARD.device, torch.float32), (reference, "cpu", torch.float64)):
@@ -112,7 +112,7 @@ def _inspection(rows: Rows, row: tuple[int, int, int, int]) -> None:
 
 
 def _culling(rows: Rows, row: tuple[int, int, int, int]) -> None:
-    import msgs_slam.pipelines.gaussians.render.cuda_projection as projection
+    import msgs_slam.pipelines.render.cuda_projection as projection
 
     scene = room(*row)
     means = scene.means * torch.tensor([3.0, 3.0, 1.0])

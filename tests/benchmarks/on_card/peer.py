@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from msgs_slam.pipelines.gaussians.render import render
+from msgs_slam.pipelines.render.api import render
 from msgs_slam.pipelines.types import Intrinsics
 from on_card.rows import Rows, first_seconds, milliseconds
 from on_card.scenes import CARD, SIZES, world_of

@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 from render_scenes import room
 from torch import Tensor
 
+from msgs_slam.pipelines.compute import gpu
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.depth.stereo.matching import StereoImages
 from msgs_slam.pipelines.depth.stereo.sweep import warps_to
-from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.gaussians.render import cards, render
 from msgs_slam.pipelines.mapping.optimise import MapOptimiser
 from msgs_slam.pipelines.mapping.schedule import Seeding, Step
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View, make_view
+from msgs_slam.pipelines.render.api import render
+from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.types import ProxyMaps
 
 REHEARSAL = os.environ.get("TRITON_INTERPRET") == "1"
@@ -71,7 +72,7 @@ class Place:
             yield self
             return
         takes = self.kernels
-        with mock.patch.object(cards, "takes_kernels", lambda example: takes and example.dtype == torch.float32):
+        with mock.patch.object(gpu, "supports_triton", lambda example: takes and example.dtype == torch.float32):
             yield self
 
 

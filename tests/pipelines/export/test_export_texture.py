@@ -5,10 +5,10 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.export import texture
 from msgs_slam.pipelines.export.atlas import Atlas, owners, simplified, unwrapped
 from msgs_slam.pipelines.export.texture import Shot, paint_texture, texels_wanted, vertex_normals, view_weights
-from msgs_slam.pipelines.gaussians.render.threads import get_threads, set_threads
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Intrinsics, SemanticMesh

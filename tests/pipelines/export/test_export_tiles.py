@@ -18,8 +18,8 @@ from msgs_slam.formats.gaussian_glb import read_gaussian_glb
 from msgs_slam.formats.gaussians import GaussianCloud
 from msgs_slam.pipelines.export import tiles
 from msgs_slam.pipelines.export.stage import export_run
-from msgs_slam.pipelines.gaussians.render import render
 from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.render.api import render
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.georeference import Georeference
 from msgs_slam.pipelines.scene.world import SAME, World

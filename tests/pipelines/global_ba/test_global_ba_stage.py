@@ -16,7 +16,6 @@ from msgs_slam.formats.jsonfile import write_json
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.camera import unproject
@@ -24,6 +23,7 @@ from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.stage import STAGE
 from msgs_slam.pipelines.mapping.views import occurring_classes
 from msgs_slam.pipelines.read_config import load_config
+from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.run.files import (
     BACKBONE,
     CALIBRATION,

@@ -5,7 +5,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from msgs_slam.pipelines.gaussians.ssim import ssim_map
+from msgs_slam.pipelines.compute.ssim import ssim_map
 from msgs_slam.pipelines.mapping import losses
 from msgs_slam.pipelines.mapping.exposure import expose, fit_exposure
 from msgs_slam.pipelines.mapping.losses import photo_loss, plain_photo_loss

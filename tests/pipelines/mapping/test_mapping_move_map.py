@@ -3,10 +3,10 @@
 import numpy as np
 import torch
 
-from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.mapping.move_map import follow_keyframes, move_map
+from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.types import Intrinsics
 
 CAMERA = Intrinsics(320, 240, 300, 300, 160, 120)

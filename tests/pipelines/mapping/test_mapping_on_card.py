@@ -15,8 +15,8 @@ if not ON_CARD:
     os.environ["TRITON_INTERPRET"] = "1"  # read when triton is imported and again when the kernels are
 pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip install 'msgs-slam[cuda-check]'")
 
+from msgs_slam.pipelines.compute import gpu  # noqa: E402
 from msgs_slam.pipelines.config import MappingConfig  # noqa: E402
-from msgs_slam.pipelines.gaussians.render import Rendering, cards  # noqa: E402
 from msgs_slam.pipelines.mapping import losses  # noqa: E402
 from msgs_slam.pipelines.mapping.exposure import expose, fit_exposure  # noqa: E402
 from msgs_slam.pipelines.mapping.load import MappingInput  # noqa: E402
@@ -32,6 +32,7 @@ from msgs_slam.pipelines.mapping.state import (  # noqa: E402
     OptimiserState,
 )
 from msgs_slam.pipelines.mapping.views import View  # noqa: E402
+from msgs_slam.pipelines.render.api import Rendering  # noqa: E402
 from msgs_slam.pipelines.types import VOID, Intrinsics  # noqa: E402
 from tests.card_builds import build  # noqa: E402
 
@@ -43,7 +44,7 @@ UNIT = 2.0
 @pytest.fixture(autouse=True)
 def kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     """The interpreter takes the tensors of the CPU: float32 ones go to the kernels, as those of a card would."""
-    monkeypatch.setattr(cards, "takes_kernels", lambda example: example.dtype == torch.float32)
+    monkeypatch.setattr(gpu, "supports_triton", lambda example: example.dtype == torch.float32)
 
 
 def made_view(size: tuple[int, int], classes: int, masked: bool, generator: torch.Generator) -> tuple[View, Tensor]:
@@ -131,7 +132,7 @@ def started(room: MappingInput) -> Any:
     views = [room.views[i] for i in range(3)]
     settings = MappingConfig(passes=1.0, min_iterations=0, seed_stride=3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cards, "takes_kernels", lambda example: False)
+        patch.setattr(gpu, "supports_triton", lambda example: False)
         return views, optimise_map(views, len(room.class_ids), settings, seed=0), len(room.class_ids)
 
 
@@ -142,7 +143,7 @@ def test_visits_are_those_of_the_cpu(started: Any, monkeypatch: pytest.MonkeyPat
     for takes, place in ((True, there), (False, lambda v: v)):
         # On a card the poses stay with the host, whose tensors no kernel takes.
         monkeypatch.setattr(
-            cards, "takes_kernels", lambda example, takes=takes: takes and (example.is_cuda or not ON_CARD)
+            gpu, "supports_triton", lambda example, takes=takes: takes and (example.is_cuda or not ON_CARD)
         )
         own = [place(v) for v in views]
         gaussians = type(first.gaussian_map)(

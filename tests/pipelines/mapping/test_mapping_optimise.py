@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.config import MappingConfig
-from msgs_slam.pipelines.gaussians.render import get_threads, set_threads
-from msgs_slam.pipelines.gaussians.seeding import SEED_LOGIT
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project_gaussians
 from msgs_slam.pipelines.mapping import growth, optimise, schedule
@@ -20,6 +19,7 @@ from msgs_slam.pipelines.mapping.measure import ViewFigures, measure_view
 from msgs_slam.pipelines.mapping.optimise import MapOptimiser, OptimisedMap, optimise_map, voted_logits
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View
+from msgs_slam.pipelines.render.seeding import SEED_LOGIT
 from msgs_slam.pipelines.types import VOID
 
 SETTINGS = MappingConfig(passes=6.0, min_iterations=0, snapshot_every=20, seed_stride=1)

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from msgs_slam.pipelines.config import MappingConfig
-from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.resampling import resize_depth
 from msgs_slam.pipelines.mapping import extending
@@ -18,6 +17,7 @@ from msgs_slam.pipelines.mapping.load import MappingInput, load_views, split_fra
 from msgs_slam.pipelines.mapping.move_map import interpolate_rows, move_trajectory
 from msgs_slam.pipelines.mapping.schedule import RATE_DECAY, Schedule, Seeding, keyframe_weights
 from msgs_slam.pipelines.mapping.views import channel_table, halved, occurring_classes
+from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.run.files import CALIBRATION, CLASSES, PROXY_MAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress

@@ -3,9 +3,10 @@
 import numpy as np
 import torch
 
-from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.gaussians.render import blending_weights, in_view, render
 from msgs_slam.pipelines.mapping.growth import CHILDREN, DensificationError, densification_error, split
+from msgs_slam.pipelines.render.api import in_view, render
+from msgs_slam.pipelines.render.gaussian_map import GaussianMap
+from msgs_slam.pipelines.render.inspection import blending_weights
 from msgs_slam.pipelines.types import Intrinsics
 
 CAMERA = Intrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0)

@@ -19,7 +19,6 @@ from msgs_slam.pipelines.depth.stereo.bands import Bands
 from msgs_slam.pipelines.depth.stereo.sweep import sweep_cost
 from msgs_slam.pipelines.frames.keyframes import choose_keyframes
 from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
-from msgs_slam.pipelines.gaussians.render import Rendering
 from msgs_slam.pipelines.mapping.objective import Objective
 from msgs_slam.pipelines.mapping.views import View, make_view
 from msgs_slam.pipelines.masks.files import open_masks
@@ -27,6 +26,7 @@ from msgs_slam.pipelines.masks.people import PeopleFinder, join_people, people_c
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.providers import DepthEstimate, LabelEstimate
 from msgs_slam.pipelines.read_config import load_config
+from msgs_slam.pipelines.render.api import Rendering
 from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame, Intrinsics

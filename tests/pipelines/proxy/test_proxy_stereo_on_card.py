@@ -15,6 +15,7 @@ pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip
 
 from test_proxy_stereo import CAMERAS, MATRIX, scene, view_of_plane  # noqa: E402
 
+from msgs_slam.pipelines.compute import gpu  # noqa: E402
 from msgs_slam.pipelines.depth.stereo import card, matching  # noqa: E402
 from msgs_slam.pipelines.depth.stereo.bands import Bands  # noqa: E402
 from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths  # noqa: E402
@@ -23,7 +24,6 @@ from msgs_slam.pipelines.depth.stereo.smoothing import smooth_cost  # noqa: E402
 from msgs_slam.pipelines.depth.stereo.sweep import sweep_cost, warps_to  # noqa: E402
 from msgs_slam.pipelines.depth.stereo.tiles import TILE  # noqa: E402
 from msgs_slam.pipelines.depth.stereo.volume import UNREACHED, Volume, pick_planes  # noqa: E402
-from msgs_slam.pipelines.gaussians.render import cards  # noqa: E402
 from tests.card_builds import build  # noqa: E402
 
 DEVICE = "cuda" if ON_CARD else "cpu"
@@ -121,8 +121,8 @@ def test_depths_are_fused_as_on_the_cpu() -> None:
 
 
 def test_a_keyframe_asks_for_few_launches(pictures: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
-    launched, right = [], cards.launch
-    monkeypatch.setattr(cards, "launch", lambda kernel, *a, **k: launched.append(kernel) or right(kernel, *a, **k))
+    launched, right = [], gpu.launch
+    monkeypatch.setattr(gpu, "launch", lambda kernel, *a, **k: launched.append(kernel) or right(kernel, *a, **k))
     small = matching.StereoImages(pictures[0][:6, :8].copy(), pictures[1][:, :6, :8].copy(), pictures[2])
     card.match_planes(small, PLANES[:4], DEVICE)
     assert len(launched) == (8 + 2) + (8 + 5)

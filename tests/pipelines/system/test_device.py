@@ -15,13 +15,13 @@ from msgs_slam.pipelines.config import Config, ExportConfig, GlobalBaConfig, Map
 from msgs_slam.pipelines.engine.stages import StageContext, run_stages
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.export.stage import export_run
-from msgs_slam.pipelines.gaussian_map import GaussianMap
 from msgs_slam.pipelines.mapping import growth
 from msgs_slam.pipelines.mapping import stage as mapping_stage
 from msgs_slam.pipelines.mapping.move_map import move_map
 from msgs_slam.pipelines.mapping.state import MapParameters, empty_map
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.reconstruct import all_stages
+from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.render_run import render_run
 from msgs_slam.pipelines.run.files import MAP, SPARSE, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder

@@ -109,7 +109,7 @@ def test_no_other_way_to_numba_and_no_fastmath():
 
 
 def test_kernels_run_and_are_cached_without_a_home(tmp_path):
-    code = "import numpy as np; from msgs_slam.pipelines.gaussians.render.cpu_bands import list_tiles; "
+    code = "import numpy as np; from msgs_slam.pipelines.render.cpu_bands import list_tiles; "
     code += "starts, members = list_tiles(np.array([20, 5, 1, 1, 0.5, 3], np.float32), 0, 40, 16); "
     code += "assert starts.tolist() == [0, 0, 1, 1]; print(sum(list_tiles.stats.cache_hits.values()))"
     environment = {**os.environ, "HOME": "/dev/null", "TMPDIR": str(tmp_path)}

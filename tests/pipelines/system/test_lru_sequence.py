@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from msgs_slam.pipelines.compute import threads
+from msgs_slam.pipelines.compute.threads import get_threads
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.gaussians.render import threads
-from msgs_slam.pipelines.gaussians.render.threads import get_threads
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system import limits
 from msgs_slam.pipelines.system.limits import available_cpus

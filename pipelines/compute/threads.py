@@ -1,0 +1,76 @@
+"""One pool of threads for the CPU kernels, which run without the GIL."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+from torch import Tensor
+
+from ..system.limits import available_cpus
+from . import gpu
+
+PART = 16384
+"""Gaussians that a thread takes at a time."""
+
+_state: dict[str, int] = {"threads": 0}
+_pools: dict[int, ThreadPoolExecutor] = {}
+
+
+def set_threads(count: int) -> None:
+    """Use `count` threads from now on, 0 for one per CPU this process may use. No result depends on it."""
+    if count < 0:
+        raise ValueError(f"threads: got {count}, expected >= 0")
+    _state["threads"] = count
+
+
+def get_threads() -> int:
+    """The number of threads in use, at least 1."""
+    if _state["threads"]:
+        return _state["threads"]
+    return available_cpus()
+
+
+def host_threads(example: Tensor) -> int:
+    """The number of threads in use where our loops on the host take tensors like `example`; 1 where Triton's kernels
+    take them or they lie on a card: kernels there wait for each other anyway, and Triton's interpreter has one state
+    for all threads."""
+    return get_threads() if example.device.type == "cpu" and not gpu.supports_triton(example) else 1
+
+
+def for_each(task: Callable[[int], None], count: int) -> None:
+    """Call task(0) .. task(count - 1), each once, spread over the threads; the first exception is raised."""
+    helpers = min(get_threads(), count) - 1
+    numbers = iter(itertools.count())  # next() on it is atomic: every number is handed out once
+
+    def work() -> None:
+        while (number := next(numbers)) < count:
+            task(number)
+
+    if helpers < 1:
+        work()
+        return
+    futures = [_pool(helpers).submit(work) for _ in range(helpers)]
+    try:
+        work()
+    finally:
+        for future in futures:
+            future.result()
+
+
+def _pool(size: int) -> ThreadPoolExecutor:
+    """Pools are kept: starting threads costs more than a small rendering."""
+    if size not in _pools:
+        _pools[size] = ThreadPoolExecutor(size, thread_name_prefix="render")
+    return _pools[size]
+
+
+def _forget_pools() -> None:
+    """A forked child has none of its parent's threads: work handed to the old pool would never run."""
+    _pools.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_pools)

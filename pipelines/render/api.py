@@ -1,0 +1,274 @@
+"""Drawing a map from a camera: projection (MSGS-SLAM eq. 5) around the compositing of eq. (6)-(9)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..compute import gpu
+from ..compute.jit import kernel
+from ..compute.threads import PART, for_each
+from ..geometry import se3
+from ..geometry.camera import project_gaussians
+from ..types import Intrinsics
+from . import reference
+
+NEAR = 0.01
+"""Gaussians whose centre is nearer than this (or behind the camera) are not drawn; in the unit of the map."""
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """features (H, W, C); depth (H, W) = depth sum / depth silhouette, 0 where nothing is seen; silhouette (H, W)."""
+
+    features: Tensor
+    depth: Tensor
+    silhouette: Tensor
+
+
+def render(
+    means: Tensor,
+    radii: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    cam_from_world: Tensor,
+    intrinsics: Intrinsics,
+    twist: Tensor | None = None,
+    near: float = NEAR,
+    backend: str | None = None,
+) -> Rendering:
+    """Draw M Gaussians from the pose exp(twist) @ cam_from_world; differentiable in all of them.
+
+    means (M, 3), radii (M,) world standard deviations, opacities (M,) 0..1, features (M, C), cam_from_world (4, 4),
+    twist (6,) translation first (see `pipelines.geometry.se3`). Pose and twist best stay on
+    the host where the Gaussians lie on a card: on six numbers a card is slower. Raises ValueError for wrong shapes, and
+    for NaN and infinity in what lies on the CPU.
+    """
+    pose = cam_from_world if twist is None else moved(cam_from_world, twist)
+    if (kernels := kernels_for(backend, means)) is not None:
+        size = (intrinsics.width, intrinsics.height)
+        check_arguments({"radii": radii, "opacities": opacities, "features": features}, *size)
+        records = kernels.project(means, radii, opacities, beside(pose, means), intrinsics, near)
+        shown, above, below, silhouette = kernels.composite_records(records, features, *size)
+        return Rendering(shown, kernels.depth_ratio(above, below), silhouette)
+    if not torch.is_grad_enabled():
+        rows = in_view(means, radii, pose, intrinsics, near)
+        means, radii, opacities, features = means[rows], radii[rows], opacities[rows], features[rows]
+    u, v, sigma_px, z = project_map(means, radii, pose, intrinsics, near)
+    image = composite(u, v, sigma_px, z, opacities, features, intrinsics.width, intrinsics.height, backend, near)
+    depth = depth_ratio(image.depth_sum, image.depth_silhouette)
+    return Rendering(image.features, depth, image.silhouette)
+
+
+def kernels_for(backend: str | None, example: Tensor) -> ModuleType | None:
+    """The kernels that also project, where tensors like `example` take them; they need no culling before."""
+    if backend != "cuda" and (backend is not None or not gpu.supports_triton(example)):
+        return None
+    return choose_backend("cuda", example)
+
+
+def moved(cam_from_world: Tensor, twist: Tensor) -> Tensor:
+    """exp(twist) @ cam_from_world in the pose's own precision (float64 in this project); raises ValueError for NaN in
+    a twist on the CPU."""
+    require_finite("twist", twist)
+    return se3.exp(twist.to(cam_from_world.dtype)) @ cam_from_world
+
+
+def project_map(
+    means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float = NEAR
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """u, v, sigma_px, z (M,) of the Gaussians in the camera; raises ValueError for NaN in what lies on the CPU."""
+    for name, tensor in (("means", means), ("radii", radii), ("cam_from_world", cam_from_world)):
+        require_finite(name, tensor)
+    if means.device.type == "cpu" and means.dtype == torch.float32:
+        from .cpu_projection import project  # imports numba
+
+        return project(means, radii, beside(cam_from_world, means), intrinsics, near)
+    points_in_cam = se3.transform(beside(cam_from_world, means), means)
+    return project_gaussians(points_in_cam, radii, intrinsics, near)
+
+
+def beside(numbers: Tensor, other: Tensor) -> Tensor:
+    """`numbers` where `other` lies and in its type; the gradient comes back in one copy."""
+    if numbers.device == other.device:
+        return numbers.to(other)
+    return _Beside.apply(numbers, other)
+
+
+class _Beside(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, numbers: Tensor, other: Tensor) -> Tensor:
+        ctx.device, ctx.dtype = numbers.device, numbers.dtype
+        return numbers.detach().to(other)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        return grads[0].to(ctx.device).to(ctx.dtype), None
+
+
+def depth_ratio(depth_sum: Tensor, depth_silhouette: Tensor) -> Tensor:
+    """Depth sum / depth silhouette with value and gradient 0 where no Gaussian is seen."""
+    seen = depth_silhouette > 1e-6
+    return torch.where(seen, depth_sum / torch.where(seen, depth_silhouette, 1.0), 0.0)
+
+
+@dataclass(frozen=True)
+class Composite:
+    """features (H, W, C); depth_sum, depth_silhouette, silhouette (H, W).
+
+    silhouette is 1 - T. depth_silhouette has the same values, and is what the depth sum is divided by: the gradient of
+    the depth comes back apart from that of the silhouette.
+    """
+
+    features: Tensor
+    depth_sum: Tensor
+    depth_silhouette: Tensor
+    silhouette: Tensor
+
+
+def composite(
+    u: Tensor,
+    v: Tensor,
+    sigma_px: Tensor,
+    z: Tensor,
+    opacity: Tensor,
+    features: Tensor,
+    width: int,
+    height: int,
+    backend: str | None = None,
+    near: float = 0.0,
+) -> Composite:
+    """Blend M Gaussians into a width x height image; differentiable in the first six arguments.
+
+    u, v, sigma_px (M,) pixels, pixel centres at half integers; z (M,) depth, ignored where <= near; opacity (M,) 0..1;
+    features (M, C). backend: "reference", "cpu", "cuda" or None for the fastest that runs these tensors. Raises
+    ValueError for wrong shapes, for NaN or infinity on the CPU (by the argument's name) and for an unknown backend.
+    """
+    arguments = {"u": u, "v": v, "sigma_px": sigma_px, "z": z, "opacity": opacity, "features": features}
+    check_arguments(arguments, width, height)
+    module = choose_backend(backend, u)
+    return Composite(*module.composite(u, v, sigma_px, z, opacity, features, width, height, float(near)))
+
+
+def check_arguments(arguments: dict[str, Tensor], width: int, height: int) -> None:
+    """Raise ValueError, naming the argument, for wrong shapes and values that are not finite."""
+    if width < 1 or height < 1:
+        raise ValueError(f"image size must be positive, got {width}x{height}")
+    count = len(next(iter(arguments.values())))
+    for name, tensor in arguments.items():
+        wanted = 2 if name == "features" else 1
+        if tensor.ndim != wanted or len(tensor) != count:
+            raise ValueError(
+                f"{name}: got shape {tuple(tensor.shape)}, expected {count} rows and {wanted} dimension(s)"
+            )
+        require_finite(name, tensor)
+
+
+def require_finite(name: str, tensor: Tensor) -> None:
+    """Raise ValueError if any element is NaN or infinite, of a tensor on the CPU.
+
+    Tensors of a card pass: each look would make the host wait for all that the card has still to do. Who keeps a map
+    there looks at it once in a while by `require_all_finite`.
+    """
+    if tensor.device.type == "cpu":
+        require_all_finite({name: tensor})
+
+
+def require_all_finite(tensors: Mapping[str, Tensor]) -> None:
+    """Raise ValueError, naming the tensor, if any element of any is NaN or infinite; on a card with a single read."""
+    # A sum is finite unless an element is not (or it overflows, which the second look settles): one pass, no copy.
+    if torch.isfinite(sum((x.detach().sum() for x in tensors.values()), torch.zeros(()))):
+        return
+    for name, tensor in tensors.items():
+        if not (finite := torch.isfinite(tensor.detach())).all():
+            bad = int((~finite).sum())
+            raise ValueError(f"{name}: {bad} of {tensor.numel()} values are NaN or infinite")
+
+
+def choose_backend(backend: str | None, example: Tensor) -> ModuleType:
+    """The module that composites tensors like `example`; without a choice, the fastest that can."""
+    name = backend or _fastest(example)
+    if name == "reference":
+        return reference
+    if name == "cpu":
+        from . import cpu  # importing numba takes a while: only where it is used
+
+        return cpu
+    if name == "cuda":
+        if not gpu.has_triton():
+            raise ValueError("backend: 'cuda' needs triton >= 3.3, which comes with torch >= 2.7 built for CUDA")
+        from . import cuda
+
+        return cuda
+    raise ValueError(f"backend: got {backend!r}, expected 'reference', 'cpu', 'cuda' or None")
+
+
+def _fastest(example: Tensor) -> str:
+    if example.device.type == "cpu" and example.dtype == torch.float32:
+        return "cpu"
+    return "cuda" if gpu.supports_triton(example) else "reference"
+
+
+@torch.no_grad()
+def in_view(means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float = NEAR) -> Tensor:
+    """(n,) indices of the Gaussians whose square reaches the image, a pixel to spare: no others take part in it."""
+    for name, tensor in (("means", means), ("radii", radii)):
+        require_finite(name, tensor)
+    k, pose = intrinsics, cam_from_world.to(means)
+    if means.device.type == "cpu" and means.dtype == torch.float32:
+        camera = np.array([k.fx, k.fy, k.cx, k.cy, k.width, k.height, near], np.float32)
+        centers, sizes, motion = (x.detach().contiguous().numpy() for x in (means, radii, pose))
+        parts = -(-len(centers) // PART)
+        found = [np.empty(0, np.int64)] * parts
+
+        def find(part: int) -> None:
+            own = slice(part * PART, (part + 1) * PART)
+            found[part] = _list_in_view(centers[own], sizes[own], motion, camera, own.start)
+
+        for_each(find, parts)
+        return torch.from_numpy(np.concatenate([np.empty(0, np.int64), *found]))
+    if gpu.supports_triton(means):
+        return torch.nonzero(marked_in_view(means, radii, pose, k, near))[:, 0]
+    u, v, sigma_px, z = project_gaussians(se3.transform(pose, means), radii, k, near)
+    reach = reference.CUT_SIGMAS * sigma_px + 1
+    seen = (z > near) & (u > -reach) & (u < k.width + reach) & (v > -reach) & (v < k.height + reach)
+    return torch.nonzero(seen)[:, 0]
+
+
+def marked_in_view(
+    means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float = NEAR
+) -> Tensor:
+    """(M,) bool: which are `in_view`, of tensors of one card; unlike a list it keeps nobody waiting for its length."""
+    from .cuda_projection import mark_in_view  # imports triton
+
+    return mark_in_view(means, radii, cam_from_world.to(means), intrinsics, near)
+
+
+@kernel
+def _list_in_view(
+    means: NDArray[np.float32], radii: NDArray[np.float32], pose: NDArray[np.float32], camera: NDArray[np.float32],
+    start: int,
+) -> NDArray[np.int64]:  # fmt: skip
+    """See `in_view`; camera: fx, fy, cx, cy, width, height, near; the first of these is Gaussian number `start`."""
+    fx, fy, cx, cy, width, height, near = camera
+    focal = np.sqrt(fx * fy) * np.float32(reference.CUT_SIGMAS)
+    out, count = np.empty(len(means), np.int64), 0
+    for i in range(len(means)):
+        x, y, z = means[i]
+        depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+        if depth > near:
+            # All lengths times the depth: nothing is divided.
+            reach = focal * radii[i] + depth
+            u = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) + cx * depth
+            v = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) + cy * depth
+            if u > -reach and v > -reach and u < width * depth + reach and v < height * depth + reach:
+                out[count] = start + i
+                count += 1
+    return out[:count].copy()

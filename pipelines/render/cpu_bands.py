@@ -1,0 +1,231 @@
+"""Which Gaussian goes where: bands of rows, the unit of work of a thread, and the tiles of a band.
+
+Everything is sized by a first counting pass, so a Gaussian may cover any number of bands and tiles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..compute.jit import inner, kernel
+from ..compute.threads import PART, for_each
+from . import reference
+
+F32 = np.float32
+TILE = 16
+BAND_ROWS = 32  # two rows of tiles: more would leave threads idle at the end, fewer would split more Gaussians
+RECORD = 6
+"""Numbers kept per Gaussian of a band: u, v, sigma_px, z, opacity, reach."""
+
+_ALPHA_MIN, _CUT2 = F32(reference.ALPHA_MIN), F32(reference.CUT_SIGMAS**2)
+_HALF, _ZERO, _ONE, _TWO = F32(0.5), F32(0), F32(1), F32(2)
+
+
+@inner
+def first_pixel(low: np.float32) -> int:
+    """The first pixel whose centre is >= low, if low > -1/2; else 0."""
+    return math.ceil(low - _HALF) if low > _HALF else 0
+
+
+@inner
+def last_pixel(high: np.float32, size: int) -> int:
+    """The last pixel below `size` whose centre is <= high; -1 if there is none."""
+    if high >= F32(size):
+        return size - 1
+    return math.floor(high - _HALF) if high >= _HALF else -1
+
+
+@dataclass(frozen=True)
+class Bands:
+    """What the bands of an image see. Band b sees the Gaussians entries[starts[b]:starts[b + 1]], near to far.
+
+    first (M,): the first band of a Gaussian; slots (M + 1,): Gaussians in several bands own the places
+    slots[i]:slots[i + 1], one a band, for what each of them has to say; prepared: per band its records and padded
+    features (`gather_band`) and where its tiles look in them (`list_tiles`).
+    """
+
+    first: NDArray[np.int32]
+    starts: NDArray[np.int64]
+    entries: NDArray[np.int32]
+    slots: NDArray[np.int64]
+    prepared: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64], NDArray[np.int32]]]
+
+    def __len__(self) -> int:
+        return len(self.prepared)
+
+    def own(self, band: int) -> NDArray[np.int32]:
+        """Indices of the Gaussians of a band, in the order of its records."""
+        return self.entries[self.starts[band] : self.starts[band + 1]]
+
+    @property
+    def straddling(self) -> NDArray[np.int64]:
+        """Indices of the Gaussians in several bands."""
+        return np.flatnonzero(np.diff(self.slots))
+
+
+def for_each_band(task: Callable[[int], None], starts: NDArray[np.int64]) -> None:
+    """Call task(0) .. task(B - 1), those of the most Gaussians first: at the end no thread waits long for another."""
+    order = np.argsort(starts[:-1] - starts[1:], kind="stable").tolist()
+    for_each(lambda n: task(order[n]), len(order))
+
+
+def split_into_bands(
+    projected: tuple[NDArray[np.float32], ...],
+    features: NDArray[np.float32],
+    channels: int,
+    width: int,
+    height: int,
+    near: float,
+) -> Bands:
+    """Everything about the Gaussians u, v, sigma_px, z, opacity (M,) and features (M, C) that bands need to know."""
+    reach, first, starts, entries, slots = bin_gaussians(projected, width, height, near)
+    bands = Bands(first, starts, entries, slots, [None] * (len(starts) - 1))  # type: ignore[list-item]
+
+    def prepare(band: int) -> None:
+        top = band * BAND_ROWS
+        own = bands.own(band)
+        own[:] = near_to_far(own, projected[3])
+        records, padded = gather_band(own, *projected, reach, features, channels)
+        bands.prepared[band] = (records, padded, *list_tiles(records, top, width, min(BAND_ROWS, height - top)))
+
+    for_each_band(prepare, starts)
+    return bands
+
+
+def bin_gaussians(
+    projected: tuple[NDArray[np.float32], ...], width: int, height: int, near: float
+) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
+    """How far from its centre each Gaussian is seen, in pixels (M,), 0 where it is not seen at all; and the first four
+    fields of `Bands`, entries in the order of their indices."""
+    count, bands, parts = len(projected[0]), -(-height // BAND_ROWS), -(-len(projected[0]) // PART)
+    reach, first, last = np.zeros(count, np.float32), np.zeros(count, np.int32), np.full(count, -1, np.int32)
+    counts = np.zeros((parts, bands), np.int64)
+
+    def own(part: int) -> slice:
+        return slice(part * PART, (part + 1) * PART)
+
+    def find(part: int) -> None:
+        here, size = own(part), (width, height, F32(near))
+        find_bands(*(x[here] for x in projected), *size, reach[here], first[here], last[here], counts[part])
+
+    for_each(find, parts)
+    spans = last.astype(np.int64) - first + 1
+    slots = np.concatenate([[0], np.cumsum(np.where(spans > 1, spans, 0))])
+    starts = np.concatenate([[0], np.cumsum(counts.sum(0))])
+    # Of each band the part's own place follows those of the parts before it.
+    places = starts[:-1] + np.cumsum(counts, axis=0) - counts
+    entries = np.empty(starts[-1], np.int32)
+    for_each(lambda part: list_bands(part * PART, first[own(part)], last[own(part)], places[part], entries), parts)
+    return reach, first, starts, entries, slots
+
+
+@kernel
+def find_bands(
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    sigma_px: NDArray[np.float32],
+    z: NDArray[np.float32],
+    opacity: NDArray[np.float32],
+    width: int,
+    height: int,
+    near: np.float32,
+    reach: NDArray[np.float32],
+    first: NDArray[np.int32],
+    last: NDArray[np.int32],
+    counts: NDArray[np.int64],
+) -> None:
+    """Fill in what is not 0 of `reach`, and the `first` and `last` band, of those that are seen; counts (B,): how many
+    are seen in each band."""
+    right, bottom = F32(width) - _HALF, F32(height) - _HALF
+    for i in range(len(u)):
+        if z[i] > near and opacity[i] > _ALPHA_MIN:
+            r = sigma_px[i] * np.sqrt(min(_CUT2, _TWO * np.log(opacity[i] / _ALPHA_MIN)))
+            if r > 0 and u[i] + r >= _HALF and u[i] - r <= right and v[i] + r >= _HALF and v[i] - r <= bottom:
+                top, low = first_pixel(v[i] - r), last_pixel(v[i] + r, height)
+                if low >= top:  # else it lies between two rows of pixels
+                    reach[i] = r
+                    first[i], last[i] = top // BAND_ROWS, low // BAND_ROWS
+                    for band in range(first[i], last[i] + 1):
+                        counts[band] += 1
+
+
+@kernel
+def list_bands(
+    start: int, first: NDArray[np.int32], last: NDArray[np.int32], places: NDArray[np.int64], entries: NDArray[np.int32]
+) -> None:
+    """The indices, from `start` on, of Gaussians with a `first` and `last` band into the `entries` of these bands, from
+    the band's own of `places` (B,) on, which move along."""
+    for i in range(len(first)):
+        for band in range(first[i], last[i] + 1):
+            entries[places[band]] = start + i
+            places[band] += 1
+
+
+def near_to_far(entries: NDArray[np.int32], z: NDArray[np.float32]) -> NDArray[np.int32]:
+    """The indices sorted by z > 0, equal depths in the order of their indices.
+
+    The bits of positive floats sort as the floats do: with the index behind them all keys differ, and numpy's fastest
+    sort, which is not stable, gives one result.
+    """
+    keys = z[entries].view(np.uint32).astype(np.uint64) << np.uint64(32) | entries.astype(np.uint64)
+    keys.sort()
+    return keys.astype(np.uint32).view(np.int32)
+
+
+@kernel
+def gather_band(
+    entries: NDArray[np.int32],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    sigma_px: NDArray[np.float32],
+    z: NDArray[np.float32],
+    opacity: NDArray[np.float32],
+    reach: NDArray[np.float32],
+    features: NDArray[np.float32],
+    channels: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The band's Gaussians side by side: records (n * RECORD,) and features padded with 0 to (n * channels,)."""
+    records = np.empty(len(entries) * RECORD, np.float32)
+    padded = np.zeros(len(entries) * channels, np.float32)
+    for k in range(len(entries)):
+        i, at = entries[k], k * RECORD
+        records[at], records[at + 1], records[at + 2] = u[i], v[i], sigma_px[i]
+        records[at + 3], records[at + 4], records[at + 5] = z[i], opacity[i], reach[i]
+        for c in range(features.shape[1]):
+            padded[k * channels + c] = features[i, c]
+    return records, padded
+
+
+@kernel
+def list_tiles(
+    records: NDArray[np.float32], top: int, width: int, rows: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Of a band from row `top`: the Gaussians that may touch tile t, near to far: members[starts[t]:starts[t + 1]]."""
+    count = len(records) // RECORD
+    across = (width + TILE - 1) // TILE
+    tiles = across * ((rows + TILE - 1) // TILE)
+    boxes = np.empty(4 * count, np.int32)
+    ends = np.zeros(tiles + 2, np.int64)
+    for k in range(count):
+        x, y, r = records[k * RECORD], records[k * RECORD + 1] - F32(top), records[k * RECORD + 5]
+        x0, x1 = first_pixel(x - r) // TILE, last_pixel(x + r, width) // TILE
+        y0, y1 = first_pixel(y - r) // TILE, last_pixel(y + r, rows) // TILE
+        boxes[4 * k], boxes[4 * k + 1], boxes[4 * k + 2], boxes[4 * k + 3] = x0, x1, y0, y1
+        for y_tile in range(y0, y1 + 1):
+            for x_tile in range(x0, x1 + 1):
+                ends[y_tile * across + x_tile + 2] += 1
+    for tile in range(tiles):
+        ends[tile + 2] += ends[tile + 1]
+    members = np.empty(ends[tiles + 1], np.int32)
+    for k in range(count):
+        for y_tile in range(boxes[4 * k + 2], boxes[4 * k + 3] + 1):
+            for x_tile in range(boxes[4 * k], boxes[4 * k + 1] + 1):
+                place = y_tile * across + x_tile + 1
+                members[ends[place]] = k
+                ends[place] += 1
+    return ends[: tiles + 1], members

@@ -1,0 +1,129 @@
+"""Median depth and blending weights against what the images already say."""
+
+import pytest
+import torch
+from render_scenes import random_gaussians, room
+
+from msgs_slam.pipelines.compute.threads import set_threads
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.render.api import choose_backend, in_view, render
+from msgs_slam.pipelines.render.inspection import (
+    blending_weights,
+    class_weights,
+    error_shares,
+    median_and_seen,
+    median_depth,
+)
+
+POSE = torch.eye(4, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_both_backends_agree(seed):
+    scene = random_gaussians(3000, 70, 90, 1, seed, sigma=(0.3, 30.0), opacity=(0.01, 0.6))
+    arguments = [scene[name] for name in ("u", "v", "sigma_px", "z", "opacity")]
+    counts = torch.rand(90, 70, generator=torch.Generator().manual_seed(seed))
+    exact = choose_backend("reference", scene["u"]).inspect(
+        *(x.double() for x in arguments), 70, 90, 0.0, counts.double()
+    )
+    for threads in (1, 3):
+        set_threads(threads)
+        ours = choose_backend("cpu", scene["u"]).inspect(*arguments, 70, 90, 0.0, counts)
+        for name, mine, theirs in zip(("median", "total", "largest"), ours, exact, strict=True):
+            torch.testing.assert_close(mine.double(), theirs, rtol=1e-4, atol=1e-5, msg=name)
+    set_threads(0)
+    assert (ours[0] > 0).float().mean() > 0.1
+
+
+def test_median_depth_is_a_surface_and_not_a_mean():
+    """Before a gap between two walls the mean depth floats between them, the median stands on one."""
+    scene = room(64, 48, 2000, 1)
+    median = median_depth(scene.means, scene.radii, scene.opacities, POSE, scene.intrinsics)
+    mean = render(scene.means, scene.radii, scene.opacities, scene.colors, POSE, scene.intrinsics)
+    assert median.shape == (48, 64)
+    covered = mean.silhouette > 0.55
+    assert covered.float().mean() > 0.9
+    assert (median[covered] > 0).all()
+    assert torch.isin(median[covered], scene.means[:, 2].contiguous()).all()
+    assert (median[covered] - mean.depth[covered]).abs().median() < 0.05
+    assert (median[mean.silhouette < 0.45] == 0).all()
+
+
+def test_summed_weights_are_the_gradient_of_a_feature_of_ones():
+    scene = room(64, 48, 2000, 1)
+    ones = torch.ones(2000, 3, requires_grad=True)
+    render(scene.means, scene.radii, scene.opacities, ones, POSE, scene.intrinsics).features.sum().backward()
+    weights = blending_weights(scene.means, scene.radii, scene.opacities, POSE, scene.intrinsics)
+    torch.testing.assert_close(weights.total, ones.grad[:, 0], rtol=1e-4, atol=1e-5)
+    assert (weights.largest <= weights.total + 1e-6).all()
+    assert 0.3 < weights.largest.max() <= 0.99
+
+
+def test_weights_by_class_are_those_of_the_pixels_of_the_class():
+    """Compiled, and by the gradient of the readable renderer; in patches, so that tiles show one class or several."""
+    scene = room(90, 70, 2000, 1)
+    generator = torch.Generator().manual_seed(0)
+    patches = torch.randint(0, 5, (4, 5), generator=generator, dtype=torch.uint8).repeat_interleave(18, 0)
+    channels, counts = patches.repeat_interleave(18, 1)[:70, :90], torch.rand(70, 90, generator=generator)
+    seen, beside = (scene.means, scene.radii, scene.opacities), (POSE, scene.intrinsics)
+    for classes in (1, 4):
+        found = torch.zeros(2000, classes).index_add_(0, *class_weights(*seen, *beside, channels, counts, classes))
+        exact = (x.double() for x in seen)
+        rows, plain = class_weights(*exact, *beside, channels, counts.double(), classes, backend="reference")
+        assert len(rows) == 2000
+        torch.testing.assert_close(found.double(), plain, rtol=1e-4, atol=1e-5)
+        counted = torch.where(channels < classes, counts, 0.0)
+        whole = blending_weights(*seen, *beside, counts=counted)
+        torch.testing.assert_close(found.sum(1), whole.total, rtol=1e-4, atol=1e-5)
+    assert (found > 0.01).float().mean(0).min() > 0.05
+
+
+def test_errors_are_shared_as_weights_say():
+    scene = room(90, 70, 2000, 1)
+    seen, beside = (scene.means, scene.radii, scene.opacities), (POSE, scene.intrinsics)
+    errors, footprints = error_shares(*seen, scene.colors, *beside, lambda colors: (colors - 0.3).abs().mean(-1))
+    shown = render(*seen, scene.colors, *beside).features
+    weights = blending_weights(*seen, *beside, counts=(shown - 0.3).abs().mean(-1))
+    torch.testing.assert_close(errors, weights.total, rtol=1e-5, atol=1e-6)
+    assert (footprints[errors > 0] > 0).all()
+    assert errors.max() > 0.1
+
+
+def test_unseen_gaussians_weigh_nothing():
+    scene = room(32, 24, 100, 1)
+    behind = scene.means * torch.tensor([1.0, 1.0, -1.0])
+    weights = blending_weights(behind, scene.radii, scene.opacities, POSE, scene.intrinsics)
+    assert (weights.total == 0).all()
+    assert (weights.largest == 0).all()
+    assert (median_depth(behind, scene.radii, scene.opacities, POSE, scene.intrinsics) == 0).all()
+
+
+def test_what_is_in_view_is_all_that_a_picture_depends_on():
+    """On both backends, and no more than a rim beside it."""
+    scene = room(64, 48, 2000, 1)
+    turned = se3.exp(torch.tensor([0.3, 0.0, 0.2, 0.0, 0.5, 0.1], dtype=torch.float64))
+    for backend, kind in (("cpu", torch.float32), ("reference", torch.float64)):
+        arguments = [x.to(kind) for x in (scene.means, scene.radii, scene.opacities, scene.colors)]
+        rows = in_view(*arguments[:2], turned, scene.intrinsics)
+        part, whole = (
+            render(*given, turned, scene.intrinsics, backend=backend).features
+            for given in ([x[rows] for x in arguments], arguments)
+        )
+        torch.testing.assert_close(part, whole, rtol=0, atol=0)
+        seen = blending_weights(*arguments[:3], turned, scene.intrinsics, backend=backend).total > 0
+        assert 100 < seen.sum() < len(rows) < 1.3 * seen.sum() + 50 < 2000
+
+
+def test_what_hides_behind_walls_is_not_seen_and_changes_nothing():
+    """Of a room twice as far behind the room only a little shines through; the picture is the same without the rest."""
+    scene = room(64, 48, 20_000, 1)
+    means, k = torch.cat([scene.means, 3 * scene.means]), scene.intrinsics
+    radii, opacities, colors = (torch.cat([x, x]) for x in (scene.radii, scene.opacities, scene.colors))
+    median, seen = median_and_seen(means, radii, opacities, POSE, k)
+    assert (median == median_depth(means, radii, opacities, POSE, k)).all()
+    assert len(seen) < 0.8 * len(in_view(means, radii, POSE, k))
+    with torch.no_grad():
+        part = render(means[seen], radii[seen], opacities[seen], colors[seen], POSE, k)
+        whole = render(means, radii, opacities, colors, POSE, k)
+    for name in ("features", "depth", "silhouette"):
+        assert (getattr(part, name) == getattr(whole, name)).all()
