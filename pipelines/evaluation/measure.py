@@ -178,7 +178,8 @@ def _measure(
         if (labels := matched.sequence.labels(index)) is not None:
             accuracy = _add_labels(measured, view, pixels.sample(labels))
     perceived = float("nan") if isinstance(measured.lpips, str) else measured.lpips(picture, photo)
-    likeness = psnr(picture, photo, None if left_out is None else ~left_out)
+    judged = left_out is None or not left_out.all()
+    likeness = psnr(picture, photo, None if left_out is None else ~left_out) if judged else float("nan")
     return MeasuredView(frame_id, kind, likeness, ssim(picture, photo), perceived, depth_l1, accuracy)
 
 

@@ -13,6 +13,8 @@ from ..types import SemanticMesh
 
 SHARE = 0.1
 """Vertices that are kept: with a texture they need to follow the shape only."""
+_FEWEST = 4
+"""Faces that a mesh is not simplified below."""
 _SMOOTH = 5.0
 """How readily fast-simplification goes on to worse edges (its `agg`; lower is slower and keeps the shape better)."""
 _GUTTER = 2
@@ -41,12 +43,15 @@ class Atlas:
 
 
 def simplified(mesh: SemanticMesh, share: float = SHARE) -> SemanticMesh:
-    """At most that share of the vertices (Garland and Heckbert 1997); colour and label are the nearest vertex's."""
+    """At most that share of the vertices (Garland and Heckbert 1997), down to four faces; colour and label are the
+    nearest vertex's."""
     from fast_simplification import simplify
 
     most, wanted = share * len(mesh.vertices), share * len(mesh.faces)
+    if len(mesh.faces) <= _FEWEST:
+        return mesh
     for _ in range(3):  # along open rims there are more vertices to a face than elsewhere
-        points, faces = simplify(mesh.vertices, mesh.faces, target_count=max(int(wanted), 4), agg=_SMOOTH)
+        points, faces = simplify(mesh.vertices, mesh.faces, target_count=max(int(wanted), _FEWEST), agg=_SMOOTH)
         points = points.astype(np.float32)
         used, renumbered = np.unique(faces[_areas(points, faces) > 0], return_inverse=True)
         if len(used) <= most:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 
 from ...formats.glb import Part, write_primitive
 from ..outcome import Outcome
@@ -36,8 +36,12 @@ def write_collision(outcome: Outcome, world: World, folder: Path) -> list[Path]:
 
 
 def with_floor(points: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """The mesh (V, 3), (F, 3) with z up, and a floor at z = 0, seen from above, under everything."""
-    rim = points[ConvexHull(points[:, :2]).vertices, :2]  # counterclockwise
+    """The mesh (V, 3), (F, 3) with z up, and a floor at z = 0, seen from above, under everything; without one where the
+    mesh is a line from above."""
+    try:
+        rim = points[ConvexHull(points[:, :2]).vertices, :2]  # counterclockwise
+    except QhullError:
+        return points, faces
     n, start = len(rim), len(points)
     fan = start + np.stack([np.zeros(n - 2, int), np.arange(1, n - 1), np.arange(2, n)], axis=1)
     floor = np.column_stack([rim, np.zeros(n)])

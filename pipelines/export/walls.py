@@ -108,7 +108,7 @@ class _Line:
 def find_walls(vertices: NDArray, faces: NDArray) -> list[Wall]:
     """Find the walls of a mesh (V, 3), (F, 3) with z up whose faces look into the room, longest first; corners meet."""
     upright = _upright_faces(vertices, faces)
-    if len(upright.area) == 0:
+    if len(upright.area) == 0 or upright.height <= 0:
         return []
     angles = [angle + turn for angle in _directions(upright) for turn in (0.0, np.pi)]
     walls: list[Wall] = []

@@ -50,6 +50,8 @@ def georeference(centers: Array, places: Array, metric: bool) -> tuple[Similarit
     residual = float(np.sqrt((np.abs(errors) ** 2).sum() / max(2 * inside.sum() - 4, 1)))
     spread = float(np.sqrt((np.abs(target[inside] - target[inside].mean()) ** 2).sum()))
     span = float(np.abs(target[inside] - target[inside].mean()).max())
+    if span < 1e-6:
+        return "all places are the same, as of one fix that the device has kept"
     if span < _LEAST_SPAN * residual:
         return f"the path spans {2 * span:.1f} m, too little against places that are {residual:.1f} m off"
     scale = abs(turn)
