@@ -37,6 +37,13 @@ MAX_IMAGE_PIXELS = 120_000_000
 """A larger image is refused by its header, before memory is spent on it (phones go to 108 million)."""
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif"})
+VIDEO_SUFFIXES = frozenset(
+    {
+    ".264", ".265", ".360", ".3g2", ".3gp", ".asf", ".avi", ".divx", ".dv", ".flv", ".gif", ".h264", ".h265", ".hevc",
+    ".insv", ".ivf", ".m2t", ".m2ts", ".m2v", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg",
+    ".mts", ".mxf", ".nut", ".ogg", ".ogv", ".qt", ".sens", ".ts", ".videos", ".vob", ".webm", ".wmv", ".y4m",
+}
+)  # fmt: skip
 _FORMATS = ("JPEG", "PNG", "BMP", "DIB", "TIFF", "WEBP", "GIF", "HEIF")
 _PLAIN_FORMATS = ("JPEG", "MPO", "PNG")
 _SEVERAL_IMAGES = ("TIFF", "WEBP", "PNG", "GIF")
@@ -87,6 +94,10 @@ def _why_no_images(folder: Path, files: list[Path]) -> str:
     raw = sorted({p.suffix.lower() for p in files} & RAW_SUFFIXES)
     if raw:
         return f"no readable image in {folder}: {', '.join(raw)} files are not supported, export them as JPEG first"
+    videos = sorted(p.name for p in files if p.suffix.lower() in VIDEO_SUFFIXES)
+    if videos:
+        more = f"{len(videos)} videos, such as {videos[0]}" if videos[1:] else f"the video {videos[0]}"
+        return f"no images in {folder}, but {more}: give one of them, or the folder to `msgs-slam batch`"
     hint = hint_at_inner_folder(folder)
     kinds = f"give the folder that directly holds the {', '.join(sorted(IMAGE_SUFFIXES))} files"
     return f"no images in {folder} ({len(files)} other files): {hint or kinds}"

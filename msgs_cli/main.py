@@ -54,6 +54,17 @@ class FriendlyGroup(click.Group):
         with only_json():
             sys.exit(super().main(args, *rest, **more | {"standalone_mode": False}))
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command, or say which one a file or folder in its place is meant for."""
+        path = Path(args[0])
+        if self.get_command(ctx, args[0]) is None and (path.suffix or path.exists()):
+            for_run = path.suffix == ".msgs" or (path / "manifest.json").exists()
+            meant = f"{'resume' if for_run else 'reconstruct'} {quoted(path)}"
+            ctx.fail(f"{args[0]!r} is no command; did you mean `msgs-slam {meant}`?")
+        return super().resolve_command(ctx, args)
+
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command inside the one error boundary."""
         try:
@@ -90,6 +101,20 @@ class SettingRefused(click.ClickException):
 
 _COMES_WITH = {"nerfstudio": "colmap"}
 """Of `export --only`: written together with another kind."""
+_MEANT = {"obj": "texture", "gltf": "glb", "usdz": "usd", "gaussians": "ply", "splat": "ply", "point_cloud": "ply",
+          "pointcloud": "ply", "poses": "tum", "trajectory": "tum", "transforms": "nerfstudio", "3dtiles": "tiles",
+          "web": "html", "page": "html", "map": "html", "svg": "floorplan", "plan": "floorplan"}  # fmt: skip
+"""What people call a kind of file → its name."""
+
+
+class KindOfFile(click.Choice[str]):
+    """The kinds of `export --only`, by the names of their formats too."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Take a format's name for its kind, then check as click does."""
+        return super().convert(_MEANT.get(str(value).lower(), str(value).lower()), param, ctx)
+
+
 _SYSTEM_REFUSES = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENAMETOOLONG}
 """What the user can do something about: rights, room, names."""
 
@@ -214,8 +239,8 @@ def resume(
 @main.command()
 @RUN_ARGUMENT
 @click.option(
-    "--only", type=click.Choice([*EXPORTS, *_COMES_WITH]),
-    help="Write one kind of file only; nerfstudio's comes with colmap. Default: all.",
+    "--only", type=KindOfFile([*EXPORTS, *_COMES_WITH]),
+    help="Write one kind of file only; nerfstudio's comes with colmap, an OBJ with texture. Default: all.",
 )  # fmt: skip
 @click.option("--to", type=FOLDER, metavar="DIR", help="Where to write. Default: RUN/export.")
 @settings_options

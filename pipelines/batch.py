@@ -15,6 +15,7 @@ from typing import Any
 from ..formats.atomic import own_temporaries, write_text
 from ..formats.datasets import looks_like_recording
 from ..formats.errors import InputError
+from ..formats.images import VIDEO_SUFFIXES
 from ..formats.jsonfile import write_json
 from .config import Config
 from .engine.engines import Call, Engine
@@ -28,11 +29,6 @@ from .run.records import load_records
 from .system.progress import Progress, log
 from .system.wording import markdown_table
 
-_VIDEOS = {
-    ".264", ".265", ".360", ".3g2", ".3gp", ".asf", ".avi", ".divx", ".dv", ".flv", ".gif", ".h264", ".h265", ".hevc",
-    ".insv", ".ivf", ".m2t", ".m2ts", ".m2v", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg",
-    ".mts", ".mxf", ".nut", ".ogg", ".ogv", ".qt", ".sens", ".ts", ".videos", ".vob", ".webm", ".wmv", ".y4m",
-}  # fmt: skip
 _MOST_NAMED = 5
 _NOT_LISTED = (".", "__MACOSX")
 """How names begin that nobody gave: hidden files, and what macOS adds to an archive."""
@@ -101,7 +97,7 @@ def _is_run(path: Path, runs: Path) -> bool:
 
 def _is_recording(path: Path) -> bool:
     if path.is_file():
-        return path.suffix.lower() in _VIDEOS
+        return path.suffix.lower() in VIDEO_SUFFIXES
     try:
         return path.is_dir() and looks_like_recording(path)
     except InputError:  # it may not be read, which its own attempt reports

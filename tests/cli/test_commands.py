@@ -12,10 +12,11 @@ from click.testing import CliRunner, Result
 
 from msgs_slam.formats.atomic import temporary_of
 from msgs_slam.formats.video_writer import write_video
-from msgs_slam.msgs_cli.main import main
+from msgs_slam.msgs_cli.main import KindOfFile, main
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.reconstruct import existing_config
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.names import EXPORTS
 from msgs_slam.pipelines.run.records import Manifest, Source, write_manifest
 from msgs_slam.pipelines.run.settings_file import save_settings
 
@@ -76,6 +77,36 @@ def refused(source: Path, out: Path, *options: object) -> str:
     assert result.exception is None or isinstance(result.exception, SystemExit)
     assert out.exists() == existed, "a refused source must leave no run folder"
     return result.stderr
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    [("room.mp4", "reconstruct room.mp4"), ("my room.MOV", "reconstruct 'my room.MOV'"), ("a.msgs", "resume a.msgs")],
+)
+def test_a_video_or_a_run_without_a_command(word: str, meant: str) -> None:
+    result = invoke(word)
+    assert result.exit_code == 2
+    assert f"did you mean `msgs-slam {meant}`?" in result.stderr
+
+
+def test_a_folder_without_a_command(tmp_path: Path) -> None:
+    assert f"`msgs-slam reconstruct {tmp_path}`" in invoke(tmp_path, "--out", "x").stderr
+    (tmp_path / "manifest.json").touch()
+    assert f"`msgs-slam resume {tmp_path}`" in invoke(tmp_path).stderr
+    assert "Did you mean" in invoke("reconstrct", "x").stderr
+
+
+def test_a_folder_of_videos_is_for_batch(tmp_path: Path) -> None:
+    for name in ("a.mp4", "b.MOV", "notes.txt"):
+        (tmp_path / name).write_bytes(b"x")
+    said = " ".join(refused(tmp_path, tmp_path / "run").split())
+    assert "but 2 videos, such as a.mp4: give one of them, or the folder to `msgs-slam batch`" in said
+
+
+@pytest.mark.parametrize(("word", "kind"), [("obj", "texture"), ("GLTF", "glb"), ("poses", "tum"), ("ply", "ply")])
+def test_kinds_of_files_by_the_names_of_their_formats(word: str, kind: str) -> None:
+    assert KindOfFile(EXPORTS).convert(word, None, None) == kind
+    assert invoke("export", "no_such_run", "--only", word).exit_code == 1, "no wrong usage"
 
 
 def test_missing_source(tmp_path: Path) -> None:
