@@ -83,6 +83,11 @@ def read_gaussian_ply(path: Path) -> GaussianCloud:
         raise InputError(f"{path} has no vertices: it is no Gaussian splat PLY")
     vertex = ply["vertex"].data
     names = vertex.dtype.names or ()
+    if "packed_position" in names:
+        raise InputError(
+            f"{path} is a compressed PLY of SuperSplat (PlayCanvas), which is not supported: export it there again as "
+            "an uncompressed PLY, or as .spz or .splat"
+        )
     if not set(_SCALES[:1] + _DC) <= set(names):
         kind = "a mesh" if "face" in ply else "a point cloud"
         raise InputError(f"{path} is {kind}, not a Gaussian splat PLY: it lacks f_dc_0..2 and scale_0..2")

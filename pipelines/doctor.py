@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .system.device import unused_card
 from .system.limits import available_cpus
 
 GOOD, NOTE, BAD = "ok", "note", "BAD"
@@ -151,10 +152,8 @@ def _gpu() -> Finding:
         return Finding(
             "gpu", GOOD, f"{properties.name}, {properties.total_memory / 1e9:.0f} GB; --device auto takes it"
         )
-    if shutil.which("nvidia-smi") or Path("/dev/nvidia0").exists():
-        built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "a CPU build"
-        fix = "install a CUDA build of torch that fits the driver (pytorch.org, Get started)"
-        return Finding("gpu", BAD, f"there is an NVIDIA driver, but torch ({built}) finds no device", fix)
+    if unused := unused_card():
+        return Finding("gpu", NOTE, *unused)
     return Finding("gpu", GOOD, "none; everything runs on the CPU")
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import functools
+import os
+import shutil
+from pathlib import Path
 
 from ...formats.errors import InputError
 from .progress import log
@@ -22,7 +25,27 @@ def resolve_device(wanted: str = "auto") -> str:
     return _told("cuda" if found else "cpu")
 
 
+def unused_card() -> tuple[str, str] | None:
+    """An NVIDIA driver whose card torch does not find, and what to install; None where there is none, or where
+    CUDA_VISIBLE_DEVICES hides it."""
+    import torch
+
+    has_driver = shutil.which("nvidia-smi") or Path("/dev/nvidia0").exists()
+    if torch.cuda.is_available() or not has_driver or os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1"):
+        return None
+    if torch.version.cuda is None:
+        fix = (
+            "install a CUDA build of torch that fits the driver (pytorch.org, Get started; on Linux pip install "
+            "--force-reinstall torch)"
+        )
+        return "there is an NVIDIA driver, but torch is a CPU build: everything runs on the CPU", fix
+    built = f"torch is built for CUDA {torch.version.cuda} and finds no device: everything runs on the CPU"
+    return f"there is an NVIDIA driver, but {built}", "update the driver, or install a torch for its CUDA version"
+
+
 @functools.cache
 def _told(device: str) -> str:
     log.info("device: %s", device)  # once
+    if device == "cpu" and (unused := unused_card()):
+        log.warning("%s. To use the card: %s", *unused)
     return device

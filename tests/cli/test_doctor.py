@@ -5,11 +5,13 @@ from collections import namedtuple
 from pathlib import Path
 
 import pytest
+import torch
 from click.testing import CliRunner
 
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines import doctor
 from msgs_slam.pipelines.doctor import BAD, GOOD, NOTE, Finding, examine
+from msgs_slam.pipelines.system import device
 
 
 def found(name: str, folder: Path) -> Finding:
@@ -52,3 +54,21 @@ def test_a_check_that_breaks_is_a_finding(tmp_path: Path, monkeypatch: pytest.Mo
     assert finding.state == BAD
     assert "no such bus" in finding.text
     assert found("viewer", tmp_path).state in (GOOD, NOTE)
+
+
+@pytest.mark.parametrize(("built", "fix"), [(None, "install a CUDA build of torch"), ("12.6", "update the driver")])
+def test_a_card_that_torch_cannot_use_is_a_note(
+    built: str | None, fix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(device.shutil, "which", lambda name: f"/usr/bin/{name}")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.version, "cuda", built)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    seen = found("gpu", tmp_path)
+    assert (seen.state, fix in seen.fix) == (NOTE, True)
+    device._told.cache_clear()
+    assert device.resolve_device("auto") == "cpu"
+    assert fix in caplog.text
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert found("gpu", tmp_path).state == GOOD
+    device._told.cache_clear()

@@ -136,3 +136,11 @@ def test_transforms_come_back_through_the_data_set_reader(tmp_path: Path) -> Non
     np.testing.assert_allclose(sequence.world_from_cam, poses, atol=1e-12)
     with pytest.raises(ValueError, match="got 2 images"):
         write_transforms(tmp_path / "transforms.json", 8, 6, 7.0, 7.5, 4.25, 3.0, names[:2], poses)
+
+
+def test_a_compressed_ply_is_named(tmp_path: Path) -> None:
+    packed = "".join(f"property uint packed_{name}\n" for name in ("position", "rotation", "scale", "color"))
+    head = f"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 1\n{packed}"
+    (tmp_path / "a.compressed.ply").write_bytes(f"{head}end_header\n".encode() + bytes(20))
+    with pytest.raises(InputError, match=r"compressed PLY of SuperSplat .*again as an uncompressed PLY"):
+        read_gaussians(tmp_path / "a.compressed.ply")
