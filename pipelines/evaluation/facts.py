@@ -152,8 +152,8 @@ def _about_texture(capture: Capture) -> list[str]:
     found = []
     if len(capture.points) and (poor := int((capture.points < 60).sum())) > 0.15 * len(capture.points):
         found.append(
-            f"{poor} of {len(capture.points)} keyframes see fewer than 60 points: bare walls give nothing to hold on "
-            "to; keep furniture, corners or pictures in view."
+            f"{poor} of {len(capture.points)} keyframes see fewer than 60 points. Possible causes: bare walls, blur or "
+            "little overlap; keep furniture, corners or pictures in view, and move slowly."
         )
     return found
 

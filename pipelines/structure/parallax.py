@@ -19,6 +19,7 @@ _MOVING_FRACTION = 0.01
 _TURN_ONLY_PX = 1.5
 _MIN_DISPLACEMENT_PX = 10.0
 _SAMPLED_PAIRS = 40
+_MOST_MATCH = 0.9
 _COARSE_FOCALS = np.geomspace(0.4, 4.0, 13)
 _FINE_FACTORS = np.geomspace(0.85, 1.18, 9)
 
@@ -28,7 +29,8 @@ def require_motion(largest_displacement: float) -> None:
     if largest_displacement < _MOVING_FRACTION:
         raise InputError(
             f"there is no parallax: over the whole source the image moves by at most {largest_displacement:.2%} of "
-            f"its width, the camera stands still, so no depth can be found. {HOW_TO_FILM}"
+            f"its width, so no depth can be found. Either the camera stands still, or the images are black or all the "
+            f"same: look at them. {HOW_TO_FILM}"
         )
 
 
@@ -53,6 +55,23 @@ def require_parallax(
             f"there is no parallax: turning the camera on the spot explains all matches of {len(moved)} pairs of views "
             f"to {unexplained:.1f} px, so no depth can be found. {HOW_TO_FILM}"
         )
+
+
+def why_no_structure(views: int, pairs: Sequence[VerifiedPair]) -> str:
+    """Say what may be wrong where no model was found of so many views, and what the matching pairs rule out."""
+    matched = len({view for pair in pairs for view in (pair.first, pair.second)})
+    if matched < _MOST_MATCH * views:
+        return (
+            f"no structure could be found among {views} views; pairs that match: {len(pairs)}. {views - matched} views "
+            "match no other. Possible causes: too little overlap, plain surfaces, blur, darkness, or things that move. "
+            "Film more slowly, in better light, or give images closer together"
+        )
+    return (
+        f"no structure could be found among {views} views; pairs that match: {len(pairs)}. {matched} views match "
+        "others, which rules out blur and plain surfaces. Possible causes: different lenses, zooms or crops among the "
+        "images, a fisheye lens (--camera fisheye, --intrinsics), a camera that hardly moves sideways, or things that "
+        "move and fill the image"
+    )
 
 
 def _least_unexplained(

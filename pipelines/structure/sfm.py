@@ -36,7 +36,7 @@ from .candidates import GIVEN_ALONE, Adjusted, Candidates, Views
 from .consistency import ModelReport, judge
 from .given import bare_model, set_best_focal
 from .lens import set_lens
-from .parallax import HOW_TO_FILM, require_parallax
+from .parallax import require_parallax, why_no_structure
 from .rolling import NO_READOUT, Readout, adjust_rolling, read_readout
 from .seams import cut, remove_keyframes
 from .window_models import WindowModels
@@ -112,10 +112,7 @@ class StructureFromMotion(Candidates):
         found, apart = (self._calibrated(views, pairs), []) if at_once else self._in_windows(windows, views, pairs)
         found = found or self._as_given(views, pairs)
         if found is None:
-            raise InputError(
-                f"no structure could be found among {len(features)} views; pairs that match: {len(pairs)}. They have "
-                f"too little texture or overlap, or are blurred. {HOW_TO_FILM}, slowly and in good light"
-            )
+            raise InputError(why_no_structure(len(features), pairs))
         found, pieces = self._largest_first(found, self._pieces(views, pairs, found.model, apart), views)
         report = judge(found.model, pairs, views.xy, self._places(features), self.config.overlap)
         cut(found.model, report.parts, report.total)

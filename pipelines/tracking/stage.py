@@ -81,8 +81,9 @@ def require_poses(context: StageContext, state: TrackState, frames: list[Frame],
     """Raise InputError where fewer than `least` frames have a pose."""
     if len(state.poses) < least:
         raise InputError(
-            f"{context.source}: no camera motion could be recovered from {len(frames)} frames. A still camera, pure "
-            "rotation or images without texture give no parallax; film while walking, or choose another part"
+            f"{context.source}: no camera motion could be recovered from {len(frames)} frames. Possible causes: a "
+            "camera that stands still or only turns, plain or blurred images, or wrong --intrinsics. "
+            "Move the camera sideways, or choose another part"
         )
 
 

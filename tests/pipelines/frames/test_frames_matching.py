@@ -27,7 +27,7 @@ from msgs_slam.pipelines.correspondence.snapshots import Snapshots
 from msgs_slam.pipelines.frames.keyframes import choose_keyframes
 from msgs_slam.pipelines.geometry.rig import ONE_CAMERA
 from msgs_slam.pipelines.structure.consistency import epipolar_error, judge, without_misplaced
-from msgs_slam.pipelines.structure.parallax import rotation_residual
+from msgs_slam.pipelines.structure.parallax import rotation_residual, why_no_structure
 from msgs_slam.pipelines.types import Features
 from tests.pipelines.frames.conftest import FOCAL, HEIGHT, WIDTH, render, sideways, turn
 
@@ -332,3 +332,11 @@ def test_keyframes_go_on_behind_a_blank_stretch() -> None:
     choice = choose_keyframes(((picture, None) for picture in [blank] * 3 + walk), 0.025)
     assert choice.keyframes[:2] == [0, 3]
     assert len(choice.keyframes) > 6
+
+
+def test_what_matches_rule_out_is_not_blamed() -> None:
+    pairs = [VerifiedPair(i, i + 1, np.zeros((9, 2), np.uint32), 2, np.zeros((3, 3, 3))) for i in range(9)]
+    assert "10 views match others, which rules out blur and plain surfaces. Possible" in why_no_structure(10, pairs)
+    few = why_no_structure(10, pairs[:2])
+    assert "pairs that match: 2. 7 views match no other. Possible causes: too little overlap" in few
+    assert "fisheye" not in few
