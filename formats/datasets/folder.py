@@ -43,7 +43,8 @@ def open_folder(path: Path) -> Sequence:
     distortion, depth_scale, pixel_centre), timestamps.txt, and traj.txt: world-from-camera, a 4x4 matrix or a TUM line
     for each image or each frame number. Raises InputError where one of them contradicts the images.
     """
-    folder = image_folder(path)
+    counts = _image_counts(path)
+    folder = _fullest(counts)
     if folder is None:
         raise InputError(f"no images in {path}: give the folder that holds the images, or one above rgb/ or images/")
     images = list_images(folder)
@@ -65,7 +66,7 @@ def open_folder(path: Path) -> Sequence:
         depth_per_metre=depth_scale or 1000.0,
         label_paths=label_paths,
         classes=_classes(root, label_paths),
-        notes=_unused_images(path, folder),
+        notes=_unused_images(counts, folder),
     )
 
 
@@ -74,7 +75,10 @@ def image_folder(path: Path) -> Path | None:
 
     A picture or two beside images/ are thumbnails or plots; the other way round images/ is something else's.
     """
-    counts = _image_counts(path)
+    return _fullest(_image_counts(path))
+
+
+def _fullest(counts: dict[Path, int]) -> Path | None:
     return max(counts, key=counts.__getitem__) if any(counts.values()) else None
 
 
@@ -82,8 +86,7 @@ def _image_counts(path: Path) -> dict[Path, int]:
     return {folder: count_images(folder) for folder in (path, *(path / name for name in _IMAGE_FOLDERS))}
 
 
-def _unused_images(path: Path, used: Path) -> tuple[str, ...]:
-    counts = _image_counts(path)
+def _unused_images(counts: dict[Path, int], used: Path) -> tuple[str, ...]:
     others = [f"{count} in {folder.name}/" for folder, count in counts.items() if count and folder != used]
     if not others:
         return ()

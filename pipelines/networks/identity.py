@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,17 @@ from .runtime import is_tflite
 
 
 def card_identity(card: Card) -> str:
-    """The contract and the bytes of the network and of all that it loads. InputError for weights elsewhere."""
+    """The contract and the bytes of the network and of all that it loads. InputError for weights elsewhere.
+
+    A file of the same size and time is read once a process: hundreds of megabytes are asked for at the begin and at the
+    end of a command.
+    """
+    files = [*filter(None, (card.model, card.head, card.text, card.tokenizer))]
+    return _identity(card, tuple((s.st_size, s.st_mtime_ns) for s in (p.stat() for p in files if p.exists())))
+
+
+@functools.lru_cache(maxsize=32)
+def _identity(card: Card, _: tuple[tuple[int, int], ...]) -> str:
     beside = []
     if not is_tflite(card.model):  # those carry all of their weights
         require_own_weights(card.model)

@@ -234,6 +234,15 @@ def test_a_file_of_unknown_size_is_continued_too(server: tuple[str, Behaviour], 
     assert [r for _, r in behaviour.requests] == ["", "bytes=300000-"]
 
 
+def test_the_small_depth_network_comes_before_the_large_one(tmp_path: Path) -> None:
+    models = ModelStore.open(tmp_path)
+    large, small = models.get("metric3d-large"), models.get("metric3d-small")
+    for model in (large, small):
+        with models.path(model).open("wb") as file:
+            file.truncate(model.bytes)  # a sparse file
+        assert models.first_here("depth") == model
+
+
 def test_a_model_that_needs_another_is_here_when_both_are(server: tuple[str, Behaviour], tmp_path: Path) -> None:
     models = ModelStore.open(tmp_path)
     dino = models.get("dinov2-small")

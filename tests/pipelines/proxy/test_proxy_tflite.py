@@ -94,6 +94,16 @@ def test_the_same_bytes_whatever_the_threads(tmp_path: Path) -> None:
     assert card_identity(card) != card_identity(replace(card, output="uint8"))
 
 
+def test_a_network_is_read_once_for_its_identity(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    card = replace(CARD, model=write_tflite(tmp_path / "net.tflite", COLOURS, [0, 0, 0.5], "argmax"))
+    first = card_identity(card)
+    with monkeypatch.context() as patch:
+        patch.setattr("msgs_slam.pipelines.networks.identity.files_sha256", lambda _: pytest.fail("read again"))
+        assert card_identity(card) == first
+    write_tflite(card.model, COLOURS, [0.5, 0, 0, 0.5], "argmax")
+    assert card_identity(card) != first
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
