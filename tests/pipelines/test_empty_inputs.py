@@ -9,8 +9,6 @@ import pytest
 import torch
 
 from msgs_slam.pipelines.depth.align import Anchors, align_keyframes, fit_fields
-from msgs_slam.pipelines.depth.posed import PosedDepth, neighbours, overlaps
-from msgs_slam.pipelines.depth.resize import resize_maps
 from msgs_slam.pipelines.depth.scales import COARSE, fit_to_points, keyframe_scale, scale_at_points
 from msgs_slam.pipelines.depth.see_through import contradicted
 from msgs_slam.pipelines.evaluation.camera_paths import orbit, resampled, smoothed
@@ -30,24 +28,26 @@ from msgs_slam.pipelines.export.texture import vertex_normals
 from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid
 from msgs_slam.pipelines.export.walls import find_walls
 from msgs_slam.pipelines.export.writers import seen_points
-from msgs_slam.pipelines.gaussian_map import GaussianMap
-from msgs_slam.pipelines.gaussians.seeding import complete_depth, fill_smoothly, seed_spacing
+from msgs_slam.pipelines.geometry.posed_depth import PosedDepth, neighbours, overlaps
+from msgs_slam.pipelines.geometry.resampling import resize_maps
+from msgs_slam.pipelines.geometry.room_layout import Gravity, find_gravity, floor_plane, levels, name_structure
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.mapping.depth_views import depth_view, drawn_view
+from msgs_slam.pipelines.geometry.voxels import Voxels, find_near, gather_depths, touching, voxel_keys
 from msgs_slam.pipelines.mapping.exposure import fit_exposure
-from msgs_slam.pipelines.mapping.label_votes import voted_logits
 from msgs_slam.pipelines.mapping.losses import depth_loss
+from msgs_slam.pipelines.mapping.measure import depth_view, drawn_view
+from msgs_slam.pipelines.mapping.optimise import voted_logits
 from msgs_slam.pipelines.mapping.region_prior import with_region_prior
 from msgs_slam.pipelines.mapping.submaps import nearest_seeing
 from msgs_slam.pipelines.mapping.views import halved, make_view, occurring_classes
-from msgs_slam.pipelines.metres.find import Seen, contradiction, usual_evidence
-from msgs_slam.pipelines.metres.scene import SeenFrame, build_scene
+from msgs_slam.pipelines.render.gaussian_map import GaussianMap
+from msgs_slam.pipelines.render.seeding import complete_depth, fill_smoothly, seed_spacing
+from msgs_slam.pipelines.scene.georeference import georeference
+from msgs_slam.pipelines.scene.lines import line_planes, up_of_lines
+from msgs_slam.pipelines.scene.metres import Seen, contradiction, usual_evidence
+from msgs_slam.pipelines.scene.upright import cameras_up
+from msgs_slam.pipelines.scene.view import SeenFrame, build_scene
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps, SemanticMesh
-from msgs_slam.pipelines.upright.find import cameras_up
-from msgs_slam.pipelines.upright.georeference import georeference
-from msgs_slam.pipelines.upright.lines import line_planes, up_of_lines
-from msgs_slam.pipelines.voxels.layout import Gravity, find_gravity, floor_plane, levels, name_structure
-from msgs_slam.pipelines.voxels.voxels import Voxels, find_near, gather_depths, touching, voxel_keys
 
 UP = np.array([0.0, -1, 0])
 EYE = np.eye(4)
