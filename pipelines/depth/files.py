@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ from ...formats.tensors import HEADERS
 from ..geometry.resampling import resample_nearest, resize_depth
 from ..providers import DepthEstimate, DepthProvider, Sequence
 from ..types import Frame
-from .matching_names import find_folder, match_files
+from .matching_names import as_read, find_folder, match_files
 
 _SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 _NAMES = ("depth",)
@@ -32,11 +34,19 @@ class FilesDepth(DepthProvider):
 
     metric = True
 
-    def __init__(self, folder: str, source: Path, sequence: Sequence, unit: float) -> None:
-        """Raises InputError unless the folder is there, frames find their files, and the first file fits the frames."""
+    def __init__(
+        self,
+        folder: str,
+        source: Path,
+        sequence: Sequence,
+        unit: float,
+        turns: Mapping[int, int] = MappingProxyType({}),
+    ) -> None:
+        """Raises InputError unless the folder is there, frames find their files, and the first file fits the frames;
+        `turns` are the quarter turns of frames that are not read upright."""
         if not unit > 0:
             raise InputError(f"proxy.depth_scale must be positive (metres per unit of the depth files), got {unit}")
-        self._sequence, self._unit = sequence, unit
+        self._sequence, self._unit, self._turns = sequence, unit, turns
         is_video = source.is_file()
         path = find_folder(folder, source, _NAMES, _SUFFIXES)
         self.name = f"files:{path}"
@@ -55,12 +65,13 @@ class FilesDepth(DepthProvider):
             empty = np.zeros((camera.height, camera.width), np.float32)
             return DepthEstimate(empty, empty)
         path = self._files[frame.id]
-        depth, invalid = clean_depth(_read(path, self._unit))
+        turn, full = self._turns.get(frame.id, 0), self._sequence.calibration.intrinsics
+        depth, invalid = clean_depth(as_read(_read(path, self._unit), turn, full))
         require_aspect(path, depth, self._sequence)
         depth = resize_depth(depth, camera.height, camera.width)
         confidence = (depth > 0).astype(np.float32)
         if frame.id in self._confidences:
-            given = read_grey_png(self._confidences[frame.id])
+            given = as_read(read_grey_png(self._confidences[frame.id]), turn, full)
             require_aspect(self._confidences[frame.id], given, self._sequence)
             confidence *= resample_nearest(given, camera.height, camera.width)
         return DepthEstimate(depth, confidence, invalid)
@@ -68,6 +79,10 @@ class FilesDepth(DepthProvider):
     def files(self) -> list[Path]:
         """Every file that it may read."""
         return [*self._files.values(), *self._confidences.values()]
+
+    def turned(self) -> set[Path]:
+        """Return the files of photos that are not read upright."""
+        return {files[i] for files in (self._files, self._confidences) for i in self._turns if i in files}
 
     def figures(self) -> dict[str, Any]:
         """Whether the folder had confidences too."""
@@ -86,14 +101,19 @@ def require_aspect(path: Path, array: NDArray, sequence: Sequence) -> None:
     require_size(path, array.shape[1], array.shape[0], sequence)
 
 
-def require_sizes(files: list[Path], sequence: Sequence) -> None:
-    """`require_aspect` of many files by their headers alone, without reading what they hold."""
+def require_sizes(files: list[Path], turned: Collection[Path], sequence: Sequence) -> None:
+    """`require_aspect` of many files by their headers alone, without reading what they hold; the `turned` are of photos
+    that are not read upright."""
+    full = sequence.calibration.intrinsics
     for path in files:
         if path.suffix.lower() == ".npy":
             height, width = _open_npy(path).shape
-            require_size(path, width, height, sequence)
         elif path.suffix.lower() in (".png", ".tif", ".tiff"):
-            require_size(path, *image_size(path), sequence)
+            width, height = image_size(path)
+        else:
+            continue
+        is_turned = path in turned and (width > height) != (full.width > full.height)
+        require_size(path, *((height, width) if is_turned else (width, height)), sequence)
 
 
 def require_size(path: Path, width: int, height: int, sequence: Sequence) -> None:

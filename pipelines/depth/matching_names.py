@@ -5,10 +5,13 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ...formats.errors import InputError
 from ...formats.images import natural_key
 from ...formats.reading import home_expanded, reaching
-from ..types import Frame
+from ..types import Frame, Intrinsics
 
 _KINDS = r"(colou?r|rgb|image|img|depth|disp|labels?|semantic|segmentation|class|conf|confidence)"
 _PREFIX = re.compile(rf"^{_KINDS}[._-]", re.IGNORECASE)
@@ -66,6 +69,12 @@ def match_files(
             f"({frames[0].name} …). Name each file by {rule}"
         )
     return found
+
+
+def as_read(array: NDArray, turn: int, frame: Intrinsics) -> NDArray:
+    """A map (h, w) of an upright photo, turned as the photo is; one that lies already as the frames do stays."""
+    is_turned = turn % 2 == 0 or (array.shape[1] > array.shape[0]) != (frame.width > frame.height)
+    return np.rot90(array, turn) if turn and is_turned else array
 
 
 def _list(folder: Path, suffixes: tuple[str, ...], names: tuple[str, ...]) -> list[Path]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from ...formats.errors import InputError
 from ...formats.images import read_label_png
 from ..depth.files import require_aspect
-from ..depth.matching_names import find_folder, match_files
+from ..depth.matching_names import as_read, find_folder, match_files
 from ..geometry.resampling import resample_nearest
 from ..networks.classes import MAX_ID, NamedClass, find_class_table, read_class_table
 from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, Sequence
@@ -33,25 +34,33 @@ class FilesLabels(SemanticsProvider):
 
     of_all = ("_label_of",)
 
-    def __init__(self, folder: str, source: Path, sequence: Sequence, progress: Progress) -> None:
-        """Raises InputError unless the folder is there, frames find their files, and the first file fits the frames."""
+    def __init__(
+        self,
+        folder: str,
+        source: Path,
+        sequence: Sequence,
+        progress: Progress,
+        turns: Mapping[int, int] = MappingProxyType({}),
+    ) -> None:
+        """Raises InputError unless the folder is there, frames find their files, and the first file fits the frames;
+        `turns` are the quarter turns of frames that are not read upright."""
         path = find_folder(folder, source, _NAMES, _SUFFIXES)
         self.name = f"files:{path}"
-        self._sequence, self._progress = sequence, progress
+        self._sequence, self._progress, self._turns = sequence, progress, turns
         self._files = match_files(path, _SUFFIXES, _NAMES, sequence.frames, source.is_file())
         self._table_file = find_class_table(path)
         self._table = read_class_table(self._table_file) if self._table_file else None
         self._label_of = np.full(MAX_ID + 1, VOID, np.uint8)
         self._classes = ClassTable((), ())
         self._outside: dict[int, int] = {}
-        self._read(next(iter(self._files.values())))
+        self._read(next(iter(self._files)))
 
     def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Count the ids of all frames and give labels to those that are classes. InputError for more than 254."""
         counts = np.zeros(MAX_ID + 1, np.int64)
-        files = [self._files[f.id] for f in frames if f.id in self._files]
-        for path in self._progress.track(files, "labels", len(files)):
-            counts += np.bincount(self._read(path).ravel(), minlength=MAX_ID + 1)
+        ids = [f.id for f in frames if f.id in self._files]
+        for frame_id in self._progress.track(ids, "labels", len(ids)):
+            counts += np.bincount(self._read(frame_id).ravel(), minlength=MAX_ID + 1)
         occurring = np.flatnonzero(counts).tolist()
         table = self._table or {i: NamedClass(f"class {i}") for i in occurring if i not in (VOID, MAX_ID)}
         kept = [i for i in occurring if i in table and not table[i].is_void]
@@ -85,7 +94,7 @@ class FilesLabels(SemanticsProvider):
         if frame.id not in self._files:
             labels = np.full((camera.height, camera.width), VOID, np.uint8)
         else:
-            labels = resample_nearest(self._label_of[self._read(self._files[frame.id])], camera.height, camera.width)
+            labels = resample_nearest(self._label_of[self._read(frame.id)], camera.height, camera.width)
         return LabelEstimate(labels, (labels != VOID).astype(np.float32))
 
     def classes(self) -> ClassTable:
@@ -96,11 +105,16 @@ class FilesLabels(SemanticsProvider):
         """Every file that it may read."""
         return [*self._files.values(), *([self._table_file] if self._table_file else [])]
 
+    def turned(self) -> set[Path]:
+        """Return the files of photos that are not read upright."""
+        return {self._files[i] for i in self._turns if i in self._files}
+
     def figures(self) -> dict[str, Any]:
         """Pixels whose id is not in the table, by id."""
         return {"label_ids_outside_table": {str(k): v for k, v in self._outside.items()}}
 
-    def _read(self, path: Path) -> NDArray[np.uint16]:
-        ids = read_label_png(path)
+    def _read(self, frame_id: int) -> NDArray[np.uint16]:
+        path, camera = self._files[frame_id], self._sequence.calibration.intrinsics
+        ids = as_read(read_label_png(path), self._turns.get(frame_id, 0), camera)
         require_aspect(path, ids, self._sequence)
         return ids

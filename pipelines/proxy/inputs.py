@@ -72,7 +72,7 @@ def check_proxy(source: Path, config: Config) -> None:
         opened.append(open_learned_semantics(around, semantics))
     for provider in opened:
         if isinstance(provider, FilesDepth | FilesLabels):
-            require_sizes(provider.files(), around.sequence)
+            require_sizes(provider.files(), provider.turned(), around.sequence)
 
 
 def _digest_of(files: list[Path]) -> str:

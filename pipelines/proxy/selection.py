@@ -26,6 +26,7 @@ from ..networks.network_pass import ResultCache, Workplace
 from ..networks.registry import ModelStore, default_cache
 from ..networks.words import with_words
 from ..providers import DepthProvider, SemanticsProvider, Sequence
+from ..source.opening import FolderSource
 from ..system.progress import Progress
 from .recording import RecordingDepth, RecordingLabels
 
@@ -160,14 +161,25 @@ def open_depth_files(around: ProviderContext, folder: str) -> FilesDepth | Recor
     """The depth of a folder; without one, that of the data set itself, or files beside the source."""
     if not folder and around.recording is not None:
         return RecordingDepth(around.recording, around.sequence)
-    return FilesDepth(folder, around.source, around.sequence, around.config.depth_scale)
+    turns = _turns_of(around)
+    return FilesDepth(folder, around.source, around.sequence, around.config.depth_scale, turns)
 
 
 def open_label_files(around: ProviderContext, folder: str) -> FilesLabels | RecordingLabels:
     """The labels of a folder; without one, those of the data set itself, or files beside the source."""
     if not folder and around.recording is not None:
         return RecordingLabels(around.recording, around.sequence, around.progress)
-    return FilesLabels(folder, around.source, around.sequence, around.progress)
+    turns = _turns_of(around)
+    return FilesLabels(folder, around.source, around.sequence, around.progress, turns)
+
+
+def _turns_of(around: ProviderContext) -> dict[int, int]:
+    """Frame id → anticlockwise quarter turns by which its photo is read otherwise than upright, where it is: those of a
+    phone that was turned between them are all turned alike."""
+    if around.recording is not None or not around.source.is_dir():
+        return {}
+    photos = FolderSource(around.source)
+    return {f.id: turn for f in around.sequence.frames if (turn := photos.turns_from_upright(f.source_index))}
 
 
 def _read(text: str) -> Card:

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from proxy_room import Room, write_source
 
 from msgs_slam.formats.errors import InputError
@@ -15,6 +16,14 @@ from msgs_slam.pipelines.depth.matching_names import frame_key
 from msgs_slam.pipelines.labels.files import FilesLabels
 from msgs_slam.pipelines.networks.classes import find_class_table, read_class_table
 from msgs_slam.pipelines.providers import DepthEstimate, Sequence
+from msgs_slam.pipelines.proxy.inputs import _before_frames, check_proxy
+from msgs_slam.pipelines.proxy.selection import (
+    choose_depth,
+    choose_semantics,
+    open_learned_depth,
+    open_learned_semantics,
+)
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics
 
@@ -205,6 +214,32 @@ def test_class_tables_of_all_kinds(tmp_path: Path, name: str, text: str, expecte
     table = read_class_table(found)
     assert table is not None
     assert {k: v.name for k, v in table.items()} == expected
+
+
+@pytest.mark.parametrize("common", [(1, 1, 6, 3), (6, 6, 1, 8)])
+def test_files_of_photos_that_are_turned_alike_lie_as_these(tmp_path: Path, common: tuple[int, ...]) -> None:
+    """A phone is held otherwise between photos; a network saw each of them upright."""
+    rng, turns = np.random.default_rng(0), {1: 0, 8: 1, 3: 2, 6: 3}
+    sensor = [rng.integers(1, 200, (48, 64), dtype=np.uint8) for _ in common]
+    for i, orientation in enumerate(common):
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        (tmp_path / "photos").mkdir(exist_ok=True)
+        Image.fromarray(np.dstack([sensor[i]] * 3)).save(tmp_path / "photos" / f"{i}.jpg", exif=exif)
+        upright = np.rot90(sensor[i], turns[orientation])
+        write_grey_png(tmp_path / "depth" / f"{i}.png", upright.astype(np.uint16) * 100)
+        write_grey_png(tmp_path / "labels" / f"{i}.png", upright)
+    depth, labels = f"proxy.depth=files:{tmp_path / 'depth'}", f"proxy.semantics=files:{tmp_path / 'labels'}"
+    config = load_config(None, [depth, labels])
+    check_proxy(tmp_path / "photos", config)
+    around = replace(_before_frames(tmp_path / "photos", config), progress=SilentProgress())
+    found = open_learned_depth(around, choose_depth(config.proxy))
+    kinds = open_learned_semantics(around, choose_semantics(config.proxy))
+    assert isinstance(kinds, FilesLabels)
+    for i, frame in enumerate(around.sequence.frames):
+        lying = np.rot90(sensor[i], turns[common[0]])
+        np.testing.assert_allclose(found.estimate(frame).depth, lying / 10, rtol=1e-6)
+        np.testing.assert_array_equal(kinds._read(frame.id), lying)
 
 
 @pytest.mark.parametrize("text", ["{", "[1, 2]", '{"classes": 3}', '{"-1": "a"}', "[]"])
