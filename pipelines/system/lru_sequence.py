@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from threading import RLock
+from threading import Lock
 from typing import Generic, TypeVar, overload
 
 from .memory import release_free_memory
@@ -23,7 +23,8 @@ class LruSequence(Sequence[T], Generic[T]):
         self._count, self._make, self._size_of, self._room = count, make, size_of, room
         self._kept: OrderedDict[int, T] = OrderedDict()
         self._used = 0
-        self._lock = RLock()
+        self._lock = Lock()
+        self._making: dict[int, Lock] = {}
 
     def __len__(self) -> int:
         return self._count
@@ -37,10 +38,15 @@ class LruSequence(Sequence[T], Generic[T]):
             return [self[i] for i in range(self._count)[index]]
         key = range(self._count)[index]  # raises IndexError, counts from the end
         with self._lock:
-            if key not in self._kept:
-                self.keep(key, self._make(key))
-            self._kept.move_to_end(key)
-            return self._kept[key]
+            making = self._making.setdefault(key, Lock())
+        with making:  # this one alone: others are had meanwhile, and nobody makes it twice
+            with self._lock:
+                if key in self._kept:
+                    self._kept.move_to_end(key)
+                    return self._kept[key]
+            value = self._make(key)
+            self.keep(key, value)
+            return value
 
     def keep(self, index: int, value: T) -> None:
         """Take a value that is at hand, the one that `make` would make."""

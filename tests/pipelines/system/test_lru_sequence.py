@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -72,6 +73,21 @@ def test_what_is_at_hand_is_taken_and_threads_get_what_they_ask_for() -> None:
     assert made == []
     with ThreadPoolExecutor(4) as pool:
         assert list(pool.map(values.__getitem__, [i % 40 for i in range(400)])) == [str(i % 40) for i in range(400)]
+
+
+def test_two_values_are_made_at_once_and_each_of_them_once() -> None:
+    made: list[int] = []
+    both = threading.Barrier(2, timeout=30)
+
+    def make(i: int) -> str:
+        made.append(i)
+        both.wait()
+        return str(i)
+
+    values = LruSequence(2, make, len, room=9)
+    with ThreadPoolExecutor(8) as pool:
+        assert list(pool.map(values.__getitem__, [0, 1] * 4)) == ["0", "1"] * 4
+    assert sorted(made) == [0, 1]
 
 
 def test_a_value_that_is_kept_again_counts_once() -> None:
