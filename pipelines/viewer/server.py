@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import re
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 import trimesh
@@ -28,6 +29,20 @@ _PREVIEW_WIDTH = 480
 _HELP = "Drag: turn. Right drag: move. Wheel: zoom. W A S D, Q E: fly. Two fingers: move and zoom."
 _GREY, _RED = "gray", (220, 38, 38)
 """Buttons of equal weight: none of them is what the page is for."""
+
+_P, _R = ParamSpec("_P"), TypeVar("_R")
+
+
+def _alone(method: Callable[Concatenate[Viewer, _P], _R]) -> Callable[Concatenate[Viewer, _P], _R]:
+    """A method of the viewer that no other such method runs beside: the page's callbacks, timers and the watch of a
+    run are threads, and a scene that one of them swaps is the one that another shows."""
+
+    @functools.wraps(method)
+    def locked(self: Viewer, *args: _P.args, **named: _P.kwargs) -> _R:
+        with self._lock:
+            return method(self, *args, **named)
+
+    return locked
 
 
 def open_viewer(path: Path, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
@@ -58,7 +73,7 @@ class Viewer:
         self._told = ""
         server.gui.configure_theme(show_logo=False)
         self.boxes: dict[str, Any] = {}
-        self._sending = threading.Lock()
+        self._lock = threading.RLock()
         self.selection: Selection | None = None
         self._load(scenes[0])
         self._add_controls()
@@ -77,6 +92,7 @@ class Viewer:
         self._path = self._add_path()
         self._mesh = self._add_mesh()
 
+    @_alone
     def choose(self, number: int) -> None:
         """Show another scene, as it begins."""
         self._remove_tools()
@@ -88,6 +104,7 @@ class Viewer:
         for client in self.server.get_clients().values():
             self._place(client)
 
+    @_alone
     def replace(self, scenes: list[ViewerScene]) -> None:
         """Show other scenes, as after another stage of the run: all controls are made anew. Whoever looks at the same
         world keeps the view, and the camera path its keyframes."""
@@ -109,6 +126,7 @@ class Viewer:
             else:
                 self._place(client)
 
+    @_alone
     def tell(self, text: str) -> None:
         """Put a line above the controls: what is shown of an unfinished run, and what is to come."""
         self._told = re.sub(r"[<>{}\[\]\\]", "?", text)  # of a folder's name, which the page could take for its own
@@ -120,21 +138,21 @@ class Viewer:
         """The address to open in a browser."""
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
+    @_alone
     def show(self, mode: str, client: Any = None) -> None:
         """Colour the Gaussians by one of `MODES`; depth is seen from where `client` looks, else the first camera."""
         s = self.scene
         if "legend" in vars(self):
             self.legend.content, self.legend.visible = legend_html(s), mode == "classes"
         colors = s.depth_colors(*self._eye(client)) if mode == "depth" else s.colors[mode]
-        with self._sending:
-            rows = np.arange(len(s.cloud)) if self.selection is None else np.flatnonzero(self.selection.rows)
-            box = self.boxes.get(f"Show {s.what}")
-            visible = len(rows) > 0 and (box is None or bool(box.value))
-            rows = rows if len(rows) else np.zeros(1, np.int64)  # a page cannot be sent none
-            self._splats = self.server.scene.add_gaussian_splats(
-                "/map", s.centers[rows], s.covariances[rows], colors[rows].astype(np.float32) / 255,
-                s.opacities[rows], visible=visible,
-            )  # fmt: skip
+        rows = np.arange(len(s.cloud)) if self.selection is None else np.flatnonzero(self.selection.rows)
+        box = self.boxes.get(f"Show {s.what}")
+        visible = len(rows) > 0 and (box is None or bool(box.value))
+        rows = rows if len(rows) else np.zeros(1, np.int64)  # a page cannot be sent none
+        self._splats = self.server.scene.add_gaussian_splats(
+            "/map", s.centers[rows], s.covariances[rows], colors[rows].astype(np.float32) / 255,
+            s.opacities[rows], visible=visible,
+        )  # fmt: skip
 
     def _eye(self, client: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(position, direction of view) as shown."""
@@ -181,7 +199,7 @@ class Viewer:
         depth_here.on_click(self._show_depth)
         gui.add_button("Reset view", color=_GREY).on_click(lambda event: self._place(event.client))
         gui.add_button("From above", color=_GREY).on_click(lambda event: self._look_down(event.client))
-        self._checkbox(f"Show {self.scene.what}", True, lambda on: setattr(self._splats, "visible", on))
+        self._checkbox(f"Show {self.scene.what}", True, self._show_splats)
         if self._cameras:
             self._checkbox("Cameras", True, self._show_cameras)
         if any(scene.mesh_file for scene in self.scenes):
@@ -200,6 +218,7 @@ class Viewer:
             self.tape = Tape(self.server, self.scene, self.selection)
             self.flight = Flight(self.server, self.scene)
 
+    @_alone
     def _remove_tools(self) -> None:
         if self.selection is not None:
             self.tape.switch.value = False
@@ -208,6 +227,7 @@ class Viewer:
             self._tools.remove()
             self.selection = None
 
+    @_alone
     def _show_depth(self, event: Any) -> None:
         self.mode.value = "depth"
         self.show("depth", event.client)
@@ -216,14 +236,21 @@ class Viewer:
         box = self.boxes[name] = self.server.gui.add_checkbox(name, start)
         box.on_update(lambda _: change(bool(box.value)))
 
+    @_alone
+    def _show_splats(self, on: bool) -> None:
+        self._splats.visible = on
+
+    @_alone
     def _show_cameras(self, on: bool) -> None:
         for handle in [*self._cameras, *([self._path] if self._path is not None else [])]:
             handle.visible = on
 
+    @_alone
     def _show_mesh(self, on: bool) -> None:
         if self._mesh is not None:
             self._mesh.visible = on
 
+    @_alone
     def _show_floor_plan(self, on: bool) -> None:
         """Walls as lines over the map, with their lengths; the box goes off where there are none to show."""
         self.server.scene.remove_by_name("/walls")
@@ -252,6 +279,7 @@ class Viewer:
         handle.on_click(lambda event: None if self.tape.switch.value else self.visit(camera, event.client))
         return handle
 
+    @_alone
     def visit(self, camera: ViewerCamera, client: Any) -> None:
         """Look from a camera, as after a click on it, and show its frame."""
         if client is not None:
@@ -267,6 +295,7 @@ class Viewer:
                 label = plain(str(error))
             self.preview.label = label
 
+    @_alone
     def _place(self, client: Any) -> None:
         """Behind and above the first camera, or outside a scene without cameras."""
         if self.scene.cameras:
@@ -278,6 +307,7 @@ class Viewer:
             return
         client.camera.position, client.camera.look_at = self._outside()
 
+    @_alone
     def _look_down(self, client: Any) -> None:
         """From so high that the whole scene is seen, what the first camera saw ahead at the top."""
         middle, up = np.median(self.scene.centers, axis=0).astype(np.float64), self.scene.up

@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 from finished import note_finished
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gaussian_ply import write_gaussian_ply
+from msgs_slam.formats.gaussians import isotropic_cloud
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.files import BACKBONE, FRAMES, MAP, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -98,6 +101,38 @@ def test_an_error_of_the_page_does_not_end_the_watch(
     watch.stop()
     assert any("IndexError: swapped meanwhile" in text for text in said)
     assert "cannot be shown as it is now" in caplog.text
+
+
+def test_a_scene_is_not_swapped_under_a_callback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page's threads show a scene while the watch of the run has the next one."""
+    pytest.importorskip("viser")
+    from msgs_slam.pipelines.viewer import server
+
+    for count in (20, 300):
+        ones = np.ones(count, np.float32)
+        means = np.random.default_rng(count).uniform(-1, 1, (count, 3)).astype(np.float32)
+        cloud = isotropic_cloud(means, -3 * ones, 4 * ones, np.full((count, 3), 0.5, np.float32))
+        write_gaussian_ply(tmp_path / f"{count}.ply", cloud)
+    in_callback, swapped, plain_legend = threading.Event(), threading.Event(), server.legend_html
+
+    def slow_legend(scene: ViewerScene) -> str:
+        if not in_callback.is_set():
+            in_callback.set()
+            swapped.wait(1)  # the swap waits, too, where it has to
+        return plain_legend(scene)
+
+    viewer = server.open_viewer(tmp_path / "20.ply", port=0)
+    try:
+        monkeypatch.setattr(server, "legend_html", slow_legend)
+        with ThreadPoolExecutor(1) as page:
+            shown = page.submit(viewer.show, "colour")
+            assert in_callback.wait(60)
+            viewer.replace(load_scenes(tmp_path / "300.ply"))
+            swapped.set()
+            shown.result(60)
+        assert len(viewer.scene.cloud) == 300
+    finally:
+        viewer.stop()
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
