@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..formats.errors import InputError
 from .config import Config
-from .geometry.alignment import Similarity
+from .geometry.se3 import Similarity
 from .geometry.sparse_model import SparseModel
 from .render.gaussian_map import GaussianMap
 from .run.files import (

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry import se3
-from ..geometry.alignment import Similarity, align_points
+from ..geometry.se3 import Similarity, align_points
 from ..types import require_shape
 
 Array = NDArray[np.float64]

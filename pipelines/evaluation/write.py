@@ -10,7 +10,7 @@ from ...formats.atomic import write_text
 from ...formats.datasets import Sequence
 from ...formats.images import write_rgb
 from ...formats.jsonfile import write_json
-from ..geometry.alignment import Similarity, align_points
+from ..geometry.se3 import Similarity, align_points
 from ..outcome import Outcome, evenly, load_outcome
 from ..run.folder import RunFolder
 from ..source.source_pixels import FramePixels

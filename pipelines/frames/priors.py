@@ -13,8 +13,8 @@ from ..correspondence.matching import VerifiedPair, match_pair
 from ..correspondence.snapshots import Snapshots, features_name
 from ..engine.stages import StageContext
 from ..structure.candidates import GIVEN_ALONE
+from ..structure.consistency import unexplained
 from ..structure.focal import calibrated
-from ..structure.freeing import unexplained
 from ..structure.lens import FOCAL_GUESS, unknown_camera
 from ..structure.sfm import Structure, StructureFromMotion, when_asked
 from ..system.parallel import parallel_map

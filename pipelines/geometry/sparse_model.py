@@ -11,7 +11,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from ..types import require_shape, rows_by
-from .alignment import Similarity
+from .se3 import Similarity
 
 
 @dataclass(frozen=True)

@@ -40,11 +40,9 @@ from ..tracking.pictures import Pictures, load_shutter
 from ..tracking.result import to_sparse_model
 from ..tracking.state import FEATURE_SD, TrackState
 from ..types import VOID, Intrinsics, Trajectory
-from .candidates import loop_candidates
+from .candidates import LabelSummary, loop_candidates, summarise_labels
 from .close import Closed, close_loops
-from .loops import FoundLoops, find_loops
-from .semantics import LabelSummary, summarise_labels
-from .verify import KeyframeView, Loop, make_view
+from .loops import FoundLoops, KeyframeView, Loop, find_loops, make_view
 
 Array = NDArray[np.float64]
 

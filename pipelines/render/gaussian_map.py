@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..geometry.alignment import Similarity
+from ..geometry.se3 import Similarity
 
 DECIDED_LOGIT = 1.0
 """A third of what a seed gives its class. Measured on true labels with void: 85 % of the void stays void, and of the

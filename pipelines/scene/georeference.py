@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.gps import enu_from_geodetic
-from ..geometry.alignment import Similarity
+from ..geometry.se3 import Similarity
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.alignment import Similarity
+from ..geometry.se3 import Similarity
 from ..outcome import Outcome
 from ..run.layouts import RunFile, dataclass_from_json
 from .georeference import Georeference

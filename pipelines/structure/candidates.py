@@ -15,17 +15,23 @@ import pycolmap
 from numpy.typing import NDArray
 
 from ..config import FramesConfig
-from ..correspondence.database import write_database
-from ..correspondence.matching import VerifiedPair
+from ..correspondence.matching import VerifiedPair, write_database
 from ..correspondence.snapshots import Snapshots
 from ..geometry.rig import ONE_CAMERA
 from ..system.lru_sequence import LruSequence
 from ..system.progress import Progress
 from ..types import Features
 from .adjust import CAUCHY_PX, adjust, filter_outliers, solve
-from .consistency import ModelReport, judge, without_misplaced
+from .consistency import (
+    LEAST_BETTER,
+    LEAST_GAIN_OF_FREEING,
+    ModelReport,
+    gain_of_freeing,
+    judge,
+    unexplained,
+    without_misplaced,
+)
 from .focal import calibrated
-from .freeing import LEAST_BETTER, LEAST_GAIN_OF_FREEING, gain_of_freeing, unexplained
 from .given import posed_model
 from .lens import FOCAL_GUESS, unknown_camera
 from .mappers import map_globally, map_incrementally

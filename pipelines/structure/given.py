@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ..correspondence.matching import VerifiedPair
 from ..geometry import se3
-from ..geometry.alignment import Similarity, best_rotation
+from ..geometry.se3 import Similarity, best_rotation
 from .adjust import filter_outliers, solve
-from .freeing import unexplained
+from .consistency import unexplained
 from .seams import LEAST_POINTS, remove_keyframes
 from .tracks import complete_tracks
 

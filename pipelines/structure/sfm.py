@@ -39,9 +39,8 @@ from .lens import set_lens
 from .parallax import require_parallax, why_no_structure
 from .rolling import NO_READOUT, Readout, adjust_rolling, read_readout
 from .seams import cut, remove_keyframes
-from .window_models import WindowModels
 from .window_size import SIZE, windows_of
-from .windows import adjust_joined
+from .windows import WindowModels, adjust_joined
 
 _PAIRS_PER_BLOCK = 64
 _FEATURES_SHARE = 0.25

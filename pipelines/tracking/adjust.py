@@ -20,8 +20,7 @@ from ..geometry.sparse_model import SparseModel
 from ..structure.bundle import Bundle, adjust_bundle, adjust_pose
 from ..structure.rolling import rectified_bundle, rectified_pixels, velocities
 from ..types import Intrinsics, ProxyMaps, rows_by
-from .rig_poses import sync_rig_poses
-from .state import Sightings, TrackState
+from .state import Sightings, TrackState, sync_rig_poses
 
 Array = NDArray[np.float64]
 

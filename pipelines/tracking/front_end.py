@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from ..correspondence.flow import FLOW_SD, follow
 from ..geometry.camera import project
 from .extend import promote, start_segment
-from .motion import predict_pose
 from .pictures import Pictures
-from .pnp import MIN_INLIERS, FramePose, solve_pose
+from .pnp import MIN_INLIERS, FramePose, predict_pose, solve_pose
 from .refine import compare_frame
 from .relocalise import relocalise
 from .state import NO_SIGHTINGS, Sightings, TrackState

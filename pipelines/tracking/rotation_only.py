@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 
 from ..correspondence.flow import corners, follow
 from ..correspondence.matching import match_descriptors
-from ..geometry.alignment import best_rotation
 from ..geometry.camera import project, unproject
+from ..geometry.se3 import best_rotation
 from ..types import Intrinsics
-from .motion import MAX_GAP
 from .pictures import Pictures
-from .pnp import MIN_INLIERS
+from .pnp import MAX_GAP, MIN_INLIERS
 from .state import NO_SIGHTINGS, TrackState
 
 Array = NDArray[np.float64]

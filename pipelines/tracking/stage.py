@@ -24,14 +24,12 @@ from ..system.values import load_value, save_value
 from ..system.wording import stretches
 from ..types import Frame
 from .adjust import Report, adjust_state, align_depths, without_dependent_depth
-from .carry import carry_given
 from .front_end import FrontEnd
 from .pictures import Pictures, load_shutter
 from .result import split_worlds, to_sparse_model, to_trajectory
-from .rig_poses import sync_rig_poses
 from .rotation_only import set_rotation_only_poses
-from .segments import join_segments, split_segments
-from .state import FEATURE_SD, TrackState
+from .segments import carry_given, join_segments, split_segments
+from .state import FEATURE_SD, TrackState, sync_rig_poses
 
 SNAPSHOT_EVERY, SNAPSHOTS = 50, 20
 """Frames between two; of a long recording no more are taken in all, since each holds all that is known so far."""

@@ -36,8 +36,7 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import pixel_centers, project
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth, neighbours
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.global_ba.candidates import loop_candidates
-from msgs_slam.pipelines.global_ba.semantics import summarise_labels
+from msgs_slam.pipelines.global_ba.candidates import loop_candidates, summarise_labels
 from msgs_slam.pipelines.structure.bundle import adjust_bundle
 from msgs_slam.pipelines.tracking.adjust import make_bundle
 from msgs_slam.pipelines.tracking.state import TrackState

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.formats.video_writer import write_video
-from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.run.files import BACKBONE, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import STAGES

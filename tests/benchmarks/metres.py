@@ -24,7 +24,7 @@ import numpy as np
 
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.trajectory import read_matrices
-from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.labels.learned import OnnxLabels
 from msgs_slam.pipelines.networks.network_pass import ResultCache, Workplace
 from msgs_slam.pipelines.networks.registry import ModelStore

@@ -157,7 +157,7 @@ def _poses(run: Any, until: str) -> tuple[list[int], Array]:
 def compare(cam_from_world: Array, truth: list[Array | None]) -> dict[str, float]:
     """ATE and its worst in centimetres, and rotations in degrees, where there is a truth."""
     from msgs_slam.pipelines.geometry import se3
-    from msgs_slam.pipelines.geometry.alignment import align_points, best_rotation
+    from msgs_slam.pipelines.geometry.se3 import align_points, best_rotation
 
     known = [k for k, t in enumerate(truth) if t is not None]
     if len(known) < 3:

@@ -21,7 +21,7 @@ from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.gaussians import GaussianCloud
 from msgs_slam.pipelines.evaluation.truth import MatchedTruth, match_truth
 from msgs_slam.pipelines.export.writers import map_cloud
-from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.geometry.tape import Touch, tape, touch
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder

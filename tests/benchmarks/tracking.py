@@ -298,7 +298,7 @@ def errors(
     metric: bool,
 ) -> dict[str, Any]:
     """Frames posed, ATE after Sim(3), after SE(3) where metric, scale error; centimetres and per cent."""
-    from msgs_slam.pipelines.geometry.alignment import align_points
+    from msgs_slam.pipelines.geometry.se3 import align_points
 
     out: dict[str, Any] = {"posed": int(posed.sum()), "frames": len(posed)}
     use = posed & np.array([t is not None for t in truth])

@@ -14,7 +14,7 @@ from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.jsonfile import write_json
 from msgs_slam.pipelines.config import Config, MappingConfig
-from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.run.files import CALIBRATION, CLASSES, MAP, PROXY_MAPS, TRAJECTORY, save_frames
 from msgs_slam.pipelines.run.folder import RunFolder

@@ -17,7 +17,7 @@ from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome, trajectory
 from msgs_slam.pipelines.evaluation.mesh_cells import mesh_cells
 from msgs_slam.pipelines.evaluation.truth import match_truth, true_trajectory
 from msgs_slam.pipelines.evaluation.write import write_evaluation
-from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import WORLD, World

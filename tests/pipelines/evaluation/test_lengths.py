@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.pipelines.evaluation.lengths import camera_height, extents, found_lengths, path_length
-from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.geometry.tape import tape_text
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import TRAJECTORY

@@ -17,7 +17,7 @@ from msgs_slam.formats.gaussian_ply import write_gaussian_ply
 from msgs_slam.formats.gaussians import isotropic_cloud
 from msgs_slam.formats.images import list_images, read_rgb
 from msgs_slam.pipelines.evaluation.image_quality import psnr
-from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.render_run import render_file, render_run
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import WORLD, World

@@ -13,7 +13,7 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.evaluation.report import write_report
-from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder

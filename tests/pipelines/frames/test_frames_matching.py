@@ -12,9 +12,8 @@ import pycolmap
 import pytest
 
 from msgs_slam.pipelines.correspondence import matching, retrieval
-from msgs_slam.pipelines.correspondence.database import write_database
 from msgs_slam.pipelines.correspondence.features import extract_features
-from msgs_slam.pipelines.correspondence.matching import VerifiedPair, match_descriptors, verify_matches
+from msgs_slam.pipelines.correspondence.matching import VerifiedPair, match_descriptors, verify_matches, write_database
 from msgs_slam.pipelines.correspondence.retrieval import (
     GlobalDescriptors,
     describe,

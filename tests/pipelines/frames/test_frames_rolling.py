@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import TrackingConfig
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.structure.bundle import Bundle, adjust_bundle
 from msgs_slam.pipelines.structure.lens import unknown_camera
 from msgs_slam.pipelines.structure.rolling import (

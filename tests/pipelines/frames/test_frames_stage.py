@@ -19,7 +19,7 @@ from msgs_slam.formats.jsonfile import read_json
 from msgs_slam.pipelines.correspondence.snapshots import Snapshots
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import run
-from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, SPARSE
 from msgs_slam.pipelines.run.folder import RunFolder

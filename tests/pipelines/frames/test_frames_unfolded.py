@@ -11,7 +11,7 @@ from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.correspondence.bridges import Picture
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair, verify_matches
 from msgs_slam.pipelines.correspondence.snapshots import Snapshots
-from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.structure.candidates import Views
 from msgs_slam.pipelines.structure.lens import unknown_camera
 from msgs_slam.pipelines.structure.sfm import StructureFromMotion

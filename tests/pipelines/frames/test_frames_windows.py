@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.correspondence.matching import VerifiedPair
 from msgs_slam.pipelines.frames.stage import STAGE
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
 from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import CALIBRATION
 from msgs_slam.pipelines.run.folder import RunFolder

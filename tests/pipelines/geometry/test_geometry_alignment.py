@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.pipelines.geometry.alignment import Similarity, align_points
+from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
 
 
 def random_similarity(rng: np.random.Generator) -> Similarity:

@@ -17,7 +17,7 @@ from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.depth_error import DepthErrorSum
 from msgs_slam.pipelines.evaluation.views import view_map
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.stage import STAGE
 from msgs_slam.pipelines.mapping.views import occurring_classes

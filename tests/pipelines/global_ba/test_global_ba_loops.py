@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.config import GlobalBaConfig, TrackingConfig
 from msgs_slam.pipelines.correspondence.retrieval import GlobalDescriptors, describe, learn_vocabulary
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba import loops
-from msgs_slam.pipelines.global_ba.candidates import loop_candidates, shared_points
+from msgs_slam.pipelines.global_ba.candidates import loop_candidates, shared_points, summarise_labels
 from msgs_slam.pipelines.global_ba.close import close_loops, reprojection_error
-from msgs_slam.pipelines.global_ba.loops import FoundLoops, find_loops
-from msgs_slam.pipelines.global_ba.semantics import summarise_labels
-from msgs_slam.pipelines.global_ba.verify import KeyframeView, make_view, verify_loop
+from msgs_slam.pipelines.global_ba.loops import FoundLoops, KeyframeView, find_loops, make_view, verify_loop
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.tracking.state import TrackState
 from msgs_slam.pipelines.types import Features, Intrinsics
@@ -183,8 +181,7 @@ def test_a_weak_loop_needs_a_neighbour_that_agrees(monkeypatch: pytest.MonkeyPat
     walk = make_walk()
     monkeypatch.setattr(loops, "SURE_INLIERS", 10**6)
     assert len(find_loops([(2, 37)], walk.views(), walk.model.cam_from_world, CAMERA, 0).loops) == 1
-    monkeypatch.setattr(loops, "ROTATION", 1e-4)
-    monkeypatch.setattr(loops, "TRANSLATION", 1e-5)
+    monkeypatch.setattr(loops, "AGREEMENT", 1e-3)
     found = find_loops([(2, 37)], walk.views(), walk.model.cam_from_world, CAMERA, 0)
     assert (len(found.loops), found.unsupported) == (0, 1)
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.global_ba.pose_graph import Edges, apply_step, optimise_pose_graph, residuals
+from msgs_slam.pipelines.global_ba.close import Edges, apply_step, optimise_pose_graph, residuals
 
 Array = NDArray[np.float64]
 

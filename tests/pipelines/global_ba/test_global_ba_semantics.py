@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from msgs_slam.pipelines.correspondence.retrieval import describe, learn_vocabulary
-from msgs_slam.pipelines.global_ba.semantics import richness, similarity, structure_similarity, summarise_labels
+from msgs_slam.pipelines.global_ba.candidates import richness, similarity, structure_similarity, summarise_labels
 from msgs_slam.pipelines.types import Features
 
 

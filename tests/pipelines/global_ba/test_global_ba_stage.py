@@ -17,8 +17,8 @@ from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.camera import unproject
+from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.stage import STAGE
 from msgs_slam.pipelines.mapping.views import occurring_classes

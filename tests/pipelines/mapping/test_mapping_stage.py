@@ -19,7 +19,7 @@ from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.export import stage as export_stage
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.export.volume import Grid
-from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.mapping import stage as mapping_stage
 from msgs_slam.pipelines.mapping.load import load_views
 from msgs_slam.pipelines.run.files import CLASSES, EXPOSURE, MAP, SPARSE, TRAJECTORY

@@ -13,7 +13,7 @@ from msgs_slam.formats.gps import enu_from_geodetic, photo_places, read_track
 from msgs_slam.formats.images import list_images
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.stage import export_run
-from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.georeference import georeference

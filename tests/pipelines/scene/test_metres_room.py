@@ -14,8 +14,8 @@ from msgs_slam.pipelines.config import Config, ExportConfig
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.export.stage import run as export
-from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.geometry.room_layout import CEILING, FLOOR, OTHER, Gravity
+from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.geometry.voxels import Voxels
 from msgs_slam.pipelines.networks.registry import _room_classes
 from msgs_slam.pipelines.run.files import DEPTH_FIELDS, FIGURES, TRAJECTORY

@@ -15,7 +15,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.stage import export_run, find_world
-from msgs_slam.pipelines.geometry.alignment import Similarity
+from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import MAP
 from msgs_slam.pipelines.run.folder import RunFolder

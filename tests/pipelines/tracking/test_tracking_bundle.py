@@ -8,8 +8,8 @@ import pytest
 
 from msgs_slam.pipelines.config import TrackingConfig
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.structure.bundle import Bundle, Problem, adjust_bundle, adjust_pose
 from msgs_slam.pipelines.tracking.adjust import adjust_state, consistent
 from msgs_slam.pipelines.tracking.pnp import colmap_camera

@@ -13,8 +13,7 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.tracking.extend import triangulate
-from msgs_slam.pipelines.tracking.motion import interpolate_pose, predict_pose
-from msgs_slam.pipelines.tracking.pnp import solve_pose
+from msgs_slam.pipelines.tracking.pnp import interpolate_pose, predict_pose, solve_pose
 from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics
 from tests.pipelines.tracking.conftest import KnownBundle

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import BACKBONE, FIGURES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
-from msgs_slam.pipelines.tracking.carry import lose_unfit, pose_lost
+from msgs_slam.pipelines.tracking.segments import lose_unfit, pose_lost
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 from msgs_slam.pipelines.types import GivenPoses
 from tests.matrices import write_matrices

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import BACKBONE, SPARSE, TRAJECTORY
 from msgs_slam.pipelines.tracking.stage import STAGE

@@ -7,12 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.alignment import align_points
 from msgs_slam.pipelines.geometry.rig import CUBE, Rig, rig_of, tie_cameras
+from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.structure.bundle import Bundle, adjust_bundle
-from msgs_slam.pipelines.tracking.rig_poses import sync_rig_poses
 from msgs_slam.pipelines.tracking.segments import split_segments
-from msgs_slam.pipelines.tracking.state import Sightings, TrackState
+from msgs_slam.pipelines.tracking.state import Sightings, TrackState, sync_rig_poses
 from msgs_slam.pipelines.types import Intrinsics
 
 STATIONS = 5

@@ -8,8 +8,8 @@ import pytest
 
 from msgs_slam.pipelines.correspondence.features import extract_features
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.alignment import Similarity
 from msgs_slam.pipelines.geometry.camera import unproject
+from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.tracking.relocalise import relocalise
 from msgs_slam.pipelines.tracking.segments import agree
 from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState

@@ -15,7 +15,7 @@ from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.correspondence.retrieval import describe
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.alignment import align_points
+from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, DEPTH_FIELDS, FRAMES, GIVEN_POSES, SPARSE, TRAJECTORY
 from msgs_slam.pipelines.tracking import adjust, pictures, stage
