@@ -11,7 +11,7 @@ PIP := -m pip install --quiet --disable-pip-version-check
 demo:
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python $(PIP) .
-	$(VENV)/bin/msgs-slam models pull --yes || echo "The demo goes on without networks: no names, no metres."
+	$(VENV)/bin/msgs-slam models pull --yes || echo "The demo goes on without networks: few names, less certain metres."
 	$(VENV)/bin/msgs-slam demo
 
 test: lint wheel

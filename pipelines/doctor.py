@@ -164,7 +164,7 @@ def _models() -> Finding:
     here = [model.name for model in store.models if store.is_here(model)]
     if here:
         return Finding("models", GOOD, f"{', '.join(here)} in {store.cache}")
-    text = f"none in {store.cache}: depth and regions come without networks, so no metres and few class names"
+    text = f"none in {store.cache}: without networks metres are less certain and few classes have names"
     return Finding("models", NOTE, text, "msgs-slam models pull")
 
 

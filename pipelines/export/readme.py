@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
+from ..networks.registry import ModelStore
 from ..scene.world import World
 from ..types import Metres
 
@@ -166,3 +170,16 @@ def readme(world: World, metres: Metres | None, metric: bool, only: str | None =
         textwrap.fill(line, WIDTH, break_on_hyphens=False) for line in (axes + lengths(metres, metric)).splitlines()
     ]
     return "\n".join(["What is in this folder", "", *entries, "", *about]) + "\n"
+
+
+def licences(figures: Iterable[Mapping[str, Any]], metres: Metres | None) -> str:
+    """Name the networks that figures of stages and the metres rest on, with their licences; "" without any."""
+    said = " ".join(str(value) for of_stage in figures for value in of_stage.values())
+    named = set(re.findall(r"(?:onnx|tflite):([\w.-]+)", said))
+    named |= set(re.findall(r"network ([\w.-]+)", metres.text if metres else ""))
+    lines = [
+        f"  {m.name}: {m.licence}{'' if m.commercial else ' (ask before commercial use)'}"
+        for m in ModelStore.open().models
+        if m.name in named
+    ]
+    return "\n".join(["\nNetworks that these results were made with, and their licences:", *lines, ""]) if lines else ""

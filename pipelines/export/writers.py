@@ -28,7 +28,7 @@ from ..run.files import CLASSES, LEFT_OUT, METRES
 from ..scene.world import WORLD, World
 from ..system.lru_sequence import LruSequence
 from ..system.wording import stretches
-from .readme import lengths, readme
+from .readme import lengths, licences, readme
 
 IMAGES, SPARSE = "images", "sparse/0"
 """Folders of a COLMAP data set by the names that trainers expect."""
@@ -179,5 +179,6 @@ def write_notes(outcome: Outcome, world: World, folder: Path) -> list[Path]:
 
 def write_readme(outcome: Outcome, world: World, folder: Path, only: str | None = None) -> Path:
     """README.txt: what each file is for, of all of them or of one of the `EXPORTS`."""
-    write_text(folder / "README.txt", readme(world, outcome.metres, outcome.metric, only))
+    text = readme(world, outcome.metres, outcome.metric, only)
+    write_text(folder / "README.txt", text + licences([r.figures for r in outcome.records.values()], outcome.metres))
     return folder / "README.txt"

@@ -18,6 +18,7 @@ from msgs_slam.formats.gaussian_glb import read_gaussian_glb
 from msgs_slam.formats.spz import read_spz
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export import textured
+from msgs_slam.pipelines.export.readme import licences
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
@@ -25,6 +26,7 @@ from msgs_slam.pipelines.run.files import FRAMES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import EXPORTS
 from msgs_slam.pipelines.scene.world import WORLD
+from msgs_slam.pipelines.types import Metres
 
 OracleRun = Callable[..., RunFolder]
 SETTINGS = ExportConfig(spz=True, splat_glb=True, texture=True, voxel=0.03)
@@ -148,6 +150,18 @@ def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
         notes = (tmp_path / only / "README.txt").read_text()
         assert expected[only] in notes
         assert "mesh.ply" not in notes
+
+
+def test_licences_of_the_networks_are_in_the_notes() -> None:
+    metres = Metres(3.7, 0.25, True, ("1 door", "the network fast-depth"))
+    figures = [{"depth": "onnx:metric3d-small+multiview", "semantics": "tflite:ade20k-small", "frames": 3}, {}]
+    said = licences(figures, metres)
+    assert "metric3d-small: code BSD-2-Clause" in said
+    assert "commercial use (ask before commercial use)" in said
+    assert "ade20k-small: Apache-2.0\n" in said
+    assert "fast-depth: " in said
+    assert "dinov2" not in said
+    assert licences([{"depth": "multiview", "semantics": "segments"}], None) == ""
 
 
 def test_rest_coefficients_on_request(run: RunFolder, tmp_path: Path) -> None:
