@@ -30,7 +30,8 @@ _HELP = "Drag: turn. Right drag: move. Wheel: zoom. W A S D, Q E: fly. Two finge
 _GREY, _RED = "gray", (220, 38, 38)
 """Buttons of equal weight: none of them is what the page is for."""
 
-_P, _R = ParamSpec("_P"), TypeVar("_R")
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 
 def _alone(method: Callable[Concatenate[Viewer, _P], _R]) -> Callable[Concatenate[Viewer, _P], _R]:
