@@ -56,9 +56,8 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
 def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | None, output: Output) -> None:
     """Compare RUN with the truth: poses, images, depth, labels, mesh. Writes RUN/evaluation/."""
     from ..formats.datasets import open_sequence
-    from ..pipelines.evaluation.class_map import open_class_map
-    from ..pipelines.evaluation.table import evaluation_table
-    from ..pipelines.evaluation.write import write_evaluation
+    from ..pipelines.evaluation.labels import open_class_map
+    from ..pipelines.evaluation.write import evaluation_table, write_evaluation
 
     joins = open_class_map(class_map) if class_map else None
     run = open_run(run_path)
@@ -78,7 +77,7 @@ def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | No
 @verbosity_options
 def report(run_path: Path, to: Path | None, pdf: bool, output: Output) -> None:
     """Write one HTML file that says what was found, how good it is, and what to film better."""
-    from ..pipelines.evaluation.pdf import find_browser, print_pdf
+    from ..pipelines.evaluation.html import find_browser, print_pdf
     from ..pipelines.evaluation.report import write_report
 
     browser = find_browser() if pdf else ""

@@ -82,7 +82,7 @@ class Run:
         """
         import numpy as np
 
-        from .pipelines.evaluation.measure import render_outcome
+        from .pipelines.evaluation.views import render_outcome
 
         pose = np.asarray(world_from_cam, np.float64)
         if pose.shape != (4, 4):

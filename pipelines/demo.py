@@ -13,8 +13,7 @@ from ..formats.datasets import open_sequence
 from ..formats.errors import InputError
 from ..formats.images import write_rgb
 from ..formats.video import VideoReader
-from .evaluation.table import evaluation_table
-from .evaluation.write import write_evaluation
+from .evaluation.write import evaluation_table, write_evaluation
 from .run.folder import RunFolder
 from .system.progress import Progress
 

@@ -1,6 +1,4 @@
-"""The finished map as a video or as images, along the run's own path or another."""
-
-from __future__ import annotations
+"""The finished map as a video or as images, along the run's own path, the same smoothed, a circle or another."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -9,16 +7,23 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation, Slerp
 
 from ..formats.browser_video import PLAYED, write_browser_video
 from ..formats.errors import InputError
 from ..formats.gaussian_files import read_gaussians
 from ..formats.images import write_rgb
 from ..formats.video_writer import CODECS, write_video
-from .evaluation.camera_paths import around, orbit, resampled, smoothed
-from .evaluation.measure import render_outcome
-from .evaluation.pictures import Picture, depth_picture, depth_range, label_picture
-from .evaluation.splat_views import SplatScene, draw_splats
+from .evaluation.views import (
+    Picture,
+    SplatScene,
+    depth_picture,
+    depth_range,
+    draw_splats,
+    label_picture,
+    render_outcome,
+)
 from .outcome import Outcome, load_outcome
 from .run.folder import RunFolder
 from .scene.world import WORLD, up_in_run
@@ -27,6 +32,11 @@ from .system.wording import quoted
 from .types import Intrinsics
 from .viewer.camera_path import EXPORTED, CameraPath, read_camera_path
 from .viewer.scene import up_of_file
+
+Array = NDArray[np.float64]
+
+_FROM_OUTSIDE = 1.4
+"""Sizes of a scene that one stands away from its middle: then it fills most of an image of 50 degrees."""
 
 KINDS = ("color", "depth", "labels", "side-by-side")
 PATHS = ("own", "smooth", "orbit")
@@ -254,3 +264,84 @@ def _draw(outcome: Outcome, world_from_cam: NDArray[np.float64], kind: str, near
     if kind == "side-by-side":
         return np.concatenate([draw() for draw in pictures.values()], axis=1)
     return pictures[kind]()
+
+
+def resampled(world_from_cam: Array, count: int) -> Array:
+    """(count, 4, 4) poses evenly along the path in frames: centres linear, rotations on the shortest arc."""
+    if len(world_from_cam) < 2:
+        return np.repeat(world_from_cam, count, axis=0)
+    at = np.linspace(0, len(world_from_cam) - 1, count)
+    known = np.arange(len(world_from_cam))
+    path = np.tile(np.eye(4), (count, 1, 1))
+    path[:, :3, :3] = Slerp(known, Rotation.from_matrix(world_from_cam[:, :3, :3]))(at).as_matrix()
+    path[:, :3, 3] = np.stack([np.interp(at, known, world_from_cam[:, k, 3]) for k in range(3)], axis=1)
+    return path
+
+
+def smoothed(world_from_cam: Array, sigma: float) -> Array:
+    """(N, 4, 4) the path without the tremble of the hand: Gaussian means over `sigma` frames."""
+    quat_xyzw = Rotation.from_matrix(world_from_cam[:, :3, :3]).as_quat()
+    # q and -q are one rotation; neighbours must have the same sign before they are averaged.
+    flips = np.cumprod(np.concatenate([[1.0], np.where((quat_xyzw[1:] * quat_xyzw[:-1]).sum(axis=1) < 0, -1.0, 1.0)]))
+    mean_quat = gaussian_filter1d(quat_xyzw * flips[:, None], sigma, axis=0, mode="nearest")
+    path = world_from_cam.copy()
+    path[:, :3, :3] = Rotation.from_quat(mean_quat).as_matrix()
+    path[:, :3, 3] = gaussian_filter1d(world_from_cam[:, :3, 3], sigma, axis=0, mode="nearest")
+    return path
+
+
+def orbit(world_from_cam: Array, scene_depth: float, count: int, up: Array) -> Array:
+    """(count, 4, 4) once round the place the cameras look at, at their usual distance and height.
+
+    scene_depth: the usual distance of the scene, which stands in where the cameras do not look at one place; up (3,)
+    unit vector in the world.
+    """
+    focus, radius, height = _focus(world_from_cam, up, scene_depth)
+    start = world_from_cam[0, :3, 3] - focus
+    first = start - (start @ up) * up
+    first = first / np.linalg.norm(first) if np.linalg.norm(first) > 1e-9 else _any_across(up)
+    second = np.cross(up, first)
+    angle = 2 * np.pi * np.arange(count) / count
+    centers = focus + radius * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second) + height * up
+    return _looking_at(centers, focus, up)
+
+
+def around(middle: Array, size: float, up: Array, count: int) -> Array:
+    """(count, 4, 4) once round a scene of which no camera is known, a little from above; `size` is its largest side."""
+    first = _any_across(up)
+    second = np.cross(up, first)
+    angle = 2 * np.pi * np.arange(count) / count
+    circle = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
+    return _looking_at(middle + _FROM_OUTSIDE * size * (circle + 0.25 * up), middle, up)
+
+
+def _focus(world_from_cam: Array, up: Array, scene_depth: float) -> tuple[Array, float, float]:
+    """(point nearest to all optical axes, usual horizontal distance to it, usual height above it)."""
+    centers, axes = world_from_cam[:, :3, 3], world_from_cam[:, :3, 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    # A little pull to the usual depth settles what parallel axes leave open.
+    usual = (centers + scene_depth * axes).mean(axis=0)
+    matrix = across.sum(axis=0) + 0.05 * len(axes) * np.eye(3)
+    focus = np.linalg.solve(matrix, (across @ centers[:, :, None]).sum(axis=0)[:, 0] + 0.05 * len(axes) * usual)
+    if np.median(((focus - centers) * axes).sum(axis=1)) < 0.2 * scene_depth:
+        focus = usual
+    away = centers - focus
+    heights = away @ up
+    radius = float(np.median(np.linalg.norm(away - heights[:, None] * up, axis=1)))
+    return focus, max(radius, 0.3 * scene_depth), float(np.median(heights))
+
+
+def _any_across(up: Array) -> Array:
+    side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    return np.asarray(side / np.linalg.norm(side))
+
+
+def _looking_at(centers: Array, target: Array, up: Array) -> Array:
+    forward = target - centers
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    path = np.tile(np.eye(4), (len(centers), 1, 1))
+    path[:, :3, 0], path[:, :3, 1], path[:, :3, 2] = right, np.cross(forward, right), forward
+    path[:, :3, 3] = centers
+    return path

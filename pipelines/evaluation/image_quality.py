@@ -1,13 +1,23 @@
-"""Similarity of a rendered image to a photograph."""
+"""Similarity of a rendered image to a photograph (PSNR, SSIM, LPIPS), and error of a rendered depth."""
 
-from __future__ import annotations
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ...formats.digest import file_sha256
+from ...formats.errors import InputError
 from ..compute.ssim import TAPS, similarity
+from ..networks.registry import Model, ModelStore
+from ..networks.runtime import open_runtime
 from ..types import require_shape
+
+Image = NDArray[np.uint8]
+Distance = Callable[[NDArray[np.float32], NDArray[np.float32]], float]
+_INPUTS = ("image0", "image1")
 
 
 def psnr(image: NDArray, truth: NDArray, mask: NDArray[np.bool_] | None = None) -> float:
@@ -37,3 +47,118 @@ def ssim(image: NDArray, truth: NDArray) -> float:
     a, b = (torch.from_numpy(x.astype(np.float64) / 255) for x in (image, truth))
     edge = TAPS // 2
     return float(similarity(a, b)[0][edge:-edge, edge:-edge].mean())
+
+
+class Lpips:
+    """Learned perceptual distance on AlexNet's features (Zhang et al., CVPR 2018, version 0.1); 0 = equal."""
+
+    def __init__(self, distance: Distance) -> None:
+        """`distance` compares two (1, 3, H, W) images in -1..1."""
+        self._distance = distance
+
+    def __call__(self, image: Image, truth: Image) -> float:
+        """Of two (H, W, 3) images in 0..255. Raises ValueError for different shapes."""
+        require_shape("image", image, truth.shape)
+        return self._distance(_scaled(image), _scaled(truth))
+
+
+def open_lpips() -> Lpips | str:
+    """The measure, or why there is none: the file, or the package with its weights, is not here. Downloads nothing."""
+    store = ModelStore.open()
+    model = store.first_here("perceptual")
+    return _by_package() if model is None else _by_file(store, model)
+
+
+def _by_file(store: ModelStore, model: Model) -> Lpips | str:
+    """Raises InputError for a file of the right hash that onnxruntime cannot run."""
+    path = store.path(model)
+    if file_sha256(path) != model.sha256:
+        return f"{path} is damaged: delete it, then msgs-slam models pull {model.name} --from FOLDER"
+    runtime = open_runtime(path, [], torch.get_num_threads(), "cpu")
+    if tuple(runtime.inputs) != _INPUTS or len(runtime.outputs) != 1:
+        raise InputError(f"{path}: its inputs are {', '.join(runtime.inputs)}; another kind of file is needed")
+
+    def distance(image: NDArray[np.float32], truth: NDArray[np.float32]) -> float:
+        found = runtime.run(list(runtime.outputs), dict(zip(_INPUTS, (image, truth), strict=True)))
+        return float(found[0].item())
+
+    return Lpips(distance)
+
+
+def _by_package() -> Lpips | str:
+    try:
+        import lpips
+        from torchvision.models import AlexNet_Weights
+    except ImportError:
+        return "needs the model lpips-alex (msgs-slam models pull --from FOLDER) or pip install 'msgs-slam[lpips]'"
+    except RuntimeError as error:  # torchvision of another build than torch
+        return f"the package lpips cannot be loaded: {error}"
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / AlexNet_Weights.IMAGENET1K_V1.url.rsplit("/", 1)[1]
+    if not weights.exists():
+        return f"AlexNet's weights are not in {weights.parent}: python -c \"import lpips; lpips.LPIPS(net='alex')\""
+    model = lpips.LPIPS(net="alex", verbose=False).eval()
+
+    @torch.no_grad()
+    def distance(image: NDArray[np.float32], truth: NDArray[np.float32]) -> float:
+        return float(model(torch.from_numpy(image), torch.from_numpy(truth)).item())
+
+    return Lpips(distance)
+
+
+def _scaled(image: Image) -> NDArray[np.float32]:
+    """(1, 3, H, W) in -1..1, as the network was trained."""
+    return np.ascontiguousarray((image.astype(np.float32) / 127.5 - 1).transpose(2, 0, 1)[None])
+
+
+@dataclass(frozen=True)
+class DepthError:
+    """metric_l1: mean |depth - truth| in metres as it is; scaled_l1: after one scale for the whole sequence;
+    scale: that factor; valid_fraction: share of the pixels with truth where there is a depth at all; pixels: those
+    compared."""
+
+    metric_l1: float
+    scaled_l1: float
+    scale: float
+    valid_fraction: float
+    pixels: int
+
+
+class DepthErrorSum:
+    """Depth L1 over a sequence, frame by frame.
+
+    Depths are first multiplied by the scale of the trajectory's alignment where the caller asks for it; the one scale
+    of `scaled_l1` is the median of truth / depth over a sample of all pixels.
+    """
+
+    def __init__(self, samples_a_frame: int = 20000) -> None:
+        self._samples_a_frame = samples_a_frame
+        self._errors = 0.0
+        self._compared = 0
+        self._truths = 0
+        self._samples: list[NDArray[np.float32]] = []
+
+    def add(self, depth: NDArray[np.float32], truth: NDArray[np.float32]) -> None:
+        """One frame, both (H, W) in metres, 0 = unknown."""
+        require_shape("depth", depth, truth.shape)
+        known = truth > 0
+        both = known & (depth > 0) & np.isfinite(depth)
+        self._truths += int(known.sum())
+        self._compared += int(both.sum())
+        self._errors += float(np.abs(depth[both].astype(np.float64) - truth[both]).sum())
+        pairs = np.stack([depth[both], truth[both]], axis=1)
+        # Every k-th pixel: even over the image, and the same on every run.
+        self._samples.append(pairs[:: max(1, len(pairs) // self._samples_a_frame)])
+
+    def result(self) -> DepthError | None:
+        """None where no pixel could be compared."""
+        if self._compared == 0:
+            return None
+        sample = np.concatenate(self._samples).astype(np.float64)
+        scale = float(np.median(sample[:, 1] / sample[:, 0]))
+        return DepthError(
+            metric_l1=self._errors / self._compared,
+            scaled_l1=float(np.abs(scale * sample[:, 0] - sample[:, 1]).mean()),
+            scale=scale,
+            valid_fraction=self._compared / self._truths,
+            pixels=self._compared,
+        )

@@ -1,7 +1,5 @@
 """Which truth belongs to which frame of a run, pixel by pixel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

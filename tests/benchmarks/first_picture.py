@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.mesh import read_mesh_ply
-from msgs_slam.pipelines.evaluation.measure import render_outcome
-from msgs_slam.pipelines.evaluation.pictures import label_picture
+from msgs_slam.pipelines.evaluation.views import label_picture, render_outcome
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import WORLD

@@ -33,9 +33,8 @@ from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.depth.align import fit_fields
 from msgs_slam.pipelines.depth.fields import FINE, field_scales
-from msgs_slam.pipelines.evaluation.depth_error import DepthErrorSum
-from msgs_slam.pipelines.evaluation.image_quality import psnr, ssim
-from msgs_slam.pipelines.evaluation.label_score import count_labels, score
+from msgs_slam.pipelines.evaluation.image_quality import DepthErrorSum, psnr, ssim
+from msgs_slam.pipelines.evaluation.labels import count_labels, score
 from msgs_slam.pipelines.evaluation.views import view_map
 from msgs_slam.pipelines.mapping.load import without_contradicted_depth
 from msgs_slam.pipelines.mapping.optimise import optimise_map

@@ -38,11 +38,9 @@ from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.pipelines.config import ProxyConfig
-from msgs_slam.pipelines.evaluation.class_map import ClassMap, Matching, match_classes, read_class_map
-from msgs_slam.pipelines.evaluation.label_score import count_labels, score
-from msgs_slam.pipelines.evaluation.measure import render_outcome
-from msgs_slam.pipelines.evaluation.pictures import Picture, label_picture
+from msgs_slam.pipelines.evaluation.labels import ClassMap, Matching, count_labels, match_classes, read_class_map, score
 from msgs_slam.pipelines.evaluation.truth import match_truth
+from msgs_slam.pipelines.evaluation.views import Picture, label_picture, render_outcome
 from msgs_slam.pipelines.geometry.camera import unproject_depth
 from msgs_slam.pipelines.geometry.resampling import resample_nearest
 from msgs_slam.pipelines.labels.palette import class_colors

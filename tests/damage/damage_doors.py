@@ -60,7 +60,7 @@ from msgs_slam.formats.trajectory import read_matrices, read_tum, write_tum
 from msgs_slam.formats.video import VideoReader, probe_video
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.depth.files import _read as read_depth_file
-from msgs_slam.pipelines.evaluation.class_map import read_class_map
+from msgs_slam.pipelines.evaluation.labels import read_class_map
 from msgs_slam.pipelines.masks.files import open_masks
 from msgs_slam.pipelines.networks.card import Card, read_card
 from msgs_slam.pipelines.networks.classes import read_class_table

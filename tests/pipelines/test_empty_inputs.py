@@ -11,14 +11,12 @@ import torch
 from msgs_slam.pipelines.depth.align import Anchors, align_keyframes, fit_fields
 from msgs_slam.pipelines.depth.scales import COARSE, fit_to_points, keyframe_scale, scale_at_points
 from msgs_slam.pipelines.depth.see_through import contradicted
-from msgs_slam.pipelines.evaluation.camera_paths import orbit, resampled, smoothed
-from msgs_slam.pipelines.evaluation.depth_error import DepthError, DepthErrorSum
-from msgs_slam.pipelines.evaluation.label_score import matched_one_to_one, score
-from msgs_slam.pipelines.evaluation.pictures import depth_picture, depth_range
-from msgs_slam.pipelines.evaluation.plots import Line, Marks, plot
-from msgs_slam.pipelines.evaluation.surface_error import depth_points, seen_in_depth, thinned
+from msgs_slam.pipelines.evaluation.html import Line, Marks, plot
+from msgs_slam.pipelines.evaluation.image_quality import DepthError, DepthErrorSum
+from msgs_slam.pipelines.evaluation.labels import matched_one_to_one, score
+from msgs_slam.pipelines.evaluation.mesh_error import depth_points, seen_in_depth, thinned
 from msgs_slam.pipelines.evaluation.trajectory_error import associate
-from msgs_slam.pipelines.evaluation.views import view_map
+from msgs_slam.pipelines.evaluation.views import depth_picture, depth_range, view_map
 from msgs_slam.pipelines.export.atlas import simplified
 from msgs_slam.pipelines.export.collision import with_floor
 from msgs_slam.pipelines.export.joined import joined
@@ -42,6 +40,7 @@ from msgs_slam.pipelines.mapping.submaps import nearest_seeing
 from msgs_slam.pipelines.mapping.views import halved, make_view, occurring_classes
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.render.seeding import complete_depth, fill_smoothly, seed_spacing
+from msgs_slam.pipelines.render_run import orbit, resampled, smoothed
 from msgs_slam.pipelines.scene.georeference import georeference
 from msgs_slam.pipelines.scene.lines import line_planes, up_of_lines
 from msgs_slam.pipelines.scene.metres import Seen, contradiction, usual_evidence

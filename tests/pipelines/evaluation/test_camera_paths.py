@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.pipelines.evaluation.camera_paths import orbit, resampled, smoothed
+from msgs_slam.pipelines.render_run import orbit, resampled, smoothed
 from msgs_slam.pipelines.scene.upright import cameras_up
 from tests.world import make_world, walk
 

@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.evaluation.class_map import match_classes, open_class_map, read_class_map, shipped_maps
-from msgs_slam.pipelines.evaluation.label_cells import label_cells
+from msgs_slam.pipelines.evaluation.labels import (
+    label_cells,
+    match_classes,
+    open_class_map,
+    read_class_map,
+    shipped_maps,
+)
 
 THEIRS = ("couch", "stool", "wall", "shoe")
 ADE20K = ("wall", "floor", "ceiling", "sofa", "armchair", "table", "cabinet", "painting", "windowpane", "rug", "tree")

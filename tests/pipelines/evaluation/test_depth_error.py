@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from msgs_slam.pipelines.evaluation.depth_error import DepthErrorSum
+from msgs_slam.pipelines.evaluation.image_quality import DepthErrorSum
 
 
 def test_scale_noise_and_holes_are_told_apart() -> None:

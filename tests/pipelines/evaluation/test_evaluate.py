@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome, trajectory_cells
-from msgs_slam.pipelines.evaluation.mesh_cells import mesh_cells
+from msgs_slam.pipelines.evaluation.mesh_error import mesh_cells
 from msgs_slam.pipelines.evaluation.truth import match_truth, true_trajectory
 from msgs_slam.pipelines.evaluation.write import write_evaluation
 from msgs_slam.pipelines.geometry.se3 import Similarity

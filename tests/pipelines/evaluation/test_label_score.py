@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from msgs_slam.pipelines.evaluation.label_score import (
+from msgs_slam.pipelines.evaluation.labels import (
     count_labels,
     indices_by_name,
     matched_by_majority,

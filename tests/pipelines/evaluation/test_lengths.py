@@ -12,7 +12,7 @@ from finished import note_finished
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.datasets import Sequence
-from msgs_slam.pipelines.evaluation.lengths import camera_height, extents, found_lengths, path_length
+from msgs_slam.pipelines.evaluation.facts import camera_height, extents, found_lengths, path_length
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.geometry.tape import tape_text
 from msgs_slam.pipelines.outcome import load_outcome

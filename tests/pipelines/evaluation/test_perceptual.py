@@ -16,8 +16,8 @@ from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
-from msgs_slam.pipelines.evaluation.perceptual import Lpips, open_lpips
-from msgs_slam.pipelines.evaluation.table import evaluation_table
+from msgs_slam.pipelines.evaluation.image_quality import Lpips, open_lpips
+from msgs_slam.pipelines.evaluation.write import evaluation_table
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder

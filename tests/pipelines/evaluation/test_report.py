@@ -12,9 +12,8 @@ from finished import note_finished
 
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.evaluation.facts import Capture, advice, lost_stretches
-from msgs_slam.pipelines.evaluation.lengths import found_lengths
-from msgs_slam.pipelines.evaluation.plots import Line, plot, ticks
+from msgs_slam.pipelines.evaluation.facts import Capture, advice, found_lengths, lost_stretches
+from msgs_slam.pipelines.evaluation.html import Line, plot, ticks
 from msgs_slam.pipelines.evaluation.report import write_report
 from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, write_evaluation
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.msgs_cli.main import main
-from msgs_slam.pipelines.evaluation.pdf import BROWSERS, print_pdf
+from msgs_slam.pipelines.evaluation.html import BROWSERS, print_pdf
 from msgs_slam.pipelines.run.folder import RunFolder
 
 

@@ -13,8 +13,7 @@ from msgs_slam.formats.gaussian_ply import write_gaussian_ply
 from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
 from msgs_slam.formats.images import list_images, read_rgb
 from msgs_slam.pipelines.evaluation.image_quality import psnr
-from msgs_slam.pipelines.evaluation.measure import render_outcome
-from msgs_slam.pipelines.evaluation.splat_views import SplatScene, draw_splats
+from msgs_slam.pipelines.evaluation.views import SplatScene, draw_splats, render_outcome
 from msgs_slam.pipelines.export.writers import map_cloud
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.render_run import render_file

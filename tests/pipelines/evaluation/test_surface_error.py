@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from msgs_slam.pipelines.evaluation.surface_error import (
+from msgs_slam.pipelines.evaluation.mesh_error import (
     depth_points,
     sample_surface,
     seen_in_depth,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.jsonfile import write_json
 from msgs_slam.pipelines.depth.fields import FINE, DepthFields
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.evaluation.depth_error import DepthErrorSum
+from msgs_slam.pipelines.evaluation.image_quality import DepthErrorSum
 from msgs_slam.pipelines.evaluation.views import view_map
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import Similarity

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from proxy_room import UNIT, Room
 
-from msgs_slam.pipelines.evaluation.label_score import count_labels, score
+from msgs_slam.pipelines.evaluation.labels import count_labels, score
 from msgs_slam.pipelines.geometry import voxels
 from msgs_slam.pipelines.geometry.room_layout import FLOOR, OTHER, Gravity
 from msgs_slam.pipelines.geometry.voxels import Voxels, merge, voxel_keys

@@ -20,7 +20,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.tensors import save_arrays
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.evaluation.label_score import count_labels, score
+from msgs_slam.pipelines.evaluation.labels import count_labels, score
 from msgs_slam.pipelines.networks.card import read_card
 from msgs_slam.pipelines.networks.labels import network_probabilities
 from msgs_slam.pipelines.networks.session import Network
