@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import click
 
@@ -21,7 +21,7 @@ from .output import Output, verbosity_options
 from .text import say
 
 if TYPE_CHECKING:
-    from ..pipelines.engine.engines import LocalEngine, RayEngine
+    from ..pipelines.engine.placement import LocalPlacement, RayCluster
 
 
 @click.command()
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 @click.option("--out", "-o", type=FOLDER, required=True, metavar="RUNS", help="Of the runs, batch.json and batch.md.")
 @engine_options("local: one recording after the other; ray: as many at once as the cluster has room for.")
 @click.option("--shard", default="0/1", metavar="K/N", help="Every N-th recording only, the K-th from 0 on.")
+@click.option("--placed", nargs=2, hidden=True, help="Reconstruct NAME from SOURCE in this process: of a placement.")
+@click.option("--threads", type=int, default=0, hidden=True, help="Where the settings leave them open.")
 @settings_options
 @source_options
 @UNTIL
@@ -39,6 +41,8 @@ def batch(
     engine_name: str,
     address: str,
     shard: str,
+    placed: tuple[str, str] | None,
+    threads: int,
     config_file: Path | None,
     overrides: tuple[str, ...],
     until: str,
@@ -52,28 +56,27 @@ def batch(
     indexed jobs, AWS Batch: docs/batch.md).
     """
     require_engine(engine_name, address)
-    from ..formats.jsonfile import read_toml
-    from ..pipelines.batch import find_recordings, run_batch, table_rows, write_table
-    from ..pipelines.engine.shards import Shard
+    from ..pipelines.batch import find_recordings, run_batch, table_row, write_table
+    from ..pipelines.engine.tasks import Shard
     from ..pipelines.read_config import load_config
 
+    texts = (*overrides, *source_settings(about_source))
+    if placed:
+        _reconstruct_one(placed, out, config_file, texts, until, threads, output)
     recordings = find_recordings(folder.resolve(), out.resolve())
     mine = Shard.parse(shard).of(recordings)
-    settings = read_toml(config_file) if config_file else {}
-    texts = (*overrides, *source_settings(about_source))
     config = load_config(config_file, texts)
     out.mkdir(parents=True, exist_ok=True)
-    engine, cpus, threads = _open_engine(engine_name, address, config.run.threads)
-    gpus = int(config.run.device == "cuda")
-    prepare = output.worker_setup(remote=engine_name == "ray")
+    placement, cpus, threads = _open_placement(engine_name, address, config.run.threads)
+    options = ["--until", until, "--threads", str(threads), *output.options, *(w for t in texts for w in ("--set", t))]
+    options += [] if config_file is None else ["--config", str(config_file.resolve())]
     try:
         with output.stopping_softly("The same command goes on with it."):
-            failed = run_batch(mine, engine, settings, texts, until, prepare, cpus, gpus, threads)
+            failed = run_batch(mine, placement, options, cpus, int(config.run.device == "cuda"))
     finally:
-        rows = table_rows(recordings)
-        write_table(out, rows)
+        write_table(out, rows := [table_row(r) for r in recordings])
         if engine_name == "ray":
-            engine.close()  # type: ignore[union-attr]
+            placement.close()  # type: ignore[union-attr]
     if not output.quiet:
         _print(rows)
     if failed:
@@ -84,16 +87,38 @@ def batch(
         sys.exit(1)
 
 
-def _open_engine(name: str, address: str, threads: int) -> tuple[LocalEngine | RayEngine, int, int]:
-    """The engine, the CPUs of a recording, and the threads that follow: as many on every node, or the results would
+def _reconstruct_one(
+    placed: tuple[str, str], out: Path, config_file: Path | None, texts: tuple[str, ...], until: str, threads: int,
+    output: Output,
+) -> NoReturn:  # fmt: skip
+    """Do the recording that a placement has started this process for; the one that started it says what became of
+    it."""
+    from ..formats.jsonfile import read_toml
+    from ..pipelines.batch import FAILED, Recording, reconstruct_one
+    from ..pipelines.engine.placement import stop_with_parent
+    from ..pipelines.system.progress import log
+
+    name, source = placed
+    stop_with_parent()
+    settings = read_toml(config_file) if config_file else {}
+    log.info("%s: begins", name)
+    recording = Recording(name, Path(source), out / f"{name}.msgs")
+    with output.stopping_softly(""):
+        state = reconstruct_one(recording, settings, texts, output.progress(name), until, threads)
+    log.info("%s: %s", name, state)
+    sys.exit(int(state == FAILED))
+
+
+def _open_placement(name: str, address: str, threads: int) -> tuple[LocalPlacement | RayCluster, int, int]:
+    """The placement, the CPUs of a recording, and the threads that follow: as many on every node, or the results would
     differ; 0 for all of the machine's."""
-    from ..pipelines.engine.engines import LocalEngine, RayEngine
+    from ..pipelines.engine.placement import LocalPlacement, RayCluster
 
     if name == "local":
-        return LocalEngine(), 1, threads
-    engine = RayEngine(address)
-    cpus = threads or engine.smallest_node
-    return engine, cpus, cpus
+        return LocalPlacement(), 1, threads
+    cluster = RayCluster(address)
+    cpus = threads or cluster.smallest_node
+    return cluster, cpus, cpus
 
 
 def _print(rows: list[dict[str, object]]) -> None:

@@ -13,7 +13,7 @@ from ..pipelines.run.names import STAGES
 
 if TYPE_CHECKING:
     from ..pipelines.config import Config
-    from ..pipelines.engine.workers import Workers
+    from ..pipelines.engine.placement import ClusterWorkers
     from ..pipelines.run.folder import RunFolder
     from .output import Output
 
@@ -56,23 +56,22 @@ def require_engine(name: str, address: str) -> None:
 
 
 @contextmanager
-def cluster_workers(name: str, address: str, config: Config, output: Output) -> Iterator[Workers | None]:
+def cluster_workers(name: str, address: str, config: Config, output: Output) -> Iterator[ClusterWorkers | None]:
     """The workers that take a run's tasks, None for this process; each with as many threads, or the results would
     differ."""
     require_engine(name, address)
     if name == "local":
         yield None
         return
-    from ..pipelines.engine.engines import RayEngine
-    from ..pipelines.engine.workers import Workers
+    from ..pipelines.engine.placement import ClusterWorkers, RayCluster
 
-    engine = RayEngine(address)
+    cluster = RayCluster(address)
     try:
-        threads = config.run.threads or engine.smallest_node
-        setup, gpus = output.worker_setup(remote=True), int(config.run.device == "cuda")
-        yield Workers(engine, setup, threads, gpus, engine.room(threads))
+        threads = config.run.threads or cluster.smallest_node
+        gpus = int(config.run.device == "cuda")
+        yield ClusterWorkers(cluster, threads, gpus, cluster.room(threads), output.options)
     finally:
-        engine.close()
+        cluster.close()
 
 
 _SOURCE_OPTIONS = {

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial, wraps
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -73,10 +73,21 @@ class Output:
             return JsonProgress(job)
         return BarProgress() if sys.stderr.isatty() else LineProgress(job)
 
-    def worker_setup(self, remote: bool) -> Callable[[str], Progress]:
-        """Return a picklable function that sets up logging in a process that works on one recording of many, and
-        returns its progress: bars here, lines from elsewhere."""
-        return partial(_worker_progress, self, remote)
+    @property
+    def options(self) -> tuple[str, ...]:
+        """The options of a command by which a process started for this one prints the same."""
+        more = ("-q",) if self.quiet else ("-v",) if self.verbose else ()
+        return (*more, "--log-format", "json") if self.as_json else more
+
+    def task_progress(self, name: str) -> Progress:
+        """Set logging up anew for a named task of many; returns its progress, lines rather than bars."""
+        from ..pipelines.system.progress import LineProgress, log
+
+        self.set_up_logging()
+        if not self.quiet and not self.as_json:
+            return LineProgress(name)
+        log.info("%s: begins", name)
+        return self.progress(name)
 
     def tell(self, text: str) -> None:
         """Print a line on stderr, or log it as JSON, for people who wait."""
@@ -94,17 +105,18 @@ class Output:
     @contextmanager
     def stopping_softly(self, how_to_go_on: str) -> Iterator[None]:
         """End the work in this block at its next snapshot on the first SIGINT, SIGTERM or SIGHUP, at once on the
-        second; then the process ends with 128 plus the signal's number, as shells expect."""
+        second; then the process ends with 128 plus the signal's number, as shells expect. Says `how_to_go_on`, and
+        nothing where that is empty: the process that started this one does."""
         from ..pipelines.system.stopping import soft_stop
 
         try:
-            with soft_stop(self._tell_stopping):
+            with soft_stop(self._tell_stopping if how_to_go_on else lambda number: None):
                 yield
         except KeyboardInterrupt as error:
             number = getattr(error, "number", signal.SIGINT)
-            if self.as_json:
+            if how_to_go_on and self.as_json:
                 write_line("stopped", signal=int(number), message=how_to_go_on, exit_code=128 + number)
-            else:
+            elif how_to_go_on:
                 say(f"\nStopped. {how_to_go_on}", err=True)
             sys.exit(128 + number)
 
@@ -113,16 +125,6 @@ class Output:
             write_line("stopping", signal=number, message=_STOPPING)
         else:  # not through click: a signal may come while it prints
             os.write(2, f"\n{_STOPPING}\n".encode())
-
-
-def _worker_progress(output: Output, remote: bool, name: str) -> Progress:
-    from ..pipelines.system.progress import LineProgress
-
-    output.set_up_logging()
-    if remote and not output.quiet and not output.as_json:
-        return LineProgress(name)
-    logging.getLogger("msgs_slam").info("%s: begins", name)
-    return output.progress(name)
 
 
 class SaidOnce(logging.Filter):

@@ -7,7 +7,7 @@ any number of batches over the same folders may be started, killed and started a
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,7 @@ from ..formats.errors import InputError
 from ..formats.images import VIDEO_SUFFIXES
 from ..formats.jsonfile import write_json
 from .config import Config
-from .engine.engines import Call, Engine
-from .engine.workers import code_identity, require_same_world
+from .engine.placement import Command, Placement
 from .read_config import load_config, merge_settings
 from .reconstruct import existing_config, reconstruct
 from .run.folder import RunFolder
@@ -48,26 +47,6 @@ class Recording:
     def failure_file(self) -> Path:
         """Why it failed the last time; not there where it did not."""
         return self.run.with_suffix(".failed.txt")
-
-
-@dataclass(frozen=True)
-class Job:
-    """Everything a worker needs to reconstruct one recording. `settings`: of a file, by section; `prepare` sets up
-    logging there and returns the progress; `code`: identity of the stages' code here; `threads`: the number to use
-    where the settings leave that open, 0 for all."""
-
-    recording: Recording
-    settings: Mapping[str, Any]
-    overrides: tuple[str, ...]
-    until: str
-    prepare: Callable[[str], Progress]
-    code: str
-    threads: int = 0
-
-    def config(self) -> Config:
-        """The settings: those that the run has already, then the file's, then the overrides."""
-        base = existing_config(RunFolder(self.recording.run)) or Config()
-        return load_config(None, self.overrides, merge_settings(base, self.settings, "the settings file"))
 
 
 def find_recordings(folder: Path, runs: Path) -> list[Recording]:
@@ -105,43 +84,79 @@ def _is_recording(path: Path) -> bool:
 
 
 def run_batch(
-    recordings: Sequence[Recording],
-    engine: Engine,
-    settings: Mapping[str, Any],
-    overrides: tuple[str, ...],
-    until: str,
-    prepare: Callable[[str], Progress],
-    cpus: int = 1,
-    gpus: int = 0,
-    threads: int = 0,
+    recordings: Sequence[Recording], placement: Placement, options: Sequence[str], cpus: int = 1, gpus: int = 0
 ) -> list[Recording]:
-    """Bring the runs of these recordings up to date; returns those that failed. What another process works on is left
-    to it; each takes so many `threads` where the settings leave that open. Raises InputError before anything slow for
-    settings that cannot be."""
-    load_config(None, overrides, merge_settings(Config(), settings, "the settings file"))
-    code = code_identity()
-    jobs = {r.name: Job(r, settings, overrides, until, prepare, code, threads) for r in recordings}
-    calls = [Call(name, work_on, (job,), cpus, gpus) for name, job in jobs.items()]
+    """Bring the runs of these recordings up to date, each by a process of its own; what another process works on is
+    left to it.
+
+    Args:
+        recordings: with the folders of their runs.
+        placement: where the processes run.
+        options: of the command `batch`, for each of them.
+        cpus: CPUs that each takes of a node.
+        gpus: GPUs that each takes of a node.
+
+    Returns:
+        The recordings that failed.
+    """
+    by_name = {r.name: r for r in recordings}
+    commands = [
+        Command(
+            r.name,
+            (
+                "msgs_slam",
+                "batch",
+                str(r.source.parent),
+                "--out",
+                str(r.run.parent),
+                "--placed",
+                r.name,
+                str(r.source),
+                *options,
+            ),
+            cpus,
+            gpus,
+            (r.source, r.run.parent),
+        )
+        for r in recordings
+    ]
     failed = []
-    for ended in engine.run(calls):
-        recording = jobs[ended.call.name].recording
-        if ended.failure:
-            _write_failure(recording, ended.failure)
-        state = FAILED if ended.failure else ended.value
-        log.info("%s: %s", recording.name, state)
-        if state == FAILED:
-            log.error("%s: %s", recording.name, _last_line(recording.failure_file))
-            failed.append(recording)
+    for result in placement.run(commands):
+        if not result.failure:
+            continue
+        recording = by_name[result.command.name]
+        if not (result.is_reported and recording.failure_file.exists()):
+            _write_failure(recording, result.failure)
+        log.error("%s: %s", recording.name, _last_line(recording.failure_file))
+        failed.append(recording)
     return failed
 
 
-def work_on(job: Job) -> str:
-    """One recording, here: DONE, FAILED with the reason beside the run, or ELSEWHERE. May be done twice, at any time,
-    by anybody."""
-    recording, progress = job.recording, job.prepare(job.recording.name)
+def reconstruct_one(
+    recording: Recording,
+    settings: Mapping[str, Any],
+    overrides: tuple[str, ...],
+    progress: Progress,
+    until: str,
+    threads: int = 0,
+) -> str:
+    """Reconstruct one recording in this process; it may be done twice, at any time, by any process.
+
+    Args:
+        recording: its source, and the folder of its run.
+        settings: of a file, by section, laid over those that the run has already.
+        overrides: `section.key=value`, laid over these.
+        progress: shows how far it is.
+        until: the last stage.
+        threads: CPU threads where the settings leave them open, 0 for all.
+
+    Returns:
+        DONE, FAILED with the reason beside the run, or ELSEWHERE.
+    """
     try:
-        require_same_world([recording.source, recording.run.parent], job.code)
-        reconstruct(recording.source, RunFolder(recording.run), job.config(), progress, job.until, threads=job.threads)
+        run = RunFolder(recording.run)
+        base = merge_settings(existing_config(run) or Config(), settings, "the settings file")
+        reconstruct(recording.source, run, load_config(None, overrides, base), progress, until, threads=threads)
     except RunBusyError:
         return ELSEWHERE
     except InputError as error:
@@ -159,12 +174,8 @@ def _write_failure(recording: Recording, reason: str) -> None:
         write_text(recording.failure_file, reason.rstrip() + "\n")
 
 
-def table_rows(recordings: Iterable[Recording]) -> list[dict[str, Any]]:
-    """One row a recording, from the files of its run folder: whoever worked on it, and whenever."""
-    return [_row(r) for r in recordings]
-
-
-def _row(recording: Recording) -> dict[str, Any]:
+def table_row(recording: Recording) -> dict[str, Any]:
+    """One row of the table, from the files of the run folder: whichever process worked on it, and whenever."""
     row: dict[str, Any] = {"recording": recording.name, "state": NOT_YET}
     run = RunFolder(recording.run)
     try:

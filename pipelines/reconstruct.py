@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from ..formats.atomic import own_temporaries, temporary_of, write_text
@@ -10,12 +12,11 @@ from ..formats.errors import InputError, RecoverableError
 from ..formats.safe_path import require_listable, require_unicode
 from ..formats.video import probe_video
 from .config import Config
-from .engine.stages import Stage, run_stages
-from .engine.threads import set_threads
-from .engine.workers import TaskWorkers
+from .engine.stages import Stage, TaskWorkers, run_stages
+from .engine.tasks import BETWEEN_LOOKS, Shard, SharedWorkers, boards_in, set_threads
 from .read_config import with_absolute_paths
 from .run.folder import RunFolder
-from .run.lock import LEADER, LOCK, locked, make_folder
+from .run.lock import LEADER, LOCK, RunBusyError, locked, make_folder
 from .run.names import SOURCE_LIST, STAGES
 from .run.records import StageRecord, load_records, load_source, recorded_config
 from .run.running import NotedProgress
@@ -23,7 +24,8 @@ from .run.settings_file import load_settings
 from .source.opening import source_digest
 from .system.device import resolve_device
 from .system.limits import available_cpus
-from .system.progress import Progress
+from .system.progress import Progress, log
+from .system.stopping import stop_if_asked
 from .system.wording import quoted
 
 
@@ -132,6 +134,47 @@ def resume(
     with locked(run):
         once_locked()
         return _run(run, source, origin.digest, config, progress, until, workers, redo=redo)
+
+
+def work_on_run(
+    run: RunFolder,
+    shard: Shard,
+    config: Config,
+    prepare: Callable[[str], Progress],
+    until: str,
+    never_lead: bool = False,
+) -> dict[str, StageRecord]:
+    """Lead, or take the tasks that another process publishes, until the run is done up to a stage.
+
+    Args:
+        run: the run, whose first stages may be done.
+        shard: the tasks that this process does first.
+        config: the settings of the run.
+        prepare: sets logging up for a named task and returns its progress.
+        until: the last stage.
+        never_lead: take tasks until a signal comes.
+
+    Returns:
+        The records of the finished stages.
+
+    Raises:
+        InputError: as `resume` does, and for a node that cannot do a task (another version of the program, a full
+            disk); other processes go on.
+    """
+
+    def retire_left_boards() -> None:
+        for board in boards_in(run):
+            board.retire()
+
+    workers = SharedWorkers(shard, prepare, config.run.threads or available_cpus())
+    log.info("shard %d of %d", shard.index, shard.count)
+    while True:
+        with suppress(RunBusyError):
+            if not never_lead:
+                return resume(run, prepare("run"), config, until, workers, retire_left_boards)
+        if not any(board.do_one(shard, prepare) for board in boards_in(run)):
+            stop_if_asked()
+            time.sleep(BETWEEN_LOOKS)
 
 
 def extend(run: RunFolder, videos: Sequence[Path], progress: Progress) -> dict[str, StageRecord]:

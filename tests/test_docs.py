@@ -239,7 +239,9 @@ def test_the_man_page_is_that_of_todays_commands() -> None:
     for name, command in main.commands.items():
         assert f"\n.SH MSGS\\-SLAM {name.upper()}\n" in page
         assert all(
-            max(p.opts, key=len).replace("-", "\\-") in page for p in command.params if isinstance(p, click.Option)
+            max(p.opts, key=len).replace("-", "\\-") in page
+            for p in command.params
+            if isinstance(p, click.Option) and not p.hidden
         )
     assert not re.findall(r"^['.](?!TH|SH|PP|TP|BR?|nf|fi)", page, re.MULTILINE)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from ...formats.atomic import is_disk_full, watched_by, write_text
 from ...formats.errors import DiskFullError, InputError, RecoverableError
@@ -44,7 +44,6 @@ from .standing import (
     why_again,
 )
 from .time_left import TimeLeft
-from .workers import TaskWorkers
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -54,6 +53,24 @@ SameSource = Callable[[], None]
 
 def _trusted() -> None:
     """A source that nobody asks about."""
+
+
+class TaskWorkers(Protocol):
+    """Workers that take the tasks of a stage."""
+
+    @property
+    def at_once(self) -> int:
+        """Number of tasks that may run at the same time."""
+        ...
+
+    @property
+    def threads(self) -> int:
+        """Threads that each takes: the same everywhere, or the results would differ."""
+        ...
+
+    def each(self, work: Callable[[T, Progress], R], tasks: Sequence[T], folder: Path) -> list[R]:
+        """Do `work` on every task, below `folder`, a stage's unfinished one; returns its results in order."""
+        ...
 
 
 @dataclass(frozen=True)

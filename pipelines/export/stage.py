@@ -14,8 +14,8 @@ from ...formats.digest import file_sha256
 from ...formats.gps import read_track
 from ...formats.mesh import mesh_blocks, read_mesh_ply, write_mesh_glb, write_mesh_ply
 from ..config import Config, ExportConfig
-from ..engine.chunks import in_chunks
 from ..engine.stages import Stage, StageContext
+from ..engine.tasks import in_chunks
 from ..mapping.measure import Shown
 from ..networks.identity import card_identity
 from ..outcome import Outcome, load_outcome

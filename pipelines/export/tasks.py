@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..engine.chunks import Chunk
 from ..engine.stages import StageContext
+from ..engine.tasks import Chunk
 from ..outcome import load_outcome
 from ..system.progress import Progress
 from .mesh import draw, drawn_views, fuse_regions, straighten

@@ -19,8 +19,8 @@ from ...formats.jsonfile import read_json, write_json
 from ...formats.video import VideoFrame
 from ..config import Config
 from ..correspondence.bridges import Picture
-from ..engine.chunks import in_chunks
 from ..engine.stages import Stage, StageContext
+from ..engine.tasks import in_chunks
 from ..geometry.rig import Rig, rig_of
 from ..run.before import before_inputs, before_of
 from ..run.files import (

@@ -15,8 +15,8 @@ from ..correspondence.bridges import Picture
 from ..correspondence.features import to_grey
 from ..correspondence.matching import match_features
 from ..correspondence.snapshots import Snapshots
-from ..engine.chunks import Chunk
 from ..engine.stages import StageContext
+from ..engine.tasks import Chunk
 from ..geometry.rig import Rig, rig_of
 from ..run.before import before_of
 from ..source.faces import Faces, find_faces

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..depth.scale import DepthScale
-from ..engine.chunks import Chunk, in_chunks
 from ..engine.stages import StageContext
+from ..engine.tasks import Chunk, in_chunks
 from ..geometry.resampling import resample_nearest
 from ..geometry.voxels import to_lab
 from ..masks.moving import SIDE, MovingView, look_once

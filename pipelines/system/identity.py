@@ -29,6 +29,7 @@ PLUMBING = frozenset(
         "msgs_slam.pipelines.read_config",
         "msgs_slam.pipelines.engine.stages",
         "msgs_slam.pipelines.engine.standing",
+        "msgs_slam.pipelines.engine.tasks",
         "msgs_slam.pipelines.system.progress",
         "msgs_slam.pipelines.system.stopping",
         "msgs_slam.pipelines.system.limits",

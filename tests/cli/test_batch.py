@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import os
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -14,12 +17,12 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines import batch
-from msgs_slam.pipelines.batch import DONE, ELSEWHERE, FAILED, Job, Recording, find_recordings, work_on
-from msgs_slam.pipelines.engine import workers
-from msgs_slam.pipelines.engine.engines import Call, Ended
-from msgs_slam.pipelines.engine.shards import Shard
+from msgs_slam.pipelines.batch import DONE, ELSEWHERE, FAILED, Recording, find_recordings, reconstruct_one
+from msgs_slam.pipelines.engine.placement import Command, CommandResult
+from msgs_slam.pipelines.engine.tasks import Shard
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import locked
+from msgs_slam.pipelines.run.settings_file import load_settings
 from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.pipelines.frames.conftest import QUICK, render, sideways
 
@@ -60,52 +63,52 @@ def test_a_failure_costs_itself_only_and_a_second_call_does_what_is_left(recordi
     assert "| walk | unfinished (frames) |" in (runs / "batch.md").read_text()
     assert not (runs / "broken.msgs").exists()
     before = (runs / "walk.msgs" / "frames" / "frames.json").stat().st_mtime_ns
-    half = Shard.parse("1/2").of(find_recordings(recordings, runs))  # broken is of the other one
-    assert [r.name for r in half] == ["walk"]
-    assert batch.run_batch(half, Here(), {}, QUICK, "frames", _silent) == []
+    half = run_batch(recordings, runs, "--shard", "1/2")  # broken is of the other one
+    assert half.exit_code == 0
     assert (runs / "walk.msgs" / "frames" / "frames.json").stat().st_mtime_ns == before
-    assert {r["recording"]: r["state"] for r in batch.table_rows(find_recordings(recordings, runs))} == {
-        "broken": FAILED, "walk": "unfinished (frames)",
-    }  # fmt: skip
+    assert {name: row["state"] for name, row in rows(runs).items()} == {"broken": FAILED, "walk": "unfinished (frames)"}
 
 
-class Here:
-    """The simplest engine: no process of its own."""
-
-    def run(self, calls: Sequence[Call]) -> Iterator[Ended]:
-        return (Ended(call, call.function(*call.arguments)) for call in calls)
-
-
-def job_of(recording: Recording, **changes: object) -> Job:
-    given = {"settings": {}, "overrides": QUICK, "until": "frames", "prepare": _silent, "code": ""}
-    return Job(recording, **{**given, "code": workers.code_identity(), **changes})  # type: ignore[arg-type]
-
-
-def _silent(name: str) -> SilentProgress:
-    return SilentProgress()
+def reconstruct_here(recording: Recording, **settings: object) -> str:
+    return reconstruct_one(recording, settings, QUICK, SilentProgress(), "frames")
 
 
 def test_what_another_process_works_on_is_left_to_it(recordings: Path, tmp_path: Path) -> None:
     walk = find_recordings(recordings, tmp_path)[1]
     with locked(RunFolder(walk.run)):
-        assert work_on(job_of(walk)) == ELSEWHERE
+        assert reconstruct_here(walk) == ELSEWHERE
     assert not walk.failure_file.exists()
     walk.failure_file.write_text("of yesterday")
-    assert work_on(job_of(walk, settings={"frames": {"max_side": 200}})) == DONE
+    assert reconstruct_here(walk, frames={"max_side": 200}) == DONE
     assert not walk.failure_file.exists()
-    assert job_of(walk).config().frames.max_side == 200  # the run's own, from now on
+    assert load_settings(RunFolder(walk.run)).frames.max_side == 200
 
 
-def test_a_node_that_sees_no_folder_or_has_another_program_is_named(
-    recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(workers.platform, "node", lambda: "node-7")
-    elsewhere = Recording("walk", tmp_path / "disk" / "walk", tmp_path / "walk.msgs")
-    assert work_on(job_of(elsewhere)) == FAILED
-    assert "the node node-7 does not see" in elsewhere.failure_file.read_text()
-    here = find_recordings(recordings, tmp_path)[1]
-    assert work_on(job_of(here, code="another")) == FAILED
-    assert "the node node-7 has another version of msgs-slam" in here.failure_file.read_text()
+class Failing:
+    """A placement whose processes fail before they can say why, or have said it."""
+
+    def __init__(self, is_reported: bool) -> None:
+        self.is_reported, self.words = is_reported, []  # type: ignore[var-annotated]
+
+    def run(self, commands: Sequence[Command]) -> Iterator[CommandResult]:
+        for command in commands:
+            self.words.append(command.words)
+            yield CommandResult(command, "the node node-7 does not see the run", self.is_reported)
+
+
+def test_a_process_that_could_not_say_why_has_it_written_for_it(recordings: Path, tmp_path: Path) -> None:
+    walk = find_recordings(recordings, tmp_path)[1]
+    placement = Failing(is_reported=True)
+    assert batch.run_batch([walk], placement, ["-q"]) == [walk]
+    assert placement.words == [
+        ("msgs_slam", "batch", str(recordings), "--out", str(tmp_path), "--placed", "walk", str(walk.source), "-q")
+    ]
+    assert walk.failure_file.read_text() == "the node node-7 does not see the run\n"
+    walk.failure_file.write_text("what the process said\n")
+    assert batch.run_batch([walk], placement, []) == [walk]
+    assert walk.failure_file.read_text() == "what the process said\n"
+    assert batch.run_batch([walk], Failing(is_reported=False), []) == [walk]
+    assert walk.failure_file.read_text() == "the node node-7 does not see the run\n"
 
 
 def test_shards_are_disjoint_and_together_all() -> None:
@@ -185,3 +188,16 @@ def test_wrong_settings_are_refused_before_anything(recordings: Path, tmp_path: 
     assert "there is no setting frames.nonsense" in refused.stderr
     assert not (tmp_path / "runs").exists()
     assert run_batch(recordings, tmp_path / "runs", "--address", "x:1").exit_code == 2
+
+
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra msgs-slam[cluster]")
+def test_ray_places_a_process_for_each_recording(
+    recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(p for p in sys.path if p))  # as an installed program is found
+    found = run_batch(recordings, tmp_path / "runs", "--engine", "ray")
+    assert found.exit_code == 1
+    assert {name: row["state"] for name, row in rows(tmp_path / "runs").items()} == {
+        "broken": FAILED, "walk": "unfinished (frames)",
+    }  # fmt: skip
+    assert "broken.mp4 is a text file" in (tmp_path / "runs" / "broken.failed.txt").read_text()

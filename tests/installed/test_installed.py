@@ -20,7 +20,7 @@ import pytest
 import trimesh
 
 import msgs_slam
-from msgs_slam.pipelines.engine.shards import TASK_MODULES
+from msgs_slam.pipelines.engine.tasks import TASK_MODULES
 from msgs_slam.pipelines.run.names import EXPORTS, STAGES
 
 PROGRAM = Path(sys.executable).with_name("msgs-slam")

@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from msgs_slam.pipelines.compute.threads import get_threads
 from msgs_slam.pipelines.compute.threads import set_threads as set_render_threads
-from msgs_slam.pipelines.engine.threads import set_threads
+from msgs_slam.pipelines.engine.tasks import set_threads
 
 
 @pytest.fixture

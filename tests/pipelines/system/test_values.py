@@ -50,7 +50,7 @@ def test_what_is_not_of_this_program_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="install the same one everywhere"):
         of_name("os:system")
     with pytest.raises(InputError, match="install the same one everywhere"):
-        of_name("msgs_slam.pipelines.engine.shards:shutil")
+        of_name("msgs_slam.pipelines.engine.tasks:shutil")
     with pytest.raises(InputError, match="install the same one everywhere"):
         of_name("msgs_slam.pipelines.system.values:save_arrays")
     with pytest.raises(TypeError, match="does not travel"):

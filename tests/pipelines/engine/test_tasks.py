@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import platform
+import resource
 import shutil
+import signal
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +21,9 @@ import pytest
 from msgs_slam.formats import atomic
 from msgs_slam.formats.errors import InputError, RecoverableError
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine import shards, workers
-from msgs_slam.pipelines.engine.chunks import in_chunks
-from msgs_slam.pipelines.engine.shards import Posted, Shard, SharedWorkers, posted_in
+from msgs_slam.pipelines.engine import tasks
 from msgs_slam.pipelines.engine.stages import Stage, StageContext, run_stages
+from msgs_slam.pipelines.engine.tasks import Shard, SharedWorkers, TaskBoard, boards_in, in_chunks
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.system import values
@@ -33,9 +36,21 @@ HOLDS = "import fcntl, sys; f = open(sys.argv[1], 'ab'); fcntl.flock(f, fcntl.LO
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Of an unfinished stage; the tasks are those of the tests."""
     monkeypatch.setattr(values, "_OURS", "engine_calls")
-    monkeypatch.setattr(shards, "TASK_MODULES", ("engine_calls",))
+    monkeypatch.setattr(tasks, "TASK_MODULES", ("engine_calls",))
     (tmp_path / "proxy.partial").mkdir()
     return tmp_path / "proxy.partial"
+
+
+@contextmanager
+def allowed_bytes(count: int) -> Iterator[None]:
+    """Of every file that this process writes."""
+    before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (count, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
 
 
 def shared(index: int, count: int) -> SharedWorkers:
@@ -49,7 +64,9 @@ def helpers(folder: Path) -> Iterator[list[int]]:
 
     def help_out(n: int) -> None:
         while not ended.is_set():
-            done[n] += any(p.do_one(Shard(n + 1, 4), engine_calls.silent) for p in posted_in(RunFolder(folder.parent)))
+            done[n] += any(
+                board.do_one(Shard(n + 1, 4), engine_calls.silent) for board in boards_in(RunFolder(folder.parent))
+            )
 
     threads = [threading.Thread(target=help_out, args=(n,)) for n in range(3)]
     for thread in threads:
@@ -61,9 +78,9 @@ def helpers(folder: Path) -> Iterator[list[int]]:
 
 
 def test_every_task_is_done_once_and_comes_back_in_order(folder: Path, helpers: list[int]) -> None:
-    tasks = [(folder / f"{n}", 2 * n) for n in range(24)]
-    assert shared(0, 4).each(engine_calls.halve_noted, tasks, folder) == list(range(24))
-    assert [len(path.read_text()) for path, _ in tasks] == [1] * 24
+    given = [(folder / f"{n}", 2 * n) for n in range(24)]
+    assert shared(0, 4).each(engine_calls.halve_noted, given, folder) == list(range(24))
+    assert [len(path.read_text()) for path, _ in given] == [1] * 24
     assert not (folder.parent / ".tasks").exists()
 
 
@@ -72,64 +89,64 @@ def test_one_alone_does_all_whatever_its_share(folder: Path) -> None:
 
 
 def test_its_own_share_comes_first(folder: Path) -> None:
-    posted = Posted.post(engine_calls.halve, list(range(0, 20, 2)), folder, 1)
+    board = TaskBoard.publish(engine_calls.halve, list(range(0, 20, 2)), folder, 1)
     order = []
-    while missing := posted.missing():
-        assert posted.do_one(Shard(1, 4), engine_calls.silent)
-        order += [n for n in missing if posted.done(n).exists()]
+    while missing := board.missing():
+        assert board.do_one(Shard(1, 4), engine_calls.silent)
+        order += [n for n in missing if board.done(n).exists()]
     assert order[:3] == [1, 5, 9]
     assert sorted(order) == list(range(10))
 
 
 def test_what_a_killed_process_was_at_is_done_by_another(folder: Path) -> None:
-    posted = Posted.post(engine_calls.halve, [4], folder, 1)
+    board = TaskBoard.publish(engine_calls.halve, [4], folder, 1)
     process = subprocess.Popen(
-        [sys.executable, "-c", HOLDS, str(posted.folder / "0000.lock")], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-c", HOLDS, str(board.folder / "0000.lock")], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     assert process.stdout is not None
     process.stdout.readline()
-    assert not posted.do_one(Shard(), engine_calls.silent)
+    assert not board.do_one(Shard(), engine_calls.silent)
     process.kill()
     process.wait()
-    assert posted.do_one(Shard(), engine_calls.silent)
-    assert values.load_value(posted.done(0)) == 2
+    assert board.do_one(Shard(), engine_calls.silent)
+    assert values.load_value(board.done(0)) == 2
 
 
 def test_a_new_lead_waits_for_who_is_at_a_task_and_begins_anew(folder: Path) -> None:
-    posted = Posted.post(engine_calls.halve_slowly, [8, 6], folder, 1)
-    helper = threading.Thread(target=posted.do_one, args=(Shard(), engine_calls.silent))
+    board = TaskBoard.publish(engine_calls.halve_slowly, [8, 6], folder, 1)
+    helper = threading.Thread(target=board.do_one, args=(Shard(), engine_calls.silent))
     helper.start()
-    while not list(posted.folder.glob("*.lock")):
+    while not list(board.folder.glob("*.lock")):
         time.sleep(0.01)
-    posted.withdraw()
-    assert not posted.folder.exists() or not list(posted.folder.glob("*.done.npz"))
+    board.retire()
+    assert not board.folder.exists() or not list(board.folder.glob("*.done.npz"))
     helper.join(timeout=5)
     assert not helper.is_alive()
-    assert not posted.do_one(Shard(), engine_calls.silent)
+    assert not board.do_one(Shard(), engine_calls.silent)
     shutil.rmtree(folder.parent / ".tasks", ignore_errors=True)
     assert shared(0, 2).each(engine_calls.halve, [8, 6], folder) == [4, 3]
 
 
 def test_a_node_with_another_version_says_so_and_leaves_the_task(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    posted = Posted.post(engine_calls.halve, [4], folder, 1)
+    board = TaskBoard.publish(engine_calls.halve, [4], folder, 1)
     with monkeypatch.context() as patch:
-        patch.setattr(workers, "code_identity", lambda: "msgs-slam=another")
+        patch.setattr(tasks, "code_identity", lambda: "msgs-slam=another")
         with pytest.raises(RecoverableError, match="has another version of msgs-slam"):
-            posted.do_one(Shard(), engine_calls.silent)
-    assert posted.do_one(Shard(), engine_calls.silent)
+            board.do_one(Shard(), engine_calls.silent)
+    assert board.do_one(Shard(), engine_calls.silent)
 
 
 def test_a_run_cannot_name_other_work(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shards, "TASK_MODULES", ("msgs_slam.pipelines.proxy.stage",))
-    posted = Posted.post(engine_calls.halve, [4], folder, 1)
+    monkeypatch.setattr(tasks, "TASK_MODULES", ("msgs_slam.pipelines.proxy.stage",))
+    board = TaskBoard.publish(engine_calls.halve, [4], folder, 1)
     with pytest.raises(InputError, match="is not a task of this program"):
-        posted.do_one(Shard(0, 1), engine_calls.silent)
+        board.do_one(Shard(0, 1), engine_calls.silent)
 
 
 def test_a_missing_file_inside_a_task_is_told_at_once(folder: Path) -> None:
-    posted = Posted.post(engine_calls.read_missing, [folder / "nowhere.txt"], folder, 1)
+    board = TaskBoard.publish(engine_calls.read_missing, [folder / "nowhere.txt"], folder, 1)
     with pytest.raises(FileNotFoundError, match=r"nowhere\.txt"):
-        posted.do_one(Shard(), engine_calls.silent)
+        board.do_one(Shard(), engine_calls.silent)
     with pytest.raises(FileNotFoundError, match=r"nowhere\.txt"):
         shared(0, 2).each(engine_calls.read_missing, [folder / "nowhere.txt"], folder)
     assert (folder / "attempts").read_text() == "xx"
@@ -139,20 +156,20 @@ def test_two_that_end_the_same_task_without_locks_do_not_disturb_each_other(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The other one ends it between the last byte of this one's result and its renaming."""
-    posted = Posted.post(engine_calls.halve_noted, [(folder / "0", 8)], folder, 1)
+    board = TaskBoard.publish(engine_calls.halve_noted, [(folder / "0", 8)], folder, 1)
     replace, others = atomic.os.replace, []
 
     def interrupted(temporary: Path, path: Path) -> None:
-        if not others and path == posted.done(0):
+        if not others and path == board.done(0):
             others.append(temporary)
             with monkeypatch.context() as other:
                 other.setattr(atomic, "process_mark", lambda: "of the other")
-                posted._do_locked(0, posted._about(), engine_calls.silent)
+                board._do_locked(0, board._header(), engine_calls.silent)
         replace(temporary, path)
 
     monkeypatch.setattr(atomic.os, "replace", interrupted)
-    assert posted.do_one(Shard(), engine_calls.silent)
-    assert values.load_value(posted.done(0)) == 4
+    assert board.do_one(Shard(), engine_calls.silent)
+    assert values.load_value(board.done(0)) == 4
     assert others
 
 
@@ -184,3 +201,40 @@ def test_tasks_of_a_run_given_by_a_relative_path_can_be_done_from_elsewhere(
     )  # fmt: skip
     assert records[STAGES[0]].figures == {"sum": 6 * 7}
     assert not list(away.iterdir())
+
+
+def test_a_full_disk_names_the_node_and_what_to_do(folder: Path) -> None:
+    """Of a node that may write no more than a kilobyte."""
+    board = TaskBoard.publish(engine_calls.fill_disk, [folder / "large.bin"], folder, 1)
+    with allowed_bytes(1000), pytest.raises(RecoverableError) as refused:
+        board.do_one(Shard(), engine_calls.silent)
+    for part in (f"on the node {platform.node()}", "disk full", "free some space", "run the same command again"):
+        assert part in str(refused.value)
+    assert not list(folder.glob("*large*"))
+
+
+def test_a_task_that_is_refused_says_so(folder: Path) -> None:
+    with pytest.raises(RecoverableError, match=r"halve 1: on the node .*: 3 is odd"):
+        shared(0, 1).each(engine_calls.halve, [3], folder)
+
+
+def test_a_node_with_other_versions_is_named_with_what_differs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = tasks.code_identity()
+    tasks.require_same_world([tmp_path], code)
+    monkeypatch.setattr(tasks.platform, "node", lambda: "node-7")
+    for name, other in (("torch", "torch=1.0"), ("Python", "Python=2.7.18"), ("msgs-slam", "msgs-slam=0")):
+        theirs = " ".join(other if part.startswith(f"{name}=") else part for part in code.split())
+        with pytest.raises(
+            InputError, match=rf"the node node-7 has another version of {name} \(.*, not {other.partition('=')[2]}\)"
+        ):
+            tasks.require_same_world([tmp_path], theirs)
+    with pytest.raises(InputError, match="the node node-7 has another version of msgs-slam"):  # of an earlier program
+        tasks.require_same_world([tmp_path], "3f5a 99b1")
+
+
+def test_a_folder_that_a_node_does_not_see_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tasks.platform, "node", lambda: "node-7")
+    board = TaskBoard.publish(engine_calls.halve, [4], folder, 1)
+    folder.rmdir()
+    with pytest.raises(RecoverableError, match=f"halve 1: the node node-7 does not see {folder}"):
+        board.do_one(Shard(), engine_calls.silent)
