@@ -1,7 +1,9 @@
-"""The depths of all keyframes brought into one world: a field each, chosen so that views and triangulated points agree.
+"""Scales of proxy depth: a field for each keyframe, chosen so that views and triangulated points agree.
 
-The error of a depth is smooth over an image and changes from image to image; where many images see the same
-surface its true place is near the middle of what they say.
+First the points alone give each keyframe a coarse field (`fit_to_points`), then the views give it a finer one together
+(`align_keyframes`): the error of a depth is smooth over an image and changes from image to image, so where many images
+see the same surface, its true place is near the middle of their depths. A shift is no part of a field: depth that is
+known only up to one is given it before (`learned.AlignedDepth`).
 """
 
 from __future__ import annotations
@@ -18,12 +20,11 @@ from ..geometry.sparse_model import SparseModel
 from ..system.lru_sequence import LruSequence
 from ..system.memory import ALIGNED_TOGETHER
 from ..types import Intrinsics, ProxyMaps
-from .fields import FINE, Basis, DepthFields
-from .solve import Equations, Prior, solve_fields
+from .fields import FINE, Basis, DepthFields, Equations, Grid, Prior, solve_fields
 
 Array = NDArray[np.float64]
 
-PRIOR = Prior(FINE, node_sd=0.05, step_sd=0.08)
+VIEWS_PRIOR = Prior(FINE, node_sd=0.05, step_sd=0.08)
 """Around what the keyframe's own points say."""
 SAMPLES_ACROSS = 40
 SIDE = 320
@@ -37,6 +38,91 @@ SHARE = 0.25
 ROUNDS = 4
 _ROOM = 60_000_000
 """Bytes of depths, and of samples of them, that are kept; what has no room is read again."""
+COARSE = Grid(3, 4)
+"""Of the fields that points alone can determine."""
+POINTS_PRIOR = Prior(COARSE, node_sd=0.06, step_sd=0.05)
+"""Around the keyframe's scale."""
+DEPTH_SD = 0.05
+"""Relative standard deviation of a reliable proxy depth after its scale is known."""
+MIN_RELIABILITY = 0.1
+_ROUNDS = 5
+
+
+@dataclass(frozen=True)
+class WorldScale:
+    """The factor that makes the world metric, its relative standard deviation and the keyframes it comes from."""
+
+    factor: float
+    relative_sd: float
+    keyframes: int
+
+
+def sample_proxy(maps: ProxyMaps, xy: Array, intrinsics: Intrinsics) -> tuple[Array, Array]:
+    """Proxy depth (Q,), 0 where unknown, and reliability U (Q,) at pixels (Q, 2) of the frame; nearest neighbour."""
+    height, width = maps.depth.shape
+    column = np.clip((xy[:, 0] * width / intrinsics.width).astype(int), 0, width - 1)
+    row = np.clip((xy[:, 1] * height / intrinsics.height).astype(int), 0, height - 1)
+    reliability = maps.confidence[row, column].astype(np.float64)
+    depth = maps.depth[row, column].astype(np.float64)
+    return np.where(reliability >= MIN_RELIABILITY, depth, 0.0), reliability
+
+
+def weighted_median(values: Array, weights: Array) -> float:
+    """The value with half of the weight on either side."""
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weights[order])
+    return float(values[order[np.searchsorted(total, total[-1] / 2)]])
+
+
+def keyframe_scale(log_ratio: Array, weights: Array) -> float:
+    """Robust log scale of one keyframe from log(depth in the world / proxy depth) at its points; 0 without points."""
+    return weighted_median(log_ratio, weights) if len(log_ratio) and weights.sum() > 0 else 0.0
+
+
+def scale_at_points(maps: ProxyMaps, xy: Array, z: Array, intrinsics: Intrinsics, least: int) -> float | None:
+    """World over proxy depth: the median over points at pixels (Q, 2) and depths (Q,) of the world; None for fewer than
+    `least`."""
+    known, trust = sample_proxy(maps, xy, intrinsics)
+    both = (known > 0) & (z > 0)
+    if both.sum() < least:
+        return None
+    return float(np.exp(keyframe_scale(np.log(z[both] / known[both]), trust[both])))
+
+
+def world_scale(log_scales: Array) -> WorldScale:
+    """The factor on the world that makes the keyframes' proxies right on average, from their log scales (N,).
+
+    The mean without those beyond three robust sigmas. The uncertainty counts only independent keyframes: errors of
+    neighbours are alike, which the correlation of successive ones shows.
+    """
+    deviation = log_scales - np.median(log_scales)
+    sigma = 1.4826 * float(np.median(np.abs(deviation)))
+    used = log_scales[np.abs(deviation) <= 3 * max(sigma, 1e-6)]
+    mean, n = float(used.mean()), len(used)
+    rest = used - mean
+    correlation = float(rest[1:] @ rest[:-1] / max(float(rest @ rest), 1e-12)) if n > 2 else 0.0
+    independent = max(n * (1 - correlation) / (1 + correlation), 1.0) if correlation > 0 else n
+    return WorldScale(float(np.exp(-mean)), float(used.std() / np.sqrt(max(independent, 1.0))), n)
+
+
+def fit_to_points(field: NDArray[np.int64], basis: Basis, log_ratio: Array, weights: Array, middles: Array) -> Array:
+    """(N, nodes of COARSE) log scales: robust, smooth, near the keyframes' `middles` (N,) where there are few points.
+
+    field (Q,): whose point it is; basis: where, in COARSE; log_ratio (Q,) and weights (Q,) as for `keyframe_scale`.
+    """
+    expected = np.repeat(middles[:, None], COARSE.size, axis=1)
+    fields = expected
+    sd = DEPTH_SD / np.sqrt(np.maximum(weights, 1e-6))
+    for _ in range(_ROUNDS if len(fields) else 0):
+        residual = basis.of(fields[field]) - log_ratio
+        points = Equations.of_places(field, basis, COARSE.size, residual, sd, 1.0)
+        fields = solve_fields([points], fields, expected, POINTS_PRIOR)
+    return fields
+
+
+def as_fine(field: Array) -> Array:
+    """(nodes of FINE,) a field of COARSE."""
+    return COARSE.finer(field, FINE)
 
 
 @dataclass(frozen=True)
@@ -113,7 +199,7 @@ def fit_fields(views: Sequence[PosedDepth], anchors: Mapping[int, Anchors], expe
         pairs = (_pair_equations(i, j, samples[i], views[j], fields) for i, j in touching)
         own = range(first * FINE.size, (last + 1) * FINE.size)
         parts = (equations.within(own) for equations in chain(points, pairs))
-        fields[window] = solve_fields(parts, fields[window], start[window], PRIOR)
+        fields[window] = solve_fields(parts, fields[window], start[window], VIEWS_PRIOR)
     return fields
 
 

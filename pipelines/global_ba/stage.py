@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...formats.atomic import copy_file
 from ..correspondence.retrieval import GlobalDescriptors, compute_global_descriptors, unit
-from ..depth.scales import sample_proxy
+from ..depth.align import sample_proxy
 from ..engine.stages import Stage, StageContext
 from ..geometry import se3
 from ..geometry.sparse_model import SparseModel

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ...formats.images import read_label_png
-from ..depth.files import require_aspect
-from ..depth.matching_names import as_read, find_folder, match_files
+from ..depth.files import as_read, find_folder, match_files, require_aspect
 from ..geometry.resampling import resample_nearest
 from ..networks.classes import MAX_ID, NamedClass, find_class_table, read_class_table
 from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, Sequence

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError
-from ..depth.stereo.spread import spread_in_place
+from ..depth.stereo.fill import spread_in_place
 from ..geometry.camera import unproject_depth
 from ..geometry.resampling import resample_nearest
 from ..geometry.room_layout import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure

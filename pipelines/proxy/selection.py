@@ -11,10 +11,9 @@ from statistics import median
 from ...formats.datasets import Sequence as Recording
 from ...formats.errors import InputError, SettingError
 from ..config import ProxyConfig
-from ..depth.aligned import AlignedDepth
 from ..depth.files import FilesDepth
 from ..depth.fused import FusedDepth
-from ..depth.learned import OnnxDepth
+from ..depth.learned import AlignedDepth, OnnxDepth
 from ..depth.scale import measure_scale
 from ..depth.stereo.provider import MultiviewDepth
 from ..labels.clusters import OnnxClusters

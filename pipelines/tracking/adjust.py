@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..config import TrackingConfig
-from ..depth import scales
-from ..depth.align import align_keyframes
+from ..depth import align as scales
+from ..depth.align import COARSE, WorldScale, align_keyframes
 from ..depth.fields import DepthFields
-from ..depth.scales import COARSE, WorldScale
 from ..geometry import se3
 from ..geometry.camera import project
 from ..geometry.sparse_model import SparseModel

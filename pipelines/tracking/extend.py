@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..correspondence.flow import FLOW_SD, corners, follow
-from ..depth.scales import sample_proxy, scale_at_points
+from ..depth.align import sample_proxy, scale_at_points
 from ..geometry import se3
 from ..geometry.camera import project, unproject
 from ..types import Intrinsics

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..depth.scales import scale_at_points
+from ..depth.align import scale_at_points
 from ..geometry.resampling import resize_maps
 from ..render.seeding import seed_gaussians, seed_grid
 from ..types import Intrinsics

@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from msgs_slam.pipelines.depth.align import Anchors, align_keyframes, fit_fields
-from msgs_slam.pipelines.depth.scales import COARSE, fit_to_points, keyframe_scale, scale_at_points
+from msgs_slam.pipelines.depth.align import (
+    COARSE,
+    Anchors,
+    align_keyframes,
+    fit_fields,
+    fit_to_points,
+    keyframe_scale,
+    scale_at_points,
+)
 from msgs_slam.pipelines.depth.see_through import contradicted
 from msgs_slam.pipelines.evaluation.html import Line, Marks, plot
 from msgs_slam.pipelines.evaluation.image_quality import DepthError, DepthErrorSum

@@ -13,10 +13,9 @@ from torch import Tensor
 
 from ...compute import gpu
 from . import matching as rules
-from .refine import ALIKE
 from .smoothing import DIRECTIONS, path_starts
-from .tiles import TILE
-from .volume import UNREACHED
+from .sweep import ALIKE
+from .volume import TILE, UNREACHED
 from .window import LIKENESS, OUTSIDE, RADIUS, SIDE, STEP, VARIANCE_FLOOR
 
 Array = NDArray[np.float32]

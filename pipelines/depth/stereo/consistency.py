@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from ...compute.jit import inner, kernel
 from ...compute.lanes import any_of, at_most, counting, exp, largest, load, splat, store, where
-from .bands import Bands
 from .lane_sampling import choose, corners, smallest
+from .volume import Bands
 
 _LANES = 16
 _ZERO, _HALF, _ONE, _THREE, _FOUR = (np.float32(x) for x in (0, 0.5, 1, 3, 4))

@@ -10,12 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
-from .bands import Bands
-from .refine import refine_inverse_depth
 from .smoothing import smooth_cost
-from .sweep import sweep_cost
-from .tiles import TILE, tiles_of
-from .volume import least_planes, pick_planes
+from .sweep import refine_inverse_depth, sweep_cost
+from .volume import TILE, Bands, least_planes, pick_planes, tiles_of
 
 LEAST_BEST, MOST_BEST = 3, 5
 """Of the views that one is matched with, the better half counts at a pixel, but not fewer or more than these."""

@@ -25,15 +25,23 @@ from ...system.parallel import Kept, abreast
 from ...system.progress import Progress
 from ...system.values import load_value, save_value
 from ...types import Frame, Intrinsics
-from .bands import Bands
-from .borrow import agreed_depth, borrow_depth, carry_depth
 from .consistency import fuse_depths
-from .evidence import evidence_of, prefer_matches, surface_contrast
-from .fill import SURE, fill_unsure, judge_by_company
+from .fill import (
+    SURE,
+    agreed_depth,
+    borrow_depth,
+    carry_depth,
+    evidence_of,
+    fill_unsure,
+    judge_by_company,
+    prefer_matches,
+)
 from .matching import StereoImages, match_planes
 from .neighbours import choose_neighbours, depth_range
 from .sweep import warps_to
 from .upsample import upsample_depth
+from .volume import Bands
+from .window import surface_contrast
 
 _CACHED_FRAMES = 48
 _VIEWS, _FUSE_VIEWS, _LENDERS = 12, 8, 16

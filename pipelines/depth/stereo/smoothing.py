@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 
 from ...compute.jit import inner, kernel
 from ...compute.lanes import load, splat, store
-from .bands import Bands
 from .lane_sampling import smallest, smallest_of
-from .tiles import TILE
-from .volume import BLOCK, UNREACHED, Volume, pixel_of_tile
+from .volume import BLOCK, TILE, UNREACHED, Bands, Volume, pixel_of_tile
 
 DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 

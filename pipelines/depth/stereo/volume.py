@@ -1,7 +1,12 @@
-"""Numbers of a pixel's planes, only where planes are tried: costs of a match, and their sums along paths."""
+"""Bands of rows on threads, and the numbers of a pixel's planes: costs of a match, and their sums along paths.
+
+The bytes are the same whatever the number of threads. Of a volume there is only what is tried: planes in a tile.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -9,12 +14,40 @@ from numpy.typing import NDArray
 
 from ...compute.jit import inner
 from ...system.jit import kernel
-from .tiles import TILE, tiles_of
 
+TILE = BAND_ROWS = 16
+"""Pixels of a tile across and down: the rows of a band, and the pixels that one vector holds."""
 BLOCK = 16
 """Planes of a block, as many as a vector holds."""
 UNREACHED = np.float32(1e9)
 """Cost of a plane that is not tried."""
+
+
+class Bands:
+    """Runs kernels that release the interpreter lock over bands of rows; every band writes only its own rows."""
+
+    def __init__(self, threads: int) -> None:
+        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+
+    def run(self, count: int, work: Callable[[int, int], object], size: int = BAND_ROWS) -> None:
+        """Call `work(first, last)` for consecutive bands of 0..count. The bands do not depend on the threads."""
+        starts = range(0, count, size)
+        if self._pool is None:
+            for start in starts:
+                work(start, min(start + size, count))
+            return
+        for future in [self._pool.submit(work, s, min(s + size, count)) for s in starts]:
+            future.result()
+
+    def close(self) -> None:
+        """Wait for the threads to end."""
+        if self._pool is not None:
+            self._pool.shutdown()
+
+
+def tiles_of(height: int, width: int) -> tuple[int, int]:
+    """Return how many tiles an image of that size has down and across."""
+    return -(-height // TILE), -(-width // TILE)
 
 
 class Volume(NamedTuple):

@@ -13,10 +13,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compute.jit import inner
+from ...compute.jit import inner, kernel
 from ...compute.lanes import at_most, counting, exp, largest, load, splat, store, where
-from .bands import BAND_ROWS
 from .lane_sampling import choose, interpolate, smallest, square_root
+from .volume import BAND_ROWS
 
 RADIUS = 3
 STEP = 2
@@ -204,3 +204,14 @@ def best_mean(
         total = total + where(score > _OUTSIDE, score)
         used = used + where(score > _OUTSIDE, splat(_ONE))
     return total / largest(used, splat(_ONE))
+
+
+@kernel
+def surface_contrast(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(h, w) variance of the intensities (0..1) of each pixel's window, which count by how like the pixel they are: of
+    a blank surface it is small also beside its border."""
+    height, width = image.shape
+    length, contrast = row_length(width), np.empty((height, width), np.float32)
+    for y in range(height):
+        contrast[y] = weigh_windows(pad_rows(image, y, y + 1), length, LIKENESS)[1][length : length + width]
+    return contrast

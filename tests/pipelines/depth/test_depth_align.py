@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.depth import align as alignment
-from msgs_slam.pipelines.depth import solve
+from msgs_slam.pipelines.depth import fields as solve
 from msgs_slam.pipelines.depth.align import align_keyframes, fit_fields
 from msgs_slam.pipelines.depth.fields import FINE, DepthFields, field_scales
 from msgs_slam.pipelines.depth.see_through import contradicted

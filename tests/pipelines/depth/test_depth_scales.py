@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from msgs_slam.pipelines.depth import scales
-from msgs_slam.pipelines.depth.scales import COARSE
-from msgs_slam.pipelines.depth.solve import Equations, solve_fields
+from msgs_slam.pipelines.depth import align as scales
+from msgs_slam.pipelines.depth.align import COARSE
+from msgs_slam.pipelines.depth.fields import Equations, solve_fields
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 
 CAMERA = Intrinsics(640, 480, 500, 500, 320, 240)
@@ -63,7 +63,7 @@ def test_a_field_that_does_not_converge_stays_as_it_was_and_that_is_said(
     residual[0] = np.nan if broken else 0.0
     parts = [Equations.of_places(0, basis, COARSE.size, residual, np.full(40, 0.05), 1.0)]
     before = np.full((1, COARSE.size), 0.2)
-    after = solve_fields(parts, before, before, scales.PRIOR)
+    after = solve_fields(parts, before, before, scales.POINTS_PRIOR)
     assert np.array_equal(after, before) == broken
     assert np.isfinite(after).all()
     assert ("did not converge" in caplog.text) == broken

@@ -15,8 +15,8 @@ from msgs_slam.formats.images import read_rgb, write_grey_png, write_rgb
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.correspondence.features import extract_features
 from msgs_slam.pipelines.correspondence.flow import corners
-from msgs_slam.pipelines.depth.stereo.bands import Bands
 from msgs_slam.pipelines.depth.stereo.sweep import sweep_cost
+from msgs_slam.pipelines.depth.stereo.volume import Bands
 from msgs_slam.pipelines.frames.keyframes import choose_keyframes
 from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
 from msgs_slam.pipelines.mapping.objective import Objective

@@ -11,8 +11,7 @@ from proxy_room import Room, write_source
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png, write_rgb
-from msgs_slam.pipelines.depth.files import FilesDepth
-from msgs_slam.pipelines.depth.matching_names import frame_key
+from msgs_slam.pipelines.depth.files import FilesDepth, frame_key
 from msgs_slam.pipelines.labels.files import FilesLabels
 from msgs_slam.pipelines.networks.classes import find_class_table, read_class_table
 from msgs_slam.pipelines.providers import DepthEstimate, Sequence

@@ -4,11 +4,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.depth.stereo.bands import Bands
-from msgs_slam.pipelines.depth.stereo.borrow import agreed_depth, borrow_depth, carry_depth
 from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths
-from msgs_slam.pipelines.depth.stereo.evidence import evidence_of, prefer_matches, surface_contrast
-from msgs_slam.pipelines.depth.stereo.fill import SURE, fill_unsure, judge_by_company
+from msgs_slam.pipelines.depth.stereo.fill import (
+    SURE,
+    agreed_depth,
+    borrow_depth,
+    carry_depth,
+    evidence_of,
+    fill_unsure,
+    judge_by_company,
+    prefer_matches,
+)
 from msgs_slam.pipelines.depth.stereo.matching import (
     CLEAR,
     MARGIN,
@@ -18,13 +24,11 @@ from msgs_slam.pipelines.depth.stereo.matching import (
     planes_to_try,
 )
 from msgs_slam.pipelines.depth.stereo.provider import at_stops
-from msgs_slam.pipelines.depth.stereo.refine import refine_inverse_depth
 from msgs_slam.pipelines.depth.stereo.smoothing import smooth_cost
-from msgs_slam.pipelines.depth.stereo.sweep import sweep_cost, warps_to
-from msgs_slam.pipelines.depth.stereo.tiles import TILE, tiles_of
+from msgs_slam.pipelines.depth.stereo.sweep import refine_inverse_depth, sweep_cost, warps_to
 from msgs_slam.pipelines.depth.stereo.upsample import upsample_depth
-from msgs_slam.pipelines.depth.stereo.volume import UNREACHED, Volume, least_planes, pick_planes
-from msgs_slam.pipelines.depth.stereo.window import LIKENESS, RADIUS, STEP, VARIANCE_FLOOR
+from msgs_slam.pipelines.depth.stereo.volume import TILE, UNREACHED, Bands, Volume, least_planes, pick_planes, tiles_of
+from msgs_slam.pipelines.depth.stereo.window import LIKENESS, RADIUS, STEP, VARIANCE_FLOOR, surface_contrast
 
 HEIGHT, WIDTH, FOCAL = 40, 60, 50.0
 MATRIX = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])

@@ -17,13 +17,20 @@ from test_proxy_stereo import CAMERAS, MATRIX, scene, view_of_plane  # noqa: E40
 
 from msgs_slam.pipelines.compute import gpu  # noqa: E402
 from msgs_slam.pipelines.depth.stereo import card, matching  # noqa: E402
-from msgs_slam.pipelines.depth.stereo.bands import Bands  # noqa: E402
 from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths  # noqa: E402
-from msgs_slam.pipelines.depth.stereo.refine import refine_inverse_depth  # noqa: E402
 from msgs_slam.pipelines.depth.stereo.smoothing import smooth_cost  # noqa: E402
-from msgs_slam.pipelines.depth.stereo.sweep import sweep_cost, warps_to  # noqa: E402
-from msgs_slam.pipelines.depth.stereo.tiles import TILE  # noqa: E402
-from msgs_slam.pipelines.depth.stereo.volume import UNREACHED, Volume, pick_planes  # noqa: E402
+from msgs_slam.pipelines.depth.stereo.sweep import (  # noqa: E402
+    refine_inverse_depth,
+    sweep_cost,
+    warps_to,
+)
+from msgs_slam.pipelines.depth.stereo.volume import (  # noqa: E402
+    TILE,
+    UNREACHED,
+    Bands,
+    Volume,
+    pick_planes,
+)
 from tests.card_builds import build  # noqa: E402
 
 DEVICE = "cuda" if ON_CARD else "cpu"
@@ -136,6 +143,6 @@ def test_the_kernels_compile_for_cards(tmp_path: Path) -> None:
     numbers = ("views", "count", "width", "height", "down", "across", "pixels")
     floats = ("narrow", "step", "stiffness", "small", "large", "edge", "nearest", "by_value", "by_place")
     kinds = dict.fromkeys(numbers, "i32") | dict.fromkeys(floats, "fp32") | {"starts": "*i32"}
-    build({"proxy.stereo.card_kernels": names[:-1]}, constants, kinds, tmp_path)
+    build({"depth.stereo.card_kernels": names[:-1]}, constants, kinds, tmp_path)
     double = {"warps": "*fp64", "backs": "*fp64"}
-    build({"proxy.stereo.card_kernels": names[-1:]}, constants, kinds | double, tmp_path)
+    build({"depth.stereo.card_kernels": names[-1:]}, constants, kinds | double, tmp_path)
