@@ -40,7 +40,7 @@ from ..source.known_poses import check_poses, given_poses, pose_inputs
 from ..source.opening import FolderSource, Source, Warn, open_source
 from ..source.sharpness import reduce_image
 from ..structure.backbone import to_sparse_model
-from ..structure.calibration import read_intrinsics
+from ..structure.calibration import intrinsics_inputs, read_intrinsics
 from ..structure.lens import Lens, distortion_of, make_lens
 from ..structure.parallax import require_motion
 from ..structure.rolling import read_readout
@@ -312,8 +312,9 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
 
 
 def _inputs(source: Path, config: Config) -> dict[str, str] | None:
-    more = learned_inputs(config.frames) | pose_inputs(config.frames) | before_inputs(source)
-    return (mask_inputs(source, config) or {}) | more or None
+    settings = config.frames
+    given = pose_inputs(settings) | intrinsics_inputs(settings.intrinsics)
+    return (mask_inputs(source, config) or {}) | learned_inputs(settings) | given | before_inputs(source) or None
 
 
 def _division(run: RunFolder, config: Config) -> list[range]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ...formats.datasets.calibration_files import read_calibration_file
 from ...formats.datasets.camera import Camera
+from ...formats.digest import file_sha256
 from ...formats.errors import InputError
 from ...formats.reading import home_expanded, reaching
 from ...formats.textfile import read_rows
@@ -25,6 +26,19 @@ def read_intrinsics(text: str, width: int, height: int) -> Camera:
     numbers = _numbers(text.replace(",", " ").split())
     if numbers is not None:
         return _from_numbers(numbers, width, height, f"intrinsics {text}")
+    path, name = _named_file(text)
+    return _fit_to_source(_from_file(path, name, width, height), width, height, path)
+
+
+def intrinsics_inputs(text: str) -> dict[str, str]:
+    """Return the digest of the file that `frames.intrinsics` names; {} for numbers and for none."""
+    if not text or _numbers(text.replace(",", " ").split()) is not None:
+        return {}
+    return {"intrinsics": file_sha256(_named_file(text)[0])}
+
+
+def _named_file(text: str) -> tuple[Path, str]:
+    """The file of `FILE` or `FILE#NAME`, and the name. Raises InputError where there is no such file."""
     path, name = Path(text), ""
     with reaching(path):
         path = home_expanded(path)
@@ -33,7 +47,7 @@ def read_intrinsics(text: str, width: int, height: int) -> Camera:
             path = home_expanded(beginning)
         if not path.is_file():
             raise InputError(f"intrinsics {text!r} are neither numbers nor an existing file: {_HOW}")
-    return _fit_to_source(_from_file(path, name, width, height), width, height, path)
+    return path, name
 
 
 def _from_file(path: Path, name: str, width: int, height: int) -> Camera:

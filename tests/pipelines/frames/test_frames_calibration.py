@@ -13,8 +13,9 @@ import pytest
 
 from msgs_slam.formats.datasets.camera import Camera
 from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.config import Config, FramesConfig
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.frames.stage import run
+from msgs_slam.pipelines.frames.stage import STAGE, run
 from msgs_slam.pipelines.source.opening import FolderSource
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
 from msgs_slam.pipelines.structure.lens import distortion_of, make_lens, set_lens, to_pycolmap, unknown_camera
@@ -163,6 +164,21 @@ def test_what_opencv_writes_is_read(suffix: str, tmp_path: Path) -> None:
     file.write("distortion_coefficients", np.array([[0.1, -0.2, 1e-5, 0, 0.05]]))
     file.release()
     assert read_intrinsics(str(path), 640, 480) == Camera(640, 480, 525, 526, 320, 240, (0.1, -0.2, 1e-5, 0, 0.05))
+
+
+def test_a_calibration_file_that_has_changed_makes_the_stage_again(tmp_path: Path, bent_walk: Walk) -> None:
+    path = tmp_path / "camera.txt"
+    asked = Config(frames=FramesConfig(intrinsics=str(path), people="off"))
+
+    def inputs(text: str) -> dict[str, str] | None:
+        path.write_text(text)
+        return STAGE.inputs(bent_walk.folder, asked)
+
+    before = inputs("500 500 320 240")
+    assert before is not None
+    assert inputs("510 510 320 240") != before == inputs("500 500 320 240")
+    numbers = Config(frames=FramesConfig(intrinsics="500,500,320,240", people="off"))
+    assert STAGE.inputs(bent_walk.folder, numbers) is None
 
 
 @pytest.mark.parametrize("suffix", [".txt", ".bin"])
