@@ -264,11 +264,14 @@ def measure_views(
     max_views: int,
 ) -> Measured:
     """Keyframes, held-out frames and frames between at the run's own poses; held-out frames also at poses refined on
-    the map, and frames not used for the map at the true ones."""
+    the map, and frames not used for the map at the true ones. Frames that are all masked show nothing to compare."""
     measured = Measured(outcome.classes.names, matched.sequence.class_names, matching)
     pixels = FramePixels(outcome.calibration)
     jobs = _jobs(outcome, matched, alignment, max_views)
     for frame_id, kind, cam_from_world in progress.track(jobs, "measuring", len(jobs)):
+        left_out = outcome.run.left_out(outcome.frames[outcome.frame_row(frame_id)])
+        if left_out is not None and left_out.all():
+            continue
         view = render_outcome(outcome, cam_from_world)
         measured.views.append(_measure(outcome, matched, pixels, measured, view, frame_id, kind))
     return measured
@@ -338,8 +341,7 @@ def _measure(
         if (labels := matched.sequence.labels(index)) is not None:
             accuracy = _add_labels(measured, view, pixels.sample(labels))
     perceived = float("nan") if isinstance(measured.lpips, str) else measured.lpips(picture, photo)
-    judged = left_out is None or not left_out.all()
-    likeness = psnr(picture, photo, None if left_out is None else ~left_out) if judged else float("nan")
+    likeness = psnr(picture, photo, None if left_out is None else ~left_out)
     return MeasuredView(frame_id, kind, likeness, ssim(picture, photo), perceived, depth_l1, accuracy)
 
 

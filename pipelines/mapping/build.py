@@ -132,7 +132,7 @@ def _submaps(
 
 
 def _mean_psnr(figures: Sequence[ViewFigures]) -> float:
-    return float(np.mean([f.psnr for f in figures]))
+    return float(np.nanmean([f.psnr for f in figures]))
 
 
 def submap_tasks(

@@ -40,17 +40,19 @@ def measure_view(
     features: Tensor | None = None,
 ) -> ViewFigures:
     """Compare the map, seen from `cam_from_world` (4, 4) with the given exposure (3,), with what the view shows of the
-    scene; `features`: as of `features_of`, who measures several views makes them once."""
+    scene; `features`: as of `features_of`, who measures several views makes them once. NaN for a view that is all
+    masked: what is not compared agrees with nothing."""
     rendering = draw_map(gaussian_map, view, cam_from_world, features)
     colors = rendering.features[..., :3] * torch.exp(torch.tensor(log_gain)).to(view.image.device)
     colors = (colors + torch.tensor(offset).to(view.image.device)).clamp(0, 1)
     photo = view.of_scene(view.colors, colors)
     error = ((colors - photo).square().mean() / view.shown).clamp(min=1e-10)
     known = view.depth > 0
+    judged = 1.0 if view.scene is None or view.scene.any() else float("nan")
     depth_l1 = (rendering.depth - view.depth).abs()[known].mean() if known.any() else torch.tensor(float("nan"))
     return ViewFigures(
-        psnr=float(-10 * torch.log10(error)),
-        ssim=float(ssim_map(colors, photo).mean()),
+        psnr=judged * float(-10 * torch.log10(error)),
+        ssim=judged * float(ssim_map(colors, photo).mean()),
         depth_l1=float(depth_l1),
         label_agreement=_label_agreement(rendering, view),
     )

@@ -130,15 +130,14 @@ def test_the_truth_of_another_recording_and_an_unfinished_run_are_refused(
         evaluate_outcome(load_outcome(run), truth)
 
 
-def test_a_view_that_is_all_left_out_has_no_psnr(
+def test_a_frame_that_is_all_masked_is_not_judged(
     oracle_run: OracleRun, truth: Sequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = oracle_run()
     monkeypatch.setattr(RunFolder, "left_out", lambda self, frame: np.full(self.image(frame).shape[:2], frame.id == 0))
-    result = evaluate_outcome(load_outcome(run), truth, max_views=2)
-    first, *others = [view["psnr"] for view in result["views"] if view["kind"] == "keyframes"]
-    assert first is None
-    assert result["images"]["keyframes"]["psnr"] == pytest.approx(np.mean(others))
+    views = evaluate_outcome(load_outcome(run), truth, max_views=2)["views"]
+    assert len(views) > 1
+    assert all(view["frame_id"] > 0 and view["psnr"] < 60 for view in views)
 
 
 def test_without_a_map_the_poses_are_still_judged(oracle_run: OracleRun, truth: Sequence) -> None:

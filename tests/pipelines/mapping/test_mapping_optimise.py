@@ -39,6 +39,19 @@ def mapped(room: MappingInput) -> OptimisedMap:
     return optimise_map(room.views, len(room.class_ids), SETTINGS, seed=0)
 
 
+def test_a_view_that_is_all_masked_is_not_judged(room: MappingInput, mapped: OptimisedMap) -> None:
+    view = room.views[0]
+    nothing, half = (
+        torch.zeros(view.image.shape[:2], dtype=torch.bool),
+        torch.ones(view.image.shape[:2], dtype=torch.bool),
+    )
+    half[:, ::2] = False
+    (none, some) = figures(mapped, [replace(view, scene=nothing), replace(view, scene=half)])
+    assert np.isnan(none.psnr)
+    assert np.isnan(none.ssim)
+    assert 10 < some.psnr < 60
+
+
 def test_the_map_shows_what_the_frames_show(room: MappingInput, mapped: OptimisedMap) -> None:
     assert 27 < mean(mapped, room.views, "psnr") < 45
     assert 24 < mean(mapped, room.held_out, "psnr") < mean(mapped, room.views, "psnr")
