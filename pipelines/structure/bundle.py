@@ -209,6 +209,8 @@ def solve_blocks(blocks: Array, pairs: NDArray[np.int64], right: Array) -> Array
     Dense Cholesky for up to DENSE_CAMERAS, else sparse LU. None where it has no (positive definite) solution.
     """
     count = len(right) // 6
+    if not (np.isfinite(blocks).all() and np.isfinite(right).all()):
+        return None
     if count <= DENSE_CAMERAS:
         dense = np.zeros((count, 6, count, 6))
         dense[pairs[:, 0], :, pairs[:, 1], :] = blocks

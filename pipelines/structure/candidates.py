@@ -51,6 +51,9 @@ _MIN_POINTS = 30
 NEIGHBOURS, GIVEN, GIVEN_ALONE = "neighbours", "given", "given-alone"
 _AS_GOOD = 0.98
 """Share of a model's score from which another is as good: one of a camera found anew, one of given poses."""
+_UNSURE = 0.03
+"""Relative deviation of a focal length from which another start is tried: two of three that start from a wrong one are
+at 0.05 and 5, most others at 0.001 to 0.02."""
 _Tried = tuple[pycolmap.Reconstruction, str, ModelReport]
 """A model, the mapper that made it, and how good it is."""
 
@@ -89,10 +92,22 @@ class Adjusted:
     readout: Readout
 
 
+def _better(
+    first: Adjusted | None, second: Adjusted | None, views: Views, pairs: Sequence[VerifiedPair]
+) -> Adjusted | None:
+    """The first of two models of one recording, unless only the second is one or explains its matches clearly better
+    and as many of the views."""
+    if first is None or second is None:
+        return first or second
+    left = unexplained(second.model, pairs, views.xy) < (1 - LEAST_BETTER) * unexplained(first.model, pairs, views.xy)
+    return second if left and second.score >= _AS_GOOD * first.score else first
+
+
 @dataclass(frozen=True, kw_only=True)
 class Candidates:
     """Inputs of candidate models besides the keyframes: `camera` is the prior, `is_fixed` holds it, `is_stated` holds
-    it unless the images contradict it. `is_extension`: the given poses are those of a finished run that images were
+    it unless the images contradict it; `asks_pairs`: the focal length that pairs tell, not COLMAP's guess, is where
+    calibration starts. `is_extension`: the given poses are those of a finished run that images were
     added to, and are tried first. cam_from_rig (C, 3, 3): keyframes are ordered direction by direction, as in `Rig`."""
 
     config: FramesConfig
@@ -102,6 +117,7 @@ class Candidates:
     progress: Progress
     seed: int
     is_stated: bool = False
+    asks_pairs: bool = True
     is_extension: bool = False
     cam_from_rig: NDArray[np.float64] = field(default_factory=lambda: ONE_CAMERA.cam_from_rig)
 
@@ -116,11 +132,7 @@ class Candidates:
             if gain_of_freeing(straight) < LEAST_GAIN_OF_FREEING:
                 return held
         free = next(filter(None, (self._freed(name, views, pairs) for name in ("stated", "unknown"))), None)
-        if held is None or free is None:
-            return free or held
-        contradicted = unexplained(held.model, pairs, views.xy)
-        is_better = unexplained(free.model, pairs, views.xy) < (1 - LEAST_BETTER) * contradicted
-        return free if is_better and free.score >= _AS_GOOD * held.score else held
+        return _better(held, free, views, pairs)
 
     def _freed(self, start: str, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
         """The model of a camera that is found anew, from the stated focal length or from nothing."""
@@ -132,6 +144,19 @@ class Candidates:
         return replace(self, camera=camera, is_fixed=False, is_stated=False, snapshots=snapshots)._best(views, pairs)
 
     def _best(self, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
+        """The best model, its camera calibrated unless it is fixed; where that leaves the focal length unsure, of two
+        that start from different ones."""
+        found = self._adjusted(views, pairs)
+        if found is None or found.focal_sd < _UNSURE * found.model.cameras[1].mean_focal_length():
+            return found
+        if self.camera.has_prior_focal_length:
+            return found
+        snapshots = Snapshots(self.snapshots.folder / "from_guess")
+        snapshots.folder.mkdir(exist_ok=True)
+        other = replace(self, asks_pairs=False, snapshots=snapshots)._adjusted(views, pairs)
+        return _better(found, other, views, pairs)
+
+    def _adjusted(self, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
         """The best model, its camera calibrated unless it is fixed; with the readout of a rolling shutter, where one is
         given or the model shows it."""
         mappers = ("global", "incremental")
@@ -245,7 +270,9 @@ class Candidates:
             return posed_model(self.camera, views.xy, views.given, pairs, not self.is_fixed, self.seed)
         features, database = views.features, work / "database.db"
         names = [f"{i:06d}" for i in range(len(features))]
-        camera, pairs = (self.camera, pairs) if start is not None else calibrated(self.camera, pairs, views.xy)
+        camera = self.camera
+        if start is None and self.asks_pairs:
+            camera, pairs = calibrated(camera, pairs, views.xy)
         write_database(database, camera, names, features, pairs, self.cam_from_rig)
         features.forget()  # the mapper needs the memory, and no descriptor
         if start is not None:
