@@ -13,6 +13,9 @@ from ...formats.reconstruction import ModelArrays
 from .lens import set_lens
 
 CAUCHY_PX = 1.0
+LOSS_SD = CAUCHY_PX / 2
+"""Pixels: by this deviation of its observations a `Bundle`, whose loss is two deviations wide, has the same loss. Not
+how good features are: see `tracking.state.FEATURE_SD`."""
 _MAX_REPROJECTION_PX = 4.0
 _MIN_ANGLE_DEG = 1.0
 _MIN_KEYFRAMES_TO_SPLIT = 8

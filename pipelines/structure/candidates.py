@@ -21,7 +21,7 @@ from ..geometry.rig import ONE_CAMERA
 from ..system.lru_sequence import LruSequence
 from ..system.progress import Progress
 from ..types import Features
-from .adjust import CAUCHY_PX, adjust, filter_outliers, solve
+from .adjust import CAUCHY_PX, LOSS_SD, adjust, filter_outliers, solve
 from .consistency import (
     LEAST_BETTER,
     LEAST_GAIN_OF_FREEING,
@@ -35,14 +35,7 @@ from .focal import calibrated
 from .given import posed_model
 from .lens import FOCAL_GUESS, unknown_camera
 from .mappers import map_globally, map_incrementally
-from .rolling import (
-    FEATURE_SD,
-    NO_READOUT,
-    Readout,
-    adjust_rolling,
-    read_readout,
-    straight_copy,
-)
+from .rolling import NO_READOUT, Readout, adjust_rolling, read_readout, straight_copy
 from .scale_repair import mended
 from .windows import WIDE, close_loops
 
@@ -215,7 +208,7 @@ class Candidates:
             if not close_loops(model, pairs, (), views.xy):
                 return found
             images = sorted(model.reg_image_ids())
-            for width in (WIDE * FEATURE_SD, CAUCHY_PX):
+            for width in (WIDE * LOSS_SD, CAUCHY_PX):
                 solve(model, images, refine_camera=False, width=width, roughly=True)
             filter_outliers(model)
             closed = self._judged(f"{NEIGHBOURS}-closed", model, views, pairs)

@@ -22,7 +22,7 @@ from ...formats.reconstruction import ModelArrays
 from ..geometry import se3
 from ..types import Intrinsics
 from . import bundle_kernels as kernels
-from .adjust import adjust, solve
+from .adjust import LOSS_SD, adjust, solve
 from .bundle import Bundle, Problem
 
 Array = NDArray[np.float64]
@@ -41,7 +41,6 @@ LEAST_GAIN = 0.01
 REACH = (-2, -1, 1, 2)
 _ROUNDS = 3
 """Of readout and rough adjustment by turns; the last adjustment comes after them."""
-FEATURE_SD = 0.5
 
 
 @dataclass(frozen=True)
@@ -174,7 +173,7 @@ class RollingModel:
         bundle = Bundle(
             np.ascontiguousarray(at.cam_from_world), at.points, at.obs_cam, at.obs_point,
             np.asarray(camera.cam_from_img(self.now)) * focal + half,
-            *(np.broadcast_to(value, count) for value in (FEATURE_SD, 0.0, 1.0, -1)),
+            *(np.broadcast_to(value, count) for value in (LOSS_SD, 0.0, 1.0, -1)),
         )  # fmt: skip
         return bundle, np.asarray(camera.cam_from_img(self.plain)) * focal + half, pinhole
 

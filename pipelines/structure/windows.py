@@ -18,11 +18,10 @@ from ...formats.reconstruction import pose_of, set_pose
 from ..correspondence.matching import VerifiedPair
 from ..geometry import se3
 from ..geometry.se3 import Similarity, best_rotation
-from .adjust import filter_outliers, median_error
+from .adjust import LOSS_SD, filter_outliers, median_error
 from .bundle import adjust_bundle
 from .given import bare_model
 from .rolling import (
-    FEATURE_SD,
     LEAST_GAIN,
     NO_READOUT,
     Readout,
@@ -155,7 +154,7 @@ def adjust_joined(
     if find_readout and any(readout):
         readout = found_readout(model, xy, times, readout)
     if narrowly:
-        adjust_together(model, xy, times, readout, median_error(model) / FEATURE_SD)
+        adjust_together(model, xy, times, readout, median_error(model) / LOSS_SD)
     filter_outliers(model)
     return readout
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.pipelines.structure import focal as focal_module
 from msgs_slam.pipelines.structure.focal import _errors, _rotation, calibrated, two_view_lens
 from msgs_slam.pipelines.structure.lens import to_pycolmap, unknown_camera
 from tests.pipelines.frames.made_views import structure_of, walk_round
@@ -73,6 +74,15 @@ def test_the_lens_of_a_path_is_found_and_none_where_there_is_none(focal: float, 
     assert abs(params[0] - focal) < min(2 * found.focal_sd, 0.01 * focal)
     assert found.focal_sd < 0.03 * focal
     assert params[3] == pytest.approx(k1, abs=0.01 if k1 else 0)
+    assert 0 < made.off(found.model) < 0.004
+
+
+def test_a_bad_start_from_pairs_is_not_the_last_word(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = walk_round(to_pycolmap(Camera(*SIZE, 520.0, 520.0, 320.0, 240.0)), 16)
+    monkeypatch.setattr(focal_module, "two_view_lens", lambda *_: (2.5 * 520.0, 0.0))
+    found = structure_of(made, GUESS, tmp_path, is_fixed=False)._calibrated(made.views(), made.pairs(GUESS))
+    assert found is not None
+    assert found.model.cameras[1].focal_length == pytest.approx(520, rel=0.01)
     assert 0 < made.off(found.model) < 0.004
 
 

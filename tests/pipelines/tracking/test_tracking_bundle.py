@@ -10,7 +10,7 @@ from msgs_slam.pipelines.config import TrackingConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import align_points
-from msgs_slam.pipelines.structure.bundle import Bundle, Problem, adjust_bundle, adjust_pose
+from msgs_slam.pipelines.structure.bundle import Bundle, Problem, adjust_bundle, adjust_pose, solve_blocks
 from msgs_slam.pipelines.tracking.adjust import adjust_state, consistent
 from msgs_slam.pipelines.tracking.pnp import colmap_camera
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
@@ -235,3 +235,11 @@ def test_motion_only_adjustment_finds_the_pose(known_bundle: KnownBundle) -> Non
     twist = se3.log(found @ se3.inverse(truth))
     assert 0 < np.linalg.norm(twist[:3]) < 0.01
     assert 0 < np.linalg.norm(twist[3:]) < 0.002
+
+
+@pytest.mark.parametrize("count", [3, 400])
+def test_equations_of_a_model_gone_wild_have_no_solution(count: int) -> None:
+    blocks, pairs = np.tile(np.eye(6), (count, 1, 1)), np.repeat(np.arange(count)[:, None], 2, axis=1)
+    assert solve_blocks(blocks, pairs, np.ones(6 * count)) is not None
+    blocks[1, 0, 0] = np.nan
+    assert solve_blocks(blocks, pairs, np.ones(6 * count)) is None
