@@ -1,7 +1,8 @@
-"""Interfaces of providers of proxy depth and proxy semantics, with what one has that says nothing else."""
+"""Interfaces of providers of depth and of labels: the frames with their cameras go in, estimates come out."""
 
 from __future__ import annotations
 
+import colorsys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -181,3 +182,14 @@ def resample_linear(array: NDArray[np.float32], height: int, width: int) -> NDAr
     """(H, W, C) → (height, width, C) by linear interpolation between the centres of the pixels."""
     out = cv2.resize(np.ascontiguousarray(array), (width, height), interpolation=cv2.INTER_LINEAR)
     return np.asarray(out, np.float32).reshape(height, width, array.shape[-1])
+
+
+def class_colors(count: int) -> tuple[tuple[int, int, int], ...]:
+    """`count` RGB colours; hue steps by the golden ratio, brightness alternates."""
+    colors = []
+    for i in range(count):
+        value = (0.95, 0.7, 0.85)[i % 3]
+        saturation = (0.55, 0.75, 0.4)[(i // 3) % 3]
+        red, green, blue = colorsys.hsv_to_rgb((0.08 + i * 0.618034) % 1.0, saturation, value)
+        colors.append((round(red * 255), round(green * 255), round(blue * 255)))
+    return tuple(colors)

@@ -14,8 +14,8 @@ from .engine.stages import Stage
 from .engine.standing import newly_chosen, next_upstream, why_again
 from .masks.people import people_cards
 from .networks.card import Card
-from .networks.registry import ModelStore
-from .proxy.selection import choose_depth, choose_semantics, metric_card
+from .networks.registry import ModelStore, metric_card
+from .proxy.selection import choose_depth, choose_semantics
 from .run.files import CALIBRATION
 from .run.folder import RunFolder
 from .run.names import STAGES

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from ...formats.errors import InputError
 from ..networks.card import Card
 from ..networks.depth import network_depth
-from ..networks.identity import card_identity
 from ..networks.network_pass import Arrays, NetworkPass, Workplace
-from ..networks.session import Network
+from ..networks.session import Network, card_identity
 from ..providers import DepthEstimate, DepthProvider, Sequence
 from ..types import Frame
 from .scale import depth_at_points

@@ -17,15 +17,15 @@ from ..config import Config, ExportConfig
 from ..engine.stages import Stage, StageContext
 from ..engine.tasks import in_chunks
 from ..mapping.measure import Shown
-from ..networks.identity import card_identity
+from ..networks.registry import metric_card
+from ..networks.session import card_identity
 from ..outcome import Outcome, load_outcome
-from ..proxy.selection import metric_card
 from ..run.files import METRES, SUBMAPS
 from ..run.folder import RunFolder
 from ..run.journal import empty
 from ..run.records import load_records
+from ..scene.gps import AUTO, OFF, world_on_earth
 from ..scene.metres import find_metres
-from ..scene.places import AUTO, OFF, world_on_earth
 from ..scene.upright import find_upright
 from ..scene.world import FIRST, WORLD, World, upright_world, world_figures
 from ..system.memory import release_free_memory

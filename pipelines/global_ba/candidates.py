@@ -13,7 +13,7 @@ from scipy.sparse import csr_matrix
 from ..config import GlobalBaConfig
 from ..correspondence.retrieval import GlobalDescriptors, far_apart, loop_pairs
 from ..geometry.sparse_model import SparseModel
-from ..proxy.reliability import mean_iou
+from ..proxy.maps import mean_iou
 from ..types import VOID
 
 Array = NDArray[np.float64]

@@ -14,11 +14,10 @@ from ...formats.errors import InputError
 from ...formats.images import read_label_png
 from ..depth.files import as_read, find_folder, match_files, require_aspect
 from ..geometry.resampling import resample_nearest
-from ..networks.classes import MAX_ID, NamedClass, find_class_table, read_class_table
-from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, Sequence
+from ..networks.card import MAX_ID, NamedClass, find_class_table, read_class_table
+from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, Sequence, class_colors
 from ..system.progress import Progress
 from ..types import VOID, ClassTable, Frame
-from .palette import class_colors
 
 _SUFFIXES = (".png", ".tif", ".tiff")
 _NAMES = ("labels", "label", "semantic_class", "semantic", "semantics", "segmentation")

@@ -18,12 +18,11 @@ from ..geometry.camera import unproject_depth
 from ..geometry.resampling import resample_nearest
 from ..geometry.room_layout import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
 from ..geometry.voxels import LEAST_WEIGHT, VOXELS_PER_DEPTH, Voxels, find_near, gather_frame, merge, select, voxel_keys
-from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, Sequence
+from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, Sequence, class_colors
 from ..system.jit import kernel
 from ..system.memory import release_free_memory
 from ..system.progress import Progress
 from ..types import VOID, ClassTable, Frame
-from .palette import class_colors
 from .parts import cut_parts
 
 _GATHER_SIDE = 200

@@ -12,11 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...formats.errors import InputError
 from ..networks.card import Card
-from ..networks.identity import card_identity
-from ..networks.person import person_probability
 from ..networks.registry import ModelStore
-from ..networks.session import Network
+from ..networks.session import Network, card_identity
 
 _MAYBE = 0.3
 """Probability of the class from which pixels form a candidate."""
@@ -101,3 +100,17 @@ def join_people(person: NDArray[np.float32], by_class: NDArray[np.float32]) -> N
 def _grown(area: NDArray[np.bool_], by: float) -> NDArray[np.bool_]:
     away = cv2.distanceTransform((~area).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(away <= max(1.0, by))
+
+
+def person_probability(network: Network, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(h, w) in [0, 1]: how likely every pixel of an RGB image (h, w, 3) shows a person.
+
+    Raises InputError when the output is no image of probabilities.
+    """
+    box = network.box(image.shape[1], image.shape[0])
+    output = network.run(image, box)["output"]
+    plane = output[0] if output.ndim == 3 and output.shape[0] == 1 else output
+    if plane.ndim != 2:
+        raise InputError(f"{network.card.model}: gave {output.shape} where one image of probabilities is expected")
+    clean = np.clip(np.nan_to_num(plane.astype(np.float32), nan=0.0), 0, 1)
+    return box.take(clean, network.card.align_corners)

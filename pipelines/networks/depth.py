@@ -11,8 +11,7 @@ from ...formats.errors import InputError
 from ..geometry.camera import unproject_depth
 from ..geometry.voxels import normals_in_cam
 from ..types import Intrinsics
-from .letterbox import Letterbox
-from .session import Network
+from .session import Letterbox, Network
 
 _ALIKE = np.radians(30)
 _LEAST_COSINE = 0.7

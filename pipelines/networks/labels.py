@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from .card import Card
-from .letterbox import Letterbox
-from .session import Network
+from .session import Letterbox, Network
 
 
 def network_probabilities(network: Network, output: NDArray, width: int, height: int, side: int = 0) -> NDArray:

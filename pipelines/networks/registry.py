@@ -253,6 +253,27 @@ class ModelStore:
         write_json(self.cache / "own.json", own)
 
 
+def metric_card() -> Card | None:
+    """The card of the best network in the cache for metric depth, be it good for nothing else; None without one."""
+    model = ModelStore.open().first_metric()
+    return None if model is None else ModelStore.open().card(model)
+
+
+def missing_networks() -> str | None:
+    """One line on what the default networks would add where there are none; None where there are."""
+    store = ModelStore.open()
+    lacks = [
+        what
+        for what, task in (("names", "segmentation"), ("metres", "depth"), ("masks of people", "person"))
+        if store.first_here(task, metres_only=True) is None
+    ]
+    if not lacks:
+        return None
+    size = sum(m.bytes for m in store.with_needed([])) / 1e6
+    named = ", ".join(lacks)
+    return f"no networks for {named} are installed: `msgs-slam models pull` fetches them ({size:.0f} MB, once)"
+
+
 def _addresses(row: dict[str, Any]) -> tuple[str, ...]:
     return tuple(url.format(revision=row.get("revision") or "main") for url in row["urls"])
 

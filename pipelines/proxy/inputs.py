@@ -10,18 +10,18 @@ from ...formats.errors import InputError
 from ..config import Config
 from ..depth.files import FilesDepth, require_sizes
 from ..labels.files import FilesLabels
-from ..networks.identity import card_identity
+from ..networks.registry import missing_networks
+from ..networks.session import card_identity
 from ..providers import Sequence
 from ..source.opening import open_source
 from ..source.recording import RecordingSource
 from ..system.progress import SilentProgress, log
 from ..types import Calibration, Frame, Intrinsics
-from .scale_reference import POSES, require_reference_in
+from .reference import POSES, require_reference_in
 from .selection import (
     ProviderContext,
     choose_depth,
     choose_semantics,
-    missing_networks,
     open_depth_files,
     open_label_files,
     open_learned_depth,

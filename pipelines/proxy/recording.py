@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from ...formats.datasets import Sequence as Recording
 from ...formats.errors import InputError
-from ..labels.palette import class_colors
-from ..providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider, Sequence
+from ..providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider, Sequence, class_colors
 from ..source.source_pixels import FramePixels
 from ..system.progress import Progress
 from ..types import VOID, ClassTable, Frame

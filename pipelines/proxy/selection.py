@@ -16,9 +16,8 @@ from ..depth.fused import FusedDepth
 from ..depth.learned import AlignedDepth, OnnxDepth
 from ..depth.scale import measure_scale
 from ..depth.stereo.provider import MultiviewDepth
-from ..labels.clusters import OnnxClusters
 from ..labels.files import FilesLabels
-from ..labels.learned import OnnxLabels
+from ..labels.learned import OnnxClusters, OnnxLabels
 from ..labels.segments import SegmentLabels
 from ..networks.card import Card, read_card
 from ..networks.network_pass import ResultCache, Workplace
@@ -197,27 +196,6 @@ def _cached(task: str) -> Card | None:
     store = ModelStore.open()
     model = store.first_here(task)
     return None if model is None else store.card(model)
-
-
-def metric_card() -> Card | None:
-    """The card of the best network in the cache for metric depth, be it good for nothing else; None without one."""
-    model = ModelStore.open().first_metric()
-    return None if model is None else ModelStore.open().card(model)
-
-
-def missing_networks() -> str | None:
-    """One line on what the default networks would add where there are none; None where there are."""
-    store = ModelStore.open()
-    lacks = [
-        what
-        for what, task in (("names", "segmentation"), ("metres", "depth"), ("masks of people", "person"))
-        if store.first_here(task, metres_only=True) is None
-    ]
-    if not lacks:
-        return None
-    size = sum(m.bytes for m in store.with_needed([])) / 1e6
-    named = ", ".join(lacks)
-    return f"no networks for {named} are installed: `msgs-slam models pull` fetches them ({size:.0f} MB, once)"
 
 
 def _multiview(around: ProviderContext) -> MultiviewDepth:

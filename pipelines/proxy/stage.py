@@ -17,8 +17,7 @@ from ..run.files import CLASSES, DESCRIPTORS, FIGURES, FRAME_SCALES, LEFT_OUT, P
 from ..system.progress import log
 from ..types import VOID, Frame
 from .inputs import check_proxy, left_to_auto, proxy_inputs
-from .metres import reference_scale, scale_figures
-from .scale_reference import ReferenceScale
+from .reference import ReferenceScale, reference_scale, scale_figures
 from .tasks import (
     ProxyWork,
     in_frames,

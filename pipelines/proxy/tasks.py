@@ -32,8 +32,7 @@ from ..system.parallel import abreast
 from ..system.progress import Progress
 from ..system.values import load_value, save_value
 from ..types import Frame, Intrinsics, ProxyMaps, any_of
-from .compact import compact
-from .reliability import reliability
+from .maps import compact, reliability
 from .selection import ProviderContext, open_depth, open_semantics
 
 R = TypeVar("R")

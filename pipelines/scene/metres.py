@@ -13,12 +13,9 @@ from ..networks.card import Card
 from ..run.files import CALIBRATION, CLASSES, DEPTH_FIELDS, FIGURES, FRAME_SCALES, FRAMES, PROXY_MAPS
 from ..run.folder import RunFolder
 from ..types import Intrinsics, Metres, MetresSource, Trajectory
-from .evidence import Combined, Evidence, combine, independence
-from .heights import camera_height, ceiling_height, usual_distance
-from .known import MEASURED, known_scale
-from .network import network_scale
-from .sizes import OUTDOORS, THINGS
-from .things import sizes_of_things
+from .evidence import OUTDOORS, THINGS, Combined, Evidence, combine, independence
+from .heights import camera_height, ceiling_height, sizes_of_things, usual_distance
+from .network import MEASURED, known_scale, network_scale
 from .view import Scene, SeenFrame, build_scene
 
 _MOST_FRAMES = 40

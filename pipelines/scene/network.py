@@ -1,8 +1,10 @@
-"""The scale by a network that was trained on metric depth."""
+"""The scale where the run is metric already (a reference, depth files, a metric network), and by a network that was
+trained on metric depth."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,11 +12,19 @@ from numpy.typing import NDArray
 
 from ..networks.card import Card
 from ..networks.depth import network_depth
-from ..networks.letterbox import Letterbox
-from ..networks.session import Network
+from ..networks.session import Letterbox, Network
 from ..types import Intrinsics
 from .evidence import Evidence, Mode
 from .view import LEAST_CONFIDENCE, SeenFrame
+
+_SENSOR_SD = 0.02
+"""Depth cameras: 1 to 3 % at room distances after the factory's calibration (Khoshelham and Oude Elberink, Sensors
+2012, for the Kinect)."""
+_SENSOR_SPREAD = 0.02
+"""Depth that strays more than this from the triangulated points, relatively, is no sensor's."""
+_LEAST_SD = 0.003
+MEASURED = "measured"
+"""Kind of what somebody has measured: a length that the user knows, a depth camera."""
 
 Array = NDArray[np.float64]
 
@@ -114,3 +124,21 @@ def retake_nearest(values: NDArray[np.float32], camera: Intrinsics, other: Intri
     inside = ((rows >= 0) & (rows < values.shape[0]))[:, None] & ((columns >= 0) & (columns < values.shape[1]))[None]
     taken = values[np.clip(rows, 0, values.shape[0] - 1)[:, None], np.clip(columns, 0, values.shape[1] - 1)[None]]
     return np.where(inside, taken, 0).astype(np.float64)
+
+
+def known_scale(report: Mapping[str, Any], spreads: list[float], statistical_sd: float) -> list[Evidence]:
+    """Return evidence that the unit is a metre, from whatever made the world metric; none for a run without metres.
+
+    report: the proxy stage's; spreads: relative spread of each frame's depth around its triangulated points;
+    statistical_sd: relative deviation of the scale that tracking fitted to the depth.
+    """
+    if not report.get("metric"):
+        return []
+    if report.get("scale_from") == "reference":
+        sd = max(float(report["reference_relative_sd"]), _LEAST_SD)
+        return [Evidence("the given reference", MEASURED, (Mode(0.0, sd),), 0.0, is_guess=False)]
+    name = str(report.get("depth", "depth"))
+    is_sensor = name.startswith("files") and (not spreads or float(np.median(spreads)) < _SENSOR_SPREAD)
+    sd = float(np.hypot(_SENSOR_SD if is_sensor else LARGE_SD, statistical_sd))
+    kind = MEASURED if is_sensor else "network"
+    return [Evidence(f"the depth of {name}", kind, (Mode(0.0, sd),), 0.0 if is_sensor else 0.03, is_guess=False)]

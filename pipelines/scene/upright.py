@@ -1,10 +1,16 @@
-"""Up and the floor of a finished run: by vertical lines in its images and level surfaces in its map."""
+"""Up and the floor of a finished run: by vertical lines in its images and level surfaces in its map.
+
+A line in an image and the camera's centre span a plane. The direction of the line in the world lies in that plane, so
+the plane's normal n is across it: n . up = 0 for every upright line, whatever its place. With the cameras' rotations
+known, the lines of all images vote together (the vanishing point of all cameras at once).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,8 +20,20 @@ from ..geometry.room_layout import Gravity, find_gravity, floor_plane, name_stru
 from ..geometry.voxels import VOXELS_PER_DEPTH, Voxels, gather_depths
 from ..mapping.measure import depth_view
 from ..outcome import Outcome, evenly, maps_around
-from ..system.parallel import abreast
-from .lines import up_of_lines
+from ..system.parallel import abreast, parallel_map
+from ..types import Intrinsics
+
+_LEAST_LENGTH = 0.05
+"""Shorter segments, as a share of the image's long side, have no reliable direction."""
+_REACH = 35.0
+_PRIOR_SD = 15.0
+"""Degrees by which the cameras' own up is wrong: phones are held at a slant, and one direction of view leaves its tilt
+open. The prior chooses among the directions of a room, it does not bend the one it chooses."""
+_COARSE_SD = 1.5
+_SDS = (2.0, 1.0, 0.7, 0.5, 0.5, 0.5)
+_INSIDE = 1.0
+_LEAST_LINES = 40
+_LEAST_CONTRAST = 3.0
 
 Array = NDArray[np.float64]
 
@@ -99,3 +117,89 @@ def surface_voxels(outcome: Outcome, rows: Sequence[int]) -> Voxels:
 
 def _degrees(a: Array, b: Array) -> float:
     return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
+
+
+@dataclass(frozen=True)
+class Vertical:
+    """up (3,) unit vector in the world; `lines` within a degree of it, and the `contrast` of their length there to the
+    length a degree farther out, where only chance brings lines."""
+
+    up: Array
+    lines: int
+    contrast: float
+
+    @property
+    def is_sure(self) -> bool:
+        """Far more lines are vertical than chance would have it."""
+        return self.lines >= _LEAST_LINES and self.contrast >= _LEAST_CONTRAST
+
+
+def line_planes(picture: NDArray[np.uint8], intrinsics: Intrinsics) -> tuple[Array, Array]:
+    """normals (L, 3) in the camera of the planes through its straight segments, and lengths (L,) in image sides.
+
+    `picture`: (H, W, 3) RGB without lens distortion. Segments by LSD (von Gioi et al., PAMI 2010).
+    """
+    side = max(picture.shape[:2])
+    grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
+    found = cv2.createLineSegmentDetector().detect(grey)[0]
+    if found is None:
+        return np.zeros((0, 3)), np.zeros(0)
+    # OpenCV counts from the centre of the first pixel.
+    ends = np.asarray(found, np.float64).reshape(-1, 2, 2) + 0.5
+    lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / side
+    ends, lengths = ends[lengths > _LEAST_LENGTH], lengths[lengths > _LEAST_LENGTH]
+    k = intrinsics
+    rays = np.concatenate([(ends - (k.cx, k.cy)) / (k.fx, k.fy), np.ones((len(ends), 2, 1))], axis=2)
+    normals = np.cross(rays[:, 0], rays[:, 1])
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True), lengths
+
+
+def up_of_lines(
+    pictures: Iterable[NDArray[np.uint8]], cam_from_world: Array, intrinsics: Intrinsics, prior: Array, threads: int = 1
+) -> Vertical:
+    """Up by the lines of images at poses cam_from_world (N, 4, 4), near the unit vector `prior` (3,)."""
+    found = list(parallel_map(lambda picture: line_planes(picture, intrinsics), pictures, threads))
+    normals = np.concatenate(
+        [np.zeros((0, 3)), *(n @ p[:3, :3] for (n, _), p in zip(found, cam_from_world, strict=True))]
+    )
+    return common_direction(normals, np.concatenate([np.zeros(0), *(w for _, w in found)]), prior)
+
+
+def common_direction(normals: Array, lengths: Array, prior: Array) -> Vertical:
+    """The direction near `prior` (3,) that lies in the most planes (L, 3), each counted by its length (L,)."""
+    if len(normals) == 0:
+        return Vertical(prior, 0, 0.0)
+    candidates = _around(prior)
+    off = np.degrees(np.arccos(np.clip(candidates @ prior, -1, 1)))
+    votes = np.exp(-0.5 * ((candidates @ normals.T) / _sine(_COARSE_SD)) ** 2) @ lengths
+    up = candidates[int((votes * np.exp(-0.5 * (off / _PRIOR_SD) ** 2)).argmax())]
+    for sd in _SDS:
+        up = _refined(up, normals, lengths, _sine(sd))
+    away = np.degrees(np.arcsin(np.clip(np.abs(normals @ up), 0, 1)))
+    inside, ring = away < _INSIDE, (away > 3 * _INSIDE) & (away < 15 * _INSIDE)
+    by_chance = float(lengths[ring].sum()) / 12 + 1e-9
+    return Vertical(up, int(inside.sum()), float(lengths[inside].sum()) / by_chance)
+
+
+def _refined(up: Array, normals: Array, lengths: Array, sd: float) -> Array:
+    """One step of robust least squares on the sphere (Geman-McClure); what the lines leave open stays as it was."""
+    weights = lengths / (1 + ((normals @ up) / sd) ** 2) ** 2
+    tangent = np.linalg.svd(up[None])[2][1:]
+    across = normals @ tangent.T
+    matrix = (across * weights[:, None]).T @ across + 0.02 * weights.sum() * np.eye(2)
+    step = np.linalg.solve(matrix, -(across * weights[:, None]).T @ (normals @ up))
+    moved = up + step @ tangent
+    return np.asarray(moved / np.linalg.norm(moved))
+
+
+def _around(direction: Array) -> Array:
+    """(D, 3) unit vectors every two degrees within `_REACH` of a direction."""
+    steps = np.arange(-_REACH, _REACH + 1e-9, 2.0)
+    offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    offsets = offsets[np.hypot(offsets[:, 0], offsets[:, 1]) <= _REACH]
+    out = direction + np.tan(np.radians(offsets)) @ np.linalg.svd(direction[None])[2][1:]
+    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
+
+
+def _sine(degrees: float) -> float:
+    return float(np.sin(np.radians(degrees)))

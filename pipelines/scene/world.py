@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from ..geometry.se3 import Similarity
 from ..outcome import Outcome
 from ..run.layouts import RunFile, dataclass_from_json
-from .georeference import Georeference
 from .upright import Upright, cameras_up
 
 Array = NDArray[np.float64]
@@ -20,6 +19,18 @@ SAME = Similarity(1.0, np.eye(3), np.zeros(3))
 Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """glTF's axes (y up, z towards the viewer) from those of the exported world."""
 _Y_DOWN_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """origin (3,) latitude, longitude, altitude of (0, 0, 0); x is east, y north. `residual`: metres, root mean square
+    of a horizontal coordinate over the `used` of `fixes`; `scale_sd`: relative standard deviation of the scale."""
+
+    origin: tuple[float, float, float]
+    residual: float
+    used: int
+    fixes: int
+    scale_sd: float
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from ...formats.reading import reaching
 from ..export.stage import on_earth
 from ..export.writers import map_cloud
 from ..geometry.sparse_model import SparseModel
-from ..labels.palette import class_colors
 from ..outcome import Outcome, evenly, labels_of_channels, load_outcome
+from ..providers import class_colors
 from ..render.gaussian_map import decided_channels
 from ..run.files import BACKBONE, CALIBRATION, FRAMES, MESH
 from ..run.folder import RunFolder

@@ -29,7 +29,7 @@ from shape import gather, make_view, measure, true_depths
 
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.providers import Sequence
-from msgs_slam.pipelines.proxy.reliability import reliability
+from msgs_slam.pipelines.proxy.maps import reliability
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder

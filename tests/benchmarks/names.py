@@ -43,9 +43,9 @@ from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.evaluation.views import Picture, label_picture, render_outcome
 from msgs_slam.pipelines.geometry.camera import unproject_depth
 from msgs_slam.pipelines.geometry.resampling import resample_nearest
-from msgs_slam.pipelines.labels.palette import class_colors
 from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.providers import class_colors
 from msgs_slam.pipelines.proxy.selection import choose_semantics
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct

@@ -35,7 +35,7 @@ from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.evaluation.views import render_outcome
 from msgs_slam.pipelines.geometry.camera import project, unproject_depth
 from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
-from msgs_slam.pipelines.networks.person import person_probability
+from msgs_slam.pipelines.masks.people import person_probability
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.outcome import Outcome, load_outcome

@@ -62,13 +62,11 @@ from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.depth.files import _read as read_depth_file
 from msgs_slam.pipelines.evaluation.labels import read_class_map
 from msgs_slam.pipelines.masks.files import open_masks
-from msgs_slam.pipelines.networks.card import Card, read_card
-from msgs_slam.pipelines.networks.classes import read_class_table
-from msgs_slam.pipelines.networks.head import load_linear_head
+from msgs_slam.pipelines.networks.card import Card, read_card, read_class_table
 from msgs_slam.pipelines.networks.network_pass import ResultCache
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.networks.session import Network
-from msgs_slam.pipelines.networks.words import load_word_head, open_tokenizer, with_words
+from msgs_slam.pipelines.networks.words import load_linear_head, load_word_head, open_tokenizer, with_words
 from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.structure.calibration import read_intrinsics
 from msgs_slam.pipelines.viewer.scene import load_scenes

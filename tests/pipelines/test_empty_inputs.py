@@ -48,10 +48,9 @@ from msgs_slam.pipelines.mapping.views import halved, make_view, occurring_class
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.render.seeding import complete_depth, fill_smoothly, seed_spacing
 from msgs_slam.pipelines.render_run import orbit, resampled, smoothed
-from msgs_slam.pipelines.scene.georeference import georeference
-from msgs_slam.pipelines.scene.lines import line_planes, up_of_lines
+from msgs_slam.pipelines.scene.gps import georeference
 from msgs_slam.pipelines.scene.metres import Seen, contradiction, usual_evidence
-from msgs_slam.pipelines.scene.upright import cameras_up
+from msgs_slam.pipelines.scene.upright import cameras_up, line_planes, up_of_lines
 from msgs_slam.pipelines.scene.view import SeenFrame, build_scene
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps, SemanticMesh
 

@@ -21,8 +21,7 @@ from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.render.api import render
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.scene.georeference import Georeference
-from msgs_slam.pipelines.scene.world import SAME, World
+from msgs_slam.pipelines.scene.world import SAME, Georeference, World
 
 OracleRun = Callable[..., RunFolder]
 VALIDATE = """

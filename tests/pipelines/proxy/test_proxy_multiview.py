@@ -17,7 +17,7 @@ from msgs_slam.pipelines.depth.stereo.neighbours import depth_range
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.labels.segments import SegmentLabels
 from msgs_slam.pipelines.providers import DepthEstimate, Sequence
-from msgs_slam.pipelines.proxy.reliability import mean_iou
+from msgs_slam.pipelines.proxy.maps import mean_iou
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame, Intrinsics

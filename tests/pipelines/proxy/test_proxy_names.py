@@ -12,9 +12,7 @@ from msgs_slam.pipelines.evaluation.labels import count_labels, score
 from msgs_slam.pipelines.geometry import voxels
 from msgs_slam.pipelines.geometry.room_layout import FLOOR, OTHER, Gravity
 from msgs_slam.pipelines.geometry.voxels import Voxels, merge, voxel_keys
-from msgs_slam.pipelines.labels.belonging import disputed, one_name_each
-from msgs_slam.pipelines.labels.named import NamedScene, Vocabulary
-from msgs_slam.pipelines.labels.orientation import name_likelihood
+from msgs_slam.pipelines.labels.named import NamedScene, Vocabulary, disputed, name_likelihood, one_name_each
 from msgs_slam.pipelines.labels.segments import SegmentLabels
 from msgs_slam.pipelines.networks.labels import best_classes
 from msgs_slam.pipelines.providers import DepthEstimate, resample_linear

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from proxy_room import Room
 
-from msgs_slam.pipelines.labels.clusters import OnnxClusters, spherical_kmeans
+from msgs_slam.pipelines.labels.learned import OnnxClusters, spherical_kmeans
 from msgs_slam.pipelines.networks import network_pass
 from msgs_slam.pipelines.networks.card import read_card
 from msgs_slam.pipelines.networks.network_pass import Arrays, NetworkPass, ResultCache, Workplace

@@ -17,12 +17,11 @@ from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.depth.learned import OnnxDepth
 from msgs_slam.pipelines.networks.card import Card, read_card
 from msgs_slam.pipelines.networks.depth import network_depth, solve_shift, solve_shift_and_focal
-from msgs_slam.pipelines.networks.head import load_linear_head
 from msgs_slam.pipelines.networks.labels import class_token
-from msgs_slam.pipelines.networks.letterbox import choose_box
 from msgs_slam.pipelines.networks.network_pass import ResultCache, Workplace
-from msgs_slam.pipelines.networks.onnx_file import external_locations, require_own_weights
-from msgs_slam.pipelines.networks.session import Network
+from msgs_slam.pipelines.networks.runtime import external_locations, require_own_weights
+from msgs_slam.pipelines.networks.session import Network, choose_box
+from msgs_slam.pipelines.networks.words import load_linear_head
 from msgs_slam.pipelines.providers import Sequence
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics

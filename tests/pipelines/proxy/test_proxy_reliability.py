@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from msgs_slam.pipelines.proxy.compact import compact
-from msgs_slam.pipelines.proxy.reliability import (
-    EDGE_STEP,
-    mean_iou,
-    reliability,
-)
+from msgs_slam.pipelines.proxy.maps import EDGE_STEP, compact, mean_iou, reliability
 from msgs_slam.pipelines.types import VOID, ProxyMaps
 
 RNG = np.random.default_rng(3)

@@ -13,7 +13,7 @@ from msgs_slam.formats.images import write_grey_png
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry.camera import unproject, unproject_depth
 from msgs_slam.pipelines.proxy.inputs import check_proxy
-from msgs_slam.pipelines.proxy.scale_reference import Reference, parse_reference
+from msgs_slam.pipelines.proxy.reference import Reference, parse_reference
 from msgs_slam.pipelines.proxy.stage import run
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct

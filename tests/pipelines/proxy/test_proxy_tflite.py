@@ -12,13 +12,12 @@ from tiny_tflite import write_tflite
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.config import ProxyConfig
+from msgs_slam.pipelines.masks.people import person_probability
 from msgs_slam.pipelines.networks.card import Card, read_card
 from msgs_slam.pipelines.networks.depth import network_depth
-from msgs_slam.pipelines.networks.identity import card_identity
-from msgs_slam.pipelines.networks.person import person_probability
-from msgs_slam.pipelines.networks.registry import ModelStore
-from msgs_slam.pipelines.networks.session import Network
-from msgs_slam.pipelines.proxy.selection import choose_depth, choose_semantics, missing_networks
+from msgs_slam.pipelines.networks.registry import ModelStore, missing_networks
+from msgs_slam.pipelines.networks.session import Network, card_identity
+from msgs_slam.pipelines.proxy.selection import choose_depth, choose_semantics
 from msgs_slam.pipelines.types import Intrinsics
 from tests.network_labels import network_labels
 
@@ -80,7 +79,7 @@ def test_litert_says_nothing_and_others_still_can(tmp_path: Path) -> None:
         f"from ai_edge_litert.interpreter import Interpreter\nInterpreter(model_path={str(file)!r}).allocate_tensors()"
     )
     here = (
-        "import os, pathlib\nfrom msgs_slam.pipelines.networks.tflite_runtime import TfliteRuntime\n"
+        "import os, pathlib\nfrom msgs_slam.pipelines.networks.runtime import TfliteRuntime\n"
         f"TfliteRuntime(pathlib.Path({str(file)!r}), ['scores'], 1)\nos.write(2, b'heard')"
     )
     said = [subprocess.run([sys.executable, "-c", c], capture_output=True, text=True).stderr for c in (by_itself, here)]
@@ -98,7 +97,7 @@ def test_a_network_is_read_once_for_its_identity(tmp_path: Path, monkeypatch: py
     card = replace(CARD, model=write_tflite(tmp_path / "net.tflite", COLOURS, [0, 0, 0.5], "argmax"))
     first = card_identity(card)
     with monkeypatch.context() as patch:
-        patch.setattr("msgs_slam.pipelines.networks.identity.files_sha256", lambda _: pytest.fail("read again"))
+        patch.setattr("msgs_slam.pipelines.networks.session.files_sha256", lambda _: pytest.fail("read again"))
         assert card_identity(card) == first
     write_tflite(card.model, COLOURS, [0.5, 0, 0, 0.5], "argmax")
     assert card_identity(card) != first

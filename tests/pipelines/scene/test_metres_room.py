@@ -21,7 +21,8 @@ from msgs_slam.pipelines.networks.registry import _room_classes
 from msgs_slam.pipelines.run.files import DEPTH_FIELDS, FIGURES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene import metres as find
-from msgs_slam.pipelines.scene.heights import camera_height, ceiling_height, floor_trust
+from msgs_slam.pipelines.scene.evidence import OUTDOORS
+from msgs_slam.pipelines.scene.heights import camera_height, ceiling_height, floor_trust, sizes_of_things
 from msgs_slam.pipelines.scene.metres import (
     Seen,
     contradiction,
@@ -31,8 +32,6 @@ from msgs_slam.pipelines.scene.metres import (
     scene_evidence,
     usual_evidence,
 )
-from msgs_slam.pipelines.scene.sizes import OUTDOORS
-from msgs_slam.pipelines.scene.things import sizes_of_things
 from msgs_slam.pipelines.scene.view import Scene, SeenFrame, build_scene
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Intrinsics, Metres, ProxyMaps

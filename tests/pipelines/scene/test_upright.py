@@ -19,8 +19,7 @@ from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import MAP
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.scene.lines import common_direction, line_planes
-from msgs_slam.pipelines.scene.upright import find_upright
+from msgs_slam.pipelines.scene.upright import common_direction, find_upright, line_planes
 from msgs_slam.pipelines.scene.world import FIRST, WORLD, World, upright_world
 from msgs_slam.pipelines.types import Intrinsics
 
