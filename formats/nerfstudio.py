@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .atomic import write_text
-
-_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+from .trajectory import OPENCV_FROM_OPENGL
 
 
 def write_transforms(
@@ -33,7 +32,7 @@ def write_transforms(
     """
     if world_from_cam.shape != (len(image_paths), 4, 4):
         raise ValueError(f"write_transforms: got {len(image_paths)} images and poses {world_from_cam.shape}")
-    matrices = world_from_cam @ _OPENGL_FROM_OPENCV
+    matrices = world_from_cam @ OPENCV_FROM_OPENGL
     table: dict[str, object] = {
         "camera_model": "OPENCV",
         "w": width,

@@ -21,13 +21,12 @@ from numpy.typing import NDArray
 from .errors import InputError
 from .jsonfile import read_json, read_json_object
 from .textfile import read_text
-from .trajectory import clean_poses, poses_from_quaternions
+from .trajectory import OPENCV_FROM_OPENGL, clean_poses, poses_from_quaternions
 
 Array = NDArray[np.float64]
 _POLYCAM = ("keyframes/corrected_cameras", "keyframes/cameras", "corrected_cameras", "cameras")
 _ROWS = [[f"t_{i}{j}" for j in range(4)] for i in range(3)]
 _ODOMETRY = ("frame", "x", "y", "z", "qx", "qy", "qz", "qw")
-OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 Found = tuple[str, list[str], Array]
 """Of which app, the images' names without suffix, and world_from_cam (N, 4, 4)."""
 

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from .colmap import model_suffix, read_colmap_model
 from .errors import InputError
 from .jsonfile import read_json
-from .phone_poses import OPENCV_FROM_OPENGL, phone_poses
+from .phone_poses import phone_poses
 from .reading import home_expanded, reaching
 from .textfile import read_rows
-from .trajectory import clean_poses, read_matrices, read_tum
+from .trajectory import OPENCV_FROM_OPENGL, clean_poses, read_matrices, read_tum
 
 _MODEL_FOLDERS = (".", "sparse/0", "sparse", "0")
 _TABLES = ("transforms.json", "transforms_train.json")

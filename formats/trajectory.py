@@ -17,6 +17,9 @@ _ROTATION_TOLERANCE = 0.05
 
 _LARGEST_ENTRY = 2.0
 
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Camera axes x right, y down, z forward from those of graphics (y up, z backward); its own inverse."""
+
 FARTHEST = 1e9
 """No camera is farther from the origin, whatever the unit: beyond, float32 and the squares of lengths break."""
 

@@ -11,8 +11,10 @@ from typing import TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ..formats.errors import InputError
+from ..formats.gaussians import GaussianCloud, isotropic_cloud
 from .config import Config
 from .geometry.se3 import Similarity
 from .geometry.sparse_model import SparseModel
@@ -38,6 +40,8 @@ from .system.wording import quoted
 from .types import VOID, Calibration, ClassTable, Frame, Metres, Trajectory
 
 T = TypeVar("T")
+_AT_ONCE = 1 << 16
+"""Gaussians whose probabilities are copied at a time."""
 _MAP_STAGES = ("global_ba", "mapping")
 _POSE_STAGES = ("global_ba", "mapping", "tracking")
 
@@ -186,6 +190,21 @@ def maps_around(outcome: Outcome) -> Callable[[int], GaussianMap]:
         return whole.only(torch.from_numpy(rows).to(whole.means.device))
 
     return lambda frame_id: around(number_of.get(frame_id))
+
+
+def map_cloud(outcome: Outcome, rows: Tensor | slice | None = None) -> GaussianCloud:
+    """The map, or `rows` of it (a slice or (M,) bool), as a splat cloud, class probabilities in the order of the run's
+    classes where it has any."""
+    m, channels = outcome.require_map(), outcome.label_of_channel
+    m = m if rows is None else m.only(rows)
+    probabilities = None
+    if len(channels):
+        probabilities = np.zeros((len(m), len(outcome.classes)), np.float32)
+        for start in range(0, len(m), _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
+            probabilities[part, channels] = torch.softmax(m.class_logits[part], dim=1).cpu().numpy()
+    means, log_radii, logits, colors = (x.cpu().numpy() for x in (m.means, m.log_radii, m.opacity_logits, m.colors))
+    return isotropic_cloud(means, log_radii, logits, colors, probabilities)
 
 
 def _load_exposure(run: RunFolder, map_stage: str, trajectory: Trajectory) -> Exposure | None:

@@ -271,23 +271,6 @@ class LoopEdge:
 
 
 @dataclass(frozen=True)
-class SemanticMesh:
-    """vertices (V, 3) float32, faces (F, 3) int32, colors (V, 3) uint8, labels (V,) uint8."""
-
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.int32]
-    colors: NDArray[np.uint8]
-    labels: NDArray[np.uint8]
-
-    def __post_init__(self) -> None:
-        v = len(self.vertices)
-        require_shape("vertices", self.vertices, (None, 3))
-        require_shape("faces", self.faces, (None, 3))
-        require_shape("colors", self.colors, (v, 3))
-        require_shape("labels", self.labels, (v,))
-
-
-@dataclass(frozen=True)
 class MetresSource:
     """Estimate of one source alone: metres per unit and their relative standard deviation."""
 

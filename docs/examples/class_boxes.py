@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from msgs_slam.formats.atomic import write_text
-from msgs_slam.pipelines.export.writers import map_cloud
-from msgs_slam.pipelines.outcome import Outcome
+from msgs_slam.pipelines.outcome import Outcome, map_cloud
 
 
 def write_class_boxes(outcome: Outcome, folder: Path) -> list[Path]:

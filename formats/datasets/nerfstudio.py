@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..images import first_readable, image_size, natural_key
 from ..jsonfile import number, optional_number, read_json_object
 from ..safe_path import named_file
-from ..trajectory import clean_poses
+from ..trajectory import OPENCV_FROM_OPENGL, clean_poses
 from .camera import Camera, distortion_names
 from .matching import times_or_frame_numbers
 from .sequence import Sequence
@@ -22,7 +22,6 @@ _FILE_NAMES = ("transforms.json", "transforms_train.json")
 _SUFFIXES_TRIED = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 _IMAGE_FOLDERS = ("images", "rgb", "frames", "color")
 _DEPTH_FOLDERS = ("depths", "depth")
-_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _INTRINSIC_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", *_DISTORTION)
 _MODELS = ("OPENCV", "OPENCV_FISHEYE", "PERSPECTIVE", "PINHOLE", "RADIAL", "SIMPLE_PINHOLE", "SIMPLE_RADIAL")
@@ -57,7 +56,7 @@ def open_nerfstudio(path: Path) -> Sequence:
     kept.sort(key=lambda frame: natural_key(str(images[id(frame)])))
     paths = [p for p in (images[id(frame)] for frame in kept) if p is not None]
     _require_different(file, kept, paths)
-    poses = np.stack([_matrix(frame, file) for frame in kept]) @ _OPENCV_FROM_OPENGL
+    poses = np.stack([_matrix(frame, file) for frame in kept]) @ OPENCV_FROM_OPENGL
     depth_paths = tuple(_depth(file, frame) for frame in kept)
     camera, notes = _camera(table, kept, file, first_readable(paths))
     missing = len(frames) - len(kept)

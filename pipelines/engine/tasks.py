@@ -43,7 +43,7 @@ TASK_MODULES = (
     "msgs_slam.pipelines.frames.tasks",
     "msgs_slam.pipelines.proxy.tasks",
     "msgs_slam.pipelines.mapping.submap_tasks",
-    "msgs_slam.pipelines.export.tasks",
+    "msgs_slam.pipelines.export.mesh",
 )
 """Where functions that do tasks are defined: a run from elsewhere could name any function of the program."""
 _TASKS, _HEADER = ".tasks", "ready.json"

@@ -1,6 +1,7 @@
-"""The labelled mesh: rendered median depth of the keyframes, fused, extracted, painted."""
+"""The labelled mesh: rendered median depth of the keyframes, fused, extracted, painted.
 
-from __future__ import annotations
+Each step is a task over chunks of keyframes or of regions, and leaves files in the stage's snapshot.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -9,26 +10,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.errors import InputError
-from ...formats.mesh import MeshBlocks, read_mesh_ply
+from ...formats.mesh import MeshBlocks
 from ..compute.threads import get_threads, host_threads
 from ..config import ExportConfig
+from ..engine.stages import StageContext
+from ..engine.tasks import Chunk
+from ..geometry.camera import project
 from ..geometry.posed_depth import PosedDepth
 from ..geometry.resampling import resample_nearest
 from ..mapping.measure import DrawnView, Shown, drawn_view
-from ..outcome import Outcome, maps_around
-from ..run.files import MESH
-from ..scene.world import WORLD, World
+from ..outcome import Outcome, load_outcome, maps_around
 from ..system.lru_sequence import LruSequence
 from ..system.parallel import abreast
 from ..system.progress import Progress
 from ..system.values import load_value, save_value
-from ..types import VOID, Intrinsics, ProxyMaps, SemanticMesh
-from .joined import Region
-from .paint import paint
-from .planes import Planes
-from .straighten import planes_of, straightened
-from .surface import chunk_surfaces, weld
+from ..types import VOID, Intrinsics, ProxyMaps
+from .planes import Planes, planes_of, straightened
+from .surface import Region, chunk_surfaces, weld
 from .volume import Grid, fuse, make_grid
 
 TRUNCATION = 3.0
@@ -40,25 +38,6 @@ LONG = 200
 SURE = 0.5
 """Confidence of a proxy's depth from which the depth drawn there stays where it is."""
 _KEPT_BYTES = 100e6
-
-
-def mesh_of_run(outcome: Outcome, world: World) -> SemanticMesh:
-    """The mesh that a run's own export has made, in `world`; `outcome` is in the run's own.
-
-    Raises InputError where there is none, or an empty one.
-    """
-    run = outcome.run
-    if not run.has("export", MESH):
-        raise InputError(
-            f"{run.root} has no mesh yet, and this file is made from it: finish the run with msgs-slam resume"
-        )
-    mesh = SemanticMesh(**vars(read_mesh_ply(run.file("export", MESH))))
-    if len(mesh.faces) == 0:
-        raise InputError(f"{run.root}: the mesh is empty, so there is nothing to write: film the scene again")
-    if (own := run.find(WORLD)) is None:
-        return mesh
-    move = world.exported_from_run @ own.exported_from_run.inverse()
-    return replace(mesh, vertices=move.apply(mesh.vertices.astype(np.float64)).astype(np.float32))
 
 
 def keyframe_rows(outcome: Outcome) -> list[int]:
@@ -179,3 +158,64 @@ def mesh_figures(mesh: MeshBlocks) -> dict[str, int | float]:
     labelled = sum(int((labels != VOID).sum()) for _, _, labels in mesh.vertices())
     share = round(labelled / max(mesh.vertex_count, 1), 4)
     return {"vertices": mesh.vertex_count, "faces": mesh.face_count, "labelled_share": share}
+
+
+def paint(
+    vertices: NDArray[np.float32], views: Iterable[DrawnView], class_ids: tuple[int, ...], tolerance: float
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """colors (V, 3) uint8 and labels (V,) uint8: weighted mean and vote of the views that see a vertex.
+
+    A view sees a vertex where its depth there agrees within `tolerance`. Unseen ones are grey and VOID.
+    """
+    total = np.zeros((len(vertices), 3), np.float32)
+    weight = np.zeros(len(vertices), np.float32)
+    votes = np.zeros((len(vertices), max(len(class_ids), 1)), np.float32)
+    for view in views:
+        rows, place = _seen(vertices, view.shown, tolerance)
+        share = view.shown.trust[place]
+        total[rows] += view.colors[place] * share[:, None]
+        weight[rows] += share
+        if view.channels is not None and class_ids:
+            channel = view.channels[place]
+            votes[rows[channel >= 0], channel[channel >= 0]] += share[channel >= 0]
+    colors = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-9)[:, None], 127.5)
+    table = np.array([*class_ids, VOID] if class_ids else [VOID, VOID], np.uint8)
+    labels = np.where(votes.max(1) > 0, votes.argmax(1), len(table) - 1)
+    return np.round(colors).astype(np.uint8), table[labels]
+
+
+def _seen(
+    vertices: NDArray[np.float32], view: PosedDepth, tolerance: float
+) -> tuple[NDArray[np.int64], tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Which vertices the view sees, and the (row, column) of each."""
+    pose = view.cam_from_world
+    xy, z = project(vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3], view.intrinsics)
+    inside = np.flatnonzero(((xy >= 0) & (xy < (view.intrinsics.width, view.intrinsics.height))).all(1))
+    place = xy[inside].astype(int)
+    close = np.abs(view.depth[place[:, 1], place[:, 0]] - z[inside]) < tolerance
+    close &= view.trust[place[:, 1], place[:, 0]] > 0
+    return inside[close], (place[close, 1], place[close, 0])
+
+
+def draw_keyframes(task: Chunk, progress: Progress) -> None:
+    """Render the map in the keyframes of a chunk."""
+    context = task.context(progress)
+    outcome = load_outcome(task.run, context.device).moved(task.known["move"])
+    draw(outcome, task.config.export, scratch_of(context), progress, task.numbers)
+
+
+def straighten_views(task: Chunk, progress: Progress) -> None:
+    """Move the unsure depths of a chunk's views onto the planes of all."""
+    straighten(scratch_of(task.context(progress)), task.known["planes"], progress, task.numbers)
+
+
+def fuse_views(task: Chunk, progress: Progress) -> None:
+    """The surface in some regions of the grid."""
+    scratch, known = scratch_of(task.context(progress)), task.known
+    views = drawn_views(scratch, known["views"])
+    fuse_regions(views, known["grid"], known["class_ids"], scratch, progress, task.numbers)
+
+
+def scratch_of(context: StageContext) -> Path:
+    """Return the folder of rendered views and finished regions."""
+    return context.snapshot / "mesh"

@@ -4,8 +4,6 @@ A piece has its own frames, world and unit of length. Its first stage takes them
 are those of any run, and so is all that reads it.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from hashlib import sha256
 from typing import Any

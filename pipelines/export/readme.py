@@ -1,7 +1,5 @@
 """The README of an export: what each file is for."""
 
-from __future__ import annotations
-
 import re
 import textwrap
 from collections.abc import Iterable, Mapping

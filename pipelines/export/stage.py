@@ -1,7 +1,5 @@
 """Stage 6: files for other programs."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -30,33 +28,27 @@ from ..scene.upright import find_upright
 from ..scene.world import FIRST, WORLD, World, upright_world, world_figures
 from ..system.memory import release_free_memory
 from ..system.progress import Progress, SilentProgress
-from ..types import Metres, SemanticMesh
-from .collision import write_collision
-from .floor_plan import write_floor_plan
-from .joined import joined
+from ..types import Metres
+from .extra.floor_plan import write_floor_plan
+from .extra.meshes import write_collision, write_usd
+from .extra.texture import make_textured, write_textured
+from .extra.tiles import write_tiles
+from .extra.web_page import write_web_page
 from .mesh import (
+    draw_keyframes,
     drawn_views,
+    fuse_views,
     fused_regions,
     keyframe_rows,
     make_grid_of,
     mesh_figures,
     planes_in,
+    scratch_of,
+    straighten_views,
 )
 from .pieces import make_pieces
-from .tasks import draw_keyframes, fuse_views, scratch_of, straighten_views
-from .textured import make_textured, write_textured
-from .tiles import write_tiles
-from .usd import write_usd
-from .web_page import write_web_page
-from .writers import (
-    write_colmap,
-    write_notes,
-    write_ply,
-    write_readme,
-    write_splats,
-    write_trajectory,
-    write_world,
-)
+from .surface import joined
+from .writers import write_colmap, write_notes, write_ply, write_readme, write_splats, write_trajectory, write_world
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -135,7 +127,7 @@ def write_meshes(job: MeshJob, outcome: Outcome, world: World) -> list[Path]:
         write_mesh_glb(glb, mesh, names, axes)
     paths = [job.ply, glb][: 1 + (mesh.face_count > 0)] if "mesh" in job.kinds else []
     if "texture" in job.kinds and mesh.face_count:
-        whole = SemanticMesh(**vars(read_mesh_ply(job.ply)))
+        whole = read_mesh_ply(job.ply)
         texture = make_textured(outcome, whole, Shown(views), job.context.progress)
         paths += write_textured(texture, names, job.folder, axes)
     return paths

@@ -1,20 +1,16 @@
 """The files for other programs, each written from what the run ended with."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ...formats.atomic import copy_file, write_text
 from ...formats.colmap import ColmapModel, write_colmap_model
 from ...formats.gaussian_glb import write_gaussian_glb
 from ...formats.gaussian_ply import write_gaussian_ply
-from ...formats.gaussians import GaussianCloud, isotropic_cloud
+from ...formats.gaussians import GaussianCloud
 from ...formats.nerfstudio import write_transforms
 from ...formats.point_ply import write_point_ply
 from ...formats.sog import write_sog
@@ -23,7 +19,7 @@ from ...formats.trajectory import write_tum
 from ..config import ExportConfig
 from ..geometry.rig import rig_of
 from ..geometry.sparse_model import SparseModel
-from ..outcome import Outcome
+from ..outcome import Outcome, map_cloud
 from ..run.files import CLASSES, LEFT_OUT, METRES
 from ..scene.world import WORLD, World
 from ..system.lru_sequence import LruSequence
@@ -33,8 +29,8 @@ from .readme import lengths, licences, readme
 IMAGES, SPARSE = "images", "sparse/0"
 """Folders of a COLMAP data set by the names that trainers expect."""
 START = f"{SPARSE}/points3D.ply"
-_AT_ONCE, _PART = 1 << 16, 1 << 17
-"""Gaussians whose probabilities are copied at a time, and those of a part that is written at a time."""
+_PART = 1 << 17
+"""Gaussians of a part that is written at a time."""
 
 
 def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
@@ -89,21 +85,6 @@ def seen_points(
     return (
         model.points_in_world[used], model.colors[used], image[kept], place[model.obs_point[kept]], model.obs_xy[kept],
     )  # fmt: skip
-
-
-def map_cloud(outcome: Outcome, rows: Tensor | slice | None = None) -> GaussianCloud:
-    """The map, or `rows` of it (a slice or (M,) bool), as a splat cloud, class probabilities in the order of the run's
-    classes where it has any."""
-    m, channels = outcome.require_map(), outcome.label_of_channel
-    m = m if rows is None else m.only(rows)
-    probabilities = None
-    if len(channels):
-        probabilities = np.zeros((len(m), len(outcome.classes)), np.float32)
-        for start in range(0, len(m), _AT_ONCE):
-            part = slice(start, start + _AT_ONCE)
-            probabilities[part, channels] = torch.softmax(m.class_logits[part], dim=1).cpu().numpy()
-    means, log_radii, logits, colors = (x.cpu().numpy() for x in (m.means, m.log_radii, m.opacity_logits, m.colors))
-    return isotropic_cloud(means, log_radii, logits, colors, probabilities)
 
 
 def write_ply(outcome: Outcome, sh_rest: bool, folder: Path) -> list[Path]:

@@ -19,6 +19,8 @@ SAME = Similarity(1.0, np.eye(3), np.zeros(3))
 Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """glTF's axes (y up, z towards the viewer) from those of the exported world."""
 _Y_DOWN_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+Z_UP_FROM_Y_DOWN = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""Axes of a world that stands from x right, y down, z forward."""
 
 
 @dataclass(frozen=True)

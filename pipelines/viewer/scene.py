@@ -16,9 +16,8 @@ from ...formats.gaussian_files import read_gaussians
 from ...formats.gaussians import GaussianCloud, isotropic_cloud
 from ...formats.reading import reaching
 from ..export.stage import on_earth
-from ..export.writers import map_cloud
 from ..geometry.sparse_model import SparseModel
-from ..outcome import Outcome, evenly, labels_of_channels, load_outcome
+from ..outcome import Outcome, evenly, labels_of_channels, load_outcome, map_cloud
 from ..providers import class_colors
 from ..render.gaussian_map import decided_channels
 from ..run.files import BACKBONE, CALIBRATION, FRAMES, MESH

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ...formats.mesh import read_mesh_ply
-from ..export.floor_plan import walls_of_run
+from ..export.extra.floor_plan import walls_of_run
 from ..source.sharpness import at_most_wide
 from .door import guarding
 from .flight import Flight

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.gaussians import GaussianCloud
 from msgs_slam.pipelines.evaluation.truth import MatchedTruth, match_truth
-from msgs_slam.pipelines.export.writers import map_cloud
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.geometry.tape import Touch, tape, touch
-from msgs_slam.pipelines.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.outcome import Outcome, load_outcome, map_cloud
 from msgs_slam.pipelines.run.folder import RunFolder
 
 Array = NDArray[np.float64]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from msgs_slam.formats.mesh import MeshArrays
 from msgs_slam.pipelines.depth.align import (
     COARSE,
     Anchors,
@@ -24,14 +25,13 @@ from msgs_slam.pipelines.evaluation.labels import matched_one_to_one, score
 from msgs_slam.pipelines.evaluation.mesh_error import depth_points, seen_in_depth, thinned
 from msgs_slam.pipelines.evaluation.trajectory_error import associate
 from msgs_slam.pipelines.evaluation.views import depth_picture, depth_range, view_map
-from msgs_slam.pipelines.export.atlas import simplified
-from msgs_slam.pipelines.export.collision import with_floor
-from msgs_slam.pipelines.export.joined import joined
+from msgs_slam.pipelines.export.extra.atlas import simplified
+from msgs_slam.pipelines.export.extra.meshes import with_floor
+from msgs_slam.pipelines.export.extra.texture import vertex_normals
+from msgs_slam.pipelines.export.extra.walls import find_walls
 from msgs_slam.pipelines.export.planes import find_planes
-from msgs_slam.pipelines.export.surface import chunk_surfaces, weld
-from msgs_slam.pipelines.export.texture import vertex_normals
+from msgs_slam.pipelines.export.surface import chunk_surfaces, joined, weld
 from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid
-from msgs_slam.pipelines.export.walls import find_walls
 from msgs_slam.pipelines.export.writers import seen_points
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth, neighbours, overlaps
 from msgs_slam.pipelines.geometry.resampling import resize_maps
@@ -52,7 +52,7 @@ from msgs_slam.pipelines.scene.gps import georeference
 from msgs_slam.pipelines.scene.metres import Seen, contradiction, usual_evidence
 from msgs_slam.pipelines.scene.upright import cameras_up, line_planes, up_of_lines
 from msgs_slam.pipelines.scene.view import SeenFrame, build_scene
-from msgs_slam.pipelines.types import Intrinsics, ProxyMaps, SemanticMesh
+from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 
 UP = np.array([0.0, -1, 0])
 EYE = np.eye(4)
@@ -139,7 +139,7 @@ def test_rooms_of_few_voxels(count: int) -> None:
 
 @pytest.mark.parametrize(("vertices", "faces"), MESHES.values(), ids=MESHES)
 def test_meshes_of_nothing(vertices: np.ndarray, faces: np.ndarray) -> None:
-    mesh = SemanticMesh(vertices, faces, np.zeros((len(vertices), 3), np.uint8), np.zeros(len(vertices), np.uint8))
+    mesh = MeshArrays(vertices, faces, np.zeros((len(vertices), 3), np.uint8), np.zeros(len(vertices), np.uint8))
     assert len(simplified(mesh).faces) == len(faces)
     if len(vertices):
         assert len(with_floor(vertices.astype(float), faces)[1]) >= len(faces)

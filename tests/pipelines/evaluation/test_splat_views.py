@@ -14,8 +14,7 @@ from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
 from msgs_slam.formats.images import list_images, read_rgb
 from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.evaluation.views import SplatScene, draw_splats, render_outcome
-from msgs_slam.pipelines.export.writers import map_cloud
-from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.outcome import load_outcome, map_cloud
 from msgs_slam.pipelines.render_run import render_file
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Intrinsics

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.export.extra.walls import Wall, find_walls
 from msgs_slam.pipelines.export.stage import export_run
-from msgs_slam.pipelines.export.walls import Wall, find_walls
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import SAME, WORLD, World
 

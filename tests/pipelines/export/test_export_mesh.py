@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.mesh import read_mesh_ply, write_mesh_ply
 from msgs_slam.pipelines.compute.threads import get_threads, set_threads
-from msgs_slam.pipelines.export.joined import Region, joined
-from msgs_slam.pipelines.export.paint import paint
-from msgs_slam.pipelines.export.surface import Surface, chunk_surfaces, weld
+from msgs_slam.pipelines.export.mesh import paint
+from msgs_slam.pipelines.export.surface import Region, Surface, chunk_surfaces, joined, weld
 from msgs_slam.pipelines.export.volume import CHUNK, Grid, Volume, fuse, make_grid
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.mapping.measure import DrawnView

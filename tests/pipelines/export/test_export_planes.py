@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.mesh import draw, drawn_views, keyframe_rows, planes_in, straighten
-from msgs_slam.pipelines.export.planes import Planes, find_planes
-from msgs_slam.pipelines.export.straighten import planes_of, straightened
+from msgs_slam.pipelines.export.planes import Planes, find_planes, planes_of, straightened
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.geometry.voxels import Voxels
 from msgs_slam.pipelines.mapping.measure import DrawnView

@@ -17,7 +17,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gaussian_glb import read_gaussian_glb
 from msgs_slam.formats.spz import read_spz
 from msgs_slam.pipelines.config import ExportConfig
-from msgs_slam.pipelines.export import textured
+from msgs_slam.pipelines.export.extra import texture as textured
 from msgs_slam.pipelines.export.readme import licences
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.geometry.camera import project

@@ -5,13 +5,14 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+from msgs_slam.formats.mesh import MeshArrays
 from msgs_slam.pipelines.compute.threads import get_threads, set_threads
-from msgs_slam.pipelines.export import texture
-from msgs_slam.pipelines.export.atlas import Atlas, owners, simplified, unwrapped
-from msgs_slam.pipelines.export.texture import Shot, paint_texture, texels_wanted, vertex_normals, view_weights
+from msgs_slam.pipelines.export.extra import texture
+from msgs_slam.pipelines.export.extra.atlas import Atlas, owners, simplified, unwrapped
+from msgs_slam.pipelines.export.extra.texture import Shot, paint_texture, texels_wanted, vertex_normals, view_weights
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.system.progress import SilentProgress
-from msgs_slam.pipelines.types import VOID, Intrinsics, SemanticMesh
+from msgs_slam.pipelines.types import VOID, Intrinsics
 
 CAMERA = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
 FULL = CAMERA.resized(320, 240)
@@ -53,15 +54,15 @@ SHOTS = [shot(a) for a in np.arange(12) * np.pi / 6]
 
 
 @pytest.fixture(scope="module")
-def fine() -> SemanticMesh:
+def fine() -> MeshArrays:
     ball = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS)
     labels = np.where(ball.vertices[:, 0] < 0, 3, VOID).astype(np.uint8)
     grey = np.full((len(ball.vertices), 3), 128, np.uint8)
-    return SemanticMesh(ball.vertices.astype(np.float32), ball.faces.astype(np.int32), grey, labels)
+    return MeshArrays(ball.vertices.astype(np.float32), ball.faces.astype(np.int32), grey, labels)
 
 
 @pytest.fixture(scope="module")
-def atlas(fine: SemanticMesh) -> Atlas:
+def atlas(fine: MeshArrays) -> Atlas:
     light = simplified(fine)
     return unwrapped(light, texels_wanted(light.vertices, light.faces, SHOTS), 4096)
 
@@ -90,7 +91,7 @@ def places(atlas: Atlas) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     return inside, points[(shares >= 0).all(1)]
 
 
-def test_a_tenth_of_the_vertices_keeps_shape_and_labels(fine: SemanticMesh) -> None:
+def test_a_tenth_of_the_vertices_keeps_shape_and_labels(fine: MeshArrays) -> None:
     light = simplified(fine)
     assert 0.08 < len(light.vertices) / len(fine.vertices) <= 0.1
     off = np.abs(np.linalg.norm(light.vertices, axis=1) - RADIUS)

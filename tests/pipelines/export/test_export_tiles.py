@@ -16,7 +16,7 @@ from msgs_slam.formats import atomic
 from msgs_slam.formats.errors import DiskFullError
 from msgs_slam.formats.gaussian_glb import read_gaussian_glb
 from msgs_slam.formats.gaussians import GaussianCloud
-from msgs_slam.pipelines.export import tiles
+from msgs_slam.pipelines.export.extra import tiles
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.render.api import render

@@ -20,10 +20,9 @@ from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.evaluation.views import view_map
-from msgs_slam.pipelines.export import web_page
+from msgs_slam.pipelines.export.extra import web_page
 from msgs_slam.pipelines.export.stage import export_run
-from msgs_slam.pipelines.export.writers import map_cloud
-from msgs_slam.pipelines.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.outcome import Outcome, load_outcome, map_cloud
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import FIRST, WORLD
 from tests.browser import browser

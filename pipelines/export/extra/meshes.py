@@ -1,22 +1,76 @@
-"""The mesh as USDZ, one file for Quick Look, Blender, Houdini and Omniverse; in true size where metres are known."""
-
-from __future__ import annotations
+"""The mesh of a run for engines: collision.glb to walk in, with a floor without holes, and USDZ in true size."""
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
-from ...formats.atomic import atomic_path, require_room
-from ...formats.errors import InputError
-from ..outcome import Outcome
-from ..scene.world import World
-from ..types import SemanticMesh
-from .mesh import mesh_of_run
+from ....formats.atomic import atomic_path, require_room
+from ....formats.errors import InputError
+from ....formats.glb import Part, write_primitive
+from ....formats.mesh import MeshArrays, read_mesh_ply
+from ...outcome import Outcome
+from ...run.files import MESH
+from ...scene.world import WORLD, World
+from .atlas import simplified
 
 USD = "mesh.usdz"
+
+COLLISION = "collision.glb"
+MOST_FACES = 20_000
+"""Triangles that physics engines on the web and on phones take."""
+
+
+def mesh_of_run(outcome: Outcome, world: World) -> MeshArrays:
+    """The mesh that a run's own export has made, in `world`; `outcome` is in the run's own.
+
+    Raises InputError where there is none, or an empty one.
+    """
+    run = outcome.run
+    if not run.has("export", MESH):
+        raise InputError(
+            f"{run.root} has no mesh yet, and this file is made from it: finish the run with msgs-slam resume"
+        )
+    mesh = read_mesh_ply(run.file("export", MESH))
+    if len(mesh.faces) == 0:
+        raise InputError(f"{run.root}: the mesh is empty, so there is nothing to write: film the scene again")
+    if (own := run.find(WORLD)) is None:
+        return mesh
+    move = world.exported_from_run @ own.exported_from_run.inverse()
+    return replace(mesh, vertices=move.apply(mesh.vertices.astype(np.float64)).astype(np.float32))
+
+
+def write_collision(outcome: Outcome, world: World, folder: Path) -> list[Path]:
+    """collision.glb of an outcome in the run's own world, for files in `world`: no colours, y up.
+
+    Raises InputError where the run has no mesh, or an empty one.
+    """
+    mesh = mesh_of_run(outcome, world)
+    light = simplified(mesh, MOST_FACES / len(mesh.faces)) if len(mesh.faces) > MOST_FACES else mesh
+    points = light.vertices.astype(np.float64)
+    faces = light.faces
+    if world.axes == "up" and world.has_floor:
+        points, faces = with_floor(points, faces)
+    parts = [Part.of("POSITION", points @ world.gltf_from_exported.T), Part.of("", faces.astype(np.uint32).ravel())]
+    write_primitive(folder / COLLISION, parts, {"mode": 4}, (), {"name": "collision"})
+    return [folder / COLLISION]
+
+
+def with_floor(points: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """The mesh (V, 3), (F, 3) with z up, and a floor at z = 0, seen from above, under everything; without one where the
+    mesh is a line from above."""
+    try:
+        rim = points[ConvexHull(points[:, :2]).vertices, :2]  # counterclockwise
+    except QhullError:
+        return points, faces
+    n, start = len(rim), len(points)
+    fan = start + np.stack([np.zeros(n - 2, int), np.arange(1, n - 1), np.arange(2, n)], axis=1)
+    floor = np.column_stack([rim, np.zeros(n)])
+    return np.concatenate([points, floor]), np.concatenate([faces, fan]).astype(np.int32)
 
 
 def write_usd(outcome: Outcome, world: World, folder: Path) -> list[Path]:
@@ -37,7 +91,7 @@ def write_usd(outcome: Outcome, world: World, folder: Path) -> list[Path]:
 
 
 def write_usdz(
-    path: Path, mesh: SemanticMesh, names: tuple[str, ...], turn: NDArray[np.float64], metres_per_unit: float
+    path: Path, mesh: MeshArrays, names: tuple[str, ...], turn: NDArray[np.float64], metres_per_unit: float
 ) -> None:
     """Write a package with one binary layer in it; `turn` (3, 3) makes y up. Raises DiskFullError where there
     is no room for it."""
@@ -59,7 +113,7 @@ def write_usdz(
         package.replace(temporary)
 
 
-def _fill(shape: Any, mesh: SemanticMesh, names: tuple[str, ...], points: NDArray[np.float32]) -> None:
+def _fill(shape: Any, mesh: MeshArrays, names: tuple[str, ...], points: NDArray[np.float32]) -> None:
     """Triangles, linear colours, and the number of each vertex's class as the primvar `label`."""
     from pxr import Sdf, UsdGeom, Vt
 

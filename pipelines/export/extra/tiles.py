@@ -4,8 +4,6 @@ A binary tree: the Gaussians are halved along the longest side until a tile is s
 its two halves with fewer, larger Gaussians (`merged`). The file format is that of `write_compressed_glb`.
 """
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any
@@ -13,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.atomic import require_room
-from ...formats.gaussian_glb import COMPRESSION, EXTENSION, write_compressed_glb
-from ...formats.gaussians import GaussianCloud, isotropic_cloud
-from ...formats.gps import ecef_from_enu
-from ...formats.jsonfile import write_json
-from ..outcome import Outcome
-from ..run.journal import empty
-from ..scene.world import World
+from ....formats.atomic import require_room
+from ....formats.gaussian_glb import COMPRESSION, EXTENSION, write_compressed_glb
+from ....formats.gaussians import GaussianCloud, isotropic_cloud
+from ....formats.gps import ecef_from_enu
+from ....formats.jsonfile import write_json
+from ...outcome import Outcome
+from ...run.journal import empty
+from ...scene.world import Z_UP_FROM_Y_DOWN, World
 
 Array = NDArray[np.float64]
 
@@ -38,8 +36,6 @@ _REACH = 3.0
 _MOST_OPAQUE = 0.99
 _WIDEST = 0.5
 """Radius to which a merged Gaussian may grow, in sides of its cell."""
-_Z_UP_FROM_IMAGE_AXES = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""What viewers turn the y-up content of a tile by, from x right, y down, z forward."""
 
 
 def write_tiles(outcome: Outcome, world: World, folder: Path) -> list[Path]:
@@ -142,7 +138,7 @@ def merged(cloud: GaussianCloud, side: float) -> GaussianCloud:
 
 def _box(cloud: GaussianCloud) -> tuple[Array, Array]:
     """Corners, z up."""
-    means, reach = cloud.means @ _Z_UP_FROM_IMAGE_AXES.T, _REACH * np.exp(cloud.log_scales[:, :1].astype(np.float64))
+    means, reach = cloud.means @ Z_UP_FROM_Y_DOWN.T, _REACH * np.exp(cloud.log_scales[:, :1].astype(np.float64))
     return (means - reach).min(axis=0), (means + reach).max(axis=0)
 
 

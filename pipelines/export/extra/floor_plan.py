@@ -1,20 +1,18 @@
 """The walls from above as an SVG, with their lengths."""
 
-from __future__ import annotations
-
 from html import escape
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.atomic import write_text
-from ...formats.errors import InputError
-from ...formats.mesh import read_mesh_ply
-from ..outcome import Outcome
-from ..run.files import MESH
-from ..run.folder import RunFolder
-from ..scene.world import WORLD
+from ....formats.atomic import write_text
+from ....formats.errors import InputError
+from ....formats.mesh import read_mesh_ply
+from ...outcome import Outcome
+from ...run.files import MESH
+from ...run.folder import RunFolder
+from ...scene.world import WORLD
 from .walls import Wall, find_walls
 
 Array = NDArray[np.float64]

@@ -4,8 +4,6 @@ The page holds the Gaussians and a renderer of its own for them (`page/`, WebGL 
 screen, a square each, sorted by depth. What it draws is what `render` draws, up to the 8 bits of a screen.
 """
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json
@@ -17,14 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.atomic import require_room, write_text
-from ...formats.gaussians import GaussianCloud
-from ...formats.sog import morton_order
-from ..geometry.rig import rig_of
-from ..outcome import Outcome, evenly
-from ..scene.world import World
-from ..types import VOID
-from .writers import map_cloud
+from ....formats.atomic import require_room, write_text
+from ....formats.gaussians import GaussianCloud
+from ....formats.sog import morton_order
+from ...geometry.rig import rig_of
+from ...outcome import Outcome, evenly, map_cloud
+from ...scene.world import Z_UP_FROM_Y_DOWN, World
+from ...types import VOID
 
 WEB_PAGE = "map.html"
 MOST_GAUSSIANS = 1_500_000
@@ -34,7 +31,6 @@ _LEAST_BYTES = 10
 MOST_CAMERAS = 120
 _PARTS = Path(__file__).parent / "page"
 _SCRIPTS = ("cloud.js", "draw.js", "moves.js", "tape.js", "page.js")
-_Z_UP_FROM_IMAGE_AXES = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
 def write_web_page(outcome: Outcome, world: World, folder: Path) -> list[Path]:
@@ -44,7 +40,7 @@ def write_web_page(outcome: Outcome, world: World, folder: Path) -> list[Path]:
     cloud = map_cloud(outcome)
     if len(cloud) == 0:
         return []
-    upright = np.eye(3) if world.axes == "up" else _Z_UP_FROM_IMAGE_AXES
+    upright = np.eye(3) if world.axes == "up" else Z_UP_FROM_Y_DOWN
     about, packed = pack_cloud(cloud, upright)
     about |= _classes(cloud, outcome) | _cameras(outcome, upright) | _unit(outcome, world)
     write_text(folder / WEB_PAGE, _page(outcome.run.root.stem, about, packed))

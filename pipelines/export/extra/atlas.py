@@ -1,15 +1,13 @@
 """A lighter mesh and a flat image of its surface: quadric simplification, charts, and who owns which texel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..system.jit import kernel
-from ..types import SemanticMesh
+from ....formats.mesh import MeshArrays
+from ...system.jit import kernel
 
 SHARE = 0.1
 """Vertices that are kept: with a texture they need to follow the shape only."""
@@ -34,7 +32,7 @@ class Atlas:
     corner_faces (F, 3) are the faces in corners; width and height in texels.
     """
 
-    mesh: SemanticMesh
+    mesh: MeshArrays
     corners: NDArray[np.float64]
     corner_vertex: NDArray[np.int64]
     corner_faces: NDArray[np.int32]
@@ -42,7 +40,7 @@ class Atlas:
     height: int
 
 
-def simplified(mesh: SemanticMesh, share: float = SHARE) -> SemanticMesh:
+def simplified(mesh: MeshArrays, share: float = SHARE) -> MeshArrays:
     """At most that share of the vertices (Garland and Heckbert 1997), down to four faces; colour and label are the
     nearest vertex's."""
     from fast_simplification import simplify
@@ -58,12 +56,12 @@ def simplified(mesh: SemanticMesh, share: float = SHARE) -> SemanticMesh:
             break
         wanted *= 0.99 * most / len(used)
     _, nearest = cKDTree(mesh.vertices).query(points[used])
-    return SemanticMesh(
+    return MeshArrays(
         points[used], renumbered.reshape(-1, 3).astype(np.int32), mesh.colors[nearest], mesh.labels[nearest]
     )
 
 
-def unwrapped(mesh: SemanticMesh, texels_per_unit: float, most: int) -> Atlas:
+def unwrapped(mesh: MeshArrays, texels_per_unit: float, most: int) -> Atlas:
     """The mesh cut into charts that lie flat beside each other, in an image of at most that many texels a side."""
     import xatlas
 
@@ -89,7 +87,7 @@ def unwrapped(mesh: SemanticMesh, texels_per_unit: float, most: int) -> Atlas:
     return Atlas(mesh, corners, vertex.astype(np.int64), faces, width, height)
 
 
-def _parts(mesh: SemanticMesh) -> list[NDArray[np.int64]]:
+def _parts(mesh: MeshArrays) -> list[NDArray[np.int64]]:
     """The faces (by number) in boxes of at most `_PART`, halved along their longest side."""
     middles = mesh.vertices[mesh.faces].mean(axis=1)
     waiting, parts = [np.arange(len(mesh.faces))], []
