@@ -254,46 +254,6 @@ def any_of(typing_context: Any, condition: Any) -> Any:
     return types.boolean(mask), emit
 
 
-@intrinsic
-def halves(typing_context: Any, low: Any, high: Any) -> Any:
-    """Eight times one number, then eight times the other."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        order = ir.Constant(vector_type(element=I32), [0] * 8 + [WIDTH] * 8)
-        return builder.shuffle_vector(splat_lanes(builder, args[0]), splat_lanes(builder, args[1]), order)
-
-    return lanes(types.float32, types.float32), emit
-
-
-@intrinsic
-def load_twice(typing_context: Any, array: Any, index: Any) -> Any:
-    """array[index : index + 8] in the low and again in the high half."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        half = load_lanes(builder, address_of(context, builder, sig.args[0], *args), 8)
-        order = ir.Constant(vector_type(element=I32), [*range(8), *range(8)])
-        return builder.shuffle_vector(half, ir.Constant(half.type, ir.Undefined), order)
-
-    return lanes(array, types.intp), emit
-
-
-@intrinsic
-def add_products(typing_context: Any, sums: Any, value: Any, weight: Any) -> Any:
-    """sums[16 p : 16 p + 16] += weight * value[p] * value for p = 0..5, each half with its own value[p]."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        weighted = builder.fmul(args[1], args[2], flags=FLAGS)
-        for p in range(6):
-            order = ir.Constant(vector_type(element=I32), [p] * 8 + [8 + p] * 8)
-            factor = builder.shuffle_vector(weighted, ir.Constant(vector_type(), ir.Undefined), order)
-            target = address_of(context, builder, sig.args[0], args[0], I64(WIDTH * p))
-            product = builder.fmul(factor, args[1], flags=FLAGS)
-            store_lanes(builder, builder.fadd(load_lanes(builder, target), product, flags=FLAGS), target)
-        return context.get_dummy_value()
-
-    return types.void(sums, lanes, lanes), emit
-
-
 _EXP2 = (1.0, 0.693147206, 0.240226466, 0.0555032900, 0.00961851953, 0.00133998604, 0.000153375768)
 """2^f on [-1/2, 1/2], relative error 2e-9: least squares of the relative error at Chebyshev's nodes."""
 

@@ -17,11 +17,11 @@ from ..config import MappingConfig
 from ..render.api import Rendering
 from ..render.gaussian_map import GaussianMap
 from ..render.inspection import error_shares
-from ..render.seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
 from ..system.lru_sequence import LruSequence
 from ..types import Intrinsics
 from .region_prior import with_region_prior
 from .schedule import Seeding
+from .seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
 from .state import OptimiserState
 from .views import View
 

@@ -18,7 +18,6 @@ from ..config import MappingConfig
 from ..render.api import Rendering, in_view, marked_in_view, render
 from ..render.gaussian_map import GaussianMap
 from ..render.inspection import blending_weights, class_weights
-from ..render.seeding import SEED_LOGIT
 from ..system.lru_sequence import LruSequence
 from ..system.parallel import abreast
 from ..system.progress import Progress, SilentProgress
@@ -27,6 +26,7 @@ from .exposure import SOLID, expose, fit_exposure
 from .growth import HIGH_RELIABILITY, LOW_RELIABILITY, DensificationError, Growth, densification_error
 from .objective import Objective, color_errors_on_card, fit_exposure_on_card
 from .schedule import Schedule, Seeding, Step
+from .seeding import SEED_LOGIT
 from .state import KEYS, Exposures, OptimisedMap, OptimiserState
 from .views import View, halved
 

@@ -10,7 +10,6 @@ from ..geometry.camera import project
 from .extend import promote, start_segment
 from .pictures import Pictures
 from .pnp import MIN_INLIERS, FramePose, predict_pose, solve_pose
-from .refine import compare_frame
 from .relocalise import relocalise
 from .state import NO_SIGHTINGS, Sightings, TrackState
 
@@ -23,8 +22,6 @@ REACH = 60
 """Frames within which a neighbour still says something of where a frame is."""
 KEYFRAME_SHARE = 0.6
 """Where structure from motion has none, what sees less than this share of its keyframe's points is a keyframe."""
-RENDER_LOSS = 0.4
-"""A lost frame is posed by rendering when less than this share of its contrast is left."""
 
 
 class FrontEnd:
@@ -55,7 +52,7 @@ class FrontEnd:
             segment = self.state.segment_of_point(int(seen.point[solved.inliers][0]), frame_id)
             self.state.add_frame(frame_id, solved.cam_from_world, seen.select(solved.inliers), False, segment)
             self.extend_at(frame_id)
-        elif not (self._by_rendering(frame_id) or (may_start and self._start(frame_id, start))):
+        elif not (may_start and self._start(frame_id, start)):
             self.state.lost.setdefault(frame_id, reason)
 
     def by_flow(self, frame_id: int) -> tuple[Sightings, FramePose | None, Array | None]:
@@ -74,23 +71,6 @@ class FrontEnd:
             return NO_SIGHTINGS, None, start
         seen = self.correspond(frame_id, start, keyframes)
         return seen, self.solve(frame_id, seen, start), start
-
-    def _by_rendering(self, frame_id: int) -> bool:
-        """Pose the frame by comparing it with Gaussians, where a neighbour is posed and the image agrees well."""
-        neighbours = [i for i in (frame_id - 1, frame_id + 1) if i in self.state.poses]
-        if not neighbours or self.is_rig:  # what one direction does not show, the others do
-            return False
-        segment = self.state.segment[neighbours[0]]
-        keyframes = [k for k in self.state.nearest_keyframes(frame_id, 1) if self.state.segment[k] == segment]
-        start = self.by_flow(frame_id)[2]
-        if start is None or not keyframes:
-            return False
-        found = compare_frame(frame_id, start, keyframes, self.state, self.pictures)
-        if found is None or not found.is_better or found.unexplained > RENDER_LOSS:
-            return False
-        self.state.add_frame(frame_id, found.cam_from_world, NO_SIGHTINGS, False, segment)
-        self.state.rendered.append(frame_id)
-        return True
 
     def is_inside(self, frame_id: int) -> bool:
         """Whether keyframes of one segment are on both sides: then there is no need for new ones."""

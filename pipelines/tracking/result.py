@@ -36,7 +36,6 @@ def _alone(state: TrackState, segment: int) -> TrackState:
         {i: state.sightings[i] for i in inside},
         [k for k in state.keyframes if state.segment[k] == segment],
         segment=dict.fromkeys(inside, segment),
-        rendered=[i for i in state.rendered if state.segment[i] == segment],
         rig=state.rig,
         turned=[i for i in state.turned if state.segment[i] == segment],
         shutter=state.shutter,

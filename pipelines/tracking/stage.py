@@ -139,7 +139,6 @@ def describe(state: TrackState, frames: list[Frame], report: Report, metric: boo
         "frames": len(frames),
         "posed": len(state.poses),
         "keyframes": len(state.keyframes),
-        "by_rendering": len(state.rendered),
         "by_rotation": len(state.turned),
         "lost": {str(i): reason for i, reason in sorted(state.lost.items())},
         "scale": "metric" if metric and world else "free",

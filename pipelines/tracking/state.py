@@ -75,9 +75,9 @@ NO_SIGHTINGS = Sightings.of(np.zeros(0, np.int64), np.zeros((0, 2)), 1.0)
 class TrackState:
     """points (P, 3) in the world, colors (P, 3); per frame id its pose cam_from_world, its sightings or why it is lost.
 
-    `segment` numbers connected stretches: poses of different segments cannot be compared. `rendered` are the
-    frames that only rendering could pose, `turned` those of which only the rotation is known; `done` counts the frames
-    that have been visited; `rig` says which frames were taken at one place, `shutter` how their rows were.
+    `segment` numbers connected stretches: poses of different segments cannot be compared. `turned` are the
+    frames of which only the rotation is known; `done` counts the frames that have been visited; `rig` says which frames
+    were taken at one place, `shutter` how their rows were.
     """
 
     points: Array = field(default_factory=lambda: np.zeros((0, 3)))
@@ -87,7 +87,6 @@ class TrackState:
     keyframes: list[int] = field(default_factory=list)
     lost: dict[int, str] = field(default_factory=dict)
     segment: dict[int, int] = field(default_factory=dict)
-    rendered: list[int] = field(default_factory=list)
     done: int = 0
     rig: Rig = ONE_CAMERA
     turned: list[int] = field(default_factory=list)
@@ -123,7 +122,7 @@ class TrackState:
         """Remove a posed frame; its points stay."""
         for table in (self.poses, self.sightings, self.segment):
             del table[frame_id]
-        for listed in (self.keyframes, self.rendered, self.turned):
+        for listed in (self.keyframes, self.turned):
             if frame_id in listed:
                 listed.remove(frame_id)
 

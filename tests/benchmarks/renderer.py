@@ -2,7 +2,7 @@
 
     python tests/benchmarks/renderer.py                       the table
     python tests/benchmarks/renderer.py --json rows.json      the same as rows
-    python tests/benchmarks/renderer.py --iteration --tracking --memory --first-use
+    python tests/benchmarks/renderer.py --iteration --pose --memory --first-use
 
 Backends take turns, so that whatever else the machine does slows all of them: the ratios are what to look at.
 """
@@ -30,7 +30,6 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests/pipelines/render")]
 
-import numpy as np
 import torch
 from render_scenes import room
 from torch import Tensor
@@ -39,8 +38,7 @@ from msgs_slam.pipelines.compute.threads import set_threads
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.mapping import losses
 from msgs_slam.pipelines.mapping.losses import photo_loss
-from msgs_slam.pipelines.render.api import Rendering, choose_backend, composite, project_map, render
-from msgs_slam.pipelines.render.tracking import track_gn
+from msgs_slam.pipelines.render.api import Rendering, choose_backend, composite, pose_gradient, project_map, render
 
 ROWS = [(320, 240, 50_000, 8), (320, 240, 200_000, 8), (640, 480, 200_000, 8), (640, 480, 200_000, 40)]
 WANTED = [8.2, 8.8, 12.3, 7.9]
@@ -207,27 +205,18 @@ def measure_iteration(repeats: int, device: torch.device) -> None:
     )
 
 
-def measure_tracking(repeats: int) -> None:
+def measure_pose(repeats: int) -> None:
     scene = room(320, 240, 50_000, 1)
     gaussians = (scene.means, scene.radii, scene.opacities, scene.colors)
-    truth = torch.eye(4, dtype=torch.float64)
-    seen = render(*gaussians, truth, scene.intrinsics)
-    generator = torch.Generator().manual_seed(0)
-    image = seen.features + 0.02 * torch.randn(seen.features.shape, generator=generator)
-    rng = np.random.default_rng(0)
-    for distance, degrees in ((0.01, 0.3), (0.03, 1.0), (0.1, 3.0)):
-        fits, times = [], []
-        for _ in range(repeats):
-            a, b = (x / np.linalg.norm(x) for x in rng.normal(size=(2, 3)))
-            start = se3.exp(torch.from_numpy(np.concatenate([distance * a, np.radians(degrees) * b])))
-            began = time.perf_counter()
-            fits.append(track_gn(*gaussians, start, scene.intrinsics, image))
-            times.append(1e3 * (time.perf_counter() - began) / fits[-1].evaluations)
-        good = [fit for fit in fits if fit.converged]
-        errors = sorted(1e3 * float(se3.inverse(fit.cam_from_world)[:3, 3].norm()) for fit in good)
-        worst = f"error <= {errors[-1]:.2f} mm, <= {max(fit.evaluations for fit in good)} evaluations" if good else ""
-        print(f"track_gn from {100 * distance:.0f} cm / {degrees} deg: {len(good)} of {repeats} converged, {worst} "
-              f"({statistics.median(times):.1f} ms each)")  # fmt: skip
+
+    def loss(seen: Rendering) -> Tensor:
+        return seen.features.mean() + seen.depth.mean() + seen.silhouette.mean()
+
+    times = [
+        timed(lambda: pose_gradient(*gaussians, POSE, scene.intrinsics, loss), torch.device("cpu"))
+        for _ in range(repeats + 1)
+    ]
+    print(f"gradient of a pose by colour, depth and silhouette: {statistics.median(times[1:]):.1f} ms")
 
 
 def measure_memory() -> None:
@@ -288,7 +277,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--threads", type=int, default=0, help="0: one per CPU")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    for name in ("iteration", "tracking", "memory", "first-use"):
+    for name in ("iteration", "pose", "memory", "first-use"):
         parser.add_argument(f"--{name}", action="store_true", help="measure this instead of the table")
     arguments = parser.parse_args()
     device = torch.device(arguments.device)
@@ -297,7 +286,7 @@ def main() -> None:
         torch.set_num_threads(arguments.threads)
     others = [
         (arguments.iteration, lambda: measure_iteration(arguments.repeats, device)),
-        (arguments.tracking, lambda: measure_tracking(arguments.repeats)),
+        (arguments.pose, lambda: measure_pose(arguments.repeats)),
         (arguments.memory, measure_memory),
         (arguments.first_use, measure_first_use),
     ]

@@ -43,10 +43,10 @@ from msgs_slam.pipelines.mapping.losses import depth_loss
 from msgs_slam.pipelines.mapping.measure import depth_view, drawn_view
 from msgs_slam.pipelines.mapping.optimise import voted_logits
 from msgs_slam.pipelines.mapping.region_prior import with_region_prior
+from msgs_slam.pipelines.mapping.seeding import complete_depth, fill_smoothly, seed_spacing
 from msgs_slam.pipelines.mapping.submaps import nearest_seeing
 from msgs_slam.pipelines.mapping.views import halved, make_view, occurring_classes
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
-from msgs_slam.pipelines.render.seeding import complete_depth, fill_smoothly, seed_spacing
 from msgs_slam.pipelines.render_run import orbit, resampled, smoothed
 from msgs_slam.pipelines.scene.gps import georeference
 from msgs_slam.pipelines.scene.metres import Seen, contradiction, usual_evidence

@@ -7,18 +7,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from finished import note_finished
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome, trajectory_cells
+from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome, refined_pose, trajectory_cells
 from msgs_slam.pipelines.evaluation.mesh_error import mesh_cells
 from msgs_slam.pipelines.evaluation.truth import match_truth, true_trajectory
 from msgs_slam.pipelines.evaluation.write import write_evaluation
+from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.render.api import render
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import WORLD, World
 from msgs_slam.pipelines.types import Frame
@@ -164,3 +167,21 @@ def test_a_mesh_exported_into_another_world_is_brought_back(oracle_run: OracleRu
     moved = mesh_cells(load_outcome(run), matched, alignment)
     assert moved["accuracy"] == pytest.approx(plain["accuracy"], rel=0.05)
     assert moved["completeness"] == pytest.approx(plain["completeness"], rel=0.02)
+
+
+def test_a_refined_pose_is_where_the_image_was_taken(oracle_run: OracleRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    outcome, frame_id = load_outcome(oracle_run()), 9
+    m, true = outcome.require_map(), outcome.trajectory.cam_from_world[9]
+    with torch.no_grad():
+        shown = render(
+            m.means, m.radii, m.opacities, m.colors, torch.from_numpy(true), outcome.calibration.intrinsics
+        ).features
+    noise = 0.02 * torch.randn(shown.shape, generator=torch.Generator().manual_seed(0))
+    image = (255 * (shown + noise).clamp(0, 1)).numpy().astype(np.uint8)
+    monkeypatch.setattr(RunFolder, "image", lambda run, frame: image)
+    start = se3.exp(np.array([0.01, -0.01, 0.01, 0.003, -0.003, 0.003])) @ true
+    found = refined_pose(outcome, frame_id, start)
+    before, after = (float(np.linalg.norm(se3.log(pose @ se3.inverse(true)))) for pose in (start, found))
+    assert 0 < after < 0.1 * before
+    away = se3.exp(np.array([0.0, 0, -50, 0, 0, 0])) @ true
+    assert np.array_equal(refined_pose(outcome, frame_id, away), away), "the map covers nothing there"

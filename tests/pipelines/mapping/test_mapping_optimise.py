@@ -17,9 +17,9 @@ from msgs_slam.pipelines.mapping import growth, optimise, schedule
 from msgs_slam.pipelines.mapping.load import MappingInput
 from msgs_slam.pipelines.mapping.measure import ViewFigures, measure_view
 from msgs_slam.pipelines.mapping.optimise import MapOptimiser, OptimisedMap, optimise_map, voted_logits
+from msgs_slam.pipelines.mapping.seeding import SEED_LOGIT
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View
-from msgs_slam.pipelines.render.seeding import SEED_LOGIT
 from msgs_slam.pipelines.types import VOID
 
 SETTINGS = MappingConfig(passes=6.0, min_iterations=0, snapshot_every=20, seed_stride=1)

@@ -23,13 +23,10 @@ from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.render_run import render_run
-from msgs_slam.pipelines.run.files import MAP, SPARSE, TRAJECTORY
+from msgs_slam.pipelines.run.files import MAP, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.system.progress import SilentProgress
-from msgs_slam.pipelines.tracking.pictures import Pictures
-from msgs_slam.pipelines.tracking.refine import compare_frame
-from msgs_slam.pipelines.tracking.state import FEATURE_SD, TrackState
 from msgs_slam.pipelines.viewer.scene import load_scenes
 from tests.pipelines.mapping.small_run import make_run
 from tests.pretend_device import DEVICE, PretendTensor, WrongDeviceError, pretended
@@ -62,13 +59,6 @@ def run(device: None, tmp_path_factory: pytest.TempPathFactory, world_sequence: 
     assert records["mapping"].figures["held_out_psnr"] > 10
     assert records["global_ba"].figures["joint"] in ("kept", "thrown away")
     return made
-
-
-def test_a_frame_is_compared_with_gaussians_there(run: RunFolder) -> None:
-    state = TrackState.from_backbone(run.load(SPARSE, "tracking"), FEATURE_SD)
-    found = compare_frame(5, state.poses[5], [4, 6], state, Pictures(run, CONFIG.frames))
-    assert found is not None
-    assert found.unexplained < 0.5
 
 
 def test_a_map_can_be_moved_there(run: RunFolder) -> None:

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..render.gaussian_map import GaussianMap
 from ..types import Intrinsics
-from .gaussian_map import GaussianMap
 
 SEED_OPACITY = 0.73
 SEED_RADIUS = 0.7
